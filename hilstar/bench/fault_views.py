@@ -12,7 +12,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import star_rates
 from hilstar.bench.cameras import bench_camera, tracker_camera
-from hilstar.bench.fault_desk import FaultDesk
+from hilstar.bench.fault_schedule import FaultSchedule
 from hilstar.bench.frame import Bench
 from hilstar.bench.scenario import NO_SCENARIO, Scenario
 from hilstar.frame.fault_light import FaultCamera, FaultView
@@ -81,8 +81,8 @@ def _v0_e_per_s(file: BenchFile) -> Callable[[float], float]:
 
 
 def faults_at(bench: Bench, scenario: Scenario, t_ns: int) -> FaultLayer:
-    """The faults of one frame of the display that is shown at a moment of a scenario. Raises InputError (see `FaultDesk`)."""
+    """The faults of one frame shown at a moment of a scenario. Raises InputError (see `FaultSchedule`)."""
     view = display_view(bench, scenario)
-    desk = FaultDesk(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare)
-    desk.begin(0)
-    return FaultLayer(view, desk.at(t_ns))
+    schedule = FaultSchedule(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare)
+    schedule.begin(0)
+    return FaultLayer(view, schedule.at(t_ns))

@@ -39,7 +39,7 @@ from hilstar.cli.running import (
     end_of_run,
     explain_bench,
     explain_source,
-    fault_desk,
+    fault_schedule,
     followed,
     optional_ledger,
     optional_pulse,
@@ -127,7 +127,7 @@ def replay(
 
         page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
         parts = PageParts(
-            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong)
+            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_schedule(wrong)
         )
         with on_terminal(status), followed(listener, control, page, parts, status, record) as (sink, follower, requests):
             outlet = Outlet(screen, kept, notices, follower=follower, requests=requests, faults=wrong, pulse=pulse)

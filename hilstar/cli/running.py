@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Conventions, Mounting
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.cameras import FieldsOfView
-    from hilstar.bench.fault_desk import FaultDesk
+    from hilstar.bench.fault_schedule import FaultSchedule
     from hilstar.bench.scenario import Scenario
     from hilstar.console.listener import PageListener
     from hilstar.console.publisher import FramePublisher, PageParts, RunDescription
@@ -224,9 +224,9 @@ def end_of_run(summary: RunSummary, screen: Any, ledger: LedgerSwitch, notices: 
         raise typer.Exit(1)
 
 
-def fault_desk(faults: AnyFaults | None) -> FaultDesk | None:
-    """The desk at which the page requests faults; None for a run without faults, or with those of an earlier run."""
-    return getattr(faults, "desk", None)
+def fault_schedule(faults: AnyFaults | None) -> FaultSchedule | None:
+    """The schedule at which the page requests faults; None for a run without faults, or with those of an earlier run."""
+    return getattr(faults, "schedule", None)
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from hilstar.cli.running import (
     end_of_run,
     explain_bench,
     explain_source,
-    fault_desk,
+    fault_schedule,
     followed,
     optional_ledger,
     optional_pulse,
@@ -218,7 +218,7 @@ def serve(
             "serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock"
         )
         parts = PageParts(
-            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong)
+            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_schedule(wrong)
         )
         with on_terminal(status), followed(listener, control, page, parts, status) as (sink, follower, requests):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse)
@@ -246,4 +246,4 @@ def tracker_pictures(link: AnyLink, bench: Bench, faults: Any = None) -> Picture
         return None
     if faults is None:
         return TrackerPictures(bench)
-    return TrackerPictures(bench, faults.desk.scenario, lambda: faults.frames.now)
+    return TrackerPictures(bench, faults.schedule.scenario, lambda: faults.frames.now)

@@ -46,7 +46,7 @@ from hilstar.version import __version__
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile
-    from hilstar.bench.fault_desk import FaultDesk
+    from hilstar.bench.fault_schedule import FaultSchedule
     from hilstar.calibrate.first_light.image_sources import Pattern
     from hilstar.notices import Notices
     from hilstar.run.record.ledger import Ledger, LedgerSwitch
@@ -151,7 +151,7 @@ class WatchedRun:
     notices: Notices
     ledger: LedgerSwitch
     screen: Screen | None = None
-    faults: FaultDesk | None = None
+    faults: FaultSchedule | None = None
 
     def listen(self, listener: Listener) -> None:
         """Pass every further event of the run to `listener`."""
@@ -392,7 +392,7 @@ class PageParts:
     ledger: LedgerSwitch
     make_ledger: Callable[[Path], Ledger]
     screen: Screen | None = None
-    faults: FaultDesk | None = None
+    faults: FaultSchedule | None = None
 
 
 @contextmanager

@@ -87,7 +87,7 @@ class FaultView:
         self._tracks: dict[tuple[str, int], Chain] = {}
 
     def prepare(self, fault: Fault) -> Fault:
-        """The fault as it is drawn, with everything ready that a frame has no time for. Raises InputError (see `FaultDesk`)."""
+        """The fault with everything prepared that a frame has no time for. Raises InputError (see `FaultSchedule`)."""
         if isinstance(fault, CosmicRays) and fault.for_s is None:
             fault = msgspec.structs.replace(fault, for_s=self.by.exposure_s)
         self._targets.check(self.by.stars, fault)

@@ -20,7 +20,7 @@ import msgspec
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.bench.config.attitude import FaultSettings
-from hilstar.bench.fault_desk import FILE, Change, FaultDesk, share_on
+from hilstar.bench.fault_schedule import FILE, FaultChange, FaultSchedule, share_on
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
 from hilstar.bench.scenario import NO_SCENARIO, Scenario
@@ -50,7 +50,7 @@ class FaultLink(ZmqReceiver):
     max_part_bytes = MAX_MESSAGE_BYTES
 
 
-def act(desk: FaultDesk, raw: bytes) -> None:
+def act(schedule: FaultSchedule, raw: bytes) -> None:
     """Do what a message asks for. Raises InputError for one that is wrong, or that cannot be done."""
     try:
         message: Any = msgspec.json.decode(raw)
@@ -63,20 +63,26 @@ def act(desk: FaultDesk, raw: bytes) -> None:
             name = message[verb]
             if len(message) > 1 or not isinstance(name, str):
                 raise InputError(f"{shortened(message)}: {FORM}")
-            desk.start(name, STREAM) if verb == "start" else desk.stop(name, STREAM)
+            schedule.start(name, STREAM) if verb == "start" else schedule.stop(name, STREAM)
             return
-    desk.ask(fault_of(message), STREAM)
+    schedule.ask(fault_of(message), STREAM)
 
 
 class FaultStream:
     """Listens on a thread of its own while it is open. Raises InputError where the endpoint cannot be used."""
 
     def __init__(
-        self, desk: FaultDesk, endpoint: str, *, bind: bool = False, keys: CurveKeys = NO_KEYS, notices: Notices | None = None
+        self,
+        schedule: FaultSchedule,
+        endpoint: str,
+        *,
+        bind: bool = False,
+        keys: CurveKeys = NO_KEYS,
+        notices: Notices | None = None,
     ) -> None:
         self.messages = 0
         self.refused: Counter[str] = Counter()
-        self._desk, self._notices = desk, Notices() if notices is None else notices
+        self._schedule, self._notices = schedule, Notices() if notices is None else notices
         self._link = FaultLink(endpoint, bind=bind, keys=keys, notices=self._notices)
         self._allowance = Allowance(MAX_BURST, MAX_PER_S)
         self._stop = threading.Event()
@@ -103,7 +109,7 @@ class FaultStream:
             self._refuse("too-many", f"more than {MAX_PER_S} messages a second; send fewer")
             return
         try:
-            act(self._desk, raw)
+            act(self._schedule, raw)
         except InputError as error:
             self._refuse("refused", str(error))
 
@@ -192,7 +198,7 @@ MAX_NAMES = 100  # in the summary: a stream may make up names
 
 
 class RunFaults:
-    """The faults of one run: `desk` for who wants to start one, `frames` for the loop.
+    """The faults of one run: `schedule` for who wants to start one, `frames` for the loop.
 
     Raises InputError for a fault that this bench cannot draw.
     """
@@ -206,12 +212,12 @@ class RunFaults:
         self._sha256: dict[Fault, str] = {
             fault: map_sha256(scenario.folder / fault.file) for fault in scenario.faults if isinstance(fault, MeasuredMap)
         }
-        self.desk = FaultDesk(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare, self._hear)
-        self.frames = FaultyFrames(self.desk, view)
+        self.schedule = FaultSchedule(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare, self._hear)
+        self.frames = FaultyFrames(self.schedule, view)
         if ledger is not None and scenario.faults:
             ledger.fault(self._record("scenario", scenario.text, name=printable(str(scenario.path))))
 
-    def _hear(self, change: Change) -> None:
+    def _hear(self, change: FaultChange) -> None:
         fault = change.fault
         tally = self._missed if change.what == "missed" else self._started
         if change.what != "end":
@@ -242,10 +248,10 @@ class RunFaults:
 
     def begin(self, zero_ns: int) -> None:
         """Say from which time of the timeline a scenario's seconds count; by default from the first frame with an attitude."""
-        self.desk.begin(zero_ns)
+        self.schedule.begin(zero_ns)
 
     def recall(self, record: FrameRecord | None) -> None:
-        """These faults come from the desk, whatever an earlier run had."""
+        """These faults come from the schedule, whatever an earlier run had."""
 
     @contextmanager
     def listening(self, settings: FaultSettings, folder: Path) -> Iterator[str]:
@@ -258,7 +264,7 @@ class RunFaults:
             return
         names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
         keys = CurveKeys(*(None if name is None else folder / name for name in names))
-        self._stream = FaultStream(self.desk, settings.endpoint, bind=settings.bind, keys=keys, notices=self._notices)
+        self._stream = FaultStream(self.schedule, settings.endpoint, bind=settings.bind, keys=keys, notices=self._notices)
         try:
             yield self._stream.endpoint
         finally:
@@ -270,7 +276,7 @@ class RunFaults:
             "scenario": str(self._scenario.path) if self._scenario.faults else None,
             "started": dict(self._started),
             "missed": dict(self._missed),
-            "on": self.desk.on(),
+            "on": self.schedule.on(),
             "dropped_frames": self.frames.dropped,
             "frozen_frames": self.frames.frozen,
         }

@@ -1,6 +1,6 @@
 """What faults do to the frames of a run, besides their light: frames that are never shown, that stay, or are blank.
 
-The loop asks once a frame. A replay asks a recording in place of a desk, and draws the same light from it.
+The loop asks once a frame. A replay asks a recording in place of a schedule, and draws the same light from it.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import load
-from hilstar.bench.fault_desk import FaultDesk
+from hilstar.bench.fault_schedule import FaultSchedule
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
 from hilstar.bench.scenario import Scenario
@@ -104,7 +104,7 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
     scenario = Scenario(folder / "faults.toml", "", 1, faults, folder)
     view = display_view(bench, scenario)
     waiting = fault_of({"kind": "blank", "name": "later", "at_s": 1e6})
-    desk = FaultDesk(replace(scenario, faults=(waiting,)), 1 / REFRESH_HZ)
+    schedule = FaultSchedule(replace(scenario, faults=(waiting,)), 1 / REFRESH_HZ)
     ready = [view.prepare(fault) for fault in faults]
     times = []
     for k in range(rounds + 1):
@@ -115,7 +115,7 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
             return bench.draw(q).levels
 
         def faulty(q: FloatArray = q, k: int = k, now: tuple[Now, ...] = now) -> object:
-            desk.at(round(k / REFRESH_HZ * NS_PER_S))
+            schedule.at(round(k / REFRESH_HZ * NS_PER_S))
             return _frame(bench, q, FaultLayer(view, now), ready)
 
         times.append((_ms(plain), _ms(faulty)))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from hilstar.bench.fault_desk import FaultDesk
+from hilstar.bench.fault_schedule import FaultSchedule
 from hilstar.bench.scenario import parse_scenario
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -22,13 +22,13 @@ SCENARIO = parse_scenario(Path("f.toml"), '[[fault]]\nkind = "blank"\nname = "co
 
 
 def test_a_message_asks_for_a_fault_and_starts_and_stops_by_name():
-    desk = FaultDesk(SCENARIO)
-    desk.at(0)
-    act(desk, json.dumps(STAR).encode())
-    act(desk, b'{"start": "cover"}')
-    assert [now.fault.name for now in desk.at(10)] == ["ghost", "cover"]
-    act(desk, b'{"stop": "ghost"}')
-    assert [now.fault.name for now in desk.at(20)] == ["cover"]
+    schedule = FaultSchedule(SCENARIO)
+    schedule.at(0)
+    act(schedule, json.dumps(STAR).encode())
+    act(schedule, b'{"start": "cover"}')
+    assert [now.fault.name for now in schedule.at(10)] == ["ghost", "cover"]
+    act(schedule, b'{"stop": "ghost"}')
+    assert [now.fault.name for now in schedule.at(20)] == ["cover"]
 
 
 @pytest.mark.parametrize(
@@ -48,24 +48,24 @@ def test_a_message_asks_for_a_fault_and_starts_and_stops_by_name():
     ],
 )
 def test_a_bad_message_is_refused_in_a_line(raw, said):
-    desk = FaultDesk(SCENARIO)
+    schedule = FaultSchedule(SCENARIO)
     with pytest.raises(InputError) as refused:
-        act(desk, raw)
+        act(schedule, raw)
     assert said in str(refused.value)
-    assert desk.on() == []
+    assert schedule.on() == []
 
 
 @pytest.fixture
 def stream():
-    desk, notices = FaultDesk(SCENARIO), Notices()
-    opened = FaultStream(desk, "tcp://127.0.0.1:*", bind=True, notices=notices)
+    schedule, notices = FaultSchedule(SCENARIO), Notices()
+    opened = FaultStream(schedule, "tcp://127.0.0.1:*", bind=True, notices=notices)
     context = zmq.Context()
     sender = publishing(context)
     try:
         wait_for(lambda: not opened._link.endpoint.endswith("*"))
         sender.connect(opened._link.endpoint)
         await_subscriber(sender)
-        yield desk, opened, sender
+        yield schedule, opened, sender
     finally:
         sender.close(linger=0)
         context.term()
@@ -73,21 +73,21 @@ def stream():
 
 
 def test_faults_come_in_over_a_socket_and_bad_messages_are_counted(stream):
-    desk, opened, sender = stream
+    schedule, opened, sender = stream
     for message in (b"nonsense", json.dumps(STAR).encode(), b'{"start": "cover"}'):
         sender.send(message)
-    wait_for(lambda: len(desk.on()) == 2)
-    assert desk.on() == ["ghost", "cover"]
+    wait_for(lambda: len(schedule.on()) == 2)
+    assert schedule.on() == ["ghost", "cover"]
     assert opened.summary()["messages"] == 3 and opened.summary()["refused"] == 1
 
 
-def test_a_flood_and_a_huge_message_leave_the_desk_bounded_and_listening(stream):
-    desk, opened, sender = stream
+def test_a_flood_and_a_huge_message_leave_the_schedule_bounded_and_listening(stream):
+    schedule, opened, sender = stream
     begun_s = time.monotonic()
     for number in range(3000):
         sender.send(json.dumps(STAR | {"name": f"ghost {number}"}).encode())
     wait_for(lambda: opened.messages >= 1000)
-    assert len(desk.on()) <= MAX_BURST + MAX_PER_S * (time.monotonic() - begun_s) + 1
+    assert len(schedule.on()) <= MAX_BURST + MAX_PER_S * (time.monotonic() - begun_s) + 1
     sender.send(b"x" * (MAX_MESSAGE_BYTES + 1))  # drops the connection
     wait_for(lambda: opened._link.link_counts.connections >= 2)
     await_subscriber(sender)

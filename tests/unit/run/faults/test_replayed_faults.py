@@ -171,9 +171,9 @@ def test_the_console_starts_a_fault_of_the_scenario_while_it_runs(bench, log, tm
     def sink(shown):
         codes[shown.number] = shown.drawn.levels.copy()
         if shown.number == 10:
-            faults.desk.start("cover", "Ada")
+            faults.schedule.start("cover", "Ada")
         if shown.number == 20:
-            faults.desk.stop("cover", "Ada")
+            faults.schedule.stop("cover", "Ada")
 
     replay(bench, plan_play(log, Wanted(speed=float("inf")), bench.config), sink, Outlet(notices=notices, faults=faults))
     assert [number for number in codes if not codes[number].any()] == list(range(11, 21))

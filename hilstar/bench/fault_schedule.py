@@ -25,7 +25,7 @@ FILE = "file"  # who starts what a scenario has a time for
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class FaultChange:
     """A fault begins or ends at a moment of the run, ns from its zero, or falls between two frames; and who wanted that."""
 
     what: Literal["start", "end", "missed"]
@@ -45,8 +45,8 @@ class _Planned:
     number: int = 0
 
 
-def nobody_listens(change: Change) -> None:
-    """For a desk whose changes are not followed."""
+def nobody_listens(change: FaultChange) -> None:
+    """The listener of a schedule that nobody follows."""
 
 
 def as_it_is(fault: Fault) -> Fault:
@@ -54,7 +54,7 @@ def as_it_is(fault: Fault) -> Fault:
     return fault
 
 
-class FaultDesk:
+class FaultSchedule:
     """The faults of a run whose frames last `frame_s` each.
 
     `prepare` is called with each fault of the scenario at once, and with each that is asked for before it is taken; it
@@ -67,7 +67,7 @@ class FaultDesk:
         scenario: Scenario = NO_SCENARIO,
         frame_s: float = 1 / 60,
         prepare: Callable[[Fault], Fault] = as_it_is,
-        listen: Callable[[Change], None] = nobody_listens,
+        listen: Callable[[FaultChange], None] = nobody_listens,
     ) -> None:
         self.scenario = scenario
         self._frame_ns = round(frame_s * NS_PER_S)
@@ -166,8 +166,8 @@ class FaultDesk:
             self._listen(change)
         return found
 
-    def _step(self, run_ns: int) -> tuple[list[Change], tuple[Now, ...]]:
-        changes: list[Change] = []
+    def _step(self, run_ns: int) -> tuple[list[FaultChange], tuple[Now, ...]]:
+        changes: list[FaultChange] = []
         for planned in self._on[:]:
             if planned.fault.name in self._stops:
                 self._on.remove(planned)
@@ -181,7 +181,7 @@ class FaultDesk:
             if share and not planned.number:
                 self._count += 1
                 planned.number = self._count
-                changes.append(Change("start", planned.number, planned.fault, run_ns, planned.who))
+                changes.append(FaultChange("start", planned.number, planned.fault, run_ns, planned.who))
             if share:
                 found.append(Now(planned.number, planned.fault, since_ns, share))
             elif since_ns > 0:
@@ -189,12 +189,12 @@ class FaultDesk:
                 if planned.number:
                     changes.append(self._ended(planned, run_ns, planned.who))
                 elif self._last_ns is not None and (planned.start_ns or 0) > self._last_ns:
-                    changes.append(Change("missed", 0, planned.fault, run_ns, planned.who))
+                    changes.append(FaultChange("missed", 0, planned.fault, run_ns, planned.who))
         self._last_ns = run_ns
         return changes, tuple(found)
 
-    def _ended(self, planned: _Planned, run_ns: int, who: str) -> Change:
-        return Change("end", planned.number, planned.fault, run_ns, who or planned.who)
+    def _ended(self, planned: _Planned, run_ns: int, who: str) -> FaultChange:
+        return FaultChange("end", planned.number, planned.fault, run_ns, who or planned.who)
 
     def _admit(self, run_ns: int) -> None:
         """Let in what may be on within this frame."""

@@ -234,12 +234,12 @@ class Receiver:
             self._failure = f"{type(error).__name__}: {error}"
 
     def release(self) -> None:
-        """Take the samples that were in doubt, for no more will come."""
+        """Take the samples still in doubt: no more will come to decide them."""
         self._take_decided(self._senders.release())
         self._settle(self.jumps.release())
 
     def listen(self) -> None:
-        """Take what the link brings within POLL_MS; what the thread does all the time."""
+        """Take what the link brings within POLL_MS. The thread calls this in a loop."""
         waits = self._link.wait_for_message(0)
         now_ns = self._now_ns()
         if not waits:
@@ -295,7 +295,7 @@ class Receiver:
         self._take_decided(self._senders.take(arrival))
 
     def _take_decided(self, arrivals: list[SampleArrival]) -> None:
-        """What is known by now to be from the sender shown, or from another."""
+        """Take samples whose sender is decided: the one shown, or another, whose samples are refused."""
         for arrival in arrivals:
             if arrival.refusal is not None:
                 self._refuse(arrival, arrival.refusal)

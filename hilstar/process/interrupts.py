@@ -44,7 +44,7 @@ LAST_WORDS_S = 1.0  # for a traceback at the very end
 
 
 class _Ending:
-    """The state of this process's end."""
+    """The state of this process's end: the signal, the events to set, the guard's number, and holds."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -57,7 +57,7 @@ _ending = _Ending()
 
 
 def install() -> None:
-    """From here on SIGINT, SIGTERM and SIGHUP end this process; in its main thread, before it has others. Twice does nothing.
+    """Let SIGINT, SIGTERM and SIGHUP end this process. Call it in the main thread, before there are others; twice does nothing.
 
     SIGHUP stays ignored where it was (nohup); SIGINT does not, for a shell ignores it for whatever it runs with `&`.
     """
@@ -259,7 +259,7 @@ def _guard(parent: int, watched: socket.socket) -> NoReturn:
         poll.register(watched, select.POLLIN)
         [(_, events)] = poll.poll()
         if not events & select.POLLHUP:
-            poll.modify(watched, 0)  # whose end is told all the same
+            poll.modify(watched, 0)  # POLLHUP is reported all the same
             if not poll.poll(GUARD_WAITS_S * 1000) and os.getppid() == parent:
                 end_children(parent, os.getpid())
                 os.kill(parent, signal.SIGKILL)
@@ -368,7 +368,7 @@ _queued: QueuedStderr | None = None
 
 
 def queue_stderr() -> None:
-    """From here on, writing to `sys.stderr` does not wait."""
+    """Queue writes to `sys.stderr`, so that none waits."""
     global _queued  # noqa: PLW0603 - a process has one stderr
     if _queued is None and sys.stderr is not None:
         _queued = QueuedStderr()

@@ -1,4 +1,4 @@
-"""Programs around this process: one of somebody else that it runs, and systemd, which runs it (sd_notify).
+"""Programs around this process: another program that it runs, and systemd, which runs it (sd_notify).
 
 `Child` runs a command in a group of its own and reads its output as it comes, up to a bound. `Service` tells systemd in
 datagrams that the service is ready and alive, and its status in a line. The watchdog's datagrams are sent only while `alive`
@@ -96,7 +96,7 @@ class Child:
         self.kill()
         self._process.wait()
         for reader in self._readers:
-            reader.join(ENDED_WAIT_S)  # a grandchild in a group of its own may still hold the pipe
+            reader.join(ENDED_WAIT_S)  # a grandchild in another process group may still hold the pipe
         for stream, reader in zip((self._process.stderr, self._process.stdout), reversed(self._readers), strict=False):
             if stream is not None and not reader.is_alive():
                 stream.close()

@@ -126,7 +126,7 @@ def _ask_for_short_slices() -> None:
 
 @contextmanager
 def drawing_threads_apart() -> Iterator[None]:
-    """Keep each thread that llvmpipe begins in this context on a core of its own, where it begins one for each core."""
+    """Pin each thread that llvmpipe starts in this context to its own core, where it starts one per core."""
     before = _threads()
     yield
     begun_s = time.monotonic()
@@ -144,7 +144,7 @@ def drawing_threads_apart() -> Iterator[None]:
 
 
 def _drawing_threads(before: Collection[int]) -> tuple[list[int], list[int]]:
-    """The threads begun since that rasterise, and those that compute."""
+    """The threads started since then: those that rasterise, and those that compute."""
     begun = {thread: name for thread, name in sorted(_threads().items()) if thread not in before}
     rasterisers = [thread for thread, name in begun.items() if name.startswith(RASTERISERS)]
     # Those that compute have the process's own name; others of the driver's have one with a colon.
@@ -162,7 +162,7 @@ def _threads() -> dict[int, str]:
 
 
 def _cores() -> list[int]:
-    """Those that this process may run on; none where the system does not say."""
+    """The cores that this process may run on; none where the system does not say."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 

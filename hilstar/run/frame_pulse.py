@@ -1,4 +1,4 @@
-"""A pulse at each frame, for a tracker that takes a trigger: on a thread of its own, for a line may take its time."""
+"""A trigger pulse for the tracker at each frame, from a separate thread, because a line may be slow."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hilstar.run.sync import SyncSummary
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
-# How long a frame waits for the thread to take the pulse over, which else would wait for Python's lock: 0.5 ms or more.
+# A frame waits this long for the thread to take over, which would otherwise wait 0.5 ms or more for Python's lock.
 HANDOVER_S = 0.0005
 MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.1, 2.0
 END_S = 1.0
@@ -26,7 +26,7 @@ LAST_S = 0.25  # for the last pulse of a run: what follows has a second, after a
 
 
 def _nobody_counts(what: str) -> None:
-    """Whoever counts the pulses of a run that has no ledger."""
+    """The counter of pulses in a run without a ledger."""
 
 
 class FramePulse:

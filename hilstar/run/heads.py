@@ -50,7 +50,7 @@ BODY = (1.0, 0.0, 0.0, 0.0)
 
 
 class HeadProcess:
-    """A head's process, begun again whenever it ends early or says nothing.
+    """A head's process, restarted whenever it ends early or gives no sign of life.
 
     `command(number, drawn_s)` is that of its begin `number`, `drawn_s` after it drew first, 0 where it never did.
 
@@ -101,7 +101,7 @@ class HeadProcess:
 
     def _keep(self, stream: IO[bytes]) -> None:
         self.output = stream.read(MAX_OUTPUT)
-        while stream.read(MAX_LINE):  # what is more is let go, so that the head does not stand still for it
+        while stream.read(MAX_LINE):  # further output is discarded, so that the head does not block on it
             pass
 
     def _drain(self) -> bool:
@@ -146,7 +146,7 @@ class HeadProcess:
     def _ended(self, code: int, now_s: float) -> bool:
         for reader in self._readers:
             reader.join(1.0)
-        # An end by a signal or an unforeseen error is begun again; one that the command meant (0 to 4) is the end.
+        # A head ended by a signal or an unforeseen error is restarted; one that exits with 0 to 4 has finished.
         if 0 <= code <= 4 and (self._ready or code != 0):
             self.code = code
             return False
@@ -165,14 +165,14 @@ class HeadProcess:
             self._process.wait()
 
     def interrupt(self) -> None:
-        """Ask it to end in order; one that waits to begin again does not."""
+        """Ask it to end in order; a head that waits for its restart is done."""
         if self._process is None:
             self.code = 0 if self.code is None else self.code
         elif self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
 
     def close(self, patience_s: float) -> None:
-        """Wait for its end, at most so long; then end it."""
+        """Wait for its end for at most `patience_s`, then kill it."""
         if self._process is not None:
             try:
                 self.code = self._process.wait(patience_s)
@@ -210,7 +210,7 @@ def source_config(heads: HeadsFile) -> BenchConfig:
 
 
 def head_ledger(ledger: Path, name: str, number: int = 0) -> Path:
-    """A head's ledger: RUN.NAME.mcap, and RUN.NAME.again1.mcap where it was begun again."""
+    """A head's ledger: RUN.NAME.mcap, and RUN.NAME.again1.mcap where it was restarted."""
     again = f".again{number}" if number else ""
     return ledger.with_name(f"{ledger.stem}.{name}{again}{ledger.suffix}")
 

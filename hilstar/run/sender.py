@@ -50,7 +50,7 @@ class SenderEnd(Protocol):
     link_counts: LinkCounts
 
     def wait_for_listener(self, timeout_s: float) -> bool:
-        """True once somebody listens, or where the road cannot tell."""
+        """True once there is a listener, or where the road cannot tell."""
 
     def put(self, packet: bytes) -> None:
         """Send one packet."""
@@ -110,7 +110,7 @@ class Listener:
 
 
 class TwoWay:
-    """What an end hears."""
+    """An end that also listens: statuses and time requests."""
 
     _listener: Listener
 

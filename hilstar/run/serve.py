@@ -1,4 +1,4 @@
-"""A live run over a link: the stream, or a sender in lockstep."""
+"""A live run over a link: a free-running stream, or a simulation in lockstep."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ Follower = Callable[[Running], None]  # called once, when a run begins
 
 
 def nobody_follows(running: Running) -> None:
-    """The follower of a run that nobody follows."""
+    """The follower of a run without an audience."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,7 +144,7 @@ def _phases(exposures: Exposures) -> FloatArray:
 
 
 def _period_s(exposures: Exposures) -> float | None:
-    """After how long exposures begin at the same phase again; None where each begins at that of the one before.
+    """The time after which exposures begin at the same phase again; None where all begin at one phase.
 
     The refresh as the tracker's frames sample it: the difference from the nearest multiple of their rate.
     """
@@ -199,7 +199,7 @@ class Tolerance:
 
 
 def exposures_of(config: BenchConfig, refresh_hz: float | None = None) -> Exposures:
-    """The exposures of a bench, before a screen of its own refresh rate or of one that was measured. Raises InputError."""
+    """The exposures of a bench, with its screen's nominal refresh rate or a measured one. Raises InputError."""
     monitor, tracker = config.monitor, config.tracker
     lit_s = None if monitor.hold_ms is None else monitor.hold_ms * NS_PER_MS / NS_PER_S
     hz = monitor.refresh_hz if refresh_hz is None else refresh_hz

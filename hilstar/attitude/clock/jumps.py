@@ -56,14 +56,14 @@ UNSHARED = "clock-not-shared"
 
 
 class _Step(NamedTuple):
-    """From one message to the next."""
+    """The step of t_ns from one message to the next, and how many packets it spans."""
 
     ns: int
     packets: int
 
 
 class TimeSteps:
-    """By how much t_ns usually advances from one message to the next."""
+    """The usual step of t_ns from message to message."""
 
     def __init__(self) -> None:
         self._last: AttitudeSample | None = None
@@ -329,9 +329,9 @@ class SharedClockFilter:
         """Jumps are never counted."""
 
     def expire(self, host_ns: int) -> list[SampleArrival]:
-        """Nothing waits."""
+        """No sample is ever in doubt."""
         return []
 
     def release(self) -> list[SampleArrival]:
-        """Nothing waits."""
+        """No sample is ever in doubt."""
         return []

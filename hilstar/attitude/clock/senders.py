@@ -90,7 +90,7 @@ def _is_another_s(last: AttitudeSample, sample: AttitudeSample) -> bool:
 
 
 def _steps(before: int, sequence: int) -> int:
-    """By how much `sequence` advances, modulo 2^32, taken the shorter way."""
+    """The advance of `sequence`, modulo 2^32, the shorter way."""
     return (sequence - before + U32 // 2) % U32 - U32 // 2
 
 
@@ -109,37 +109,37 @@ def _turn_rad(a: Sequence[float], b: Sequence[float]) -> Turn:
 
 @dataclass(frozen=True, slots=True)
 class _CourseAgreement:
-    """In what a message agrees with a sender; `far_rad` is how far its attitude lies from the course."""
+    """Where a message agrees with a sender; `far_rad` is the distance of its attitude from the sender's course."""
 
     clock: bool
     count: bool
     sky: bool
-    plausible: bool  # a turn that a spacecraft could have made meanwhile
-    steady: bool  # it comes by the usual step of t_ns
+    plausible: bool  # a spacecraft could have turned so far since the last message
+    steady: bool  # t_ns advanced by its usual step
     far_rad: float
 
     @property
     def score(self) -> int:
-        """Of the three."""
+        """How many of clock, count and sky agree."""
         return self.clock + self.count + self.sky
 
 
 @dataclass(slots=True)
 class _KnownSender:
-    """What is known of one: its newest message, when that arrived, and how its messages advance."""
+    """One sender: its newest message, when that arrived, and how its messages advance."""
 
     sample: AttitudeSample
     host_ns: int
     waited_ns: int = 0
     heard: int = 1
     since_ns: int = 0
-    count: int = 0  # its newest `sequence`, and the time of that
+    count: int = 0  # its newest `sequence`; count_t_ns is the time of that message
     count_t_ns: int = 0
     period_ns: float | None = None  # step of t_ns for each count, or for each message
     still: bool = True  # it does not count: its sequence never changes
     turning_rad_s: Turn | None = None
-    far_rad: float = 0.0  # how far its attitudes lately came off their course
-    silence_ns: float = 0.0  # how long it was lately silent from message to message
+    far_rad: float = 0.0  # recent deviation of its attitudes from their course
+    silence_ns: float = 0.0  # recent silence between messages
     q: list[float] = field(default_factory=list)
 
     @classmethod
@@ -150,7 +150,7 @@ class _KnownSender:
         return made
 
     def agrees(self, arrival: SampleArrival) -> _CourseAgreement:
-        """In what a message agrees with this sender."""
+        """Compare a message with this sender."""
         sample = arrival.event
         later_ns, gap_ns = sample.t_ns - self.sample.t_ns, arrival.host_ns - self.host_ns
         step = _steps(self.count, sample.sequence)
@@ -180,7 +180,7 @@ class _KnownSender:
         return abs(later_ns - usual_ns) <= 0.5 * self.period_ns + 0.05 * abs(usual_ns)
 
     def _counts_on(self, step: int, later_ns: int, gap_ns: int) -> bool:
-        """Whether this counter may have reached that sequence by now."""
+        """Whether this counter can have reached the sequence since its last message."""
         later_ns = max(later_ns if 0 < later_ns < MAX_STEP_NS else 0, gap_ns)
         max_step = MAX_FIRST_LOSSES if self.period_ns is None else 2 + 2 * later_ns / self.period_ns
         return 1 <= step <= max_step
@@ -191,7 +191,7 @@ class _KnownSender:
         return STEADY[0] < later_ns / (self.period_ns * max(step, 1)) < STEADY[1]
 
     def _far_rad(self, turned: Turn, meanwhile_ns: float) -> float:
-        """From the course that it had, or from where it was."""
+        """The distance from its predicted attitude or its last one, whichever is nearer."""
         stood_rad = math.hypot(*turned)
         if self.turning_rad_s is None:
             return stood_rad

@@ -45,13 +45,13 @@ Joins = Callable[[AttitudeSample, AttitudeSample], Join]
 
 
 class Damped(NamedTuple):
-    """What to take from a sample's rate, rad/s, cam, for a prediction by `ahead_s`; less of it for a shorter one."""
+    """The excess of a sample's rate, rad/s, cam, over what a prediction by `ahead_s` uses; less for a shorter one."""
 
     excess: Vector
     ahead_s: float
 
     def by(self, seconds: float) -> Vector:
-        """The part of the rate to leave out where the attitude is predicted by so long."""
+        """The part of the rate, rad/s, to leave out of a prediction over `seconds`."""
         share = 1.0 if seconds >= self.ahead_s else (seconds / self.ahead_s) ** 2  # 1 - sin(x) / x goes with the square
         x, y, z = self.excess
         return share * x, share * y, share * z
@@ -83,11 +83,11 @@ class Damping:
         self._xx, self._xy = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
 
     def asked(self, seconds: float) -> None:
-        """A frame was predicted by so long."""
+        """Note the prediction time of a frame."""
         self.usual_s += AGE_SHARE * (seconds - self.usual_s)
 
     def add(self, t_ns: int, rate: Vector, turn: Vector | None) -> Damped:
-        """Take the next sample, which turned by `turn` (rad) since the one before it; what to take from its rate."""
+        """Take the next sample, with its turn (rad) since the previous one; returns how to damp its rate."""
         if turn is None or not self._seen:
             self.restart()
             self._seen.append(_SeenSample(t_ns, NOTHING, rate, NOTHING))
@@ -306,7 +306,7 @@ class Timeline:
         return angle_between_rad(before.q_icrs_to_cam, after.q_icrs_to_cam) > self._policy.max_rate_rad_s * seconds
 
     def _rate_of(self, previous: AttitudeSample | None, newest: AttitudeSample) -> FloatArray | None:
-        """The rate by which a sample is carried on: its own, else that of the turn to it; None where nobody knows."""
+        """The rate for predicting past a sample: its own, else that of the turn to it; None where neither is known."""
         if newest.rate_cam_rad_s is not None or previous is None or self._jumped(previous, newest):
             return newest.rate_cam_rad_s
         gap_ns = newest.t_ns - previous.t_ns

@@ -173,7 +173,7 @@ class DatedBlock:
         return timeline
 
     def at(self, t_ns: int) -> LogEntry:
-        """Its attitude at a time within it, as a replay has it between two of its own, with the place of the one before."""
+        """Its attitude at a time within its span, interpolated as in a replay, at the previous sample's place in the file."""
         where, before = self.entries[bisect_right(self.times, t_ns) - 1]
         attitude = self._timeline.at(t_ns)
         if attitude is None or not isinstance(before, AttitudeSample):

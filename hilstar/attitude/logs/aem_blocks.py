@@ -344,7 +344,7 @@ def xml_blocks(text: str) -> list[Block]:
 
 
 class _XmlReading:
-    """The elements as the parser meets them. A state is made numbers, and let go, where it ends."""
+    """Handles elements as the parser meets them. At its end, a state is reduced to its numbers."""
 
     def __init__(self) -> None:
         self.messages = 0

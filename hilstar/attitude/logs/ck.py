@@ -236,7 +236,7 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
 
 
 def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, dict[str, Any]]:
-    """What SPICE says in a process of its own."""
+    """Ask the process that runs SPICE: its arrays, and the rest of its answer."""
     request = json.dumps({"path": str(path), "kernels": [str(kernel) for kernel in kernels], "body": body})
     places = os.pathsep.join(place or str(Path.cwd()) for place in sys.path)
     try:

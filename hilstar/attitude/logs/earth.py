@@ -234,7 +234,7 @@ class Reference(NamedTuple):
 
     @property
     def words(self) -> str:
-        """For a person."""
+        """The frame in words, for `--explain`."""
         if self.kind == "icrs":
             return AXES["icrs"]
         latitude_deg, longitude_deg = self.place

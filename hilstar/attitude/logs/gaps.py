@@ -43,7 +43,7 @@ class LogJoins:
     cause: str = ""
 
     def __call__(self, before: AttitudeSample, after: AttitudeSample) -> Join:
-        """For a timeline."""
+        """How a timeline joins two successive samples."""
         if after.discontinuity or before.t_ns in self.held_ns:
             return "hold"
         return "blend" if before.t_ns in self.blended_ns else "slerp"
@@ -94,7 +94,7 @@ def _cause(samples: Sequence[AttitudeSample], first: int) -> str:
 def _fits(
     samples: Sequence[AttitudeSample], seconds: FloatArray, gap: npt.NDArray[np.bool_]
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """For each interval, (n,): whether both samples have rates, and whether those fit the turn between them."""
+    """Two masks (n,) over intervals: both samples have rates; and those fit the turn between them."""
     nothing = np.full(3, np.nan)
     rate = np.array([nothing if s.rate_cam_rad_s is None else s.rate_cam_rad_s for s in samples])
     q = np.array([sample.q_icrs_to_cam for sample in samples])

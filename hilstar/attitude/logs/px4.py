@@ -56,7 +56,7 @@ GAP_INTERVALS = 5  # usual intervals: farther than this from both neighbours, a 
 GLOBAL_POSITION = "vehicle_global_position"
 GPS = ("vehicle_gps_position", "sensor_gps")
 GROUND_TRUTH = "_groundtruth"
-# A receiver without a fix reports 0, or a date of its own past.
+# A receiver without a fix reports 0, or an old date.
 FIRST_DATE_US, LAST_DATE_US = 946_684_800_000_000, 4_102_444_800_000_000  # 2000 and 2100
 UNSURE_S = 0.1  # said of fixes that agree no better: 1.5 arcsec of the Earth's turning
 APART_S = 1.0
@@ -280,7 +280,7 @@ class VehiclePlace(NamedTuple):
 
 
 def boot_utc(path: Path, stated: Stated, topics: dict[ULogTopic, Series], told: list[tuple[str, str]]) -> Utc:
-    """From `--epoch-utc`, else the median over the receiver's times. Raises InputError where there is neither."""
+    """The UTC of boot: `--epoch-utc`, else the median over the receiver's times. Raises InputError where there is neither."""
     offsets_us = _offsets_us(topics)
     gps_ns = round(float(np.median(offsets_us - offsets_us[0]))) * 1000 + int(offsets_us[0]) * 1000 if len(offsets_us) else None
     if stated.epoch_utc is not None:
@@ -319,7 +319,7 @@ def _fixed_us(series: Series) -> IntArray:
 
 
 def place_at(path: Path, stated: Stated, topics: dict[ULogTopic, Series], t_us: IntArray, suffix: str) -> VehiclePlace:
-    """From `--place`, else the estimated position, else a receiver's. Raises InputError where there is none."""
+    """The place: `--place`, else the estimated position, else a receiver's. Raises InputError where there is none."""
     if stated.place is not None:
         latitude_deg, longitude_deg = (np.full(len(t_us), value) for value in stated.place[:2])
         return VehiclePlace(

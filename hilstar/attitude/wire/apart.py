@@ -1,11 +1,11 @@
-"""A process of its own that reads a link, so that no stamp waits for Python's lock: this process's end, and what both say.
+"""A separate process that reads a link, so that no stamp waits for Python's lock: its owner's end, and the records between.
 
 The contract:
 1. This process gives an `ReadOrder`: a ZeroMQ stream to open, an open device to read (its descriptor goes along), or nothing to
    read any more. A new order replaces the last one.
-2. The other process (`apart_child`) stamps each message and hands it over in a record that carries the order's number. What
-   is still told of an earlier order is dropped here.
-3. It says each 0.1 s that it lives. Where it ends, or hangs, that is told, and it is begun again with the same order.
+2. The other process (`apart_child`) stamps each message and hands it over in a record that carries the order's number. Records
+   of an earlier order are dropped here.
+3. It sends a sign of life every 0.1 s. Where it ends or hangs, a notice says so, and it is restarted with the same order.
 4. It ends with this process, however this one ends.
 """
 
@@ -34,9 +34,9 @@ MAX_TAKEN_BYTES = 1 << 20  # in one go
 MIN_BACK_OFF_S = 0.05
 MAX_BACK_OFF_S = 1.0
 STEADY_S = 10 * MAX_BACK_OFF_S
-HUNG_S = 0.4  # asleep for so long without a sign of life, it hangs
-STALLED_S = 3.0  # one that would run waits for a core for so long
-STARTS_S = 30.0  # and on a machine whose cores are all busy it begins within this
+HUNG_S = 0.4  # a sleeping process without a sign of life for this long hangs
+STALLED_S = 3.0  # a runnable process may wait this long for a core
+STARTS_S = 30.0  # to start, on a machine whose cores are all busy
 READY_WITHIN_S = 5.0
 ENDS_WITHIN_S = 0.3  # in order; a signal leaves a command a second for all its ends
 
@@ -83,7 +83,7 @@ class CountsRecord(msgspec.Struct, frozen=True, tag=True):
 
 
 class NoticeRecord(msgspec.Struct, frozen=True, tag=True):
-    """A notice of the link; `lasting` ones are told, others only mentioned."""
+    """A notice of the link; `lasting` notices are told, others only mentioned."""
 
     order: int
     kind: str
@@ -139,9 +139,9 @@ class RecordStream:
 
 
 class ReaderProcess:
-    """The process that reads a link: begun, given its order, read, and begun again where it ended.
+    """Runs the process that reads a link: starts it, gives it its order, and restarts it where it ended.
 
-    `generation` counts its begins. Its end raises nothing.
+    `generation` counts its starts. Its end raises nothing.
     """
 
     def __init__(self, notices: Notices, module: str = CHILD) -> None:
@@ -188,17 +188,17 @@ class ReaderProcess:
                 socket.send_fds(self._wire, [line], [self._file] if self._order.device else [])
 
     def read_stream(self, stream: ZmqStream) -> None:
-        """Have a ZeroMQ stream opened and read."""
+        """Order a ZeroMQ stream to be opened and read."""
         self._order = ReadOrder(self._order.number + 1, stream)
         self._give()
 
     def read_device(self, file: int) -> None:
-        """Have an open device read; it stays this process's to write to and to close."""
+        """Order an open device to be read; this process still writes to it and closes it."""
         self._order, self._file = ReadOrder(self._order.number + 1, device=True), file
         self._give()
 
     def read_nothing(self) -> None:
-        """Have the device let go, before it is closed here: else its line stays open, and locked."""
+        """Release the device before it is closed here: otherwise its line stays open and locked."""
         self._order = ReadOrder(self._order.number + 1)
         self._give()
 

@@ -36,7 +36,7 @@ from hilstar.notices import Notices
 from hilstar.process.interrupts import ENDING, end_with_parent
 from hilstar.process.scheduling import PromptWhileLight
 
-WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows: some hundred messages, while nobody reads them
+WANTED_BUFFER_BYTES = 1 << 20  # for some hundred unread messages; the kernel may give less
 MAX_ORDER_BYTES = 65_536
 MAX_READ_BYTES = 65_536
 LIFE_S = 0.1
@@ -85,7 +85,7 @@ class Wire:
 
 
 class Source(Protocol):
-    """What an order says to read. `empty_ns` is when nothing waited last, host time."""
+    """The thing to read. `empty_ns` is the last host time at which nothing waited."""
 
     empty_ns: int
 
@@ -93,17 +93,17 @@ class Source(Protocol):
         """Whether something waits."""
 
     def take(self, timeout_ms: int) -> Sequence[RawMessage]:
-        """What came, stamped; waits at most so long for the first. Raises OSError where a device does not answer any more."""
+        """The messages so far, stamped; waits at most `timeout_ms`. Raises OSError where a device no longer answers."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close this process's end of it."""
 
 
 class DeviceSource:
     """An open serial device, which the process that shows stars has opened and set up."""
 
     def __init__(self, file: int) -> None:
-        self.empty_ns = 0  # what waits already may have come at any time
+        self.empty_ns = 0  # bytes that already wait may have come at any time
         self._file = file
 
     def waits(self) -> bool:
@@ -129,7 +129,7 @@ class DeviceSource:
 
 
 class ForwardedNotices(Notices):
-    """Hands on what a link tells, after what it has counted by then; nothing once the other side is gone."""
+    """Forwards a link's notices, each after the counts so far; drops them once the other side is gone."""
 
     def __init__(self, wire: Wire, order: int) -> None:
         super().__init__()
@@ -137,19 +137,19 @@ class ForwardedNotices(Notices):
         self._wire, self._order, self._counted = wire, order, LinkCounts()
 
     def count(self) -> None:
-        """Hand on what the counts have grown by."""
+        """Forward the growth of the counts."""
         grown, self._counted = self.link_counts - self._counted, self.link_counts + LinkCounts()
         if grown != LinkCounts():
             self._wire.put(CountsRecord(self._order, grown))
 
     def tell(self, kind: str, detail: str, who: str = "") -> None:
-        """Have it told."""
+        """Forward a lasting notice."""
         with contextlib.suppress(EOFError):
             self.count()
             self._wire.put(NoticeRecord(self._order, kind, detail, who))
 
     def mention(self, kind: str, detail: str) -> None:
-        """Have it mentioned."""
+        """Forward a mention."""
         with contextlib.suppress(EOFError):
             self.count()
             self._wire.put(NoticeRecord(self._order, kind, detail, lasting=False))
@@ -231,7 +231,7 @@ def read_as_ordered(wire: Wire) -> NoReturn:
 
 
 def main() -> NoReturn:
-    """Read until the other side is gone; what ends this process early is told there in a line."""
+    """Read until the other side is gone; report there in a line what ends this process early."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
     file, parent = map(int, sys.argv[1:3])

@@ -32,9 +32,9 @@ E_co = TypeVar("E_co", bound=Event, covariant=True)
 class LinkCounts:
     """The counts of a link's connections and messages.
 
-    `connections` were made; `rejected` failed in the handshake, or were datagrams of senders that are not allowed; `refused`
-    were too many at once; `lost` ended on the side that connects; `resets` of the link, for memory or for messages without
-    end; `flooded` messages were dropped unread.
+    `connections`: made. `rejected`: failed handshakes, and datagrams of senders that are not allowed. `refused`: too many at
+    once. `lost`: ended, on the side that connects. `resets`: of the link, for memory or for messages without end. `flooded`:
+    messages dropped unread.
     """
 
     connections: int = 0
@@ -67,9 +67,9 @@ class FloodGate:
         self._dropped_s = -OVER_S
 
     def newest(self, waiting: list[T], declares_discontinuity: Callable[[T], bool]) -> list[T]:
-        """Of all that waits, oldest first, what may be decoded: the newest. Pauses where others are passed over.
+        """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses where others are passed over.
 
-        Of those the newest that declares a discontinuity is taken too: no attitude is interpolated across it.
+        The newest passed-over message that declares a discontinuity is taken too: no attitude is interpolated across it.
         """
         passed_over = len(waiting) - self._admit(len(waiting))
         for k in range(passed_over - 1, max(passed_over - MAX_LOOKED_AT, 0) - 1, -1):

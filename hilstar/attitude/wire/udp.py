@@ -79,7 +79,7 @@ def _keep(network: Network, source_at: int) -> bytes:
 
 
 def keep_only(receiving: socket.socket, networks: Sequence[Network]) -> bool:
-    """Have the kernel drop what comes from anywhere else; False where it does not take the filter."""
+    """Have the kernel drop datagrams from other addresses; False where it does not take the filter."""
     code = program(networks, 6 if receiving.family == socket.AF_INET6 else 4)
     count = len(code) // INSTRUCTION.size
     if count > MAX_INSTRUCTIONS:
@@ -93,7 +93,7 @@ def keep_only(receiving: socket.socket, networks: Sequence[Network]) -> bool:
 
 
 class KernelStamps:
-    """Has the kernel stamp what `receiving` gets; where it cannot, the time of reading counts.
+    """Has the kernel stamp arrivals at `receiving`; where it cannot, the time of reading counts.
 
     `empty_ns` is when nothing waited last, host time: what is read arrived later than that. Of a TCP stream the stamp is that
     of the last byte read.
@@ -219,7 +219,7 @@ class Datagrams:
         return False
 
     def keep_only(self, networks: Sequence[Network]) -> bool:
-        """Have the kernel drop what comes from anywhere else; False where it cannot."""
+        """Have the kernel drop datagrams from other addresses; False where it cannot."""
         return keep_only(self._socket, networks)
 
     def dropped(self) -> int:
@@ -255,13 +255,13 @@ class Credit:
         self._bytes: OrderedDict[SocketAddress, int] = OrderedDict()
 
     def earn(self, peer: SocketAddress, count: int) -> None:
-        """So many bytes came from there."""
+        """Credit a peer with the bytes that came from it."""
         self._bytes[peer] = min(self._bytes.pop(peer, 0) + count, MAX_CREDIT_BYTES)
         if len(self._bytes) > MAX_PEERS:
             self._bytes.popitem(last=False)
 
     def spend(self, peer: SocketAddress, count: int) -> bool:
-        """Whether so many bytes may go there; they are taken off."""
+        """Whether `count` bytes may go to a peer; if so, they are deducted."""
         left = self._bytes.get(peer, 0) - count
         if left < 0:
             return False

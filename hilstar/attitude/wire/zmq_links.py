@@ -79,7 +79,7 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         self.topic, self.decoder = topic, decoder
         self.conventions, self.stamped = decoder.conventions, decoder.stamped
         super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices, max_part_bytes=max_part_bytes)
-        if not bind:  # who connects is told of nothing until a sender binds there
+        if not bind:  # a connecting socket hears nothing until a sender binds there
             self.verb = "waiting for a sender at"
         self._shut()
         self._gate = FloodGate(self.link_counts, self._notices)
@@ -140,7 +140,7 @@ class ZmqReceiver(ZmqSocket, StreamLink):
 
 
 class ZmqApart(StreamLink):
-    """A ZeroMQ stream whose socket a process of its own reads.
+    """A ZeroMQ stream whose socket is read by a separate process.
 
     `link` was opened to see that it can be; it is closed here, and the other process opens the same socket at the first read,
     so that no old messages collect in it.
@@ -206,7 +206,7 @@ class ZmqApart(StreamLink):
 
 
 class ZmqSender(ZmqSocket):
-    """An XPUB socket, which knows when somebody subscribes; it binds, or connects with `bind=False`."""
+    """An XPUB socket, which reports subscribers; it binds, or connects with `bind=False`."""
 
     LINGER_MS, STOPPED_LINGER_MS = 2000, 200  # for a slow subscriber, without and with a signal
 

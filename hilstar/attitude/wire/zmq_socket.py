@@ -220,7 +220,7 @@ class Doorkeeper:
                     connection.shutdown(socket.SHUT_RDWR)
 
     def _is_ours(self, connection: socket.socket) -> bool:
-        """The descriptor may belong to another file by now."""
+        """Whether the descriptor is still a connection of this socket; it may have been reused for another file."""
         name = connection.getsockname()
         return bool((name[1] if isinstance(name, tuple) else name) == self.place)
 

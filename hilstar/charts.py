@@ -216,24 +216,34 @@ def log_ticks(axis: Axis, room: float) -> None:
     plain_ticks(axis, ticks)
 
 
-def label_ends(axes: Axes) -> None:
-    """Names of lines in their colours, right of the axes where each line ends: instead of a legend, when all is drawn."""
-    named = []
+def label_ends(*panels: Axes) -> None:
+    """Names of lines in their colours, right of each panel where each line ends, in place of a legend, when all is drawn."""
+    panels[0].figure.draw_without_rendering()  # type: ignore[union-attr]
+    for axes in panels:
+        _name_at_side(axes, list(_line_ends(axes)))
+
+
+def _line_ends(axes: Axes) -> Iterator[tuple[str, tuple[float, float], str]]:
+    """The name, the last point in view (x, y) and the colour of each line that has a name."""
     low, high = sorted(axes.get_xlim())
     for line in axes.get_lines():
-        x_is_data, _ = line.get_transform().contains_branch_seperately(axes.transData)  # not of an axhline
+        x_is_data, _ = line.get_transform().contains_branch_seperately(axes.transData)  # an axhline's x is not
         xy = np.asarray(line.get_xydata(), dtype=float)
         ends = xy[np.isfinite(xy[:, 1]) & ((low <= xy[:, 0]) & (xy[:, 0] <= high) | (not x_is_data))]
         if len(ends) and not str(line.get_label()).startswith("_"):
             x, y = (float(value) for value in ends[ends[:, 0].argmax()])
             place = (x if x_is_data else high), y
-            named.append((str(line.get_label()), place, str(line.get_color())))
-    name_at_side(axes, named)
+            yield str(line.get_label()), place, str(line.get_color())
 
 
 def name_at_side(axes: Axes, named: Sequence[tuple[str, tuple[float, float], str]]) -> None:
     """Names of points (x, y) of the data, with their colours, in a column right of the axes, level where there is room."""
     axes.figure.draw_without_rendering()  # type: ignore[union-attr]
+    _name_at_side(axes, named)
+
+
+def _name_at_side(axes: Axes, named: Sequence[tuple[str, tuple[float, float], str]]) -> None:
+    """The same on a figure that is laid out."""
     gap = 1.3 * SMALL_PT / 72 * axes.figure.dpi / axes.bbox.height
     at = {each: axes.transAxes.inverted().transform(axes.transData.transform(each[1])) for each in named}
     falling = sorted(named, key=lambda each: -at[each][1])

@@ -8,7 +8,6 @@ light.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -28,6 +27,7 @@ from hilstar.scene.extended import DiscView, ExtendedLight, Pose, disc_lights
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.sky.bodies.disc import Disc, lunar_share
 from hilstar.study.settings import Table, bench_text
+from hilstar.study.sweep import Spent, in_turn
 from hilstar.units import NS_PER_S
 
 REFRESH_HZ = 60.0
@@ -175,21 +175,25 @@ def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) ->
     bench, nothing = benches[scene.bench], benches["nothing"]
     knows = bench.moving is not None and scene.aim.body in bench.moving.names
     q = attitude(bench if knows else benches["all"], scene.aim)
-    times = []
-    for k in range(rounds + 1):
-        t_ns = scene.aim.t_ns + k * scene.step_ns
-        times.append((*frame_ms(nothing, q, None), *frame_ms(bench, q, t_ns)))
+    without, shown = fastest((nothing, bench), q, scene.aim.t_ns, scene.step_ns, rounds)
     stars = bench.draw(q, t_ns=scene.aim.t_ns).star_count
     discs = " ".join(disc.name for disc in bench.discs(bench.view(q, None, scene.aim.t_ns)))
-    without_ms, without_cpu_ms, with_ms, with_cpu_ms = np.min(np.array(times[1:]), axis=0).tolist()
-    return BodyCost(scene.name, with_ms, without_ms, with_ms - without_ms, with_cpu_ms - without_cpu_ms, discs, stars)
+    cost = shown.wall_ms - without.wall_ms, shown.cpu_ms - without.cpu_ms
+    return BodyCost(scene.name, shown.wall_ms, without.wall_ms, *cost, discs, stars)
 
 
-def frame_ms(bench: Bench, q: FloatArray, t_ns: int | None) -> tuple[float, float]:
-    """The time of drawing one frame and reading its levels back, ms, and the processor time."""
-    begin, begin_cpu = time.perf_counter(), time.process_time()
-    _ = bench.draw(q, t_ns=t_ns).levels
-    return (time.perf_counter() - begin) * 1e3, (time.process_time() - begin_cpu) * 1e3
+def fastest(benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int, rounds: int) -> tuple[Spent, Spent]:
+    """The fastest frame, from attitude to levels in memory, of a bench without bodies and of one with, timed in turn.
+
+    The second bench's clock begins at `t_ns` and goes on by `step_ns` from frame to frame.
+    """
+    nothing, bench = benches
+    works = {
+        "nothing": lambda _: nothing.draw(q).levels,
+        "bodies": lambda k: bench.draw(q, t_ns=t_ns + k * step_ns).levels,
+    }
+    without, shown = (Spent(*np.min(took, axis=0).tolist()) for took in in_turn(works, rounds).values())
+    return without, shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,8 +339,7 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
     bench, nothing = benches[body], benches["nothing"]
     start_ns = DAY_SIDE_NS if body == "Earth" else 0
     q = attitude(bench, Boresight(body, off_deg, start_ns))
-    times = [(*frame_ms(nothing, q, None), *frame_ms(bench, q, start_ns + k * FRAME_NS)) for k in range(rounds + 1)]
-    without_ms, _, with_ms, cpu_ms = np.min(np.array(times[1:]), axis=0).tolist()
+    without, shown = fastest((nothing, bench), q, start_ns, FRAME_NS, rounds)
     drawn = bench.draw(q, t_ns=start_ns)
     levels = drawn.levels.copy()
     light = bench.renderer.linear()
@@ -344,9 +347,9 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
     return Near(
         body=body,
         off_deg=off_deg,
-        frame_ms=with_ms,
-        cpu_ms=cpu_ms,
-        without_ms=without_ms,
+        frame_ms=shown.wall_ms,
+        cpu_ms=shown.cpu_ms,
+        without_ms=without.wall_ms,
         over_white_mag=2.5 * math.log10(max(brightest, 1e-9) / white),
         finite=bool(np.isfinite(light).all()),
         white_is_white=bool((levels[light > white] == bench.calibration.response.white).all()),
@@ -441,8 +444,7 @@ def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
             axes.axhline(limit, color=INK, linestyle="--", lw=1.2, label="limit")
         plain_ticks(pixel.xaxis, sorted({size.radius_px for size in sizes}))
         pixel.set_xlabel("radius of the Moon's disc [px]")
-        for axes in panels:
-            label_ends(axes)
+        label_ends(*panels)
 
 
 def draw_limits(path: Path, nears: Sequence[Near]) -> None:
@@ -462,5 +464,4 @@ def draw_limits(path: Path, nears: Sequence[Near]) -> None:
         light.set_xlabel("angle from the boresight [deg]")
         light.set_xscale("symlog", linthresh=1.0)
         plain_ticks(light.xaxis, (-70, -20, -8, -3, -1, 0, 1, 3, 8, 20, 40))
-        for axes in (times, light):
-            label_ends(axes)
+        label_ends(times, light)

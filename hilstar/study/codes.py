@@ -223,8 +223,7 @@ def draw(path: Path, left: list[OverFrames]) -> None:
         flux.set_ylabel("flux error, rms [mag]")
         place.set(ylabel="place by a PSF fit, rms [px]", xlabel="frames of an exposure")
         plain_ticks(place.xaxis, sorted({row.frames for row in left}))
-        for axes in (flux, place):
-            label_ends(axes)
+        label_ends(flux, place)
 
 
 def _finite(value: float) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,6 +16,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
 from hilstar.study.settings import Isolation, Table, bench_text, lone_windows, squares, star_error
+from hilstar.study.sweep import medians_ms
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import stamp_errors
 
@@ -112,7 +112,12 @@ def compare(scene: EffortScene, rounds: int) -> EffortComparison:
     with TemporaryDirectory() as folder:
         benches = {name: _open(scene, keys, Path(folder) / f"{name}.toml") for name, keys in EFFORTS.items()}
         try:
-            times = _times_ms(scene, benches, rounds)
+            turn = _turn(scene)
+            draw = {
+                name: lambda k, bench=bench: bench.draw(turn.q_icrs_to_cam, k, turn.rate_cam_rad_s).levels
+                for name, bench in benches.items()
+            }
+            times = medians_ms(draw, rounds)
             return EffortComparison(**{name: _outcome(scene, name, bench, times[name]) for name, bench in benches.items()})
         finally:
             for bench in benches.values():
@@ -134,18 +139,6 @@ def _open(scene: EffortScene, effort: Table, path: Path) -> Bench:
 
 def _turn(scene: EffortScene) -> Turn:
     return Turn(from_radec_roll_deg(*scene.radec_roll_deg), np.radians(scene.rate_deg_s))
-
-
-def _times_ms(scene: EffortScene, benches: dict[str, Bench], rounds: int) -> dict[str, float]:
-    turn = _turn(scene)
-    times: dict[str, list[float]] = {name: [] for name in benches}
-    for number in range(rounds + 1):
-        for name, bench in benches.items():
-            begin_s = time.perf_counter()
-            _ = bench.draw(turn.q_icrs_to_cam, number, turn.rate_cam_rad_s).levels
-            if number:  # the first frame compiles shaders
-                times[name].append((time.perf_counter() - begin_s) * 1e3)
-    return {name: float(np.median(values)) for name, values in times.items()}
 
 
 def _outcome(scene: EffortScene, name: str, bench: Bench, frame_ms: float) -> EffortOutcome:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +24,7 @@ from hilstar.scene.extended import Glow
 from hilstar.scene.sprites import Sprites, join_sprites
 from hilstar.study.settings import Isolation, bench_text, lone_windows
 from hilstar.study.settings import Table as Keys
+from hilstar.study.sweep import medians_ms
 from hilstar.units import NS_PER_S, magnitude
 
 REFRESH_HZ = 60
@@ -106,21 +105,18 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
     waiting = fault_of({"kind": "blank", "name": "later", "at_s": 1e6})
     schedule = FaultSchedule(replace(scenario, faults=(waiting,)), 1 / REFRESH_HZ)
     ready = [view.prepare(fault) for fault in faults]
-    times = []
-    for k in range(rounds + 1):
-        q = propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)
-        now = tuple(Now(n, fault, round(k / REFRESH_HZ * NS_PER_S)) for n, fault in enumerate(ready, start=1))
 
-        def plain(q: FloatArray = q) -> object:
-            return bench.draw(q).levels
+    def plain(k: int) -> object:
+        return bench.draw(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)).levels
 
-        def faulty(q: FloatArray = q, k: int = k, now: tuple[Now, ...] = now) -> object:
-            schedule.at(round(k / REFRESH_HZ * NS_PER_S))
-            return _frame(bench, q, FaultLayer(view, now), ready)
+    def faulty(k: int) -> object:
+        t_ns = round(k / REFRESH_HZ * NS_PER_S)
+        schedule.at(t_ns)
+        now = tuple(Now(n, fault, t_ns) for n, fault in enumerate(ready, start=1))
+        return _frame(bench, propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ), FaultLayer(view, now), ready)
 
-        times.append((_ms(plain), _ms(faulty)))
-    without_ms, with_ms = np.median(np.array(times[1:]), axis=0).tolist()
-    return FaultCost(bench.config.render.quantisation, case, with_ms, without_ms, with_ms - without_ms)
+    ms = medians_ms({"without": plain, "with": faulty}, rounds)
+    return FaultCost(bench.config.render.quantisation, case, ms["with"], ms["without"], ms["with"] - ms["without"])
 
 
 def _frame(bench: Bench, q: FloatArray, effects: FaultLayer, faults: list[Fault]) -> object:
@@ -131,12 +127,6 @@ def _frame(bench: Bench, q: FloatArray, effects: FaultLayer, faults: list[Fault]
         return bench.draw_sprites(None).levels
     view = effects.turned(bench.view(q))
     return bench.draw_sprites(bench.light(view, effects if effects.now else None)).levels
-
-
-def _ms(draw: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    draw()
-    return (time.perf_counter() - begin) * 1e3
 
 
 def stray_light(bench: Bench, share: float) -> Stray:

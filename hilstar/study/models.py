@@ -243,8 +243,7 @@ def _draw_temperatures(path: Path, finding: str, scales: Scales) -> None:
         kelvin.set(yscale="log", ylabel="temperature [K]")
         percent.set(ylabel="difference [%]")
         mag.set(xlabel="B-V [mag]", ylabel="difference in electrons [mag]")
-        for axes in panels:
-            label_ends(axes)
+        label_ends(*panels)
 
 
 def rapp(directory: Path, sensor: str) -> ChartFinding:
@@ -377,8 +376,7 @@ def _draw_choices(path: Path, finding: str, cost: dict[str, FloatArray], percent
             axes.set(ylabel="cost against a black body [mag]")
         lower.fill_between(BV_MAG, low, high, color=MUTED, alpha=0.35, lw=0)
         lower.set(xlabel="B-V [mag]")
-        for axes in (upper, lower):
-            label_ends(axes)
+        label_ends(upper, lower)
 
 
 def run(directory: Path) -> list[ChartFinding]:

@@ -249,5 +249,4 @@ def _draw_shaken(path: Path, finding: str, found: list[Shaken]) -> None:
                 plain_ticks(panel.xaxis, (1, 2, 5, 10, 20, 45))
         axes[0].set_ylabel("error, rms / vibration's rms")
         axes[2].set_ylabel("amplitude shown / true")
-        for panel in (axes[1], axes[3]):
-            label_ends(panel)
+        label_ends(axes[1], axes[3])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +31,7 @@ from hilstar.study.codes import (
     star_field,
     study_frames,
 )
+from hilstar.study.sweep import medians_ms
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import StarErrors
 from hilstar.units import flux_ratio
@@ -69,18 +70,16 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 
 
 def _frames_ms(bits: int, rounds: int) -> dict[str, float]:
-    """The median times of drawing STARS stars and reading their codes back, by way, in turn, so that all bear the same load."""
-    sprites, times = star_field(FRAME_PX, footprint_px(SIGMA_PX)), {way.name: list[float]() for way in WAYS}
+    """The median time of drawing STARS stars and reading their levels back, ms, of each way, timed in turn."""
+    sprites = star_field(FRAME_PX, footprint_px(SIGMA_PX))
+
+    def draw(renderer: Renderer, frame: int) -> object:
+        renderer.draw(sprites, frame)
+        return renderer.levels()
+
     with ExitStack() as stack:
         targets = {way.name: Target(FRAME_PX, SIGMA_PX, response_of(bits, way), WHITE, way.method) for way in WAYS}
-        renderers = {name: stack.enter_context(Renderer(target)) for name, target in targets.items()}
-        for frame in range(rounds + 1):
-            for name, renderer in renderers.items():
-                begin = time.perf_counter()
-                renderer.draw(sprites, frame)
-                renderer.levels()
-                times[name].append((time.perf_counter() - begin) * 1e3)
-    return {name: float(np.median(each[1:])) for name, each in times.items()}
+        return medians_ms({name: partial(draw, stack.enter_context(Renderer(on))) for name, on in targets.items()}, rounds)
 
 
 def _summary(bits: int, found: Found, mags: FloatArray) -> str:

@@ -8,7 +8,6 @@ the stars of one exposure see the whole beat; the beat is compared with what `ru
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -32,6 +31,7 @@ from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
 from hilstar.study.settings import Isolation, Table, bench_text, centroid_px, lone_windows, star_error
+from hilstar.study.sweep import medians_ms
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
 
@@ -174,12 +174,8 @@ class ScanningPanel:
         """Median time of drawing a frame, from its attitude to its codes, ms."""
         attitude = self.attitude(slew, 0.0)
         rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
-        times = []
-        for number in range(COST_ROUNDS):
-            begin_s = time.perf_counter()
-            _ = self.bench.draw(attitude.q_icrs_to_cam, number, rate).levels
-            times.append((time.perf_counter() - begin_s) * 1e3)
-        return float(np.median(times))
+        draw = {self.way: lambda k: self.bench.draw(attitude.q_icrs_to_cam, k, rate).levels}
+        return medians_ms(draw, COST_ROUNDS)[self.way]
 
     def close(self) -> None:
         """Free the GL contexts."""
@@ -339,8 +335,7 @@ def _draw(path: Path, finding: str, cases: list[TimingCase], points: list[BeatPo
         plain_ticks(place.yaxis, [tick for tick in PLACE_TICKS if abs(tick) <= max(map(abs, place.get_ylim()))])
         light.set_ylabel("change of its light [mag]")
         light.set_xlabel("start of the exposure after a row lights [refreshes]")
-        for axes in (place, light):
-            label_ends(axes)
+        label_ends(place, light)
 
 
 @dataclass(frozen=True, slots=True)
@@ -425,6 +420,5 @@ def draw(path: Path, outcomes: list[TimingOutcome]) -> str:
         cost.set_ylim(bottom=0)
         cost.set_xlabel("slew rate [deg/s]")
         plain_ticks(cost.xaxis, sorted({o.rate_deg_s for o in outcomes}))
-        for axes in (error, cost):
-            label_ends(axes)
+        label_ends(error, cost)
     return finding

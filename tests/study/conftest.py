@@ -1,8 +1,12 @@
-"""Every chart that a study draws in these tests is looked at as it is saved."""
+"""Every chart that a study draws in these tests is looked at as it is saved, and saved as PNG alone.
+
+That a chart without an ending becomes a PNG and an SVG is held by test_study_charts.py; an SVG takes as long as its PNG.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import wraps
 from pathlib import Path
 
 import pytest
@@ -17,9 +21,10 @@ def every_chart_is_legible() -> Iterator[None]:
 
     save = charts.save
 
+    @wraps(save)
     def looked_at(figure, path: Path) -> None:
         assert_legible(figure)
-        save(figure, path)
+        save(figure, path if path.suffix in charts.ENDINGS else path.with_name(f"{path.name}.png"))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(charts, "save", looked_at)

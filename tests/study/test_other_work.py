@@ -7,8 +7,8 @@ import subprocess
 import sys
 
 from hilstar.study.chain.run import headline
-from hilstar.study.settings import BUSY_SHARE, OtherWork, busy_line, is_busy
 from hilstar.study.speed.report import Aim, Machine, Result, lines
+from hilstar.study.sweep import BUSY_SHARE, OtherWork, busy_line, is_busy
 from tests.support.waiting import wait_for
 
 CORES = os.cpu_count() or 1

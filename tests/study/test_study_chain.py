@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from hilstar.render.reference import linear_image
 from hilstar.study.chain import choices, run
 from hilstar.study.chain.choices import ChainScene, Combination, Parts, five_scenes, lead_ns
 from hilstar.study.chain.measuring import Rounds, SceneMeasurement, error_budget
-from hilstar.study.chain.run import NOT_JUDGED, CombinationRow, Point, beaters, front
+from hilstar.study.chain.run import NOT_JUDGED, CombinationRow, beating, front
 from hilstar.study.chain.tracker import MATCH_PX, StudyTracker, add_light, off, points
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -245,13 +245,19 @@ def test_scenes_that_are_alike_are_drawn_once():
 
 
 def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():
-    spots = [Point(1.0, 3.0), Point(2.0, 2.0), Point(2.0, 2.0), Point(2.0, 2.5), Point(3.0, 1.0), Point(3.5, 1.0)]
-    assert front(spots) == [True, True, True, False, True, False]
-    near = [Point(1.00, 1.0, 0.01), Point(1.02, 1.0, 0.01), Point(1.5, 1.0, 0.01)]
-    assert beaters(near, 1) == ([], [0])
-    assert beaters(near, 2) == ([0, 1], [])
-    assert beaters([Point(1.02, 1.0, 0.01), Point(1.0, 0.1, 0.01)], 0) == ([], [1])
-    assert beaters([Point(1.02, 1.0), Point(1.02, 0.1)], 0) == ([1], [])
+    spots = [(1.0, 3.0), (2.0, 2.0), (2.0, 2.0), (2.0, 2.5), (3.0, 1.0), (3.5, 1.0)]
+    assert front([planted(time_ms=t, error_mag=e) for t, e in spots], "error_mag") == [True, True, True, False, True, False]
+
+    def beaters(which, *points):
+        rows = [planted(time_ms=t, error_arcsec=e, noise_ms=n) for t, e, n in points]
+        rows[which] = replace(rows[which], chosen="auto")
+        return tuple([rows.index(row) for row in found] for found in beating(rows))
+
+    near = (1.00, 1.0, 0.01), (1.02, 1.0, 0.01), (1.5, 1.0, 0.01)
+    assert beaters(1, *near) == ([], [0])
+    assert beaters(2, *near) == ([0, 1], [])
+    assert beaters(0, (1.02, 1.0, 0.01), (1.0, 0.1, 0.01)) == ([], [1])
+    assert beaters(0, (1.02, 1.0, 0.0), (1.02, 0.1, 0.0)) == ([1], [])
 
 
 def test_what_cannot_be_studied_is_refused_in_one_line(tmp_path):

@@ -17,13 +17,14 @@ from hilstar.scene.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
+from hilstar.study import sweep
 from hilstar.study.codes import star_field
+from hilstar.study.sweep import MIN_ROUNDS, interleaved, pareto_front
 from hilstar.study.tradeoff import run as tradeoff
-from hilstar.study.tradeoff import table as tradeoff_table
 from hilstar.study.tradeoff.light import LIMITS_V_MAG, trapezoid
 from hilstar.study.tradeoff.places import SIGMA_PX
 from hilstar.study.tradeoff.run import STEPS, draw, table_lines
-from hilstar.study.tradeoff.table import MIN_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
+from hilstar.study.tradeoff.table import Figure, Trial, Trials, measured
 
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
 # A relative error in magnitudes: 2.5 / ln 10.
@@ -130,7 +131,7 @@ def test_the_front_is_what_nothing_beats():
 def clock(monkeypatch):
     """Time that passes only where a work says so, ms."""
     now = [0.0]
-    monkeypatch.setattr(tradeoff_table.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(sweep.time, "perf_counter", lambda: now[0])
 
     def work(took_ms, calls=None):
         def run_it():

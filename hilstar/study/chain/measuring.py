@@ -37,6 +37,7 @@ from hilstar.study.chain.choices import (
     lead_ns,
 )
 from hilstar.study.chain.tracker import MeasuredStars, Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off
+from hilstar.study.sweep import Spent, spent
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
 
 STAGES = ("prediction", "sprites", "drawing and codes", "read-back")
@@ -97,13 +98,15 @@ class Stopwatch:
         self._period_ns = round(NS_PER_S / chain.bench.config.monitor.refresh_hz)
         self._number = 0
 
-    def frame_ms(self) -> tuple[float, float]:
+    def frame_ms(self) -> Spent:
         """Wall and processor time of the next frame, ms."""
         chain, (timeline, light_ns, number) = self._chain, self._next()
-        begin, begin_cpu = time.perf_counter(), time.process_time()
-        attitude = attitude_at(timeline, light_ns)
-        _ = chain.bench.draw(attitude.q_icrs_to_cam, number, chain.rate(attitude)).levels
-        return (time.perf_counter() - begin) * 1e3, (time.process_time() - begin_cpu) * 1e3
+
+        def draw() -> object:
+            attitude = attitude_at(timeline, light_ns)
+            return chain.bench.draw(attitude.q_icrs_to_cam, number, chain.rate(attitude)).levels
+
+        return spent(draw)
 
     def stages_ms(self) -> tuple[float, ...]:
         """The next frame's time by STAGES, with a wait for the GPU before its codes are read."""
@@ -269,7 +272,7 @@ def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[l
     watches = [Stopwatch(chain) for chain in chains]
     for watch in watches:
         watch.frame_ms()
-    spent: list[list[tuple[float, float]]] = [[] for _ in watches]
+    taken: list[list[Spent]] = [[] for _ in watches]
     stages: list[tuple[float, ...]] = []
     rng, begin = np.random.default_rng(SEED), time.perf_counter()
     for number in range(MAX_ROUNDS):
@@ -281,15 +284,15 @@ def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[l
                 stages += [watches[staged].stages_ms() for _ in range(FRAMES_A_VISIT)]
                 continue
             watches[k].frame_ms()
-            spent[k] += [watches[k].frame_ms() for _ in range(FRAMES_A_VISIT)]
+            taken[k] += [watches[k].frame_ms() for _ in range(FRAMES_A_VISIT)]
     middle = np.median(stages, axis=0).tolist()
-    return [_times(np.array(one)) for one in spent], [StageTime(*pair) for pair in zip(STAGES, middle, strict=True)]
+    return [_times(np.array(one)) for one in taken], [StageTime(*pair) for pair in zip(STAGES, middle, strict=True)]
 
 
-def _times(spent: np.ndarray) -> Times:
-    low, middle, high = np.percentile(spent[:, 0], (25, 50, 75))
-    noise = ERROR_OF_MEDIAN * (high - low) / SIGMAS_IN_IQR / math.sqrt(len(spent))
-    return Times(float(middle), float(high - low), float(noise), float(np.median(spent[:, 1])), len(spent))
+def _times(taken: FloatArray) -> Times:
+    low, middle, high = np.percentile(taken[:, 0], (25, 50, 75))
+    noise = ERROR_OF_MEDIAN * (high - low) / SIGMAS_IN_IQR / math.sqrt(len(taken))
+    return Times(float(middle), float(high - low), float(noise), float(np.median(taken[:, 1])), len(taken))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from hilstar.arrays import BoolArray, FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.charts import (
     BLUE,
@@ -46,7 +43,7 @@ from hilstar.study.chain.measuring import (
     error_budget,
 )
 from hilstar.study.chain.tracker import StudyTracker
-from hilstar.study.settings import OtherWork, busy_line, is_busy
+from hilstar.study.sweep import OtherWork, beaten_by, busy_line, is_busy, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,45 +65,6 @@ OUTPUTS = (
     "chain_budget.csv",
     "chain_time.csv",
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """A combination's time and error, and one sigma of its median time."""
-
-    time_ms: float
-    error: float
-    time_noise_ms: float = 0.0
-
-
-def beaten_by(points: Sequence[Point]) -> BoolArray:
-    """(n, n): whether the point of a row is beaten by that of a column."""
-    time: FloatArray = np.array([point.time_ms for point in points])
-    error: FloatArray = np.array([point.error for point in points])
-    as_good = (time <= time[:, None]) & (error <= error[:, None])
-    better = (time < time[:, None]) | (error < error[:, None])
-    return np.asarray(as_good & better)
-
-
-def front(points: Sequence[Point]) -> list[bool]:
-    """Whether each point is on the front."""
-    return [not row.any() for row in beaten_by(points)]
-
-
-def beyond_noise(point: Point, other: Point) -> bool:
-    """Whether `other`, which beats `point`, is faster by more than three sigmas of the difference of their medians.
-
-    Else their times cannot be told apart, and which of them is on the front is chance, as far as this run knows.
-    """
-    noise_ms = 3 * float(np.hypot(point.time_noise_ms, other.time_noise_ms))
-    return point.time_ms - other.time_ms > noise_ms or not noise_ms
-
-
-def beaters(points: Sequence[Point], which: int) -> tuple[list[int], list[int]]:
-    """The points that beat one of them: those beyond the noise, and those within it."""
-    found = np.flatnonzero(beaten_by(points)[which]).tolist()
-    beyond = [k for k in found if beyond_noise(points[which], points[k])]
-    return beyond, [k for k in found if k not in beyond]
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,18 +140,18 @@ def rounded(value: float) -> float:
 def rows_of(scene: SceneMeasurement, outcomes: Sequence[CombinationOutcome]) -> list[CombinationRow]:
     """The rows of a scene, the fastest first."""
     rows = sorted((_row(scene, one) for one in outcomes), key=lambda row: (row.time_ms, row.error_arcsec))
-    by_arcsec, by_mag = (front(points(rows, name)) for name in ("error_arcsec", "error_mag"))
+    by_arcsec, by_mag = (front(rows, name) for name in ("error_arcsec", "error_mag"))
     filed = [k for k, row in enumerate(rows) if left_to_effort(row, rows[auto_of(rows)])]
-    as_filed = dict(zip(filed, front(points([rows[k] for k in filed], "error_arcsec")), strict=True))
+    as_filed = dict(zip(filed, front([rows[k] for k in filed], "error_arcsec"), strict=True))
     return [
         replace(row, on_front=said(a), on_front_mag=said(m), on_front_as_filed=said(as_filed.get(k, False)))
         for k, (row, a, m) in enumerate(zip(rows, by_arcsec, by_mag, strict=True))
     ]
 
 
-def points(rows: Sequence[CombinationRow], error: str) -> list[Point]:
-    """The rows as points, by `error_arcsec` or `error_mag`."""
-    return [Point(row.time_ms, getattr(row, error), row.noise_ms) for row in rows]
+def front(rows: Sequence[CombinationRow], error: str) -> list[bool]:
+    """Whether each row is on the front of its time and `error`, the name of one of its columns."""
+    return [bool(on) for on in pareto_front([getattr(row, error) for row in rows], [row.time_ms for row in rows])]
 
 
 def auto_of(rows: Sequence[CombinationRow]) -> int:
@@ -211,8 +169,19 @@ def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[lis
     """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that effort may choose."""
     own = rows[auto_of(rows)]
     kept = [row for row in rows if not as_filed or left_to_effort(row, own)]
-    beyond, within = beaters(points(kept, "error_arcsec"), kept.index(own))
-    return [kept[k] for k in beyond], [kept[k] for k in within]
+    beats = beaten_by([row.error_arcsec for row in kept], [row.time_ms for row in kept])[kept.index(own)]
+    found = [row for row, does in zip(kept, beats, strict=True) if does]
+    beyond = [row for row in found if beyond_noise(own, row)]
+    return beyond, [row for row in found if row not in beyond]
+
+
+def beyond_noise(own: CombinationRow, other: CombinationRow) -> bool:
+    """Whether `other`, which beats `own`, is faster by more than three sigmas of the difference of their medians.
+
+    Else this run cannot tell their times apart, and which of them is on the front is chance.
+    """
+    noise_ms = 3 * math.hypot(own.noise_ms, other.noise_ms)
+    return own.time_ms - other.time_ms > noise_ms or not noise_ms
 
 
 def write_tables(

@@ -35,7 +35,7 @@ from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.psf import SQRT2
 from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, pack_sprites
 from hilstar.sky.stars import Stars, cell_grid
-from hilstar.study.settings import OtherWork, Table, Value, bench_text, is_busy
+from hilstar.study.settings import Table, Value, bench_text
 from hilstar.study.speed.report import (
     REFERENCE_PX,
     Agreement,
@@ -51,6 +51,7 @@ from hilstar.study.speed.report import (
     Skipped,
     Spread,
 )
+from hilstar.study.sweep import OtherWork, is_busy
 
 # A cap this much wider than the monitor's own: culling must have something to throw away.
 SKY_BEYOND = 1.5

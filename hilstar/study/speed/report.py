@@ -9,7 +9,7 @@ from pathlib import Path
 from msgspec import UNSET, UnsetType
 
 from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, chart, plain_ticks, write_csv
-from hilstar.study.settings import busy_line, is_busy
+from hilstar.study.sweep import busy_line, is_busy
 
 Size = tuple[int, int]
 REFERENCE_PX: Size = (1920, 1080)

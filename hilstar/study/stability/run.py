@@ -103,8 +103,7 @@ def narrow_sigmas(directory: Path) -> None:
         above.set(ylabel="flux error [share]")
         below.set(ylabel="place error [px]", xlabel="sigma of the star [px]")
         plain_ticks(below.xaxis, (0.1, 0.2, 0.3, 0.5, 0.85, 1.2, 2))
-        for axes in (above, below):
-            label_ends(axes)
+        label_ends(above, below)
 
 
 def weak_perspectives(directory: Path) -> None:
@@ -155,8 +154,7 @@ def ripples(directory: Path) -> None:
         below.plot(step_px, 1e6 * off_mag["linear image"], color=INK, lw=1.0, label="linear image")
         above.set(ylabel="light lost [mag]")
         below.set(ylabel="light lost [millionths of a mag]", xlabel="displacement in x [px]")
-        for axes in (above, below):
-            label_ends(axes)
+        label_ends(above, below)
 
 
 def turns(directory: Path) -> None:

@@ -1,18 +1,13 @@
-"""Methods of one step of the chain: their errors, their times side by side, and which of them no other beats."""
+"""One step of the chain: its methods with their errors and times, and which of them no other beats."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
-# Rounds of a work, whatever the budget: more than the maximum move no median.
-MIN_ROUNDS = 3
-MAX_ROUNDS = 500
-SEED = 1
+from hilstar.study.sweep import interleaved, pareto_front
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,34 +101,6 @@ def measured(trials: Trials, budget_s: float) -> TradeoffStep:
     rows = [_with_reason(row, rows, trials) if row.is_default and not row.on_front else row for row in rows]
     rows.sort(key=lambda row: row.time_ms)
     return TradeoffStep(trials.name, trials.work, trials.error, trials.second, tuple(rows), trials.remark)
-
-
-def interleaved(works: Sequence[Callable[[], object]], budget_s: float) -> list[list[float]]:
-    """Times of each work, ms, in rounds, so that other load on the machine affects all; slow works skip later rounds.
-
-    Each round has its own order, so that no work always follows the same one.
-    """
-    for work in works:
-        work()  # a first call compiles shaders and fills caches
-    times: list[list[float]] = [[] for _ in works]
-    share_ms = 1e3 * budget_s / len(works)
-    rng = np.random.default_rng(SEED)
-    for count in range(MAX_ROUNDS):
-        for k in rng.permutation(len(works)):
-            if count >= MIN_ROUNDS and sum(times[k]) > share_ms:
-                continue
-            begin = time.perf_counter()
-            works[k]()
-            times[k].append((time.perf_counter() - begin) * 1e3)
-    return times
-
-
-def pareto_front(errors: Sequence[float], times_ms: Sequence[float] | npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Which methods (n,) are beaten by no other: none has an error and a time as small, and one of them smaller."""
-    error, spent = np.asarray(errors, dtype=np.float64), np.asarray(times_ms, dtype=np.float64)
-    as_good = (error <= error[:, None]) & (spent <= spent[:, None])
-    better = (error < error[:, None]) | (spent < spent[:, None])
-    return np.asarray(~(as_good & better).any(axis=1))
 
 
 def _with_reason(row: MethodRow, rows: Sequence[MethodRow], trials: Trials) -> MethodRow:

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.study.settings import is_busy
 from hilstar.study.speed import benchmark
 from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, numpy_linear, scene
+from hilstar.study.sweep import is_busy
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 Q = from_radec_roll_deg(*RADEC_ROLL_DEG)

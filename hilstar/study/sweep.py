@@ -1,0 +1,138 @@
+"""Methods side by side: their times in turn, the front of error against time, and how busy the machine was meanwhile.
+
+Works are timed in rounds, so that other load on the machine is in the times of all of them. On a busy machine no time says
+which method is faster, so a study also notes what else ran.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import BoolArray
+
+MIN_ROUNDS = 3  # of each work, whatever the budget
+MAX_ROUNDS = 500  # more do not move a median
+SEED = 1
+BUSY_SHARE = 0.15  # share of the cores taken by others above which times are 5 % and more off: a third of one of two cores
+STAT = Path("/proc/stat")
+
+
+class Spent(NamedTuple):
+    """The wall time and the processor time (all threads) of one call, ms."""
+
+    wall_ms: float
+    cpu_ms: float
+
+
+def spent(work: Callable[[], object]) -> Spent:
+    """Call a work once and time it."""
+    begin_cpu, begin = time.process_time(), time.perf_counter()
+    work()
+    wall_s = time.perf_counter() - begin
+    return Spent(1e3 * wall_s, 1e3 * (time.process_time() - begin_cpu))
+
+
+def in_turn(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, list[Spent]]:
+    """The times of `rounds` calls of each work, which is given the number of its round.
+
+    Round 0 comes first and is not counted: it compiles shaders and fills caches.
+    """
+    times: dict[str, list[Spent]] = {name: [] for name in works}
+    for number in range(rounds + 1):
+        for name, work in works.items():
+            took = spent(lambda work=work, number=number: work(number))  # type: ignore[misc]
+            if number:
+                times[name].append(took)
+    return times
+
+
+def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, float]:
+    """The median wall time of each work over `rounds` rounds, ms; see `in_turn`."""
+    return {name: float(np.median([one.wall_ms for one in took])) for name, took in in_turn(works, rounds).items()}
+
+
+def interleaved(works: Sequence[Callable[[], object]], budget_s: float) -> list[list[float]]:
+    """The wall times of each work, ms, within a budget in seconds; a work that has had its share skips later rounds.
+
+    Each round has its own order, so that no work always follows the same one.
+    """
+    for work in works:
+        work()  # a first call compiles shaders and fills caches
+    times: list[list[float]] = [[] for _ in works]
+    share_ms = 1e3 * budget_s / len(works)
+    rng = np.random.default_rng(SEED)
+    for count in range(MAX_ROUNDS):
+        for k in rng.permutation(len(works)):
+            if count < MIN_ROUNDS or sum(times[k]) <= share_ms:
+                times[k].append(spent(works[k]).wall_ms)
+    return times
+
+
+def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
+    """Whether the method of a row is beaten by that of a column, (n, n).
+
+    A method beats another whose error and time are both no smaller, and one of them larger.
+    """
+    error, taken = np.asarray(errors, dtype=np.float64), np.asarray(times_ms, dtype=np.float64)
+    as_good = (error <= error[:, None]) & (taken <= taken[:, None])
+    return np.asarray(as_good & ((error < error[:, None]) | (taken < taken[:, None])))
+
+
+def pareto_front(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
+    """Which methods (n,) no other beats, by error and time; two that are equal in both are both on the front."""
+    return np.asarray(~beaten_by(errors, times_ms).any(axis=1))
+
+
+class _CoreTimes(NamedTuple):
+    """Processor time since the machine started, s: of all cores, the busy part of it, and this process's part of that."""
+
+    all_s: float
+    busy_s: float
+    own_s: float
+
+
+class OtherWork:
+    """Counts the cores that other processes take from its creation on; children of this process are its own."""
+
+    def __init__(self) -> None:
+        self._before = self._times()
+
+    def cores(self) -> float:
+        """How many cores the others took on average since creation; 0 where the system does not say."""
+        before, now = self._before, self._times()
+        passed_s = now.all_s - before.all_s
+        others_s = (now.busy_s - before.busy_s) - (now.own_s - before.own_s)
+        return max(others_s, 0.0) / passed_s * (os.cpu_count() or 1) if passed_s > 0 else 0.0
+
+    @staticmethod
+    def _times() -> _CoreTimes:
+        try:
+            ticks = [int(word) for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
+        except (OSError, ValueError):
+            return _CoreTimes(0.0, 0.0, 0.0)
+        each_s = 1 / os.sysconf("SC_CLK_TCK")
+        user, nice, system, idle, waiting, *interrupts = ticks
+        busy = user + nice + system + sum(interrupts)
+        own = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return _CoreTimes((busy + idle + waiting) * each_s, busy * each_s, sum(used.ru_utime + used.ru_stime for used in own))
+
+
+def is_busy(others_cores: float) -> bool:
+    """Whether so much other work makes times worthless."""
+    return others_cores > BUSY_SHARE * (os.cpu_count() or 1)
+
+
+def busy_line(others_cores: float) -> str:
+    """What a person has to know of times that were taken beside other work."""
+    return (
+        f"a busy machine: other processes took {others_cores:.1f} of its {os.cpu_count()} cores meanwhile, so these times name"
+        " no winner; run it again when the machine is idle"
+    )

@@ -133,7 +133,7 @@ class Bench:
     def _sigma_px(self) -> tuple[float, float]:
         return self.config.render.sprite_sigma_px
 
-    @property
+    @cached_property
     def canvas(self) -> Canvas:
         """The monitor as layers draw on it; white is that of its darkest pixel."""
         white_e_per_s = self.flux_at_white_e_per_s * self.darkest
@@ -184,7 +184,7 @@ class Bench:
 
     def _light(self, layers: tuple[Layer, ...], stars: Stars, view: View, faults: FaultLayer | None) -> Sprites:
         layers = layers if faults is None else (*layers, faults)
-        return light_of(self.canvas, layers, self.seen(stars, view), view)
+        return light_of(self.canvas, layers, seen_in(view, stars, self.moving), view)
 
     def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
         """The sprites of `stars` (by default those bright enough to show) as points, at an attitude (unit quaternion)."""

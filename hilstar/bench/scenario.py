@@ -119,7 +119,7 @@ def lasts_ns(fault: Fault) -> int | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ScheduledFault:
     """A fault with a time of its own: from `begin_ns` to `end_ns` of the run (None: to its end)."""
 
     number: int
@@ -140,7 +140,9 @@ class Timetable:
         for number, fault in enumerate(scenario.prepared(prepare), start=1):
             if fault.at_s is not None:
                 begin_ns, length_ns = round(fault.at_s * NS_PER_S), lasts_ns(fault)
-                self._entries.append(Entry(number, fault, begin_ns, None if length_ns is None else begin_ns + length_ns))
+                self._entries.append(
+                    ScheduledFault(number, fault, begin_ns, None if length_ns is None else begin_ns + length_ns)
+                )
 
     def on(self, t_ns: int, since_ns: int | None = None) -> tuple[Now, ...]:
         """The faults that are on at a moment, each as long as it has been on at `since_ns` (by default then)."""

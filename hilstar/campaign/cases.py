@@ -36,8 +36,7 @@ from hilstar.rotation import (
     to_rotation_vector,
 )
 from hilstar.twin.batch import faulty_exposure, view_at
-from hilstar.twin.faulty_exposure import FaultyExposure
-from hilstar.twin.simulator import Exposure, Simulator
+from hilstar.twin.simulator import Exposure, FaultyExposure, Simulator
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}

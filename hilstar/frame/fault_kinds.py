@@ -52,7 +52,7 @@ class Fault(Table, frozen=True, kw_only=True):
         """Refuse (InputError) what the keys mean together."""
 
 
-class Place(Fault, frozen=True, kw_only=True):
+class PlacedFault(Fault, frozen=True, kw_only=True):
     """A place: on the sky, or on the detector or the screen, where it may move."""
 
     radec_deg: tuple[float, Annotated[float, Meta(ge=-90, le=90)]] | None = None
@@ -72,7 +72,7 @@ class Place(Fault, frozen=True, kw_only=True):
             raise InputError(f"rate_px_s moves a tracker_px or a screen_px, not {given}; leave one of them out")
 
 
-class PointLight(Place, frozen=True, kw_only=True):
+class PointLight(PlacedFault, frozen=True, kw_only=True):
     """Light at a point."""
 
     OF_LIGHT: ClassVar[bool] = True
@@ -98,7 +98,7 @@ class Flash(PointLight, frozen=True, kw_only=True):
     """Light at a star (`hip`, or `star`: a name of the truth table), or at a place, for a time."""
 
     KIND: ClassVar[str] = "flash"
-    PLACES: ClassVar[tuple[str, ...]] = ("hip", "star", *Place.PLACES)
+    PLACES: ClassVar[tuple[str, ...]] = ("hip", "star", *PlacedFault.PLACES)
 
     hip: Hip | None = None
     star: Name | None = None
@@ -164,7 +164,7 @@ class Gradient(Fault, frozen=True, kw_only=True):
         _only_one(self, ("electrons_per_s", "electrons"))
 
 
-class Glow(Place, frozen=True, kw_only=True):
+class Glow(PlacedFault, frozen=True, kw_only=True):
     """Stray light about a direction, also one off the field: peak (1 + (angle / scale)^2)^(-exponent / 2).
 
     The peak is in a tracker pixel.

@@ -27,7 +27,7 @@ from hilstar.frame.fault_kinds import (
     Gradient,
     MeasuredMap,
     Now,
-    Place,
+    PlacedFault,
     PointLight,
     StarGone,
 )
@@ -80,11 +80,11 @@ class FaultView:
         self, by: FaultCamera, seed: int = 0, folder: Path | None = None, lasting: frozenset[Fault] = frozenset()
     ) -> None:
         self.by, self._seed, self._folder, self._lasting = by, seed, folder, lasting
-        self._glow_kept: tuple[Fault, float, extended.Glow] | None = None
+        self._glow_kept: tuple[Fault, float, extended.GlowLight] | None = None
         self._lock = threading.Lock()
         self._targets = Targets()
         self._maps: dict[Fault, extended.LightMap] = {}
-        self._tracks: dict[tuple[str, int], Chain] = {}
+        self._tracks: dict[tuple[str, int], PointChain] = {}
 
     def prepare(self, fault: Fault) -> Fault:
         """The fault with everything prepared that a frame has no time for. Raises InputError (see `FaultSchedule`)."""
@@ -95,11 +95,11 @@ class FaultView:
             self.by.v0_e_per_s(getattr(fault, "bv_mag", TRACK_BV_MAG))
         if isinstance(fault, Gradient | MeasuredMap):
             self._map(fault)
-        if isinstance(fault, Place) and (fault.tracker_px is not None or fault.screen_px is not None):
+        if isinstance(fault, PlacedFault) and (fault.tracker_px is not None or fault.screen_px is not None):
             self._check_place(fault)
         return fault
 
-    def _check_place(self, fault: Place) -> None:
+    def _check_place(self, fault: PlacedFault) -> None:
         camera, place = self._source(fault)
         if not np.isfinite(camera.rays(np.array([place[0]]), np.array([place[1]]))).all():
             key = "tracker_px" if fault.tracker_px is not None else "screen_px"
@@ -147,7 +147,7 @@ class FaultView:
             values = values / values.max()
         return map_image(values, fault, by.canvas.camera, by.tracker if fault.frame == "tracker" else by.monitor)
 
-    def _source(self, fault: Place) -> tuple[Camera, tuple[float, float]]:
+    def _source(self, fault: PlacedFault) -> tuple[Camera, tuple[float, float]]:
         """The camera in whose pixels a place is, and those."""
         if fault.tracker_px is not None:
             return self.by.tracker, fault.tracker_px
@@ -186,7 +186,7 @@ class FaultView:
         rate = self.light_e_per_s(fault) * share
         return AddedLight(fault.name, float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)
 
-    def camera_points(self, now: Sequence[Now], scan: Scan | None) -> tuple[list[Chain], list[AddedLight]]:
+    def camera_points(self, now: Sequence[Now], scan: Scan | None) -> tuple[list[PointChain], list[AddedLight]]:
         """False stars and flashes that move with the camera, and tracks: chains, and what each line of them is called."""
         chains, lights = [], []
         for one in now:
@@ -202,7 +202,7 @@ class FaultView:
                 lights += [AddedLight(fault.name, v_mag, TRACK_BV_MAG, rate)] * fault.number
         return chains, lights
 
-    def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> Chain:
+    def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> PointChain:
         """A point's way over its pixels while they are lit."""
         by, (source, place) = self.by, self._source(fault)
         rate, since_s = np.array(fault.rate_px_s), one.since_ns / NS_PER_S
@@ -215,7 +215,7 @@ class FaultView:
         light = np.array([self.light_e_per_s(fault) * one.share])
         return Lines(ends[0], ends[1], light).seen_by(by.canvas.camera, source, by.canvas.sigma_px)
 
-    def _burst(self, fault: CosmicRays, since_ns: int) -> Chain:
+    def _burst(self, fault: CosmicRays, since_ns: int) -> PointChain:
         """The tracks of the exposure that a moment is in, counted from the burst's beginning."""
         by = self.by
         number = int(since_ns // round(by.exposure_s * NS_PER_S))
@@ -248,7 +248,7 @@ class FaultView:
                 found.append(light if one.share == 1 else replace(light, times=light.times * one.share))
         return found
 
-    def _glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.Glow:
+    def _glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.GlowLight:
         fixed = fault.tracker_px is not None or fault.screen_px is not None
         known = self._glow_kept
         if fixed and known is not None and known[:2] == (fault, share):
@@ -258,7 +258,7 @@ class FaultView:
             self._glow_kept = fault, share, made
         return made
 
-    def _new_glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.Glow:
+    def _new_glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.GlowLight:
         by = self.by
         if fault.tracker_px is not None or fault.screen_px is not None:
             source, (x_px, y_px) = self._source(fault)
@@ -270,9 +270,9 @@ class FaultView:
         covered = (by.tracker.focal_length_px / by.canvas.camera.focal_length_px) ** 2
         peak = self.light_e_per_s(fault) * share * covered
         unit = direction / np.linalg.norm(direction)
-        return extended.Glow(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera)
+        return extended.GlowLight(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera)
 
-    def footprints(self, chains: list[Chain]) -> list[Sprites]:
+    def footprints(self, chains: list[PointChain]) -> list[Sprites]:
         """The sprites of chains; the lines count on from one to the next, as stars from -1 down."""
         made, first = [], 0
         for chain in chains:
@@ -283,7 +283,7 @@ class FaultView:
         return made
 
 
-def icrs_direction(fault: Place) -> FloatArray:
+def icrs_direction(fault: PlacedFault) -> FloatArray:
     """The unit vector (3,), ICRS, of a place on the sky."""
     if fault.icrs is not None:
         vector = np.array(fault.icrs)
@@ -344,7 +344,7 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class PointChain:
     """Points of light (n,): pixels of a camera, electrons per second, and which of `lines` lines each is of."""
 
     x_px: FloatArray
@@ -362,7 +362,7 @@ class Lines:
     end_px: FloatArray
     electrons_per_s: FloatArray
 
-    def seen_by(self, camera: Camera, source: Camera, sigma_px: tuple[float, float]) -> Chain:
+    def seen_by(self, camera: Camera, source: Camera, sigma_px: tuple[float, float]) -> PointChain:
         """The lines in pixels of `source` as `camera` sees them; lines behind it or beyond its lens have no points."""
         ends = [np.stack(camera.pixels_from(source, *place.T)) for place in (self.begin_px, self.end_px)]
         length_sigma = np.hypot(*((ends[1] - ends[0]) / np.array(sigma_px)[:, None]))
@@ -374,7 +374,7 @@ class Lines:
         share = ((np.arange(len(line)) - first + 0.5) / counts[line])[:, None]
         places = self.begin_px[line] * (1 - share) + self.end_px[line] * share
         x_px, y_px = camera.pixels_from(source, *places.T)
-        return Chain(x_px, y_px, self.electrons_per_s[line] / counts[line], line, len(counts))
+        return PointChain(x_px, y_px, self.electrons_per_s[line] / counts[line], line, len(counts))
 
 
 def tracks(burst: CosmicRays, resolution_px: tuple[int, int], exposure_s: float, rng: np.random.Generator) -> Lines:

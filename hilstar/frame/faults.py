@@ -10,10 +10,11 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.frame.fault_kinds import AttitudeStep, Blank, Drop, Fault, Freeze, Now
 from hilstar.frame.fault_light import FaultView
+from hilstar.frame.layers import no_light
 from hilstar.frame.view import View
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.extended import DiscLight, LightMap
-from hilstar.scene.sprites import AddedLight, Sprites, join_sprites, with_sprites
+from hilstar.scene.sprites import AddedLight, Sprites, with_sprites
 from hilstar.sky.stars import BODY_CELL_RAD, CellGrid, Stars
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -64,7 +65,7 @@ class FaultLayer:
         """The light before without the stars that faults take away, and with the light that they add."""
         by, now = self.view, self.now
         if self.blank:
-            return replace(join_sprites([], light.footprint_px), rate_cam_rad_s=light.rate_cam_rad_s)
+            return replace(no_light(light.footprint_px), rate_cam_rad_s=light.rate_cam_rad_s)
         gone = by.gone(now, stars)
         if gone:
             light = _without_discs(_dimmed(light, gone), by.gone_bodies(now))
@@ -73,8 +74,7 @@ class FaultLayer:
         surfaces = by.surfaces(now, view.q_icrs_to_cam)
         parts = by.footprints(chains)
         if named:
-            nothing = join_sprites([], light.footprint_px)
-            drawn = by.by.points.add(nothing, few_stars(directions, named, stars), view)
+            drawn = by.by.points.add(no_light(light.footprint_px), few_stars(directions, named, stars), view)
             parts = [replace(drawn, star=-1 - len(lines) - drawn.star), *parts]
         if parts:
             per_star = max(light.per_star, *(_most_per_star(part) for part in parts))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 from hilstar.frame.bodies import BodyLayer
@@ -45,10 +46,16 @@ def sky_layers(
 
 def light_of(canvas: Canvas, layers: Iterable[Layer], stars: Stars, view: View) -> Sprites:
     """The light of a view, layer by layer; `stars` are as seen in it (see `seen_in`)."""
-    light = join_sprites([], canvas.footprint_px)
+    light = no_light(canvas.footprint_px)
     for layer in layers:
         light = layer.add(light, stars, view)
     return light
+
+
+@cache
+def no_light(footprint_px: int) -> Sprites:
+    """The light of no layer."""
+    return join_sprites([], footprint_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,16 +72,21 @@ class StarLayer:
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
         """The light before, with a sprite or a chain of sprites for each star on the image."""
-        made = self._sprites(stars, view)
-        return with_sprites(light, [made]) if len(light) or light.extended else made
+        made = self._still(stars, view) if view.rate_cam_rad_s is None or not self.paths else self._along_paths(stars, view)
+        return with_sprites(light, [made]) if light.extended or len(light.data) else made
 
-    def _sprites(self, stars: Stars, view: View) -> Sprites:
-        canvas, camera = self.canvas, self.canvas.camera
-        if view.exposed and self.paths:
-            return smeared_sprites(stars, view.motion, camera, canvas.footprint_px, canvas.sigma_px)
-        if view.turns and self.paths:
-            made = swept_sprites(stars, view.turn, view.scan, camera, canvas.footprint_px, canvas.sigma_px)
-            return replace(made, rate_cam_rad_s=view.rate_cam_rad_s)
+    def _still(self, stars: Stars, view: View) -> Sprites:
+        canvas = self.canvas
+        camera = canvas.camera
         icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, camera)[0] if view.exposed else view.icrs_to_image(camera)
         candidates = self.candidates if stars is self.frequent else None
         return make_sprites(stars, icrs_to_image, camera, canvas.footprint_px, candidates)
+
+    def _along_paths(self, stars: Stars, view: View) -> Sprites:
+        canvas = self.canvas
+        if view.exposed:
+            return smeared_sprites(stars, view.motion, canvas.camera, canvas.footprint_px, canvas.sigma_px)
+        if not view.turns:
+            return self._still(stars, view)
+        made = swept_sprites(stars, view.turn, view.scan, canvas.camera, canvas.footprint_px, canvas.sigma_px)
+        return replace(made, rate_cam_rad_s=view.rate_cam_rad_s)

@@ -10,7 +10,7 @@ import io
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -55,23 +55,30 @@ def as_light(image: FloatArray) -> Float32Array:
     return np.ascontiguousarray(np.nan_to_num(image, nan=0.0, posinf=0.0), dtype=np.float32)
 
 
-def pixels_in(camera: Camera, other: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where each pixel of `camera` is in `other`'s pixels, and how many of them it covers: (h, w) each, NaN for nowhere."""
+class PixelsIn(NamedTuple):
+    """Where each pixel of a camera is in another's pixels, and how many of those it covers: (h, w) each, NaN for nowhere."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    area: FloatArray
+
+
+def pixels_in(camera: Camera, other: Camera) -> PixelsIn:
+    """Where each pixel of `camera` is in `other`'s pixels."""
     width, height = camera.resolution_px
     if camera is other:
         y, x = np.mgrid[0:height, 0:width].astype(np.float64)
-        return x, y, np.ones((height, width))
+        return PixelsIn(x, y, np.ones((height, width)))
     coarse = _grid_in(camera, other)
     if coarse is None:
         y, x = np.mgrid[0:height, 0:width].astype(np.float64)
         seen_x, seen_y = (part.reshape(height, width) for part in other.pixels_from(camera, x.ravel(), y.ravel()))
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
-        return seen_x, seen_y, np.abs(x_right * y_down - x_down * y_right)
-    x, y, area = (spline(np.arange(height), np.arange(width)) for spline in coarse)
-    return x, y, area
+        return PixelsIn(seen_x, seen_y, np.abs(x_right * y_down - x_down * y_right))
+    return PixelsIn(*(spline(np.arange(height), np.arange(width)) for spline in coarse))
 
 
-def _grid_in(camera: Camera, other: Camera) -> tuple[Any, Any, Any] | None:
+def _grid_in(camera: Camera, other: Camera) -> list[Any] | None:
     """Splines for the places in another camera's pixels, x and y, and for the pixels covered; None if a place has none."""
     from scipy.interpolate import RectBivariateSpline
 
@@ -83,7 +90,7 @@ def _grid_in(camera: Camera, other: Camera) -> tuple[Any, Any, Any] | None:
     along_x, along_y = (RectBivariateSpline(down, across, place) for place in places)
     x_right, y_right = along_x(down, across, dy=1), along_y(down, across, dy=1)
     x_down, y_down = along_x(down, across, dx=1), along_y(down, across, dx=1)
-    return along_x, along_y, RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))
+    return [along_x, along_y, RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))]
 
 
 def map_sha256(path: Path) -> str:

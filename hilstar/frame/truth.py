@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -90,16 +91,24 @@ def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt
     return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~own])])
 
 
-def _one_a_star(sprites: Sprites, own: BoolArray) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Each star of these sprites once, a satellite with the middle of its streak's light, px."""
+class StarPlaces(NamedTuple):
+    """Stars, each once, and their places on the image, (n,) each."""
+
+    star: IntArray
+    x_px: FloatArray
+    y_px: FloatArray
+
+
+def _one_a_star(sprites: Sprites, own: BoolArray) -> StarPlaces:
+    """Each star of these sprites once, a satellite in the middle of its streak's light."""
     star, x_px, y_px = sprites.star[own], sprites.x_px[own], sprites.y_px[own]
     once, which = np.unique(star, return_inverse=True)
     if len(once) == len(star):
-        return star, x_px, y_px
+        return StarPlaces(star, x_px, y_px)
     light = sprites.data["electrons_per_s"][own].astype(np.float64)
     total = np.bincount(which, light)
     x_px, y_px = (np.asarray(np.bincount(which, light * places) / total, dtype=np.float64) for places in (x_px, y_px))
-    return once, x_px, y_px
+    return StarPlaces(once, x_px, y_px)
 
 
 def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -12,12 +12,20 @@ from hilstar.arrays import FloatArray
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import Motion
-from hilstar.scene.frame_motion import Scan, Turn
+from hilstar.scene.frame_motion import CameraTurn, Scan
 from hilstar.scene.sprites import Sprites
 from hilstar.sky.stars import Stars
 
 STILL = np.zeros(3)
 AT_ONCE = Scan()
+
+
+class Observer(NamedTuple):
+    """When and from where the sky is seen, in the order in which `MovingSky` takes it."""
+
+    t_ns: int | None
+    velocity_km_s: FloatArray | None
+    place_km: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +68,9 @@ class View:
         return self.scan.hold_s
 
     @property
-    def observer(self) -> tuple[int | None, FloatArray | None, FloatArray | None]:
-        """Time, velocity and place, in the order in which `MovingSky` takes them."""
-        return self.t_ns, self.velocity_km_s, self.place_km
+    def observer(self) -> Observer:
+        """When and from where the sky is seen."""
+        return Observer(self.t_ns, self.velocity_km_s, self.place_km)
 
     @property
     def turns(self) -> bool:
@@ -70,9 +78,9 @@ class View:
         return self.rate_cam_rad_s is not None and bool(self.rate_cam_rad_s.any())
 
     @property
-    def turn(self) -> Turn:
+    def turn(self) -> CameraTurn:
         """The attitude and the rate; at rest a rate of 0."""
-        return Turn(self.q_icrs_to_cam, STILL if self.rate_cam_rad_s is None else self.rate_cam_rad_s)
+        return CameraTurn(self.q_icrs_to_cam, STILL if self.rate_cam_rad_s is None else self.rate_cam_rad_s)
 
     @property
     def motion(self) -> Motion:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.render.encoder import build_program
 from hilstar.scene.camera import Camera, ray_shifts
-from hilstar.scene.extended import DiscLight, ExtendedLight, Glow, LightMap, Rectangle
+from hilstar.scene.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
 from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, Disc, gauss_legendre
 
 TILE_PX = 24
@@ -198,7 +198,7 @@ class ExtendedLayer:
     def _draw_one(self, light: ExtendedLight) -> None:
         if isinstance(light, LightMap):
             self._draw_map(light)
-        elif isinstance(light, Glow):
+        elif isinstance(light, GlowLight):
             self._draw_glow(light)
         else:
             self._draw_disc(light)
@@ -219,7 +219,7 @@ class ExtendedLayer:
         for texture in own:
             texture.release()
 
-    def _draw_glow(self, light: Glow) -> None:
+    def _draw_glow(self, light: GlowLight) -> None:
         program, triangle = self._with_rays("glow.frag", light.camera)
         program["direction"] = tuple(light.direction_image.tolist())
         program["peak_e_per_s"] = light.peak_e_per_s

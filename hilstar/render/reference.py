@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.scene.extended import DiscLight, ExtendedLight, Glow, LightMap, Rectangle
+from hilstar.scene.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
 from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
 
@@ -45,7 +45,7 @@ def _lay(light: ExtendedLight, image: FloatArray) -> None:
         part = slice(top - y, top - y + height), slice(left - x, left - x + width)
         own = light.times * light.image[part].astype(np.float64)
         cover = np.zeros(1) if light.cover is None else light.cover[part]
-    elif isinstance(light, Glow):
+    elif isinstance(light, GlowLight):
         own, cover = _glow(light, region), np.zeros(1)
     else:
         own, cover = _disc(light, region)
@@ -53,7 +53,7 @@ def _lay(light: ExtendedLight, image: FloatArray) -> None:
     image[where] = image[where] * (1 - cover) + own
 
 
-def _glow(light: Glow, region: Rectangle) -> FloatArray:
+def _glow(light: GlowLight, region: Rectangle) -> FloatArray:
     left, top, width, height = region
     y, x = np.mgrid[top : top + height, left : left + width].astype(np.float64)
     u, v = light.camera.tangents(x.ravel(), y.ravel())

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -170,6 +171,23 @@ def ray_shifts(camera: Camera) -> Float32Array:
     return np.nan_to_num(shifts).astype(np.float32)
 
 
+class Slopes(NamedTuple):
+    """dx/du, dx/dv, dy/du and dy/dv of pixels by tangents, px, (n,) each."""
+
+    x_by_u: FloatArray
+    x_by_v: FloatArray
+    y_by_u: FloatArray
+    y_by_v: FloatArray
+
+
+class Approach(NamedTuple):
+    """Directions (u, v, 1) after some steps of Newton's method, and the size of the last step, (n,) each."""
+
+    u: FloatArray
+    v: FloatArray
+    size: FloatArray
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A mapping of cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
@@ -252,10 +270,8 @@ class Camera:
         found = (size < SLOPE_STEP) & (np.hypot(u, v) <= self.lens.max_tangent)
         return np.where(found, u, np.nan), np.where(found, v, np.nan)
 
-    def _approach(
-        self, u: FloatArray, v: FloatArray, x_px: FloatArray, y_px: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A few steps towards pixels with the slopes at (u, v): nearer directions, and the size of the last step."""
+    def _approach(self, u: FloatArray, v: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Approach:
+        """A few steps towards pixels with the slopes at (u, v)."""
         a, b, c, d = self.slopes(u, v)
         area = a * d - b * c
         size = np.full_like(u, np.inf)
@@ -269,14 +285,14 @@ class Camera:
             u, v = np.where(wild, np.nan, u - step_u), np.where(wild, np.nan, v - step_v)
             if not (size > NEWTON_DONE).any():
                 break
-        return u, v, size
+        return Approach(u, v, size)
 
-    def slopes(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """dx/du, dx/dv, dy/du and dy/dv in px at directions (u, v, 1), (n,) each."""
+    def slopes(self, u: FloatArray, v: FloatArray) -> Slopes:
+        """How fast pixels change with the direction (u, v, 1), (n,) each."""
         (x1, y1), (x0, y0) = self.places_px(u + SLOPE_STEP, v), self.places_px(u - SLOPE_STEP, v)
         (x3, y3), (x2, y2) = self.places_px(u, v + SLOPE_STEP), self.places_px(u, v - SLOPE_STEP)
         both = 2 * SLOPE_STEP
-        return (x1 - x0) / both, (x3 - x2) / both, (y1 - y0) / both, (y3 - y2) / both
+        return Slopes((x1 - x0) / both, (x3 - x2) / both, (y1 - y0) / both, (y3 - y2) / both)
 
     def rays(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Directions (n, 3) in cam, z in image axes 1, of pixels (n,)."""

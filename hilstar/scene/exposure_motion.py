@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -112,6 +113,14 @@ def _joined(smear: _Smear, motion: Motion, pieces: int) -> Sprites | None:
     return join_sprites(chain, smear.footprint_px)
 
 
+class PathNodes(NamedTuple):
+    """How many nodes each star's path needs (0: it misses the image), and the part of it, 0 to 1, that is on the image."""
+
+    counts: IntArray
+    begin: FloatArray
+    end: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class _Smear:
     """Stars smeared on one image."""
@@ -139,11 +148,8 @@ class _Smear:
         light = nodes.share * (end - begin)[nodes.path] * part * stars.electrons_per_s[star]
         return pack_sprites(x_px, y_px, light, star, camera.resolution_px, self.footprint_px)
 
-    def _nodes(self, paths: Paths, half_s: float) -> tuple[IntArray, FloatArray, FloatArray]:
-        """How many nodes each star's path needs (0: it misses the image), and the part of the piece that is on the image.
-
-        The piece lasts from -half_s to half_s of the paths' seconds.
-        """
+    def _nodes(self, paths: Paths, half_s: float) -> PathNodes:
+        """The nodes of paths in a piece of the exposure from -half_s to half_s of the paths' seconds."""
         x_px, y_px = paths.all_places_px(np.array([[-half_s], [0.0], [half_s]]))
         halves = [Chords(x_px[k : k + 2], y_px[k : k + 2]) for k in (0, 1)]
         # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
@@ -153,4 +159,4 @@ class _Smear:
         begin, end = whole.on_image(self.camera.resolution_px, self.footprint_px / 2 + 1 + bulge_px)
         counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA)
         counts[end <= begin] = 0
-        return np.minimum(counts, MAX_NODES), begin, end
+        return PathNodes(np.minimum(counts, MAX_NODES), begin, end)

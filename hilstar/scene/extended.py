@@ -8,6 +8,7 @@ its spread places, a larger one is drawn ray by ray.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,7 +57,7 @@ class LightMap:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Glow:
+class GlowLight:
     """A glow about a direction (3,), unit, image axes: `peak_e_per_s` (1 + (angle / scale)^2)^(-exponent / 2) in each pixel.
 
     The direction may be off the image, or behind the camera.
@@ -142,7 +143,7 @@ class DiscLight:
         return 2 * turn * float(np.hypot(self.camera.focal_length_px, max(self.camera.resolution_px)))
 
 
-ExtendedLight = LightMap | Glow | DiscLight
+ExtendedLight = LightMap | GlowLight | DiscLight
 
 
 def clipped(edges_px: tuple[float, float, float, float], resolution_px: tuple[int, int]) -> Rectangle | None:
@@ -209,9 +210,9 @@ def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
 def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be seen."""
     disc, camera, reach_px = light.disc, light.camera, footprint_px(light.sigma_px) / 2
-    x_px, y_px, law_sr = _places(light, disc, nodes)
-    whole = _places(light, replace(disc, law="uniform"), nodes) if light.covers else (x_px, y_px, law_sr)
-    if not len(whole[0]):
+    lit = _places(light, disc, nodes)
+    whole = _places(light, replace(disc, law="uniform"), nodes) if light.covers else lit
+    if not len(whole.x_px):
         return None
     (left, right), (top, bottom) = ((float(part.min()), float(part.max())) for part in whole[:2])
     edges = (left - reach_px, top - reach_px, right + reach_px + 1, bottom + reach_px + 1)
@@ -220,18 +221,26 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
         return None
     cover = None
     if light.covers:
-        share = _spread(*whole[:2], whole[2] * _px_per_sr(light), region, light.sigma_px)
+        share = _spread(whole.x_px, whole.y_px, whole.law_sr * _px_per_sr(light), region, light.sigma_px)
         cover = np.where(share > WHOLE, np.float32(1), share)
-    image = _spread(x_px, y_px, light.times * disc.normal_e_per_s_sr * law_sr, region, light.sigma_px)
+    image = _spread(lit.x_px, lit.y_px, light.times * disc.normal_e_per_s_sr * lit.law_sr, region, light.sigma_px)
     return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name, lasting=False)
 
 
-def _places(light: DiscLight, disc: Disc, nodes: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places of the face that are on any pixel, (n,) each: x and y, and the law's function times their steradian."""
+class FacePlaces(NamedTuple):
+    """Places of a disc's face in pixels, and the value of its law times the steradians of each, (n,) each."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    law_sr: FloatArray
+
+
+def _places(light: DiscLight, disc: Disc, nodes: int) -> FacePlaces:
+    """Places of the face that have a pixel."""
     directions, law_sr = disc.points(nodes)
     x_px, y_px = light.camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
-    return (x_px, y_px, law_sr) if known.all() else (x_px[known], y_px[known], law_sr[known])
+    return FacePlaces(x_px, y_px, law_sr) if known.all() else FacePlaces(x_px[known], y_px[known], law_sr[known])
 
 
 def _px_per_sr(light: DiscLight) -> float:

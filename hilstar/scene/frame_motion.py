@@ -9,6 +9,7 @@ runs with the scan meets fewer frames in a second, and has more light in each: 1
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class Scan:
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class CameraTurn:
     """The attitude when the middle row lights up, and the rate of cam in icrs (3,), cam components, constant over the frame."""
 
     q_icrs_to_cam: FloatArray
@@ -77,14 +78,14 @@ class Turn:
 
 
 def swept_sprites(
-    stars: Stars, turn: Turn, scan: Scan, camera: Camera, footprint_px: int, sigma_px: tuple[float, float]
+    stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, footprint_px: int, sigma_px: tuple[float, float]
 ) -> Sprites:
     """Sprites of each star on its path while its row is lit; the sprites of a star follow each other.
 
     `capped` counts the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
     """
     turn, is_slower = slowed(turn, scan, camera)
-    middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
+    middle = CameraTurn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
     icrs_to_middle = camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam)
     margin_px = footprint_px / 2 + 1
     radius_rad, edges = camera.field(margin_px)
@@ -95,10 +96,10 @@ def swept_sprites(
     near = near[close]
     paths = _paths(seen[close], turn, scan, camera)
     late_s = _row_delays_s(paths, scan, camera)
-    wanted, part, span_s = _wanted_nodes(paths, late_s, scan, footprint_px, sigma_px)
+    wanted, first, last, span_s = _wanted_nodes(paths, late_s, scan, footprint_px, sigma_px)
     counts = within_budget(_of_the_brightest(wanted, stars.electrons_per_s[near], footprint_px), _extra(footprint_px))
     nodes = nodes_of(counts)
-    begin, length = part[0][nodes.path], (part[1] - part[0])[nodes.path]
+    begin, length = first[nodes.path], (last - first)[nodes.path]
     seconds = late_s[nodes.path] + (begin + length * (nodes.place + 1) / 2) * span_s[nodes.path]
     x_px, y_px = paths.places_px(nodes.path, seconds)
     star = near[nodes.path]
@@ -110,7 +111,7 @@ def swept_sprites(
     return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped)
 
 
-def _paths(seen: FloatArray, turn: Turn, scan: Scan, camera: Camera) -> Paths | ShortPaths:
+def _paths(seen: FloatArray, turn: CameraTurn, scan: Scan, camera: Camera) -> Paths | ShortPaths:
     """The stars' paths while their rows are lit, seconds from the middle row's first light."""
     exact = Paths(seen, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
     # Where a pinhole has the star when the middle row lights up says to `wrong_px` which row is the star's.
@@ -139,12 +140,12 @@ def _of_the_brightest(wanted: IntArray, electrons_per_s: FloatArray, footprint_p
     return chosen
 
 
-def slowed(turn: Turn, scan: Scan, camera: Camera) -> tuple[Turn, bool]:
+def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bool]:
     """The turn itself, or one about the same axis that takes no star farther than MAX_TURN_FIELD; and whether it is slower."""
     angle_rad, most_rad = turn.speed_rad_s * scan.whole_s, MAX_TURN_FIELD * camera.field_radius_rad(0.0)
     if angle_rad <= most_rad:
         return turn, False
-    return Turn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True
+    return CameraTurn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True
 
 
 def _row_delays_s(paths: Paths | ShortPaths, scan: Scan, camera: Camera) -> FloatArray:
@@ -157,10 +158,19 @@ def _row_delays_s(paths: Paths | ShortPaths, scan: Scan, camera: Camera) -> Floa
     return np.where(np.isfinite(late_s), late_s, 0.0)
 
 
+class FramePaths(NamedTuple):
+    """Stars' paths in a frame, (n,) each: nodes (0: the path misses the image), the part on the image, and the path's time."""
+
+    counts: IntArray
+    begin: FloatArray
+    end: FloatArray
+    span_s: FloatArray
+
+
 def _wanted_nodes(
     paths: Paths | ShortPaths, late_s: FloatArray, scan: Scan, footprint_px: int, sigma_px: tuple[float, float]
-) -> tuple[IntArray, tuple[FloatArray, FloatArray], FloatArray]:
-    """How many nodes each star's path needs (0: it misses the image), the part of it that is on the image, and its time, s."""
+) -> FramePaths:
+    """The nodes that each star's path needs."""
     ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
     span_s = _spans_s(ends[1], late_s, scan, paths.camera)
     chords = Chords(*(np.stack(places) for places in zip(*ends, strict=True)))
@@ -171,7 +181,7 @@ def _wanted_nodes(
     begin, end = chords.on_image(paths.camera.resolution_px, footprint_px / 2 + 1 + bulge_px)
     counts = node_counts(chords.length_sigma(sigma_px) * (end - begin), NODES_PER_SIGMA, 1, POINT_SIGMA)
     counts[end <= begin] = 0
-    return counts, (begin, end), span_s
+    return FramePaths(counts, begin, end, span_s)
 
 
 def _spans_s(end_px: tuple[FloatArray, FloatArray], late_s: FloatArray, scan: Scan, camera: Camera) -> FloatArray:

@@ -11,6 +11,7 @@ from bisect import bisect_left
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,12 +35,19 @@ TRIED_AXES = [(x, y, z) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for 
 BEYOND_LENS = 1.05
 
 
+class NodeTable(NamedTuple):
+    """Gauss-Legendre nodes and weights over -1 to 1 for all counts to MAX_NODES, end to end; each count's begin at `first`."""
+
+    first: IntArray
+    places: FloatArray
+    weights: FloatArray
+
+
 @lru_cache(maxsize=1)
-def _node_table() -> tuple[IntArray, FloatArray, FloatArray]:
-    """Where the nodes of each count begin, and nodes and weights over -1 to 1 of all counts to MAX_NODES, end to end."""
+def _node_table() -> NodeTable:
     rules = [np.polynomial.legendre.leggauss(count) for count in range(1, MAX_NODES + 1)]
     first = np.cumsum([0, 0, *range(1, MAX_NODES)])
-    return first, np.concatenate([nodes for nodes, _ in rules]), np.concatenate([weights for _, weights in rules])
+    return NodeTable(first, np.concatenate([nodes for nodes, _ in rules]), np.concatenate([weights for _, weights in rules]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +61,11 @@ class Nodes:
 
 def nodes_of(counts: IntArray) -> Nodes:
     """The Gauss-Legendre nodes of paths that have `counts` (n,) of them, each 0 to MAX_NODES."""
-    first, places, weights = _node_table()
+    table = _node_table()
     path = np.repeat(np.arange(len(counts)), counts)
     begin = np.cumsum(counts) - counts
-    entry = np.arange(len(path)) + np.repeat(first[counts] - begin, counts)
-    return Nodes(path, places[entry], weights[entry] / 2)
+    entry = np.arange(len(path)) + np.repeat(table.first[counts] - begin, counts)
+    return Nodes(path, table.places[entry], table.weights[entry] / 2)
 
 
 def within_budget(wanted: IntArray, extra: int) -> IntArray:

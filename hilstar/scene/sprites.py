@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,17 +38,23 @@ MAX_DOUBTFUL = 512
 FEW_PAIRS = 4096  # pairs of pixels and sprites near them: up to so many are tested all at once, without sorting
 
 
+class NearStars(NamedTuple):
+    """Stars about a field: their places in `Stars`, rising, directions (3, n), ICRS, and electrons per second (n,)."""
+
+    star: IntArray
+    directions: FloatArray
+    electrons_per_s: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """Stars found about a field at an attitude: their places in `stars`, directions (3, n) and electron rates."""
+    """The stars found about a field at an attitude."""
 
     stars: Stars
     camera: Camera
     margin_px: float
     icrs_to_image: FloatArray
-    near: IntArray
-    directions: FloatArray
-    electrons_per_s: FloatArray
+    near: NearStars
 
     def holds(self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float) -> bool:
         """Whether every star near that field is among these."""
@@ -72,21 +78,16 @@ class Candidates:
     def __init__(self) -> None:
         self._kept: _Kept | None = None
 
-    def near(
-        self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float
-    ) -> tuple[IntArray, FloatArray, FloatArray]:
-        """The stars within `margin_px` of the image, and some more: places in `stars`, rising, and what `stars` has for them.
-
-        That is directions (3, n), ICRS, and electrons per second (n,). None of it is the caller's to change.
-        """
+    def near(self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float) -> NearStars:
+        """The stars within `margin_px` of the image, and some more. The caller must not change the arrays."""
         kept, keeps = self._kept, not stars.bodies and stars.velocity_km_s is None
         if keeps and kept is not None and kept.holds(stars, icrs_to_image, camera, margin_px):
-            return kept.near, kept.directions, kept.electrons_per_s
-        near = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
-        directions, electrons_per_s = stars.directions(near).T, stars.electrons_per_s.take(near)
+            return kept.near
+        star = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
+        near = NearStars(star, stars.directions(star).T, stars.electrons_per_s.take(star))
         if keeps:
-            self._kept = _Kept(stars, camera, margin_px, icrs_to_image.copy(), near, directions, electrons_per_s)
-        return near, directions, electrons_per_s
+            self._kept = _Kept(stars, camera, margin_px, icrs_to_image.copy(), near)
+        return near
 
 
 def stars_about(stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float, reach_rad: float = 0.0) -> IntArray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -247,8 +247,16 @@ def hidden(sprites: Sprites, directions: FloatArray, found: DiscTrail) -> Sprite
     return replace(sprites, data=data, star=star, x_px=x_px, y_px=y_px)
 
 
-def places_of(found: list[DiscTrail]) -> tuple[IntArray, FloatArray, FloatArray]:
-    """The places in the list, the directions (k, 3) and the rates (k,) of several."""
+class TrailPlaces(NamedTuple):
+    """Satellites' places in the list, directions (k, 3), ICRS, and electrons per second (k,)."""
+
+    listed: IntArray
+    directions: FloatArray
+    electrons_per_s: FloatArray
+
+
+def places_of(found: list[DiscTrail]) -> TrailPlaces:
+    """Where several satellites are in the middle of their light."""
     index = np.array([one.index for one in found], dtype=np.intp)
     middle = np.array([one.middle for one in found]).reshape(-1, 3)
-    return index, middle, np.array([one.electrons_per_s for one in found])
+    return TrailPlaces(index, middle, np.array([one.electrons_per_s for one in found]))

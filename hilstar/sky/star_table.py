@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -112,6 +112,15 @@ def assemble(path: Path, table: RawTable, stated_epoch_jyear: float | None, comp
     return Assembled(catalog, line, int((~kept).sum()))
 
 
+class TableMagnitudes(NamedTuple):
+    """V, B-V and V-I of a table's rows (n,), NaN for unknown, and how they were found, in words."""
+
+    v_mag: FloatArray
+    bv_mag: FloatArray
+    vi_mag: FloatArray
+    words: str
+
+
 class _Columns:
     """A table's columns by role, in the units of a catalogue."""
 
@@ -146,8 +155,8 @@ class _Columns:
         west = (ra_deg < 0) & (ra_deg >= -180)
         return np.where(west, ra_deg + 360, ra_deg), dec_deg
 
-    def magnitudes(self) -> tuple[FloatArray, FloatArray, FloatArray, str]:
-        """V, B-V and V-I by the first road that a row's columns allow, and the roads in words."""
+    def magnitudes(self) -> TableMagnitudes:
+        """The magnitudes of each row by the first conversion that its columns allow."""
         v, bv, vi = (np.full(self.table.row_count, np.nan) for _ in range(3))
         words: list[str] = []
         for route in (route for route in ROUTES if route.roles in self.layout.magnitudes):
@@ -161,7 +170,7 @@ class _Columns:
         if "vi_mag" in self.layout.role:
             given = self.role("vi_mag", np.nan)
             vi = np.where(np.isfinite(given), given, vi)
-        return v, bv, vi, ", ".join(words)
+        return TableMagnitudes(v, bv, vi, ", ".join(words))
 
     def identifiers(self) -> tuple[str, npt.NDArray[np.int64]]:
         """What the stars are called, and the number of each: Gaia's, Tycho's, or that of the row, from 1."""

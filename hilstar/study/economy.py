@@ -14,7 +14,7 @@ from hilstar.charts import BLUE, MUTED, ORANGE, RED, SMALL_PT, chart, write_reco
 from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
+from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
 from hilstar.study.settings import Isolation, Table, bench_text, lone_windows, squares, star_error
 from hilstar.study.sweep import medians_ms
 from hilstar.tracker.centroiders import FAMILY
@@ -137,8 +137,8 @@ def _open(scene: EffortScene, effort: Table, path: Path) -> Bench:
     return load(path)
 
 
-def _turn(scene: EffortScene) -> Turn:
-    return Turn(from_radec_roll_deg(*scene.radec_roll_deg), np.radians(scene.rate_deg_s))
+def _turn(scene: EffortScene) -> CameraTurn:
+    return CameraTurn(from_radec_roll_deg(*scene.radec_roll_deg), np.radians(scene.rate_deg_s))
 
 
 def _outcome(scene: EffortScene, name: str, bench: Bench, frame_ms: float) -> EffortOutcome:

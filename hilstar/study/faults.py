@@ -20,7 +20,7 @@ from hilstar.frame.fault_kinds import Fault, Freeze, Now, fault_of
 from hilstar.frame.faults import FaultLayer
 from hilstar.monitor.quantise import shown_light
 from hilstar.rotation import from_radec_roll_deg, propagate
-from hilstar.scene.extended import Glow
+from hilstar.scene.extended import GlowLight
 from hilstar.scene.sprites import Sprites, join_sprites
 from hilstar.study.settings import Isolation, bench_text, lone_windows
 from hilstar.study.settings import Table as Keys
@@ -135,7 +135,7 @@ def stray_light(bench: Bench, share: float) -> Stray:
     sprites = bench.light(bench.view(FIELD))
     if sprites is None:
         raise AssertionError("a frame with an attitude has sprites")
-    glow = Glow(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)  # 100 rad wide: even
+    glow = GlowLight(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)  # 100 rad wide: even
     lights = (glow,) if share else ()
     both = _shown(bench, replace(sprites, extended=lights))
     alone = _shown(bench, replace(join_sprites([], sprites.footprint_px), extended=lights))

@@ -21,9 +21,8 @@ from hilstar.files import make_directory
 from hilstar.frame.view import View
 from hilstar.process.pool import ProcessPool
 from hilstar.rotation import rate_between_rad_s
-from hilstar.twin.faulty_exposure import ExposurePiece, FaultyExposure, pieces_of
 from hilstar.twin.pictures import write_exposure_fits
-from hilstar.twin.simulator import FrameNoise, Simulator, simulator_view
+from hilstar.twin.simulator import ExposurePiece, FaultyExposure, FrameNoise, Simulator, pieces_of, simulator_view
 from hilstar.units import NS_PER_S
 
 

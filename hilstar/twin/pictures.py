@@ -24,8 +24,7 @@ from hilstar.files import written
 from hilstar.frame.fault_kinds import Drop, Freeze, Now
 from hilstar.frame.view import STILL, View
 from hilstar.scene.camera import Camera
-from hilstar.twin.faulty_exposure import ExposurePiece, FaultyExposure
-from hilstar.twin.simulator import Exposure, FrameNoise, Simulator, simulator_view
+from hilstar.twin.simulator import Exposure, ExposurePiece, FaultyExposure, FrameNoise, Simulator, simulator_view
 
 BOX_PX = 5  # side of the square over which a star's light is summed: where the middle is full, the wings still grow
 MAX_RADIUS_PX = 8  # radius of the brightest star's disc

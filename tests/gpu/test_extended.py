@@ -11,7 +11,7 @@ from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels, sho
 from hilstar.monitor.response import srgb_response
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera, Lens
-from hilstar.scene.extended import Glow, LightMap
+from hilstar.scene.extended import GlowLight, LightMap
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
@@ -117,7 +117,7 @@ def test_a_glow_has_its_profile_about_a_direction_on_and_off_the_image(lens):
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
         for direction in ([0.1, -0.05, 0.99], [1.0, 0.2, -0.3]):
             towards = np.array(direction) / np.linalg.norm(direction)
-            gl.draw(replace(none, extended=(Glow(towards, 5e4, 0.1, 3.0, cam),)))
+            gl.draw(replace(none, extended=(GlowLight(towards, 5e4, 0.1, 3.0, cam),)))
             angle = np.arctan2(np.linalg.norm(np.cross(seen, towards), axis=1), seen @ towards)
             wanted = 5e4 * (1 + (angle / 0.1) ** 2) ** -1.5
             assert np.abs(gl.linear().ravel() / wanted - 1).max() < (GLOW_LIMIT if lens is None else GLOW_LENS_LIMIT)

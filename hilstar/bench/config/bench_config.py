@@ -16,7 +16,7 @@ from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
 from hilstar.bench.config.hardware import Collimator, Monitor, SyncSettings, Tracker, Verify, check_sync
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES, RenderSettings
-from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SkySettings, Spacecraft
+from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SkySettings, SpacecraftSettings
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, Table, explained
@@ -39,7 +39,7 @@ class BenchConfig(Table, frozen=True):
     monitor: Monitor
     collimator: Collimator
     sky: SkySettings = msgspec.field(default_factory=SkySettings)
-    spacecraft: Spacecraft = msgspec.field(default_factory=Spacecraft)
+    spacecraft: SpacecraftSettings = msgspec.field(default_factory=SpacecraftSettings)
     attitude: AttitudeSettings = msgspec.field(default_factory=AttitudeSettings)
     render: RenderSettings = msgspec.field(default_factory=RenderSettings)
     background: Background = msgspec.field(default_factory=Background)

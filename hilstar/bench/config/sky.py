@@ -148,7 +148,7 @@ class SkySettings(Table, frozen=True):
     bodies: Bodies = msgspec.field(default_factory=Bodies)
 
 
-class Spacecraft(Table, frozen=True):
+class SpacecraftSettings(Table, frozen=True):
     """From where the sky is seen. With this table, or bodies, places are apparent: parallax, light bending and aberration.
 
     `[sky] observer_velocity_km_s` is then left out: the velocity is that of the Earth about the barycentre, and the satellite's

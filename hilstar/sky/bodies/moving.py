@@ -65,14 +65,14 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class SkyMoment:
     """A time since the start, and the observer's state about the Earth, km and km/s, where it comes with the frame."""
 
     since_ns: int
     state: tuple[float, float, float, float, float, float] | None = None
 
 
-START = Moment(0)
+START = SkyMoment(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,9 +124,9 @@ class MovingSky:
         self._limits_ns = self._limits()
         self._step_ns = round(orbit.step_s * NS_PER_S)
         self._span: Callable[[int], Span] = lru_cache(maxsize=2)(self._compute_span)
-        self._node: Callable[[Moment], FloatArray] = lru_cache(maxsize=2)(self._compute_node)
-        self._light: Callable[[Moment], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(self._compute_light)
-        self._face: Callable[[Moment, int], Disc] = lru_cache(maxsize=len(names) + 1)(self._compute_face)
+        self._node: Callable[[SkyMoment], FloatArray] = lru_cache(maxsize=2)(self._compute_node)
+        self._light: Callable[[SkyMoment], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(self._compute_light)
+        self._face: Callable[[SkyMoment, int], Disc] = lru_cache(maxsize=len(names) + 1)(self._compute_face)
         self._circumstances: Callable[[int], Circumstances] = lru_cache(maxsize=2)(self._compute_circumstances)
         self.satellites: Satellites | None = None
         self._told = False
@@ -228,37 +228,37 @@ class MovingSky:
         """How far the bodies (n,) are, in the order of `names`; else as `seen`."""
         return self._at(self._moment(t_ns, velocity_km_s, place_km))[:-1, 3]
 
-    def _moment(self, t_ns: int | None, velocity_km_s: FloatArray | None, place_km: FloatArray | None) -> Moment:
+    def _moment(self, t_ns: int | None, velocity_km_s: FloatArray | None, place_km: FloatArray | None) -> SkyMoment:
         """A time since the start, held within the ephemeris, with the observer's state about the Earth where it is given."""
         since_ns = self._within(t_ns)
         if place_km is None:
-            return Moment(since_ns)
+            return SkyMoment(since_ns)
         x, y, z = place_km.tolist()
         u, v, w = (0.0, 0.0, 0.0) if velocity_km_s is None else velocity_km_s.tolist()
-        return Moment(since_ns, (x, y, z, u, v, w))
+        return SkyMoment(since_ns, (x, y, z, u, v, w))
 
-    def _step(self, moment: Moment) -> Moment:
+    def _step(self, moment: SkyMoment) -> SkyMoment:
         """The last step of the orbit; where the observer's state comes with the frame, the moment itself."""
-        return Moment(moment.since_ns // self._step_ns * self._step_ns) if moment.state is None else moment
+        return SkyMoment(moment.since_ns // self._step_ns * self._step_ns) if moment.state is None else moment
 
-    def _at(self, moment: Moment) -> FloatArray:
+    def _at(self, moment: SkyMoment) -> FloatArray:
         """A node's rows (see `_compute_node`) at any moment."""
         if moment.state is not None:
             return self._node(moment)
         first = self._step(moment)
         node = self._node(first)
         share = (moment.since_ns - first.since_ns) / self._step_ns
-        return node + (self._node(Moment(first.since_ns + self._step_ns)) - node) * share
+        return node + (self._node(SkyMoment(first.since_ns + self._step_ns)) - node) * share
 
     def sight(self, since_ns: int) -> Sight:
         """What is seen at a moment, the directions aberrated by the observer's velocity at the start; Sun first."""
-        return self._sight(Moment(since_ns))
+        return self._sight(SkyMoment(since_ns))
 
-    def _sight(self, moment: Moment) -> Sight:
+    def _sight(self, moment: SkyMoment) -> Sight:
         seen = self._seen_from(moment)
         return replace(seen, directions=apparent_bodies(seen.seen_km, replace(seen.view, velocity_km_s=self._fixed_km_s)))
 
-    def _seen_from(self, moment: Moment) -> Sight:
+    def _seen_from(self, moment: SkyMoment) -> Sight:
         """What is seen at a moment, but for the directions."""
         span, rest_ns = divmod(moment.since_ns, SPAN_NS)
         cubics = self._span(span)
@@ -295,7 +295,7 @@ class MovingSky:
         seen_km = [self._kernel.seen_km(name, date.whole, part, earth_km) for name in self._tracked]
         return Span(np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s)
 
-    def _compute_node(self, moment: Moment) -> FloatArray:
+    def _compute_node(self, moment: SkyMoment) -> FloatArray:
         """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the change of the observer's velocity.
 
         The Earth's is its disc's middle as it is seen, all aberration included.
@@ -312,7 +312,7 @@ class MovingSky:
         node[-1, :3] = sight.view.velocity_km_s - self._fixed_km_s
         return node
 
-    def _compute_face(self, moment: Moment, i: int) -> Disc:
+    def _compute_face(self, moment: SkyMoment, i: int) -> Disc:
         """The disc of a drawn body, with its light."""
         sight, name, rate = self._sight(moment), self.names[i], float(self._light(moment)[1][i])
         if name == EARTH:
@@ -338,7 +338,7 @@ class MovingSky:
         from_sun_km = sight.view.from_sun_km - sight.place_km
         return earth_disc(-sight.place_km, from_sun_km, sight.about_earth_km_s, v0_e_per_s)
 
-    def _compute_light(self, moment: Moment) -> tuple[FloatArray, FloatArray]:
+    def _compute_light(self, moment: SkyMoment) -> tuple[FloatArray, FloatArray]:
         sight, jyear = self._sight(moment), self._jyear(moment.since_ns / NS_PER_S)
         from_sun_km = sight.seen_km + sight.view.from_sun_km
         v_mag = np.array(

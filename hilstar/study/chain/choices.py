@@ -23,7 +23,7 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import assembled, bench_stars
 from hilstar.bench.config import AttitudeSettings, BenchConfig, RenderSettings, SkySettings
-from hilstar.bench.config.sky import Spacecraft
+from hilstar.bench.config.sky import SpacecraftSettings
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.monitor.quantise import Quantisation
@@ -282,7 +282,7 @@ class Parts:
         if not file.config.tracker.exposure_s:
             raise InputError(f"{file.path}: [tracker] exposure_s = 0 gathers no light; write a longer one")
         sky = msgspec.structs.replace(file.config.sky, bodies=SkySettings().bodies)
-        config = msgspec.structs.replace(file.config, sky=sky, spacecraft=Spacecraft())
+        config = msgspec.structs.replace(file.config, sky=sky, spacecraft=SpacecraftSettings())
         self._file = BenchFile(file.path, file.text, config, file.sha256)
         self._benches: dict[tuple[tuple[str, Any], ...], Bench] = {}
         stars = bench_stars(config, file.folder)

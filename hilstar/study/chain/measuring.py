@@ -19,7 +19,7 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.bench.frame import Bench, Drawn
 from hilstar.rotation import propagate, to_matrix
-from hilstar.scene.frame_motion import Turn, swept_sprites
+from hilstar.scene.frame_motion import CameraTurn, swept_sprites
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars
 from hilstar.study.chain.choices import (
@@ -333,14 +333,14 @@ def _lights(scene: SceneMeasurement, combination: Combination, number: int) -> I
         return (seen.mean if movement.turns else seen.at_rest)(light_of, bench.camera.resolution_px)
 
     def true(_: int, light_ns: int) -> Lit:
-        turn = Turn(movement.at(light_ns), movement.rate_rad_s(light_ns))
+        turn = CameraTurn(movement.at(light_ns), movement.rate_rad_s(light_ns))
         return linear_light(bench, _sprites(bench, every, turn, movement.turns))
 
     def shown_as(stars: Stars, along_paths: bool) -> FloatArray:
         def light_of(_: int, light_ns: int) -> Lit:
             attitude = chain.attitude(light_ns)
             rate = attitude.rate_cam_rad_s
-            turn = Turn(attitude.q_icrs_to_cam, np.zeros(3) if rate is None else rate)
+            turn = CameraTurn(attitude.q_icrs_to_cam, np.zeros(3) if rate is None else rate)
             return linear_light(bench, _sprites(bench, stars, turn, along_paths and rate is not None))
 
         return exposed(light_of)
@@ -354,7 +354,7 @@ def _lights(scene: SceneMeasurement, combination: Combination, number: int) -> I
     yield chain.exposed(seen)
 
 
-def _sprites(bench: Bench, stars: Stars, turn: Turn, along_paths: bool) -> Sprites:
+def _sprites(bench: Bench, stars: Stars, turn: CameraTurn, along_paths: bool) -> Sprites:
     """Whole sprites of stars in a frame, along their paths or as points."""
     footprint_px, sigma_px = bench.renderer.footprint_px, bench.config.render.sprite_sigma_px
     if along_paths:

@@ -15,7 +15,19 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Frame
 from hilstar.bench.scenario import Scenario, lasts_ns
-from hilstar.frame.fault_kinds import AttitudeStep, Blank, Drop, Fault, Flash, Freeze, Glow, Now, Place, PointLight, StarGone
+from hilstar.frame.fault_kinds import (
+    AttitudeStep,
+    Blank,
+    Drop,
+    Fault,
+    Flash,
+    Freeze,
+    Glow,
+    Now,
+    PlacedFault,
+    PointLight,
+    StarGone,
+)
 from hilstar.frame.fault_light import FaultView, icrs_direction
 from hilstar.frame.faults import FaultLayer
 from hilstar.monitor.quantise import MASK_TURNS
@@ -121,7 +133,7 @@ class FaultyFields:
 
     def _direction(self, fault: Fault) -> FloatArray | None:
         """A fault's place on the sky; None where it has none of its own."""
-        if isinstance(fault, Place) and (fault.radec_deg is not None or fault.icrs is not None):
+        if isinstance(fault, PlacedFault) and (fault.radec_deg is not None or fault.icrs is not None):
             return icrs_direction(fault)
         if isinstance(fault, Flash | StarGone):
             return self._view.star_direction(fault)

@@ -37,7 +37,7 @@ MIN_STARS = 6  # fewer of those that were measured would say little
 
 
 @dataclass(frozen=True, slots=True)
-class KeyChange:
+class KeyProposal:
     """One key of a bench file with another value."""
 
     table: str
@@ -61,16 +61,16 @@ class Verified:
 
 
 @dataclass(frozen=True, slots=True)
-class Proposal:
+class BenchProposal:
     """The changes that make a bench pass, with what the twin said of it so changed; the fields are keys of the JSON object.
 
     `changes` is empty where none passes: then `verified` is of the best of those that were tried (None without any), `best` is
     that one, and `cannot` says what cannot be met.
     """
 
-    changes: tuple[KeyChange, ...]
+    changes: tuple[KeyProposal, ...]
     verified: Verified | None
-    best: tuple[KeyChange, ...]
+    best: tuple[KeyProposal, ...]
     tried: int
     cannot: str | None
 
@@ -83,34 +83,34 @@ class _Key:
     key: str
     values: tuple[float | str | bool, ...]
 
-    def at(self, place: int) -> KeyChange:
-        return KeyChange(self.table, self.key, self.values[place])
+    def at(self, place: int) -> KeyProposal:
+        return KeyProposal(self.table, self.key, self.values[place])
 
 
 def propose(
     file: BenchFile, verdict: Verdict, fields: int, seed: int, on_try: Callable[[int], None] = lambda tried: None
-) -> Proposal:
+) -> BenchProposal:
     """The fewest changes with which the bench of `file`, judged as `verdict`, passes over the same fields.
 
     `on_try` hears how many changes have been tried. Raises MachineError where the twin does.
     """
     if not codes_at_fault(verdict):
         cannot = f"the codes are within the limits, and no key of the light mends the rest: {verdict.reasons[0]}"
-        return Proposal((), None, (), 0, cannot)
+        return BenchProposal((), None, (), 0, cannot)
     rest = _not_the_codes(verdict)
     if rest is not None:
-        return Proposal((), None, (), 0, f"no key of the light mends what the codes do not cause: {rest}")
+        return BenchProposal((), None, (), 0, f"no key of the light mends what the codes do not cause: {rest}")
     trials = _Trials(file, fields, seed, on_try)
     keys = _keys(verdict)
     for count in range(1, len(keys) + 1):
         for chosen in combinations(keys, count):
             if trials.passes(_strongest(chosen)):
                 changes = _mildest(chosen, trials)
-                return Proposal(changes, _verified(trials.verdicts[changes]), (), trials.tried, None)
+                return BenchProposal(changes, _verified(trials.verdicts[changes]), (), trials.tried, None)
     return _none_passes(verdict, trials)
 
 
-def changed_text(text: str, changes: tuple[KeyChange, ...]) -> str:
+def changed_text(text: str, changes: tuple[KeyProposal, ...]) -> str:
     """The text of a bench file with changes; comments and all else stay."""
     for change in changes:
         text = with_key(text, change.table, change.key, change.value)
@@ -150,9 +150,9 @@ class _Trials:
     def __init__(self, file: BenchFile, fields: int, seed: int, on_try: Callable[[int], None]) -> None:
         self.file, self.fields, self.seed, self.on_try = file, fields, seed, on_try
         self.tried = 0
-        self.verdicts: dict[tuple[KeyChange, ...], Verdict] = {}
+        self.verdicts: dict[tuple[KeyProposal, ...], Verdict] = {}
 
-    def passes(self, changes: tuple[KeyChange, ...]) -> bool:
+    def passes(self, changes: tuple[KeyProposal, ...]) -> bool:
         """Whether the bench passes with the changes; False where its file is refused with them."""
         if changes not in self.verdicts:
             self.tried += 1
@@ -164,7 +164,7 @@ class _Trials:
                 self.on_try(self.tried)
         return self.verdicts[changes].passed
 
-    def _verdict(self, changes: tuple[KeyChange, ...]) -> Verdict:
+    def _verdict(self, changes: tuple[KeyProposal, ...]) -> Verdict:
         file = bench_file_of(self.file.path, changed_text(self.file.text, changes))
         for change in changes:  # a table that is not in plain form takes no key
             if getattr(getattr(file.config, change.table), change.key) != change.value:
@@ -196,11 +196,11 @@ def _faintest_v_mag(verdict: Verdict) -> tuple[float, ...]:
     return tuple(limit for limit in limits if (v_mag <= limit).sum() >= MIN_STARS)
 
 
-def _strongest(keys: tuple[_Key, ...]) -> tuple[KeyChange, ...]:
+def _strongest(keys: tuple[_Key, ...]) -> tuple[KeyProposal, ...]:
     return tuple(key.at(-1) for key in keys)
 
 
-def _mildest(keys: tuple[_Key, ...], trials: _Trials) -> tuple[KeyChange, ...]:
+def _mildest(keys: tuple[_Key, ...], trials: _Trials) -> tuple[KeyProposal, ...]:
     """The changes of keys that pass at their strongest, each brought to its mildest value that passes, the last key first."""
     changes = _strongest(keys)
     for place in reversed(range(len(keys))):
@@ -227,13 +227,13 @@ def _verified(verdict: Verdict) -> Verified:
     )
 
 
-def _none_passes(verdict: Verdict, trials: _Trials) -> Proposal:
+def _none_passes(verdict: Verdict, trials: _Trials) -> BenchProposal:
     judged = [changes for changes, one in trials.verdicts.items() if one.errors.stars]
     if not judged:
-        return Proposal((), None, (), trials.tried, f"none of {trials.tried} changes can be judged: {verdict.reasons[0]}")
+        return BenchProposal((), None, (), trials.tried, f"none of {trials.tried} changes can be judged: {verdict.reasons[0]}")
     best = min(judged, key=lambda changes: _excess(trials.verdicts[changes]))
     cannot = f"none of {trials.tried} changes passes; {_what_fails(trials.verdicts[best])}"
-    return Proposal((), _verified(trials.verdicts[best]), best, trials.tried, cannot)
+    return BenchProposal((), _verified(trials.verdicts[best]), best, trials.tried, cannot)
 
 
 def _excess(verdict: Verdict) -> float:
@@ -257,7 +257,7 @@ def _what_fails(verdict: Verdict) -> str:
     return f"{monitor.bits} bits cannot show stars of V {failing[0].v_from} to {failing[-1].v_to} within the limits"
 
 
-def proposal_lines(file: BenchFile, proposal: Proposal) -> list[str]:
+def proposal_lines(file: BenchFile, proposal: BenchProposal) -> list[str]:
     """The proposal for a person, with the difference that it makes in the bench file."""
     verified = proposal.verified
     if not proposal.changes:
@@ -269,7 +269,7 @@ def proposal_lines(file: BenchFile, proposal: Proposal) -> list[str]:
     return [f"{'proposal':20}{_words(proposal.changes)}{said}", *difference(file, proposal)]
 
 
-def difference(file: BenchFile, proposal: Proposal) -> list[str]:
+def difference(file: BenchFile, proposal: BenchProposal) -> list[str]:
     """The lines that a proposal changes in the bench file, as a unified diff."""
     before, after = file.text.splitlines(), changed_text(file.text, proposal.changes).splitlines()
     return list(difflib.unified_diff(before, after, str(file.path), str(file.path), n=1, lineterm=""))
@@ -289,7 +289,7 @@ def check_writable(file: BenchFile) -> None:
         raise cannot_write(file.path, "it is read-only", "copy it, and verify the copy")
 
 
-def write_proposal(file: BenchFile, proposal: Proposal) -> None:
+def write_proposal(file: BenchFile, proposal: BenchProposal) -> None:
     """Make the changes in the bench file. Raises InputError where it cannot be written, or has changed since it was read."""
     check_writable(file)
     if read_text(file.path, "give the path of a bench file", MAX_TOML_BYTES) != file.text:
@@ -297,7 +297,7 @@ def write_proposal(file: BenchFile, proposal: Proposal) -> None:
     write_whole(file.path, changed_text(file.text, proposal.changes))
 
 
-def _words(changes: tuple[KeyChange, ...]) -> str:
+def _words(changes: tuple[KeyProposal, ...]) -> str:
     return ", ".join(f"[{change.table}] {change.key} = {json.dumps(change.value)}" for change in changes)
 
 

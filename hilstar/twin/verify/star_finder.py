@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,14 @@ WING_SIGMAS = 6.0  # how far a neighbour's light reaches: 1e-9 of it, and Sirius
 MIN_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
 
 
+class Difference(NamedTuple):
+    """A star in one image against itself in another: magnitudes too faint, pixels to the right and down; NaN if not found."""
+
+    flux_mag: float
+    x_px: float
+    y_px: float
+
+
 @dataclass(frozen=True, slots=True)
 class Matched:
     """What was found in an image, and which of it each star (n,) is; -1 for none."""
@@ -32,13 +41,13 @@ class Matched:
     found: Centroids
     index: IntArray
 
-    def against(self, other: Matched, k: int) -> tuple[float, float, float]:
-        """Star `k` against itself in another image: magnitudes too faint, pixels to the right and down; NaN where not found."""
+    def against(self, other: Matched, k: int) -> Difference:
+        """Star `k` against itself in another image."""
         i, j = self.index[k], other.index[k]
         if i < 0 or j < 0:
-            return math.nan, math.nan, math.nan
+            return Difference(math.nan, math.nan, math.nan)
         a, b = self.found, other.found
-        return magnitude(float(a.flux[i] / b.flux[j])), float(a.x_px[i] - b.x_px[j]), float(a.y_px[i] - b.y_px[j])
+        return Difference(magnitude(float(a.flux[i] / b.flux[j])), float(a.x_px[i] - b.x_px[j]), float(a.y_px[i] - b.y_px[j]))
 
 
 @dataclass(frozen=True, slots=True)

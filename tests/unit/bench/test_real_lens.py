@@ -8,7 +8,7 @@ from scipy.special import ndtr
 
 from hilstar.bench.build import load
 from hilstar.rotation import propagate, to_matrix
-from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
+from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
 from hilstar.twin.budget import budget
 from tests.support.real_lens import SIZE, true_places_px, write_bench
 
@@ -166,7 +166,7 @@ def test_a_fast_star_that_cuts_a_corner_from_beyond_the_lens_to_beyond_it_is_dra
     q /= np.linalg.norm(q)
     outward = camera.cam_to_image.T @ [*(camera.cam_to_image @ ray)[:2], 0.0]
     rate = 4.5 * outward / np.linalg.norm(outward)
-    turn = Turn(propagate(q, rate, -hold_s / 2), rate)
+    turn = CameraTurn(propagate(q, rate, -hold_s / 2), rate)
     for seconds in (0.0, hold_s):
         seen = camera.cam_to_image @ to_matrix(propagate(turn.q_icrs_to_cam, rate, seconds)) @ from_star
         assert np.isnan(camera.project(seen[None])[0])

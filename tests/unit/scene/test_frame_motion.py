@@ -10,7 +10,7 @@ from hilstar.render.presenter import Orientation
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.scene import sprites as sprites_module
-from hilstar.scene.frame_motion import EXTRA_SPRITES, Scan, Turn, swept_sprites
+from hilstar.scene.frame_motion import EXTRA_SPRITES, CameraTurn, Scan, swept_sprites
 from hilstar.scene.paths import MAX_NODES
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import clipped_sprites, make_sprites
@@ -35,11 +35,11 @@ def stars_on(pixels):
     return stars_at(image @ (CAMERA.cam_to_image @ to_matrix(Q)), np.ones(len(offsets)))
 
 
-def turn(rate_deg_s) -> Turn:
-    return Turn(Q, np.radians(np.array(rate_deg_s, dtype=float)))
+def turn(rate_deg_s) -> CameraTurn:
+    return CameraTurn(Q, np.radians(np.array(rate_deg_s, dtype=float)))
 
 
-def place_px(stars, at: Turn, seconds: float):
+def place_px(stars, at: CameraTurn, seconds: float):
     """Where the stars are so long after Q, by the quaternion's own way."""
     q = propagate(at.q_icrs_to_cam, at.rate_cam_rad_s, seconds)
     sprites = make_sprites(stars, to_matrix(q), CAMERA, FOOTPRINT)
@@ -87,7 +87,7 @@ def test_a_path_is_the_mean_of_its_instants_and_keeps_its_flux(rate):
 def test_paths_of_following_frames_join():
     """Where one frame's path ends the next one's begins: the streak has no gap and no overlap along a row."""
     stars, at = stars_on([(160.3, 20.0)]), turn((0.0, 2.0, 0.0))
-    following = Turn(propagate(Q, at.rate_cam_rad_s, FRAME_S), at.rate_cam_rad_s)
+    following = CameraTurn(propagate(Q, at.rate_cam_rad_s, FRAME_S), at.rate_cam_rad_s)
     path, begins = Scan((0, 1), FRAME_S, FRAME_S), Scan((0, 1), FRAME_S, 0.0)
     first, second = (float(swept(stars, frame, begins).x_px[0]) for frame in (at, following))
     drawn = swept(stars, at, path)
@@ -136,7 +136,7 @@ def crowd(count: int, rng: np.random.Generator):
 def test_no_turn_makes_more_than_its_budget_of_sprites(speed, axis, scan, rng):
     stars = crowd(1000, rng)
     still = len(make_sprites(stars, CAMERA.cam_to_image @ to_matrix(Q), CAMERA, FOOTPRINT))
-    sprites = swept(stars, Turn(Q, speed * np.array(axis) / np.linalg.norm(axis)), scan)
+    sprites = swept(stars, CameraTurn(Q, speed * np.array(axis) / np.linalg.norm(axis)), scan)
     assert np.isfinite(sprites.x_px).all()
     assert sprites.per_star <= MAX_NODES
     # A path of half the field's radius takes that many more stars across the image.

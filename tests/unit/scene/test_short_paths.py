@@ -11,7 +11,7 @@ from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene import frame_motion
 from hilstar.scene.camera import Lens, ResidualField, bounded
-from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
+from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
 from hilstar.scene.paths import LIMIT_PX, LIMIT_SHARE, Paths, ShortPaths, points_within
 from tests.support.stars import stars_at
 
@@ -106,7 +106,7 @@ def test_a_turn_too_long_for_a_few_points_has_exact_paths():
 def test_a_frame_of_short_paths_is_a_frame_of_exact_ones(camera, rate_deg_s, rng, monkeypatch):
     """The same stars and light: also of those that cross the border, or the end of the lens beyond its corner."""
     q, axis = from_radec_roll_deg(84.0, -1.0, 20.0), np.array([0.4, -0.7, 0.3])
-    turn = Turn(q, np.radians(rate_deg_s) * axis / np.linalg.norm(axis))
+    turn = CameraTurn(q, np.radians(rate_deg_s) * axis / np.linalg.norm(axis))
     reach = camera.field_radius_rad(MARGIN_PX) * 1.3
     u, v = rng.uniform(-np.tan(reach), np.tan(reach), (2, 3000))
     image = np.column_stack([u, v, np.ones(3000)])

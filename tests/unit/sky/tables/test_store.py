@@ -113,7 +113,7 @@ def test_only_the_newest_files_are_kept(table):
 def test_two_processes_at_once_both_have_the_catalogue(table):
     program = (
         "import sys; from pathlib import Path; from hilstar.sky.star_table import *;"
-        "print(len(choose_catalog(Choice(Path(sys.argv[1])))))"
+        "print(len(choose_catalog(TableChoice(Path(sys.argv[1])))))"
     )
     runs = [subprocess.Popen([sys.executable, "-c", program, table], stdout=subprocess.PIPE) for _ in range(2)]
     counts = [run.communicate(timeout=PATIENCE_S)[0].strip() for run in runs]

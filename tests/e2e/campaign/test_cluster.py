@@ -19,7 +19,7 @@ import hilstar
 from hilstar.campaign import cluster
 from tests.support.benches import ROOT
 from tests.support.campaigns import read_columns, write_campaign
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.waiting import PATIENCE_S, wait_for
 
 DASK = [sys.executable, "-m", "dask"]
@@ -86,6 +86,17 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def pool_table(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The table that a pool makes of the same plan."""
+    folder = tmp_path_factory.mktemp("pool")
+    write_campaign(folder, cases=24)
+    (folder / "sleepy.py").write_text(SOLVER)
+    result = run_hilstar_here("campaign", "plan.toml", "-o", "pool", "--workers", "1", *OPTIONS, cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return (folder / "pool/cases.parquet").read_bytes()
+
+
 def rows_so_far(folder: Path) -> int:
     return sum(path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl"))
 
@@ -108,7 +119,7 @@ def driver_of(folder: Path, address: str) -> subprocess.Popen[bytes]:
         return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
 
 
-def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_killed(folder: Path) -> None:
+def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_killed(folder: Path, pool_table: bytes) -> None:
     with contextlib.ExitStack() as stack:
         _, address = stack.enter_context(scheduler(folder))
         other = str(other_version(folder))
@@ -127,14 +138,13 @@ def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_kill
         (folder / "slow").unlink()
         assert rows_so_far(folder) < 24
 
-        last = run_hilstar("campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS, cwd=folder)
+        last = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS, cwd=folder)
     assert last.returncode == 0, last.stderr
     for said in ((folder / "driver.log").read_text(), last.stderr):
         assert re.search(
             rf"worker tcp://\S+ is refused: it has hilstar 99.0, and the campaign is of {hilstar.__version__}", said
         )
-    pool = run_hilstar_here("campaign", "plan.toml", "-o", "pool", "--workers", "1", *OPTIONS, cwd=folder)
-    assert (folder / "out/cases.parquet").read_bytes() == (folder / "pool/cases.parquet").read_bytes(), pool.stderr
+    assert (folder / "out/cases.parquet").read_bytes() == pool_table
     columns = read_columns(folder / "out/cases.parquet")
     assert columns["case"] == list(range(24)) and {"done", "failed"} == set(columns["status"])
 
@@ -180,7 +190,7 @@ def certificates(folder: Path, name: str) -> tuple[str, ...]:
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="the system has no openssl")
 def test_a_cluster_with_dasks_tls_runs_a_campaign_and_takes_nobody_elses_certificate(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch, pool_table: bytes
 ) -> None:
     (folder / "slow").unlink()
     ours, theirs = certificates(folder, "ours"), certificates(folder, "theirs")
@@ -194,11 +204,10 @@ def test_a_cluster_with_dasks_tls_runs_a_campaign_and_takes_nobody_elses_certifi
         assert_refused(refused, 3, "certificate")
         assert_refused(run_hilstar_here(*words, cwd=folder), 2, "no certificate is named", "--tls-ca-file")
         monkeypatch.undo()
-        result = run_hilstar("campaign", *words[1:], *ours, cwd=folder)
+        result = run_hilstar_here(*words, *ours, cwd=folder)
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["cases"] == 24
-    pool = run_hilstar_here("campaign", "plan.toml", "-o", "pool", "--workers", "1", *OPTIONS, cwd=folder)
-    assert (folder / "out/cases.parquet").read_bytes() == (folder / "pool/cases.parquet").read_bytes(), pool.stderr
+    assert (folder / "out/cases.parquet").read_bytes() == pool_table
 
 
 TLS = ("--tls-ca-file", "plan.toml", "--tls-cert", "plan.toml")
@@ -228,6 +237,7 @@ def test_code_runs_over_no_network_without_tls(folder: Path, words: list[str], s
 
 
 def test_a_scheduler_on_loopback_that_listens_to_the_network_too_is_said(folder: Path) -> None:
+    write_campaign(folder, cases=2)
     (folder / "slow").unlink()
     with contextlib.ExitStack() as stack:
         _, address = stack.enter_context(scheduler(folder, "0", "--protocol", "tcp"))
@@ -235,7 +245,7 @@ def test_a_scheduler_on_loopback_that_listens_to_the_network_too_is_said(folder:
             pytest.skip("this machine has no other address than loopback's")
         here = f"tcp://127.0.0.1:{address.rpartition(':')[2]}"
         stack.enter_context(running(folder, "a.log", "worker", here, *WORKER, "--host", "127.0.0.1"))
-        result = run_hilstar("campaign", "plan.toml", "-o", "out", "--scheduler", here, *OPTIONS, cwd=folder)
+        result = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--scheduler", here, *OPTIONS, cwd=folder)
     assert result.returncode == 0, result.stderr
     assert f"the scheduler listens at {address} without TLS" in result.stderr
 

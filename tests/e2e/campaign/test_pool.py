@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.campaigns import read_columns, write_campaign
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.waiting import PATIENCE_S, wait_for
 
 # Slow enough to be killed in its middle; its answer, and the images that it fails over, are those of the pixels alone.
@@ -60,12 +60,12 @@ def runs(pid: int) -> bool:
 
 
 def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(folder: Path) -> None:
-    whole = run_hilstar_here("campaign", "plan.toml", "-o", "whole", "--workers", "3", *OPTIONS, cwd=folder)
+    whole = run_hilstar_here("campaign", "plan.toml", "-o", "whole", "--workers", "2", *OPTIONS, cwd=folder)
     assert whole.returncode == 0, whole.stderr
     wanted = json.loads(whole.stdout)
 
     (folder / "slow").touch()
-    stopped = start(folder, 2)  # Ctrl-C
+    stopped = start(folder, 1)  # Ctrl-C
     wait_for(lambda: rows_so_far(folder) >= 3)
     stopped.send_signal(signal.SIGINT)
     _, err = stopped.communicate(timeout=PATIENCE_S)
@@ -89,7 +89,7 @@ def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
     after_both = rows_so_far(folder)
 
     (folder / "slow").unlink()
-    last = run_hilstar("campaign", "plan.toml", "-o", "out", "--workers", "1", *OPTIONS, cwd=folder)
+    last = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--workers", "1", *OPTIONS, cwd=folder)
     assert last.returncode == 0, last.stderr
     summary = json.loads(last.stdout)
     assert after_both < 30 and summary["sha256"] == wanted["sha256"]

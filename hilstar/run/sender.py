@@ -37,17 +37,19 @@ PATIENCE_S = 0.5  # a line that accepts nothing for this long has no reader
 MAX_TAKEN = 100
 PROBE_S = 0.02
 UDP = re.compile(r"udp://(?:\[([0-9A-Fa-f:.]+(?:%\w+)?)\]|([^:\[\]/\s]+)):(\d{1,5})")
-
-
 Clock = Callable[[], int]
 Numbers = Sequence[float] | FloatArray
 
 
 class SenderEnd(Protocol):
-    """Where a sender puts its packets. One that listens too is a `TwoWay`."""
+    """Where a sender puts its packets."""
 
     endpoint: str
     link_counts: LinkCounts
+
+    @property
+    def status(self) -> Status | None:
+        """The newest status of hilstar; None before the first, and where nothing comes back."""
 
     def wait_for_listener(self, timeout_s: float) -> bool:
         """True once there is a listener, or where the road cannot tell."""
@@ -235,7 +237,7 @@ class Sender:
     @property
     def status(self) -> Status | None:
         """The newest status of hilstar; None before the first, and over ZeroMQ, which has no way back."""
-        return self._end.status if isinstance(self._end, TwoWay) else None
+        return self._end.status
 
     def wait(self, timeout_s: float = 30.0) -> bool:
         """True once hilstar listens: a subscriber (ZeroMQ), an answer (UDP), or at once where the road cannot tell (serial)."""

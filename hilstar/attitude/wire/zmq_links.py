@@ -209,6 +209,7 @@ class ZmqSender(ZmqSocket):
     """An XPUB socket, which reports subscribers; it binds, or connects with `bind=False`."""
 
     LINGER_MS, STOPPED_LINGER_MS = 2000, 200  # for a slow subscriber, without and with a signal
+    status: Status | None = None  # no way back
 
     def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
         self._tended_s = 0.0

@@ -1,7 +1,8 @@
 """Settings of a display's output that change codes on their way to the panel, or the time of a frame: a table of them.
 
 Names and values are those of the drivers (Linux DRM connectors, which modesetting, amdgpu, radeon and nouveau pass on by
-RandR; xf86-video-amdgpu's own; nvidia-settings' attributes). Read in their sources; no such driver was there to be tried.
+RandR; xf86-video-amdgpu's own; nvidia-settings' attributes). `dithering mode`, `Broadcast RGB`, `Colorspace`, `vrr_capable`,
+`max bpc` and vibrance were read in drivers' sources; the other names are from their documentation. None was tried on hardware.
 """
 
 from __future__ import annotations

@@ -44,12 +44,6 @@ MAX_BURST, MAX_PER_S = 50, 10
 FORM = 'write a JSON object with kind and name, {"start": "NAME"} or {"stop": "NAME"}'
 
 
-class FaultLink(ZmqReceiver):
-    """The socket that messages come in through."""
-
-    max_part_bytes = MAX_MESSAGE_BYTES
-
-
 def act(schedule: FaultSchedule, raw: bytes) -> None:
     """Do what a message asks for. Raises InputError for one that is wrong, or that cannot be done."""
     try:
@@ -83,7 +77,7 @@ class FaultStream:
         self.messages = 0
         self.refused: Counter[str] = Counter()
         self._schedule, self._notices = schedule, Notices() if notices is None else notices
-        self._link = FaultLink(endpoint, bind=bind, keys=keys, notices=self._notices)
+        self._link = ZmqReceiver(endpoint, bind=bind, keys=keys, notices=self._notices, max_part_bytes=MAX_MESSAGE_BYTES)
         self._allowance = Allowance(MAX_BURST, MAX_PER_S)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-faults", daemon=True)

@@ -205,7 +205,7 @@ def with_key(
 
     Where the table is written in another TOML form, the result means something else: parse it again to see.
     """
-    line = f"{key} = {json.dumps(value)}"  # of numbers, truth values and plain text, TOML writes the same
+    line = f"{key} = {json.dumps(value)}"  # JSON and TOML write numbers, truth values and plain text alike
     header = re.search(rf"^[ \t]*\[{table}\][^\n]*\n?", text, re.MULTILINE)
     if header is None:
         return f"{text.rstrip()}\n\n[{table}]\n{line}\n".lstrip()

@@ -11,13 +11,16 @@ from msgspec.structs import replace
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.bench.cameras import bench_camera
+from hilstar.bench.cameras import bench_camera, tracker_camera
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, RenderSettings, Tracker
 from hilstar.bench.config.bench_config import epoch_utc_ns, has_observer
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
+from hilstar.frame.layers import light_of, seen_in, sky_layers
+from hilstar.frame.truth import StarInView, brightest_in_view
+from hilstar.frame.view import Canvas, View
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel
@@ -51,7 +54,7 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
 
 def assembled(file: BenchFile, stars: Stars, context: Context | None = None, moving: MovingSky | None = None) -> Bench:
     """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError or MachineError."""
-    if context is not None:  # a window's, which ends with the window
+    if context is not None:  # a window's context, which the window frees
         return _assembled(file, stars, context, moving)
     context = create_context(file.config.render.gpu)
     try:
@@ -159,13 +162,13 @@ def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
     """The bodies and the observer of a bench, None where its file has neither. Raises InputError or MachineError."""
     if not has_observer(config):
         return None
-    from hilstar.bench.moving import moving_sky  # with the ephemeris 50 ms, which a sky that stands still does not need
+    from hilstar.bench.moving import moving_sky  # importing the ephemeris takes 50 ms, which only bodies and an observer need
 
     return moving_sky(config, folder, bench_optics(config.tracker, folder))
 
 
 def moved(stars: Stars, moving: MovingSky | None) -> Stars:
-    """The stars with the bodies among them at t = 0, in arrays that `moving` may change; the stars where nothing moves."""
+    """The stars with bodies among them at t = 0, in arrays that `moving` may change; without `moving` the stars themselves."""
     return stars if moving is None else moving.among(stars)
 
 
@@ -184,6 +187,18 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     temperature_k = star_temperatures_k(catalog.bv_mag, sky.temperature)
     rates = star_rates(config, folder)(catalog.v_mag, catalog.bv_mag, catalog.vi_mag)
     return make_stars(catalog, vectors, temperature_k, rates)
+
+
+def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
+    """The `count` brightest stars and bodies that a bench's tracker sees in a view, the brightest first.
+
+    Raises InputError or MachineError (see `bench_moving`).
+    """
+    canvas = Canvas(tracker_camera(file.config.tracker, file.folder), 1, file.config.tracker.psf_sigma_px)
+    moving = bench_moving(file.config, file.folder)
+    stars = seen_in(view, moved(bench_stars(file.config, file.folder, moving), moving), moving)
+    light = light_of(canvas, sky_layers(canvas, moving), stars, view)
+    return brightest_in_view(light, stars, canvas.camera, view.q_icrs_to_cam, count)
 
 
 # Electron rates (n,) of stars by their V, B-V and V-I, which may be NaN.

@@ -1,4 +1,4 @@
-"""What a scene needs and no more: sprites, paths and codes that keep a bench's errors within its tolerance in minimum time.
+"""The cheapest sprites, paths and codes that keep a bench's errors within its tolerance.
 
 Half of the tolerance is for the codes, a quarter for the sprites' edges and a quarter for motion that is not drawn.
 """
@@ -36,7 +36,7 @@ CUT_PHASES = 51
 # wide for the shader. A field of the Milky Way has twice the stars of an average one.
 ROUND_MS_A_STAR = 0.002
 EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
-IN_TIME_SHARE = 0.5  # of a refresh
+IN_TIME_SHARE = 0.5  # share of a refresh period that a frame may take
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What the stars are shown with: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
+    """The light of a bench: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
 
     `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
     whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider` what it finds stars by: None
@@ -129,7 +129,7 @@ class Light:
 
     @property
     def judges(self) -> tuple[Centroider, ...]:
-        """Who measures where codes show a star."""
+        """The centroiders that judge where codes show a star."""
         return FAMILY if self.centroider is None else (self.centroider,)
 
     def field_ms(self, method: Quantisation, sigma_px: tuple[float, float]) -> float:

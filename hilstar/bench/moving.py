@@ -1,4 +1,4 @@
-"""The moving part of a bench's sky, from its file: who is seen, from where, and who is too wide for a point."""
+"""The moving part of a bench's sky, from its file: bodies, satellites, the observer, and bodies wider than a point."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_ORBIT_BYTES = 20_000_000  # a year of minutes
+MAX_ORBIT_BYTES = 20_000_000  # states for each minute of a year
 MAX_LIST_BYTES, MAX_TABLE_BYTES = 20_000_000, 5_000_000  # 120 000 sets: several times as many as there are in orbit
 MAX_TLE_AGE_DAYS = 7.0
-MAX_ARCSEC, MANY_PX = 7200.0, 1000.0  # a wider body is told in degrees; across a field that wide no scale holds
+MAX_ARCSEC, MANY_PX = 7200.0, 1000.0  # wider bodies are given in degrees, and without a count of pixels
 
 
 def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
@@ -42,7 +42,7 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
     start_ns = round((config.sky.epoch_jyear - jyear(utc_ns)) * YEAR_NS)
     unix = config.sky.epoch_utc == UNIX
     if unix:
-        start_ns = round(start_ns / DAY_NS) * DAY_NS  # a Julian year is good to milliseconds
+        start_ns = round(start_ns / DAY_NS) * DAY_NS  # a Julian year is right to a millisecond
     orbit = config.spacecraft.orbit or GEOCENTRE
     observer = Geocentre() if orbit in {GEOCENTRE, SOURCE} else orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
     names = body_names(config)
@@ -146,7 +146,7 @@ def _pixels(px: float) -> str:
 
 
 def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:
-    """What there is to say of a bench's satellites at a moment, a line; none where it has none."""
+    """One line about a bench's satellites at a moment; none without satellites."""
     if sky is None or sky.satellites is None:
         return []
     placed, known, every = sky.satellites_placed(t_ns), sky.satellites.listed, len(sky.satellites)

@@ -108,7 +108,7 @@ def parse_scenario(path: Path, text: str) -> Scenario:
 
 
 def _place(number: int, table: Any) -> str:
-    """Where a fault stands: by its number, and its name where it has one."""
+    """The number of a fault in its file, with its name if it has one."""
     name = table.get("name") if isinstance(table, dict) else None
     return f"[[fault]] {number} ({shortened(name, 40)}):" if isinstance(name, str) and name else f"[[fault]] {number}:"
 

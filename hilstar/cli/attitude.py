@@ -127,21 +127,12 @@ def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
     """Where the camera looks, and what it sees."""
     import numpy as np
 
-    from hilstar.bench.build import bench_moving, bench_stars, moved
-    from hilstar.bench.cameras import tracker_camera
-    from hilstar.frame.layers import light_of, seen_in, sky_layers
-    from hilstar.frame.truth import brightest_in_view
-    from hilstar.frame.view import Canvas, View
+    from hilstar.bench.build import brightest_seen
+    from hilstar.frame.view import View
     from hilstar.rotation import to_radec_roll_deg
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(sample.q_icrs_to_cam)
-    camera = tracker_camera(file.config.tracker, file.folder)
-    moving = bench_moving(file.config, file.folder)
-    view = View(sample.q_icrs_to_cam, t_ns=sample.t_ns)
-    sky = seen_in(view, moved(bench_stars(file.config, file.folder, moving), moving), moving)
-    canvas = Canvas(camera, 1, file.config.tracker.psf_sigma_px)
-    light = light_of(canvas, sky_layers(canvas, moving), sky, view)
-    stars = brightest_in_view(light, sky, camera, view.q_icrs_to_cam, SHOWN_STARS)
+    stars = brightest_seen(file, View(sample.q_icrs_to_cam, t_ns=sample.t_ns), SHOWN_STARS)
     rate = sample.rate_cam_rad_s
     return {
         "t_ns": sample.t_ns,

@@ -20,7 +20,7 @@ from hilstar.toml_tables import Kind, Table, explained
 REFERENCE = "docs/faults.md"
 TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
 MAX_TIME_S, MAX_LIGHT_E, MAX_PLACE_PX = 1e7, 1e12, 1e6
-MAX_TRACK_PX = 20_000  # of a burst's tracks together: a frame's work is bounded
+MAX_TRACK_PX = 20_000  # a burst's tracks together: bounds a frame's work
 MIN_RATE_PX_S = 1e-9
 UNIT_TOLERANCE = 1e-3
 
@@ -36,7 +36,7 @@ Share = Annotated[float, Meta(gt=0, le=1)]
 
 
 class Fault(Table, frozen=True, kw_only=True):
-    """What every fault has: a name, when it begins (seconds of the run; None: when it is asked for), and how long it lasts.
+    """The keys of every fault: a name, its beginning (seconds of the run; None: on request), and how long it lasts.
 
     Without `for_s` it lasts until it is stopped.
     """
@@ -49,7 +49,7 @@ class Fault(Table, frozen=True, kw_only=True):
     for_s: Duration | None = None
 
     def check(self) -> None:
-        """Refuse (InputError) what the keys mean together."""
+        """Refuse (InputError) keys that contradict each other."""
 
 
 class PlacedFault(Fault, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""What faults add to the light of one camera, and the stars that they take away.
+"""The light that faults add to one camera's image, and the stars that they take away.
 
 The display and the virtual tracker have a `FaultView` each; nothing else differs between them.
 """
@@ -148,15 +148,15 @@ class FaultView:
         return map_image(values, fault, by.canvas.camera, by.tracker if fault.frame == "tracker" else by.monitor)
 
     def _source(self, fault: PlacedFault) -> tuple[Camera, tuple[float, float]]:
-        """The camera in whose pixels a place is, and those."""
+        """The camera in whose pixels a place is given, and the place."""
         if fault.tracker_px is not None:
             return self.by.tracker, fault.tracker_px
         return self.by.monitor, fault.screen_px or (0.0, 0.0)
 
-    # What a frame asks for
+    # Called for each frame
 
     def sky_points(self, now: Sequence[Now], stars: Stars) -> tuple[FloatArray, list[AddedLight]]:
-        """False stars and flashes that are fixed on the sky: their directions (n, 3), and what they are called."""
+        """False stars and flashes that are fixed on the sky: their directions (n, 3), and their names and light."""
         vectors, lights = [], []
         for one in now:
             fault = one.fault
@@ -170,7 +170,7 @@ class FaultView:
 
     def _direction(self, fault: FalseStar | Flash, stars: Stars) -> FloatArray | None:
         if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
-            for known in (stars, self.by.stars):  # a star that is too faint to show is among the bench's all the same
+            for known in (stars, self.by.stars):  # a star too faint to show is among all of the bench's stars
                 found = self._targets.find(known, fault)
                 if len(found):
                     return np.asarray(known.vectors[found[0]])
@@ -178,7 +178,7 @@ class FaultView:
         return np.asarray(self.by.apparent(icrs_direction(fault)[None])[0])
 
     def star_direction(self, fault: Fault) -> FloatArray | None:
-        """Where the star of a fault is on the sky (3,); None of a fault that is about none."""
+        """The direction (3,), ICRS, of the star that a fault is about; None if it is about none."""
         found = self._targets.find(self.by.stars, fault)
         return np.asarray(self.by.stars.vectors[found[0]]) if len(found) else None
 
@@ -187,7 +187,7 @@ class FaultView:
         return AddedLight(fault.name, float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)
 
     def camera_points(self, now: Sequence[Now], scan: Scan | None) -> tuple[list[PointChain], list[AddedLight]]:
-        """False stars and flashes that move with the camera, and tracks: chains, and what each line of them is called."""
+        """False stars and flashes that move with the camera, and tracks: chains, and the name and light of each line."""
         chains, lights = [], []
         for one in now:
             fault = one.fault
@@ -203,7 +203,7 @@ class FaultView:
         return chains, lights
 
     def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> PointChain:
-        """A point's way over its pixels while they are lit."""
+        """A point's path over the pixels while they are lit."""
         by, (source, place) = self.by, self._source(fault)
         rate, since_s = np.array(fault.rate_px_s), one.since_ns / NS_PER_S
         begin_s, hold_s = since_s, 0.0
@@ -228,16 +228,16 @@ class FaultView:
         return self._tracks[key]
 
     def gone(self, now: Sequence[Now], stars: Stars) -> list[tuple[int, float]]:
-        """Stars that are not there, and the share of their light that is left in this frame."""
+        """Stars that a fault removes, and the share of their light that is left in this frame."""
         taken = [one for one in now if isinstance(one.fault, StarGone)]
         return [(int(star), 1 - one.share) for one in taken for star in self._targets.find(stars, one.fault)]
 
     def gone_bodies(self, now: Sequence[Now]) -> dict[str, float]:
-        """The same for what is gone by name."""
+        """Bodies and stars that a fault removes by name, and the share of their light that is left."""
         return {one.fault.star: 1 - one.share for one in now if isinstance(one.fault, StarGone) and one.fault.star is not None}
 
     def surfaces(self, now: Sequence[Now], q_icrs_to_cam: FloatArray) -> list[extended.ExtendedLight]:
-        """Stray light."""
+        """The stray light of the faults that are on."""
         found: list[extended.ExtendedLight] = []
         for one in now:
             fault = one.fault
@@ -252,7 +252,7 @@ class FaultView:
         fixed = fault.tracker_px is not None or fault.screen_px is not None
         known = self._glow_kept
         if fixed and known is not None and known[:2] == (fault, share):
-            return known[2]  # one object: the renderer knows the same light again by that
+            return known[2]  # the same object, by which the renderer recognises the same light
         made = self._new_glow(fault, share, q_icrs_to_cam)
         if fixed:
             self._glow_kept = fault, share, made
@@ -273,7 +273,7 @@ class FaultView:
         return extended.GlowLight(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera)
 
     def footprints(self, chains: list[PointChain]) -> list[Sprites]:
-        """The sprites of chains; the lines count on from one to the next, as stars from -1 down."""
+        """The sprites of chains. Their lines are numbered from one chain to the next, as stars -1, -2 and on."""
         made, first = [], 0
         for chain in chains:
             star = -1 - first - chain.line
@@ -292,13 +292,13 @@ def icrs_direction(fault: PlacedFault) -> FloatArray:
 
 
 class Targets:
-    """Places of stars in a bench's arrays; found once for each of them, which keep their order for a whole run."""
+    """Places of stars in a bench's arrays, which keep their order for a whole run: each is searched for once."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[int, int | str], tuple[object, IntArray]] = {}
 
     def find(self, stars: Stars, fault: Fault) -> IntArray:
-        """Where a fault's star is in `stars`; empty where it is not among them."""
+        """The places of a fault's star in `stars`; empty if it is not among them."""
         if not isinstance(fault, Flash | StarGone):
             return np.empty(0, dtype=np.intp)
         wanted = fault.hip if fault.hip is not None else fault.star

@@ -78,7 +78,7 @@ class SatelliteLayer:
 
     def _passing(self, view: View, reach_rad: float, longest_s: float, faintest_e_per_s: float | None = None) -> Pass | None:
         """The satellites that may be within `reach_rad` of the boresight; None for none."""
-        from hilstar.sky.bodies.passes import Cone  # with SGP4, which a sky without satellites does not need
+        from hilstar.sky.bodies.passes import Cone  # imports SGP4, which only satellites need
 
         axis = view.icrs_to_image(self.canvas.camera)[2]
         faintest = self.faintest_e_per_s if faintest_e_per_s is None else faintest_e_per_s

@@ -37,7 +37,7 @@ TRUTH_DTYPE = np.dtype(
 
 
 def clipped_in(truth: npt.NDArray[np.void]) -> list[int | str]:
-    """What clips in a table of TRUTH_DTYPE: HIP numbers, and names of what has none."""
+    """The rows of a table of TRUTH_DTYPE that clip: HIP numbers, or names without one."""
     rows = truth[truth["clipped"]]
     return [name or hip for name, hip in zip(rows["name"].tolist(), rows["hip"].tolist(), strict=True)]
 
@@ -62,22 +62,22 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
 
 
 def designations(stars: Stars, sprites: Sprites, which: IntArray) -> tuple[int | str, ...]:
-    """What sprites at the positions `which` (n,) are of, each once: HIP numbers, and names of what has none."""
+    """The stars of the sprites at positions `which` (n,), each once: HIP numbers, or names without one."""
     star = np.unique(sprites.star[which])
     added = dict.fromkeys(sprites.added[-1 - k].name for k in star[star < 0])
     return (*stars.designations(star[star >= 0]), *added)
 
 
 def sprite_names(stars: Stars, sprites: Sprites) -> list[int | str]:
-    """What each sprite is of: a HIP number, or the name of what has none."""
+    """The star of each sprite: its HIP number, or its name without one."""
     found = iter(stars.designations(sprites.star[sprites.star >= 0]))
     return [sprites.added[-1 - k].name if k < 0 else next(found) for k in sprites.star.tolist()]
 
 
 def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt.NDArray[np.void], IntArray]:
-    """Rows of TRUTH_DTYPE for what sprites are of, all drawn, and its indices (n,); `clipped` are positions of sprites.
+    """Rows of TRUTH_DTYPE for the stars of sprites, all drawn, and their indices (n,); `clipped` are positions of sprites.
 
-    Light of the frame's own has a row too, with its name, where its sprites have their middle.
+    Light that a fault adds has a row too, with its name, at the middle of its sprites.
     """
     over = np.zeros(len(sprites), dtype=bool)
     over[clipped] = True
@@ -112,7 +112,7 @@ def _one_a_star(sprites: Sprites, own: BoolArray) -> StarPlaces:
 
 
 def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
-    """Rows of TRUTH_DTYPE for light of a frame's own, by the index of each; `over` (n,) says which sprites clip."""
+    """Rows of TRUTH_DTYPE for the light that faults add, by the index of each; `over` (n,) says which sprites clip."""
     of_added = np.flatnonzero(sprites.star < 0)
     star, line = np.unique(sprites.star[of_added], return_inverse=True)
     light = sprites.data["electrons_per_s"][of_added].astype(np.float64)

@@ -33,7 +33,7 @@ NEWTON_DONE = 1e-13
 SLOPE_STEP = 1e-6
 BEYOND_BORDER = 1 + 1e-9  # the farthest corner is within the lens
 WITHIN = 1 - 1e-12  # the lens, whatever rounding does
-MAX_TANGENT = 1e3  # a step this long has left the solution
+MAX_TANGENT = 1e3  # a longer step has diverged
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +158,7 @@ def plane_axes(tilt_rad: tuple[float, float]) -> FloatArray:
 
 
 def ray_shifts(camera: Camera) -> Float32Array:
-    """What a lens adds to a pinhole's tangents (u, v), float32 (rows, columns, 2), at nodes over the whole image.
+    """The difference between a lens and a pinhole: tangents (u, v), float32 (rows, columns, 2), at nodes over the image.
 
     The first and the last node of a row lie on the image's edges, -0.5 and width - 0.5; a column's likewise. Where the lens
     has no direction the shift is 0.

@@ -27,7 +27,7 @@ Rectangle = tuple[int, int, int, int]  # left, top, width, height, pixels
 SMALL_SIGMAS = 8.0
 NODES_A_SIGMA = 4.0  # along a radius: places in the face's middle are then 0.8 sigma apart
 WHOLE = 0.999  # coverage that counts as a whole pixel: the rest is rounding, and the Sun behind may be 1e9 times white
-MAX_NODES = 64  # for a Gaussian ten times as wide along one axis as along the other
+MAX_NODES = 64  # enough for a Gaussian ten times as wide along one axis as along the other
 MIN_NODES = 10  # 1e-4 of the light
 
 
@@ -114,7 +114,7 @@ class DiscLight:
 
     @property
     def variance_px(self) -> tuple[float, float]:
-        """Of the Gaussian and of a square pixel, along x and y, px squared."""
+        """Variance of the Gaussian and of a square pixel together, along x and y, px squared."""
         return self.sigma_px[0] ** 2 + PIXEL_VARIANCE, self.sigma_px[1] ** 2 + PIXEL_VARIANCE
 
     def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:

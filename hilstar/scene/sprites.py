@@ -98,7 +98,7 @@ def stars_about(stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_
 
 @dataclass(frozen=True, slots=True)
 class AddedLight:
-    """Light of a frame's own, which is no star's: its name, magnitude, colour, and electrons per second."""
+    """Light that a fault adds to a frame: its name, magnitude, colour, and electrons per second."""
 
     name: str
     v_mag: float
@@ -113,7 +113,7 @@ class Sprites:
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
     divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, because
     the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
-    `extended` is the frame's light that is no star's, in the order in which it is drawn; `discs` names the bodies among it, and
+    `extended` is the frame's light other than stars, in the order in which it is drawn; `discs` names the bodies among it, and
     `over_white` those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for `star`.
     """
 
@@ -154,7 +154,7 @@ def make_sprites(
     else:
         near, directions, electrons_per_s = candidates.near(stars, icrs_to_image, camera, margin_px)
     seen = (icrs_to_image @ directions).T  # component by component, as they are kept
-    if camera.lens is not None:  # a pinhole's places cost less than the choice
+    if camera.lens is not None:  # with a pinhole, projecting all costs less than selecting
         close = camera.in_view(seen, margin_px, 0.0)
         near, seen, electrons_per_s = near[close], seen[close], electrons_per_s[close]
     x_px, y_px = camera.project(seen)

@@ -67,9 +67,9 @@ class TrailView:
 
 @dataclass(frozen=True, slots=True)
 class Brush:
-    """What a sprite is: its side and sigma; and how many all satellites get at most, beyond which they are farther apart.
+    """A sprite's side and sigma, and the maximum number for all satellites together; above it sprites are spaced more widely.
 
-    One that is a disc is drawn at up to `poses` places.
+    A satellite that is a disc is drawn at up to `poses` places.
     """
 
     footprint_px: int

@@ -102,7 +102,7 @@ class Catalog:
         return self if kept.all() else self.taken(kept)
 
     def name(self, row: int) -> str:
-        """What the star at `row` is called: "HIP 26311", "Gaia DR3 4295806720", "TYC 1-2-3"."""
+        """The designation of the star at `row`: "HIP 26311", "Gaia DR3 4295806720", "TYC 1-2-3"."""
         if self.hip[row]:
             return f"HIP {self.hip[row]}"
         identifier = int(self.identifier[row])
@@ -283,6 +283,6 @@ def star_names() -> dict[int, StarName]:
 
 
 def label_of(hip: int) -> str:
-    """What a chart writes beside a star: its designation, else its name, else its HIP number; "" without one."""
+    """A star's label on a chart: its designation, else its name, else its HIP number; "" without any."""
     designation, name = star_names().get(hip, ("", ""))
     return designation or name or (f"HIP {hip}" if hip else "")

@@ -329,7 +329,7 @@ class _Differences:
 
 
 def _differences(hipparcos: Catalog, table: Catalog, owner: IntArray, held: npt.NDArray[np.bool_]) -> _Differences:
-    """Of stars that both have alone, and that do not vary: how the table's V and B-V differ."""
+    """Differences between the table's V and B-V and Hipparcos', from single stars in both that do not vary."""
     shares = np.bincount(owner[held], minlength=len(hipparcos))
     plain = (shares == 1) & (hipparcos.variable == b"") & (hipparcos.multiple == b"")
     star = np.flatnonzero(held)[plain[owner[held]]]
@@ -396,7 +396,7 @@ def store_path(made_of: Sequence[str]) -> Path | None:
 
 
 def kept(path: Path) -> Kept | None:
-    """What the cache holds at `path`; None where it holds nothing that can be trusted."""
+    """The cached catalogue at `path`; None if it is missing or damaged."""
     try:
         with open_regular(path, "", MAX_STORED_BYTES) as file:
             status = os.fstat(file.fileno())

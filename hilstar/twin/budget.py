@@ -33,7 +33,7 @@ USUAL: Centroider = "fit"  # what most trackers do
 COMPARED_MAG = 6.0
 By = Centroider | Literal["all"]
 MAX_NAMED = 20
-MIN_ERROR = 1e-6  # as drawn
+MIN_ERROR = 1e-6  # the smallest error that the chart draws
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class NotDrawn:
 
 @dataclass(frozen=True, slots=True)
 class LightBudget:
-    """What a bench can show; its fields are the keys of the JSON object of `hilstar budget`.
+    """The range of stars that a bench can show; its fields are the keys of the JSON object of `hilstar budget`.
 
     Magnitudes are those of a star of the Sun's colour: it clips in the middle of a pixel where the screen is darkest
     (`clips_v_mag`), on a corner of four pixels (`clips_v_mag_at_best`), and shows nothing from `nothing_v_mag` on. `within`

@@ -31,7 +31,7 @@ MAX_RADIUS_PX = 8  # radius of the brightest star's disc
 # A disc's radius goes with this power of the star's share of the brightest: enough for a sum that saturates, in which five
 # magnitudes are only a factor of ten.
 RADIUS_POWER = 0.77
-STAR_SIGMA = 8.0  # a sum further above the background is a star
+STAR_SIGMA = 8.0  # a box sum this many sigmas above the background is a star
 PIXEL_GREY = 0.7  # the brightest grey of a pixel that no disc covers
 MAX_CARD = 60  # characters of text on a card of FITS
 PNG_BITS = 16
@@ -72,7 +72,7 @@ def _draw_discs(picture: npt.NDArray[Any], peaks: Any, radius: npt.NDArray[np.in
 
 
 class Imager(Protocol):
-    """What makes exposures: a bench file, and the tracker's camera."""
+    """A maker of exposures, as the header of a FITS file needs it."""
 
     file: BenchFile
     config: BenchConfig

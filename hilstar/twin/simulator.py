@@ -104,9 +104,9 @@ class Simulator:
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
     def change(self, file: BenchFile) -> None:
-        """Be the tracker of another bench file of the same folder: only what the change touches is made anew.
+        """Switch to another bench file of the same folder, rebuilding only what changed.
 
-        For a simulator in a GL context of its own. Raises what the simulator itself does, and is then to be closed.
+        The simulator must have a GL context of its own. Raises what the simulator itself does; close it then.
         """
         if file.config == self.config and file.sha256 == self.file.sha256:
             return

@@ -17,7 +17,7 @@ ENDPOINTS = {
     ("zmq", True): "tcp://127.0.0.1:5560",
     ("vizard", False): "tcp://127.0.0.1:5570",  # where Basilisk broadcasts, and where it looks for Vizard
     ("vizard", True): "tcp://127.0.0.1:5556",
-    ("42", False): "tcp://127.0.0.1:10001",  # of 42's own Inp_IPC.txt
+    ("42", False): "tcp://127.0.0.1:10001",  # from 42's own Inp_IPC.txt
     ("42", True): "tcp://127.0.0.1:10001",
 }
 

@@ -66,7 +66,7 @@ def epoch_utc_ns(config: BenchConfig) -> int | None:
             f'{EPOCH_KEY} "{FROM_SOURCE}" is for a log that has dates (replay, simulate --log, attitude LOG);'
             " write the UTC of t_ns = 0"
         )
-    from hilstar.attitude.logs.earth import utc_ns_of  # with ERFA 30 ms, which a bench without a date does not need
+    from hilstar.attitude.logs.earth import utc_ns_of  # importing ERFA takes 30 ms, which only a date needs
 
     return utc_ns_of(config.sky.epoch_utc, EPOCH_KEY)
 
@@ -245,7 +245,7 @@ def _check_finite(value: Any, path: Path, where: str = "") -> None:
 
 
 def _check_meaning(config: BenchConfig, path: Path) -> None:
-    """What a type cannot say."""
+    """Refuse (InputError) values that contradict each other."""
     _check_unit(path, "[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon)
     if config.tracker.q_body_to_cam is not None:
         _check_unit(path, "[tracker] q_body_to_cam", config.tracker.q_body_to_cam)

@@ -12,7 +12,7 @@ from hilstar.toml_tables import Table
 # White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is 100 in the median (38 with
 # Sirius for white), `verify` sees flux 0.065 mag off at 95 % (0.41), and 13 stars clip, one of them in 8 % of fields.
 DEFAULT_BRIGHTEST_V_MAG = 1.5
-MAX_JUDGED_FRAMES = 16  # of an exposure that the file does not count: longer ones are better still
+MAX_JUDGED_FRAMES = 16  # without `cycle_frames`; errors of longer exposures are smaller still
 
 
 class RenderSettings(Table, frozen=True):

@@ -115,7 +115,7 @@ class Disc:
 
     @cached_property
     def sun_sphere(self) -> FloatArray:
-        """What a place of the sphere (3,) is multiplied by for the cosine of the Sun's angle, times its normal's length."""
+        """A place's product with this vector (3,) is the cosine of the Sun's angle times the length of the normal."""
         return np.asarray(self.to_sphere @ self.sun)
 
     @property

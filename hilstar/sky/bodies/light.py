@@ -57,13 +57,13 @@ EARTH_TERMS = (-3.99, -1.060e-3, 2.054e-4)  # eq. 5
 EARTH_CURVE_DEG = 170.0
 FULL_MOON_V_MAG, MOON_PER_DEG, MOON_PER_DEG4 = -12.73, 0.026, 4e-9
 MOON_DISTANCE_KM = 384_400.0
-MOON_CRESCENT_DEG, THINNEST_DEG = 150.0, 0.3  # a thinner one, as wide as the Sun, is as bright as that
+MOON_CRESCENT_DEG, THINNEST_DEG = 150.0, 0.3  # nearer to new moon than 0.3 deg the magnitude is that at 0.3
 SUNLIGHT = "G2V"
 BANDS_NM = (366.0, 438.0, 545.0, 641.0, 798.0, 913.0)  # U B V Rc Ic (Bessell 1998, table A2) and z' (Fukugita et al. 1996)
 ALBEDOS: dict[str, tuple[float, ...]] = {
     "Mercury": (0.087, 0.105, 0.142, 0.158, 0.180, 0.237),
     "Venus": (0.348, 0.658, 0.689, 0.658, 0.640, 0.630),
-    "Earth": (0.60, 0.512, 0.434, 0.392, 0.396, 0.40),  # as recalled; U and z' are no more than likely
+    "Earth": (0.60, 0.512, 0.434, 0.392, 0.396, 0.40),  # from memory, without a source at hand; U and z' are estimates
     "Mars": (0.060, 0.088, 0.170, 0.250, 0.285, 0.325),
     "Jupiter": (0.358, 0.443, 0.538, 0.513, 0.389, 0.348),
     "Saturn": (0.203, 0.339, 0.499, 0.646, 0.543, 0.450),

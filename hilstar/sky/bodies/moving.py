@@ -77,7 +77,7 @@ START = SkyMoment(0)
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What an observer sees at a moment: vectors (n, 3) to the bodies in km, its viewpoint, and the bodies' unit vectors.
+    """The bodies as an observer sees them at a moment: vectors (n, 3), km, its viewpoint, and unit vectors.
 
     An Earth about the observer stands anywhere. `place_km` and `about_earth_km_s` (3,) are the observer's about its centre.
     """
@@ -251,7 +251,7 @@ class MovingSky:
         return node + (self._node(SkyMoment(first.since_ns + self._step_ns)) - node) * share
 
     def sight(self, since_ns: int) -> Sight:
-        """What is seen at a moment, the directions aberrated by the observer's velocity at the start; Sun first."""
+        """The bodies at a moment, aberrated by the observer's velocity at the start; the Sun first."""
         return self._sight(SkyMoment(since_ns))
 
     def _sight(self, moment: SkyMoment) -> Sight:
@@ -259,7 +259,7 @@ class MovingSky:
         return replace(seen, directions=apparent_bodies(seen.seen_km, replace(seen.view, velocity_km_s=self._fixed_km_s)))
 
     def _seen_from(self, moment: SkyMoment) -> Sight:
-        """What is seen at a moment, but for the directions."""
+        """The bodies at a moment, without their directions."""
         span, rest_ns = divmod(moment.since_ns, SPAN_NS)
         cubics = self._span(span)
         share = rest_ns / SPAN_NS

@@ -51,7 +51,7 @@ class Circumstances:
 
 @dataclass(frozen=True, slots=True)
 class SkyAt:
-    """What a sky knows of a moment: its UTC, the circumstances when they are asked for, what aberrates its bodies.
+    """A moment of the sky: its UTC, the circumstances (computed on demand), and the velocity that aberrates its bodies.
 
     `place_km` and `velocity_km_s` (3,) are the observer's about the Earth where the orbit does not say it, else None.
     """
@@ -65,7 +65,7 @@ class SkyAt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cone:
-    """What is looked for: at least `faintest_e_per_s` within `radius_rad` of `axis` (3,), within `half_s` of a moment."""
+    """A search for satellites of at least `faintest_e_per_s` within `radius_rad` of `axis` (3,), within `half_s` of a time."""
 
     axis: FloatArray
     radius_rad: float
@@ -95,7 +95,7 @@ class Pass:
         return len(self.index)
 
     def only(self, which: IntArray) -> Pass:
-        """Those at places `which` (k,) alone."""
+        """Only the satellites at places `which` (k,)."""
         return replace(self, index=self.index[which], seen_km=self.seen_km[:, which], place_km=self.place_km[:, which])
 
     def directions(self, which: IntArray | slice, seconds: FloatArray, velocity_km_s: FloatArray | None = None) -> FloatArray:
@@ -165,7 +165,7 @@ class Satellites:
         return len(self.names)
 
     def near(self, cone: Cone, sky: SkyAt) -> Pass | None:
-        """Those in a cone at a moment, and some more; None for none."""
+        """The satellites in a cone at a moment, and some more; None for none."""
         self.place(sky.utc_ns)
         observer = self._observer(sky)
         found = self._watched(cone, sky, observer)
@@ -192,7 +192,7 @@ class Satellites:
         return _falling(place_km, velocity_km_s)
 
     def _watched(self, cone: Cone, sky: SkyAt, observer: FloatArray) -> IntArray:
-        """Those that can be in a cone, by the list that is kept for a while."""
+        """The satellites that can be in a cone, from the list that is kept for some time."""
         watch = self._watch
         if watch is None or not watch.covers(cone, sky.utc_ns, observer[0]):
             self._watch = watch = _Watch(cone, sky.utc_ns, observer, self._search(cone, sky, observer))
@@ -233,7 +233,7 @@ class Satellites:
         stars.v_mag[place] = magnitude(electrons_per_s / self._v0_e_per_s)
 
     def place(self, utc_ns: int) -> int:
-        """Be ready for a UTC; how many have a place then. One line, once, about those that have none."""
+        """Prepare the places for a UTC and return how many satellites have one; log the others once, in one line."""
         if self._swarm.move_to(utc_ns):
             self.warn_of_age(utc_ns)
             self._lost = int(np.count_nonzero(self._swarm.error))

@@ -59,7 +59,7 @@ EARTH_KM, EARTH_FLATTENING = 6378.137, 1 / 298.257  # IERS Conventions 2010
 MAX_PHASE_FACTOR = np.pi  # at full phase
 FWHM_SIGMAS = 2 * float(np.sqrt(2 * np.log(2)))
 NEIGHBOURS = np.arange(-3, 4)  # a flash lasts at most half a period: 3 periods are 14 sigmas
-SHORTEST_S = 1e-6  # a mean over less is the light of a moment
+SHORTEST_S = 1e-6  # a mean over a shorter time is the light at its middle
 KEY = "norad"
 # Each column that a row may leave empty, with its limits.
 COLUMNS = {
@@ -175,7 +175,7 @@ def _check(line: str, where: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Brightness:
-    """What is known of n satellites, (n,) each: see `table`. `standard_e_per_s` are electron rates at the standard magnitude.
+    """The brightness of n satellites, (n,) each (see `read_table`). `standard_e_per_s` are rates at the standard magnitude.
 
     Without `period_s` (NaN) a satellite's light is steady; with `flash_s` (else NaN) it flashes, otherwise it goes up and down.
     """
@@ -394,7 +394,7 @@ class Swarm:
         return len(self.error)
 
     def move_to(self, utc_ns: int) -> bool:
-        """Be ready for moments about a UTC, ns since 1970; whether any satellite is now in another step."""
+        """Prepare the places about a UTC, ns since 1970; returns whether any satellite entered another step."""
         step = (utc_ns - self._late_ns) // STEP_NS
         due = np.flatnonzero(step != self._step)
         if not len(due):

@@ -42,7 +42,7 @@ MIN_RESIDUALS = 3  # to an unknown
 MIN_STARS = 6  # for a scale, a rotation and a shift: twelve residuals, four unknowns
 # A model explains a field where no larger one leaves much less: a quarter, and a tenth of the limit, beyond the best.
 ENOUGH, ENOUGH_OF_LIMIT = 1.25, 0.1
-TRIMS, WILD = 3, 6.0  # a star this many medians off, and more than the limit, is another one; 1e-11 of Gaussian ones are
+TRIMS, WILD = 3, 6.0  # a star that is off by more than 6 medians and the limit is left out: 1e-11 of Gaussian errors are
 ALIGNED, LENS, TILT, HIGHER, DECENTRED = "aligned", "lens", "tilt", "higher", "decentred"
 MODELS = (
     (ALIGNED,),
@@ -72,7 +72,7 @@ class Displaced:
 
 @dataclass(frozen=True, slots=True)
 class GeometryFit:
-    """What the smallest sufficient model explains of the displacements, as true minus assumed.
+    """The smallest sufficient model of the displacements, as true minus assumed.
 
     Scale, rotation about the detector's middle and shift, and where the displacements ask for them the screen's tilt about its
     x and y axes and the lens, k1 of its tangents; `tilt_px` and `distortion_px` are the largest displacements by these.
@@ -123,7 +123,7 @@ def _consistent(rest: FloatArray, limit: float) -> npt.NDArray[np.bool_]:
 
 
 def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
-    """What a unit of each part's unknowns moves (2 n, unknowns) by: along x, then along y."""
+    """The displacements (2 n, unknowns), x then y, by a unit of each unknown of the parts."""
     one, none, r2 = np.ones_like(x), np.zeros_like(x), x * x + y * y
     pairs = {
         ALIGNED: [(x, y), (-y, x), (one, none), (none, one)],

@@ -47,7 +47,7 @@ class KeyProposal:
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """What the twin said of a bench file with changes."""
+    """The twin's verdict on a bench file with changes."""
 
     fields: int
     stars: int
@@ -129,7 +129,7 @@ def codes_at_fault(verdict: Verdict) -> bool:
 
 
 def _not_the_codes(verdict: Verdict) -> str | None:
-    """What exceeds a limit even without the codes' part, which adds up in squares with all else; None if nothing does."""
+    """The first limit that is exceeded even without the codes' share (errors add in squares); None if all are met."""
     limits, errors = verdict.measured.config.verify, verdict.errors
     elsewhere = sum(math.isfinite(star.codes_mag) for star in errors.lost)
     if elsewhere > limits.lost_share * errors.looked_for:
@@ -166,7 +166,7 @@ class _Trials:
 
     def _verdict(self, changes: tuple[KeyProposal, ...]) -> Verdict:
         file = bench_file_of(self.file.path, changed_text(self.file.text, changes))
-        for change in changes:  # a table that is not in plain form takes no key
+        for change in changes:  # `with_key` cannot set a key of a table that is not in plain form
             if getattr(getattr(file.config, change.table), change.key) != change.value:
                 raise InputError(f"{file.path}: [{change.table}] {change.key} cannot be set")
         return verify(file, self.fields, np.random.default_rng(self.seed))
@@ -180,7 +180,7 @@ def _keys(verdict: Verdict) -> list[_Key]:
     keys = [] if render.quantisation == "exact" else [_Key("render", "quantisation", ("exact",))]
     if not render.bit_stealing and all(one.can_steal_bits for one in calibrations):
         keys.append(_Key("render", "bit_stealing", (True,)))
-    if render.flux_at_white_e_per_s is None:  # a scale that was measured is no choice
+    if render.flux_at_white_e_per_s is None:  # a measured scale is not changed
         brightest = DEFAULT_BRIGHTEST_V_MAG if render.brightest_v_mag is None else render.brightest_v_mag
         keys.append(_Key("render", "brightest_v_mag", tuple(round(brightest + step, 3) for step in BRIGHTER_MAG)))
     limits = _faintest_v_mag(verdict)

@@ -36,7 +36,7 @@ class Difference(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """What was found in an image, and which of it each star (n,) is; -1 for none."""
+    """The sources found in an image, and the index of each star's source (n,); -1 for none."""
 
     found: Centroids
     index: IntArray

@@ -72,7 +72,7 @@ class EstimatorFloor:
 
 @dataclass(frozen=True, slots=True)
 class CodesAlone:
-    """What the codes would cost if everything were as assumed."""
+    """The errors of the codes alone, with all else as assumed."""
 
     flux_mag: ErrorSpread
     centroid_px: ErrorSpread

@@ -62,7 +62,7 @@ def exposure_lights(
 
 
 def true_panel(bench: Bench) -> Panel:
-    """What really turns the bench's levels into light. Raises InputError for a true calibration that cannot be used."""
+    """The true panel, which turns the bench's levels into light. Raises InputError for an unusable true calibration."""
     verify = bench.config.verify
     white = verify.true_flux_at_white_e_per_s or bench.flux_at_white_e_per_s
     if verify.true_calibration is None:

@@ -117,7 +117,7 @@ def _centroids(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 
 def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
-    """What part of the geometry is off by more than the centroids' limit somewhere in the field."""
+    """The parts of the geometry that are off by more than the centroid limit somewhere in the field."""
     fit, limit = errors.geometry, measured.config.verify.centroid_px
     if fit is None or fit.left > MAX_LEFT:
         return []
@@ -137,7 +137,7 @@ def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 
 def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
-    """What no key of the bench file but `geometry` describes."""
+    """Errors that only the key `geometry` can describe."""
     found = []
     if fit.tilt_px > limit_px:
         a, b = (math.degrees(angle) for angle in fit.tilt_rad)
@@ -190,7 +190,7 @@ def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 
 def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
-    """What the codes would cost if everything were as assumed, and what makes them finer."""
+    """The errors of the codes alone, with all else as assumed, and the keys that make codes finer."""
     limits, render = measured.config.verify, measured.config.render
     mag, px = p95(np.abs(errors.codes_mag())), p95(errors.codes_px())
     if mag <= limits.flux_mag and px <= limits.centroid_px:
@@ -206,7 +206,7 @@ def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What was measured, the errors in it, and every reason against the bench; and the faults that were asked for."""
+    """The measurement, its errors, every reason against the bench, and the scenario's faults as they were seen."""
 
     measured: Measured
     errors: DisplayErrors

@@ -83,19 +83,19 @@ class PromptWhileLight:
     core, as in a flood, its priority is the normal one, so that it takes no frame's time.
     """
 
-    def __init__(self, now_s: Clock = time.monotonic, used_s: Clock = time.process_time) -> None:
+    def __init__(self, wall_s: Clock = time.monotonic, cpu_s: Clock = time.process_time) -> None:
         _ask_for_short_slices()
         self._prompt = _set_all_threads(os.SCHED_FIFO, PROMPT_PRIORITY)
         self._allowed = self._prompt
-        self._clocks = now_s, used_s
-        self._looked_s, self._used_s = now_s(), used_s()
+        self._wall_s, self._cpu_s = wall_s, cpu_s
+        self._looked_s, self._used_s = wall_s(), cpu_s()
 
     def tend(self) -> None:
         """Look how much the process has done; quick, so that it may be called often."""
-        now_s = self._clocks[0]()
+        now_s = self._wall_s()
         if not self._allowed or now_s - self._looked_s < LOOK_S:
             return
-        used_s = self._clocks[1]()
+        used_s = self._cpu_s()
         heavy = used_s - self._used_s > HEAVY * (now_s - self._looked_s)
         self._looked_s, self._used_s = now_s, used_s
         if heavy and self._prompt:

@@ -13,6 +13,7 @@ import socket
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn, Protocol
 
@@ -138,7 +139,7 @@ class ForwardedNotices(Notices):
 
     def count(self) -> None:
         """Forward the growth of the counts."""
-        grown, self._counted = self.link_counts - self._counted, self.link_counts + LinkCounts()
+        grown, self._counted = self.link_counts - self._counted, replace(self.link_counts)
         if grown != LinkCounts():
             self._wire.put(CountsRecord(self._order, grown))
 

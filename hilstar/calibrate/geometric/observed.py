@@ -96,30 +96,31 @@ def measure_images(paths: Sequence[Path], dark: Path | None, resolution_px: tupl
 
     Raises InputError for an image that cannot be read, has another size than the tracker's, or is saturated.
     """
-    under = None if dark is None else read_image(dark, resolution_px)
-    seen: list[tuple[int, int, FloatArray, FloatArray]] = []
-    taken: dict[tuple[int, int], Path] = {}
-    for path in paths:
+    numbered: dict[tuple[int, int], Path] = {}
+    for path in paths:  # all names before the first image, which takes a second
         frame, pose = _numbers_of(path)
-        if (frame, pose) in taken:
-            raise InputError(f"{path}: is frame {frame} of pose {pose}, and so is {taken[frame, pose]}; {IMAGE_ADVICE}")
-        taken[frame, pose] = path
-        image = read_image(path, resolution_px)
-        _refuse_saturated(path, image)
-        above = image - under if under is not None else image
-        found = find_stars(above, _settings(), noisiest_background(above))
-        kept = ~found.at_edge
-        seen.append((frame, pose, found.x_px[kept], found.y_px[kept]))
-    count = [len(x) for _, _, x, _ in seen]
+        if (frame, pose) in numbered:
+            raise InputError(f"{path}: is frame {frame} of pose {pose}, and so is {numbered[frame, pose]}; {IMAGE_ADVICE}")
+        numbered[frame, pose] = path
+    under = None if dark is None else read_image(dark, resolution_px)
+    places = [_centroids(path, resolution_px, under) for path in numbered.values()]
+    count = [len(x) for x, _ in places]
     if not sum(count):
         raise InputError(f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer")
-    frame_of, pose_of = (np.repeat([entry[k] for entry in seen], count).astype(np.intp) for k in (0, 1))
-    x_px, y_px = (np.concatenate([entry[k] for entry in seen]) for k in (2, 3))
+    frame_of, pose_of = (np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*numbered, strict=True))
+    x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
     return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)))
 
 
-def _settings() -> CentroidSettings:
-    return CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
+def _centroids(path: Path, resolution_px: tuple[int, int], under: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    """The centroids of an image above its dark frame, if there is one, px (n,). Raises InputError."""
+    image = read_image(path, resolution_px)
+    _refuse_saturated(path, image)
+    above = image if under is None else image - under
+    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
+    found = find_stars(above, settings, noisiest_background(above))
+    kept = ~found.at_edge
+    return found.x_px[kept], found.y_px[kept]
 
 
 def _numbers_of(path: Path) -> tuple[int, int]:

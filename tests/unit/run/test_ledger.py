@@ -121,6 +121,26 @@ def write_over(path, _):
         file.write(b"over what was there")
 
 
+def harm_until_said(path, harm, notices):
+    """The harmed file and its bytes. The newest file is harmed, and the next one where the ledger had just gone on to that."""
+    seen, harmed, left = set(), None, None
+
+    def said():
+        nonlocal harmed, left
+        if "ledger-lost" in notices.active:
+            return True
+        parts = sorted(path.parent.glob("run.[0-9]*.mcap")) or [path]
+        if parts[-1] not in seen:
+            seen.update(parts, [path])
+            harmed = parts[-1]
+            harm(harmed, path.parent)
+            left = harmed.read_bytes() if harmed.exists() else None
+        return False
+
+    wait_for(said)
+    return harmed, left
+
+
 @pytest.mark.parametrize("split", [SplitLimits(), SplitLimits(bytes=1)])
 @pytest.mark.parametrize("harm", [delete, replace_by_another, cut, write_anew, write_longer, write_over])
 def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, bench, harm, split):
@@ -130,10 +150,7 @@ def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, b
         wait_for(lambda: len(list(drawable_frames(path))) == 10, "the first frames on the disk")
         if split.bytes == 1:
             wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
-        harmed = parts_of(path)[-1]
-        harm(harmed, tmp_path)
-        left = harmed.read_bytes() if harmed.exists() else None
-        wait_for(lambda: "ledger-lost" in notices.active)
+        harmed, left = harm_until_said(path, harm, notices)
         keep(ledger, 10, 20)
     assert ledger.path == tmp_path / "run.next1.mcap"
     assert [frame.frame for frame in drawable_frames(ledger.path)] == list(range(10, 20))

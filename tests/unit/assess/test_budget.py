@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.assess.budget import Decomposed, assess_cases, assess_run
+from hilstar.assess.budget import DecomposedRun, assess_cases, assess_run
 from hilstar.assess.clock import coarse_offset
 from hilstar.errors import InputError
 from hilstar.run.record.commanded import Commanded
@@ -15,7 +15,6 @@ from tests.support.planted_tracker import (
     SCALE,
     Planted,
     Sizes,
-    attitude,
     odometer_px,
     plant,
     polynomial,
@@ -32,7 +31,7 @@ ISSUE = Sizes()
 OTHER = Sizes(bias=50.0, fov=5.0, pixel=1.5, noise=2.0, drift_ppm=-60.0, offset_s=123_456.7, wild=15)
 
 
-def assessed(planted: Planted) -> Decomposed:
+def assessed(planted: Planted) -> DecomposedRun:
     commanded = Commanded(planted.frames_s, planted.frames_q)
     coarse = coarse_offset(commanded, planted.tau_s, planted.reported)
     assert coarse is not None
@@ -57,8 +56,7 @@ def test_a_lens_like_field_error_and_a_pixel_error_of_passing_stars_are_recovere
     check_sizes(assessed(planted), planted, OTHER)
 
 
-def check_sizes(found: Decomposed, planted: Planted, sizes: Sizes) -> None:
-    assert found.clock is not None
+def check_sizes(found: DecomposedRun, planted: Planted, sizes: Sizes) -> None:
     fov = np.sqrt((planted.fov[0] ** 2 + planted.fov[1] ** 2) / 2), planted.fov[2]
     for axis, scale, field in (("cross", 1.0, fov[0]), ("roll", ROLL, fov[1])):
         assert getattr(found.fov_arcsec, axis) == pytest.approx(field, rel=WITHIN)
@@ -84,7 +82,6 @@ def test_what_is_not_there_is_not_found() -> None:
 
 def test_a_constant_slew_tells_the_drift_and_not_the_offset() -> None:
     found = assessed(plant(slew, Sizes(fov=0.0, pixel=0.0), np.random.default_rng(4)))
-    assert found.clock is not None
     assert not found.clock.offset_told
     assert found.clock.drift_told
     assert found.clock.drift * 1e6 == pytest.approx(20.0, abs=5 * 1e6 * found.clock.sigma_drift)
@@ -92,7 +89,6 @@ def test_a_constant_slew_tells_the_drift_and_not_the_offset() -> None:
 
 def test_a_still_run_tells_bias_and_noise_only() -> None:
     found = assessed(plant(still, Sizes(fov=0.0, pixel=0.0), np.random.default_rng(5), seconds=300.0))
-    assert found.clock is not None
     assert not found.clock.offset_told
     assert not found.clock.drift_told
     assert found.fov_arcsec.cross is None
@@ -127,27 +123,3 @@ def test_few_answers_and_wild_ones_are_refused() -> None:
     wild = rng.normal(size=(100, 4))
     with pytest.raises(InputError, match="wild"):
         assess_cases(planted.frames_q[:100], wild / np.linalg.norm(wild, axis=1, keepdims=True), SCALE, rng)
-
-
-def test_a_jump_between_frames_is_not_taken_for_a_motion() -> None:
-    t_s = np.arange(0.0, 10.0, 0.1)
-    angle = np.where(t_s < 5.05, 0.0, np.radians(0.5)) / 2
-    commanded = Commanded(t_s, np.stack([np.cos(angle), np.sin(angle), 0 * t_s, 0 * t_s], axis=1))
-    assert np.flatnonzero(~commanded.joined).tolist() == [50]
-    assert commanded.at(np.array([4.95, 5.05, 5.15])).known.tolist() == [True, False, True]
-
-
-def test_between_frames_the_commanded_attitude_is_that_of_the_motion() -> None:
-    """The scan's third derivative is 3 deg (2 pi / 271 s)^3 = 0.13 arcsec/s^3 at most: dt^3 / 15 of it is 1e-5 arcsec."""
-    t_s = np.arange(0.0, 100.0, 0.1)
-    commanded = Commanded(t_s, scalar_first(attitude(scan, t_s)))
-    between = t_s[5:-5] + 0.037
-    moments = commanded.at(between)
-    truth = scalar_first(attitude(scan, between))
-    assert moments.known.all()
-    sine = np.abs(np.cross(moments.q[:, 1:], truth[:, 1:]))
-    assert 2 * ARCSEC_PER_RAD * sine.max() < 1e-3
-    ahead = commanded.at(between + 0.01)
-    step = (attitude(scan, between + 0.01) * attitude(scan, between).inv()).as_rotvec()
-    assert ahead.known.all()
-    np.testing.assert_allclose(-step / 0.01, moments.rate_rad_s, atol=1e-6)

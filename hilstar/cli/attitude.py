@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -74,8 +74,7 @@ def attitude(
         raise InputError(f"--mounting {mounting}: write it into {source} as [tracker] q_body_to_cam")
     mounted = Mounting(first.config.tracker.q_body_to_cam) if mounting is None else parse_mounting(mounting)
     if live:
-        sample, conventions = _live(first, at, wait)
-        held = False
+        sample, conventions, held = _live(first, at, wait)
         for _, line in mounted.told if conventions.of_body else ():
             say(line)
     else:
@@ -91,7 +90,15 @@ def attitude(
         typer.echo(line)
 
 
-def _live(file: BenchFile, at: str | None, patience_s: float) -> tuple[AttitudeSample, Conventions]:
+class _Found(NamedTuple):
+    """An attitude, its source's conventions, and whether it is held over a gap of the log."""
+
+    sample: AttitudeSample
+    conventions: Conventions
+    held: bool = False
+
+
+def _live(file: BenchFile, at: str | None, patience_s: float) -> _Found:
     """The first attitude of the stream that a bench file names."""
     from hilstar.errors import InputError
     from hilstar.run.open_link import first_attitude, open_link
@@ -101,11 +108,11 @@ def _live(file: BenchFile, at: str | None, patience_s: float) -> tuple[AttitudeS
     with open_link(file.config, file.folder) as link:
         if link.steps:
             raise InputError(f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar serve --explain")
-        return first_attitude(link, patience_s), link.conventions
+        return _Found(first_attitude(link, patience_s), link.conventions)
 
 
-def _of_log(path: Path, at: str | None, stated: Stated) -> tuple[AttitudeSample, Conventions, bool]:
-    """The attitude of a log at a time, and whether it is held over a gap of the log."""
+def _of_log(path: Path, at: str | None, stated: Stated) -> _Found:
+    """The attitude of a log at a time."""
     from hilstar.attitude.clock.timeline import Policy
     from hilstar.attitude.logs.gaps import log_joins
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
@@ -120,7 +127,8 @@ def _of_log(path: Path, at: str | None, stated: Stated) -> tuple[AttitudeSample,
     if found is None:
         raise AssertionError("a log has samples")
     held = found.rate_cam_rad_s is None and found.age_ns > 0
-    return AttitudeSample(t_ns, found.q_icrs_to_cam, found.rate_cam_rad_s, found.sequence), log.conventions, held
+    sample = AttitudeSample(t_ns, found.q_icrs_to_cam, found.rate_cam_rad_s, found.sequence)
+    return _Found(sample, log.conventions, held)
 
 
 def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:

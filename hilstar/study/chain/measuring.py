@@ -51,6 +51,8 @@ MIN_ROUNDS, MAX_ROUNDS = 4, 60
 SEED = 1
 STEPS = ("refresh", "prediction", "smear", "depth", "codes", "sprites")
 RSS, WHOLE = "rss", "whole"
+AUTO = "auto"
+DIGITS, MS_PLACES = 4, 4  # significant digits of an error, decimal places of a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +148,7 @@ class Rounds:
     time_s: float = 12.0
 
 
-QUICK = Rounds(exposures=1, time_s=2.0)
+QUICK = Rounds(exposures=1, time_s=0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,10 +176,26 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class StageTime:
-    """The median time of a stage of a frame, ms."""
+    """The median time of a stage of a frame at a scene's `chosen` point; its fields are the columns of `chain_time.csv`."""
 
+    scene: str
+    chosen: str
     stage: str
-    ms: float
+    time_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorPart:
+    """What a step adds to the error (rms) at a scene's `chosen` point; its fields are the columns of `chain_budget.csv`.
+
+    The steps RSS and WHOLE are the root sum of squares of the others, and the whole error.
+    """
+
+    scene: str
+    chosen: str
+    step: str
+    error_arcsec: float
+    error_mag: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +247,9 @@ class SceneMeasurement:
             CombinationOutcome(chain.combination, sprite_px(chain), self.error(chain.combination), spent)
             for chain, spent in zip(chains, times, strict=True)
         ]
-        return found, stages
+        return found, [
+            StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES)) for stage, ms in zip(STAGES, stages, strict=True)
+        ]
 
     def error(self, combination: Combination) -> Error:
         """A combination's error over all exposures."""
@@ -263,8 +283,8 @@ def sprite_px(chain: DrawingChain) -> str:
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[list[Times], list[StageTime]]:
-    """The times of all chains, and those of the stages of one of them.
+def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[list[Times], list[float]]:
+    """The times of all chains, and the median times of STAGES, ms, of one of them.
 
     In rounds, each with an order of its own, so that other load on the machine affects all. A visit's first frame is not
     counted: it fills what the chain before has emptied.
@@ -285,8 +305,7 @@ def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[l
                 continue
             watches[k].frame_ms()
             taken[k] += [watches[k].frame_ms() for _ in range(FRAMES_A_VISIT)]
-    middle = np.median(stages, axis=0).tolist()
-    return [_times(np.array(one)) for one in taken], [StageTime(*pair) for pair in zip(STAGES, middle, strict=True)]
+    return [_times(np.array(one)) for one in taken], np.median(stages, axis=0).tolist()
 
 
 def _times(taken: FloatArray) -> Times:
@@ -295,25 +314,22 @@ def _times(taken: FloatArray) -> Times:
     return Times(float(middle), float(high - low), float(noise), float(np.median(taken[:, 1])), len(taken))
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
-    """What a step adds to the error, rms arcsec and mag; the last two are the steps' root sum of squares, and the whole."""
-
-    step: str
-    arcsec: float
-    mag: float
+def rounded(value: float) -> float:
+    """A figure with the tables' four digits."""
+    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else value
 
 
-def error_budget(scene: SceneMeasurement, combination: Combination) -> list[Part]:
-    """The parts of a combination's error by STEPS, then RSS and WHOLE."""
+def error_budget(scene: SceneMeasurement, combination: Combination) -> list[ErrorPart]:
+    """The parts of the error of the combination that `auto` takes, by STEPS, then RSS and WHOLE."""
     found = [[judge.sky, *_measured(scene, combination, number)] for number, judge in enumerate(scene.judges)]
-    parts = []
-    for k, step in enumerate(STEPS):
-        off_by = [off(judge, one[k + 1], one[k]) for judge, one in zip(scene.judges, found, strict=True)]
-        parts.append(Part(step, *pooled(off_by)))
-    rss = [float(np.sqrt(sum(getattr(part, name) ** 2 for part in parts))) for name in ("arcsec", "mag")]
-    whole = pooled([off(judge, one[-1], one[0]) for judge, one in zip(scene.judges, found, strict=True)])
-    return [*parts, Part(RSS, *rss), Part(WHOLE, *whole)]
+
+    def between(before: int, after: int) -> tuple[float, float]:
+        return pooled([off(judge, one[after], one[before]) for judge, one in zip(scene.judges, found, strict=True)])
+
+    parts = [between(k, k + 1) for k in range(len(STEPS))]
+    arcsec, mag = (float(np.sqrt(sum(value**2 for value in column))) for column in zip(*parts, strict=True))
+    named = zip((*STEPS, RSS, WHOLE), (*parts, (arcsec, mag), between(0, -1)), strict=True)
+    return [ErrorPart(scene.scene.name, AUTO, step, rounded(a), rounded(m)) for step, (a, m) in named]
 
 
 def _measured(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[MeasuredStars]:

@@ -32,15 +32,18 @@ from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.study.chain.choices import QUANTISATIONS, Parts, five_scenes, shortened_line
 from hilstar.study.chain.measuring import (
+    AUTO,
+    MS_PLACES,
     QUICK,
     RSS,
     WHOLE,
     CombinationOutcome,
-    Part,
+    ErrorPart,
     Rounds,
     SceneMeasurement,
     StageTime,
     error_budget,
+    rounded,
 )
 from hilstar.study.chain.tracker import StudyTracker
 from hilstar.study.sweep import OtherWork, beaten_by, busy_line, is_busy, pareto_front
@@ -48,8 +51,7 @@ from hilstar.study.sweep import OtherWork, beaten_by, busy_line, is_busy, pareto
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DIGITS, MS_PLACES = 4, 4
-AUTO, DEFAULT = "auto", "default"
+DEFAULT = "default"
 MAX_REASONS = 2
 NOT_JUDGED = "the times were taken on a busy machine: no combination is named the faster"
 COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (PURPLE, ORANGE, GREEN, BLUE), strict=True))
@@ -106,35 +108,9 @@ class CombinationRow:
     as_filed: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ChainBudgetRow:
-    """A step's part of the error at a scene's `chosen` point; its fields are the columns of `chain_budget.csv`."""
-
-    scene: str
-    chosen: str
-    step: str
-    error_arcsec: float
-    error_mag: float
-
-
-@dataclass(frozen=True, slots=True)
-class StageRow:
-    """A stage's part of the time at a scene's `chosen` point; its fields are the columns of `chain_time.csv`."""
-
-    scene: str
-    chosen: str
-    stage: str
-    time_ms: float
-
-
 def said(flag: bool) -> str:
     """A flag as the table has it."""
     return "true" if flag else "false"
-
-
-def rounded(value: float) -> float:
-    """A figure with the table's digits."""
-    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else value
 
 
 def rows_of(scene: SceneMeasurement, outcomes: Sequence[CombinationOutcome]) -> list[CombinationRow]:
@@ -185,21 +161,11 @@ def beyond_noise(own: CombinationRow, other: CombinationRow) -> bool:
 
 
 def write_tables(
-    directory: Path, rows: Sequence[CombinationRow], budgets: Sequence[ChainBudgetRow], stages: Sequence[StageRow]
+    directory: Path, rows: Sequence[CombinationRow], budgets: Sequence[ErrorPart], stages: Sequence[StageTime]
 ) -> None:
     """Write `chain.csv`, `chain_budget.csv` and `chain_time.csv`. Raises InputError."""
     for name, records in (("chain", rows), ("chain_budget", budgets), ("chain_time", stages)):
         write_records(directory / f"{name}.csv", records)
-
-
-def budget_rows(scene: str, parts: Sequence[Part]) -> list[ChainBudgetRow]:
-    """An error budget's rows."""
-    return [ChainBudgetRow(scene, AUTO, part.step, rounded(part.arcsec), rounded(part.mag)) for part in parts]
-
-
-def stage_rows(scene: str, times: Sequence[StageTime]) -> list[StageRow]:
-    """A time budget's rows."""
-    return [StageRow(scene, AUTO, one.stage, round(one.ms, MS_PLACES)) for one in times]
 
 
 def _row(scene: SceneMeasurement, one: CombinationOutcome) -> CombinationRow:
@@ -234,7 +200,7 @@ def _row(scene: SceneMeasurement, one: CombinationOutcome) -> CombinationRow:
 
 
 def scene_line(
-    rows: Sequence[CombinationRow], budget: Sequence[ChainBudgetRow], stages: Sequence[StageRow], busy: bool = False
+    rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], busy: bool = False
 ) -> str:
     """What `auto` takes in a scene and is off by, whether it is on the front, and what its error and time are made of."""
     own, stands = rows[auto_of(rows)], NOT_JUDGED if busy else standing(rows)
@@ -402,9 +368,7 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
     return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
 
 
-def draw_budget(
-    path: Path, rows: Sequence[CombinationRow], budget: Sequence[ChainBudgetRow], stages: Sequence[StageRow]
-) -> None:
+def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime]) -> None:
     """Where `auto`'s error and time come from, a row of panels for each scene that differs. Raises InputError."""
     scenes = differing(rows)
     last = list(scenes)[-1]
@@ -434,7 +398,7 @@ def draw_budget(
 
 
 def _budget_finding(
-    scenes: Sequence[str] | dict[str, list[str]], budget: Sequence[ChainBudgetRow], stages: Sequence[StageRow]
+    scenes: Sequence[str] | dict[str, list[str]], budget: Sequence[ErrorPart], stages: Sequence[StageTime]
 ) -> str:
     said = []
     for scene in scenes:
@@ -458,8 +422,8 @@ def run(
     `advance` hears how many scenes are done. Raises InputError, MachineError.
     """
     rows: list[CombinationRow] = []
-    budget: list[ChainBudgetRow] = []
-    stages: list[StageRow] = []
+    budget: list[ErrorPart] = []
+    stages: list[StageTime] = []
     lines, judged, others = [], [], OtherWork()
     with Parts(file) as parts:
         tracker = StudyTracker(parts.own)
@@ -469,11 +433,10 @@ def run(
                 if not measurement.star_count:
                     lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
                     continue
-                outcomes, stage_times = measurement.outcomes()
+                outcomes, parts_of_time = measurement.outcomes()
                 own = rows_of(measurement, outcomes)
                 auto = measurement.marks.auto
-                parts_of_error = budget_rows(scene.name, error_budget(measurement, auto))
-                parts_of_time = stage_rows(scene.name, stage_times)
+                parts_of_error = error_budget(measurement, auto)
                 judged.append((own, parts_of_error, parts_of_time))
                 rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
                 if advance is not None:

@@ -13,7 +13,7 @@ from hilstar.monitor.quantise import MASK_FILE
 SIDE = 64
 SIGMA_PX = 1.5  # Ulichney's choice
 SEED = 1993
-FIRST_SHARE = 0.1  # of the pixels, in the first pattern
+FIRST_SHARE = 0.1  # share of pixels that are ones in the first pattern
 UNIT = 2**40  # energies are counted in 1 / UNIT: 4096 of them stay under 2^63
 
 Ranks = npt.NDArray[np.uint16]

@@ -30,7 +30,7 @@ from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 
 MEMBER = re.compile(r"EXOSIMS/TargetList/dat_uvk/pickles_uk_(\d+)\.fits")
 SOURCE_SHA256 = (
-    "4460288203b3cea3fdf93a8f4e13b92b38ba8d3c179f9b688ec49d8fcd0d59c6"  # of all members, joined in the library's order
+    "4460288203b3cea3fdf93a8f4e13b92b38ba8d3c179f9b688ec49d8fcd0d59c6"  # hash of all members, joined in the library's order
 )
 SPECTRA = 106
 # From the atmosphere's edge to past N-BK7's and silicon's: no tracker of this package sees more.

@@ -26,7 +26,7 @@ from tests.support.browser import Browser, browser  # noqa: E402 - the checkout'
 from tests.support.senders import free_port  # noqa: E402
 
 SIZE_PX = (1366, 1400)
-COLOURS = 256  # of the palette
+COLOURS = 256  # size of the palette
 CALM_S = 60.0  # within which a minute without a missed frame may come
 ON_TIME = "/fresh, frames on time/.test(document.getElementById('health-reasons').textContent)"
 HILSTAR = [sys.executable, "-m", "hilstar"]

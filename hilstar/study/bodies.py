@@ -71,7 +71,6 @@ NEAR_DEG: dict[str, tuple[float, ...]] = {
 QUICK_DEG = {"Moon": (40.0, 0.5), "Sun": (40.0, 0.5), "Earth": (40.0, 0.0, -70.0)}
 ROUNDS, QUICK_ROUNDS = 40, 3
 QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
-FREE_MS = 0.3  # what the fastest of one frame and of the same one again differ by
 FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
 FLOOR = 1e-6  # lower end of the chart's axis
 

@@ -1,7 +1,7 @@
 """Pointing error at the moment of light against latency and against the rate of packets, by predictor, and their times.
 
-The slew is a swing of degrees, shaken on each axis (see `shared.predictors`). A frame at time t has the samples that were taken
-before t minus the latency, which covers link, drawing and scan-out.
+The slew is a swing of degrees, shaken on each axis (`study/predictors.py`). A frame at time t has the samples taken before
+t minus the latency, which covers link, drawing and scan-out.
 
 Then what prediction makes of a vibration, against its frequency, beside a steady turn: by the rate, with `prediction = "auto"`,
 and for the newest attitude alone.

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray
 
-MIN_ROUNDS = 3  # of each work, whatever the budget
+MIN_ROUNDS = 3  # every work runs this often, whatever the budget
 MAX_ROUNDS = 500  # more do not move a median
 SEED = 1
 BUSY_SHARE = 0.15  # share of the cores taken by others above which times are 5 % and more off: a third of one of two cores

@@ -16,11 +16,11 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import direction_of
 from hilstar.scene.camera import Camera
 from hilstar.sky.electrons import tabulate
+from hilstar.study.stability import FailureCase, Figures
 from hilstar.study.stability import field as stability_field
 from hilstar.study.stability import image as stability_image
 from hilstar.study.stability import run as stability
 from hilstar.study.stability import sky as stability_sky
-from hilstar.study.stability.failure_case import FailureCase, Figures
 from tests.support.commands import run_hilstar_here
 from tests.support.pictures import assert_drawn, table
 

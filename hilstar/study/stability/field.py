@@ -38,7 +38,7 @@ from hilstar.scene.sprites import Sprites, make_sprites, pack_sprites
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
 from hilstar.sky.stars import RAD_PER_MAS, cell_grid, make_stars, unit_vectors_icrs
 from hilstar.study.codes import AIMS
-from hilstar.study.stability.failure_case import FailureCase, Figures
+from hilstar.study.stability import FailureCase, Figures
 from hilstar.study.stability.image import POINT_SAMPLED, SIGMA_PX, Draw, by_renderer, point_sampled, target
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S, flux_ratio, magnitude
 

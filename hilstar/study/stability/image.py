@@ -19,7 +19,7 @@ from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import MAX_CUT, SQRT2, cut_share, footprint_px, peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
-from hilstar.study.stability.failure_case import FailureCase, Figures
+from hilstar.study.stability import FailureCase, Figures
 from hilstar.units import flux_ratio
 
 IMAGE_PX = (512, 512)

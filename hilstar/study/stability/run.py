@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.charts import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, chart, label_ends, plain_ticks, two_digits, write_csv
-from hilstar.study.stability import field, image, sky
-from hilstar.study.stability.failure_case import FailureCase
+from hilstar.study.stability import FailureCase, field, image, sky
 from hilstar.study.stability.field import (
     CODES_BITS,
     CODES_MAG_UNDER_WHITE,
@@ -27,50 +26,19 @@ from hilstar.study.stability.field import (
 from hilstar.study.stability.image import SIGMA_PX, by_renderer, narrow_errors, point_sampled, target
 from hilstar.units import magnitude
 
+# In the order of the light's way: catalogue, geometry, image, codes, detector, attitude.
 CASES: tuple[Callable[[], FailureCase], ...] = (
-    sky.bluest_star,
-    sky.reddest_star,
-    sky.temperature_range,
-    sky.planck_overflow,
-    sky.source_step,
-    sky.cool_stars,
+    *(sky.bluest_star, sky.reddest_star, sky.temperature_range, sky.planck_overflow, sky.source_step, sky.cool_stars),
     sky.blind_tracker,
-    field.motion_at_pole,
-    field.fields_over_wrap_and_pole,
-    field.boresight_at_pole,
-    field.stars_behind,
-    field.field_of_180_deg,
-    field.weak_perspective,
-    image.narrow_star,
-    image.wide_star,
-    image.negative_wings,
-    image.floored_wings,
-    image.absurd_sigmas,
-    image.star_on_pixel_edge,
-    image.star_on_image_edge,
-    image.many_stars,
-    image.flux_range,
-    field.popping,
-    field.popping_codes,
-    image.stars_half_off,
-    image.stars_a_pixel_apart,
-    image.narrow_codes,
-    image.uneven_panel,
-    image.two_bits,
-    image.sixteen_bits,
-    image.clipped_neighbours,
-    image.all_clipped,
-    image.no_stars,
-    sky.billion_electrons,
-    sky.full_well,
-    sky.empty_field,
-    sky.no_exposure,
-    sky.nan_pixel,
-    field.two_signs,
-    field.antipodal,
-    field.half_turn,
-    field.fast_turns,
-    field.not_a_number,
+    *(field.motion_at_pole, field.fields_over_wrap_and_pole, field.boresight_at_pole, field.stars_behind),
+    *(field.field_of_180_deg, field.weak_perspective),
+    *(image.narrow_star, image.wide_star, image.negative_wings, image.floored_wings, image.absurd_sigmas),
+    *(image.star_on_pixel_edge, image.star_on_image_edge, image.many_stars, image.flux_range),
+    *(field.popping, field.popping_codes),
+    *(image.stars_half_off, image.stars_a_pixel_apart, image.narrow_codes, image.uneven_panel, image.two_bits),
+    *(image.sixteen_bits, image.clipped_neighbours, image.all_clipped, image.no_stars),
+    *(sky.billion_electrons, sky.full_well, sky.empty_field, sky.no_exposure, sky.nan_pixel),
+    *(field.two_signs, field.antipodal, field.half_turn, field.fast_turns, field.not_a_number),
 )
 COLUMNS = ("case", "verdict", "failing method", "its failure", "what happens", "why", "error", "its error", "tolerance")
 

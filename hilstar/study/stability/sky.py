@@ -25,7 +25,7 @@ from hilstar.sky.electrons import (
 )
 from hilstar.sky.spectrum import BOLTZMANN_J_K, PLANCK_J_S, TEMPERATURE_SCALES, blackbody_exitance_w_m2_m, constant_curve
 from hilstar.study.settings import Table, bench_text, held_out_errors, study_optics
-from hilstar.study.stability.failure_case import FailureCase, Figures
+from hilstar.study.stability import FailureCase, Figures
 from hilstar.tracker.centroids import find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings

@@ -146,7 +146,7 @@ def panels_of(
 
 
 def finish(figure: Figure) -> None:
-    """One way to write ticks and labels, whoever drew them: plain figures on logarithmic axes, a capital first."""
+    """Make ticks and labels uniform: plain figures on logarithmic axes, a capital first."""
     from matplotlib.ticker import LogLocator
 
     figure.draw_without_rendering()
@@ -243,7 +243,7 @@ def name_at_side(axes: Axes, named: Sequence[tuple[str, tuple[float, float], str
 
 
 def _name_at_side(axes: Axes, named: Sequence[tuple[str, tuple[float, float], str]]) -> None:
-    """The same on a figure that is laid out."""
+    """`name_at_side` on a figure that is laid out."""
     gap = 1.3 * SMALL_PT / 72 * axes.figure.dpi / axes.bbox.height
     at = {each: axes.transAxes.inverted().transform(axes.transData.transform(each[1])) for each in named}
     falling = sorted(named, key=lambda each: -at[each][1])

@@ -1,8 +1,7 @@
-"""The study of bodies: what each costs in a frame, how exact its disc is at each size, and what happens as it fills the field.
+"""The study of bodies: the cost of each in a frame, the accuracy of its disc at each size, and its approach.
 
-Cost is the time of a frame against the same frame of a bench that knows no bodies: one screen, one date, each body alone. A
-disc is compared with rays in float64, and with a point in its place. A body that comes near is judged by frame time and finite
-light.
+The cost is the difference from the same frame of a bench without bodies, with each body alone. A disc is compared with rays
+traced in float64 and with a point in its place. An approaching body is judged by frame time and by finite light.
 """
 
 from __future__ import annotations

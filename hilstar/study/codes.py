@@ -1,4 +1,4 @@
-"""Ways from light to code values: what each does to a star, as centroiders see it, alone and over an exposure."""
+"""Ways from light to code values, and the error of each by every centroider: of one frame, and over an exposure."""
 
 from __future__ import annotations
 

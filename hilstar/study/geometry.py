@@ -1,7 +1,7 @@
-"""How far stars are off after a geometric calibration: against dots, against noise, and by model, with where each fails.
+"""Star errors after a geometric calibration, by number of dots, by centroid noise and by lens model.
 
-No model here is of the bench's family: chief rays are traced by Snell's law through a real doublet onto a screen (millimetres,
-cam axes; the tracker's pupil is at the origin and looks along +z). The doublet has the prescription of a 100 mm achromat (N-BK7
+The true lens belongs to no model's family: chief rays are traced by Snell's law through a real doublet onto a screen (mm, cam
+axes; the tracker's pupil is at the origin and looks along +z). The doublet has the prescription of a 100 mm achromat (N-BK7
 and SF5, radii 62.8, -45.7 and -128.2 mm, 4.0 and 2.5 mm thick), scaled to the focal length. The tracker has 38 arcsec per pixel
 and sees the whole screen; 5 % of the dots are lost and as many are false.
 """

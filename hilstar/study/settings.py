@@ -54,7 +54,7 @@ def held_out_errors(rates: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Isolation:
-    """How far a window reaches beyond a star's sprites, px, and what share of the star's light others may bring into it."""
+    """Margin of a window around a star's sprites, px, and the largest share of its light that other stars may add there."""
 
     margin_px: float
     max_share: float
@@ -63,7 +63,7 @@ class Isolation:
 def lone_windows(
     sprites: Sprites, x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int], isolation: Isolation
 ) -> Iterator[tuple[int, Window]]:
-    """Each star whose window lies on an image of `size_px` (width, height) and holds hardly any other's light, and the window.
+    """Each isolated star whose window lies on an image of `size_px` (width, height), with that window.
 
     `x_px` and `y_px` (n,) are the places of the sprites on that image. A window is rows and columns.
     """
@@ -92,7 +92,7 @@ def squares(image: FloatArray, windows: Sequence[Window]) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class StarError:
-    """How much fainter a star is shown than it is, magnitudes, and how far its centroid is off, px; NaN where it is dark."""
+    """The error of a shown star: light, mag (positive: too faint), and centroid, px; NaN where it is dark."""
 
     flux_mag: float
     centroid_px: float

@@ -1,4 +1,4 @@
-"""The study of timing: what a screen's timing does to a tracker on a slew, and what each compensation is worth and costs.
+"""The study of timing: the effect of a screen's timing on a slewing tracker, and the gain and cost of each compensation.
 
 The virtual tracker integrates over several frames of a simulated panel that lights row by row and holds each row until it is
 written again. Its image is compared with that of the sky in the same exposure, star by star. Each row is at its own phase, so
@@ -50,13 +50,13 @@ QUICK_RATES_DEG_S = (2.0,)
 
 @dataclass(frozen=True, slots=True)
 class Slew:
-    """A turn at a constant rate from t = 0 on, and the packets that tell of it."""
+    """A turn at a constant rate from t = 0 on, and the packets that report it."""
 
     rate_deg_s: float
 
     @property
     def rate_cam_rad_s(self) -> FloatArray:
-        """Of cam in icrs, cam components."""
+        """Rate of cam with respect to icrs, cam components."""
         return np.asarray(math.radians(self.rate_deg_s) * AXIS)
 
     def at(self, seconds: float) -> FloatArray:

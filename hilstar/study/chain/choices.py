@@ -1,9 +1,9 @@
 """What the study of the chain varies: five scenes, their motion and packets, the panel, and the combinations of choices.
 
-At rest every prediction is the same, and so are points and paths: one of each is measured. Where the camera turns, what is
-crude in one respect is combined with small sprites alone: whole sprites would only add time to an error that is not theirs.
-An exposure gathers each row's share of each frame from a panel that lights row by row. There is one bench for each
-quantisation, bit stealing and sprite size, all with the same stars.
+At rest all predictions are equal, and so are points and paths: one of each is measured. Where the camera turns, a crude
+prediction or smear is combined with cut sprites only: whole sprites would add time and no accuracy. An exposure sums each row's
+share of each frame of a panel that lights row by row. Each quantisation, bit stealing and sprite size has a bench of its own,
+all with the same stars.
 """
 
 from __future__ import annotations
@@ -90,20 +90,20 @@ class Movement:
         return rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S)
 
     def samples(self, until_ns: int) -> list[AttitudeSample]:
-        """The newest samples that are there at a moment."""
+        """The newest KEPT samples at time `until_ns`."""
         last = until_ns * PACKET_HZ // NS_PER_S
         times_ns = [round(k * NS_PER_S / PACKET_HZ) for k in range(last + 1 - KEPT, last + 1)]
         return [AttitudeSample(t_ns, self.at(t_ns), self.rate_rad_s(t_ns)) for t_ns in times_ns]
 
 
 def lead_ns(config: BenchConfig) -> int:
-    """From a frame's begin to the first light of its middle row: a refresh to draw it in, then the panel."""
+    """Time from the start of a frame to the first light of its middle row: a refresh to draw it in, then the panel."""
     monitor = config.monitor
     return round((monitor.period_ms + monitor.panel_delay_ms + monitor.panel_scanout_ms / 2) * NS_PER_MS)
 
 
 def filled_timeline(samples: list[AttitudeSample], prediction: Prediction, settings: AttitudeSettings) -> Timeline:
-    """The timeline of a bench file's settings with these samples, as a way of prediction has it."""
+    """A timeline with the bench file's settings and these samples, for one kind of prediction."""
     ahead_ms = settings.max_extrapolation_ms or AttitudeSettings().max_extrapolation_ms
     stale_ns = round(settings.stale_after_ms * NS_PER_MS)
     timeline = Timeline(Policy(0 if prediction == "held" else round(ahead_ms * NS_PER_MS), stale_ns))
@@ -163,7 +163,7 @@ class ChainScene:
 
 
 def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
-    """The scenes for a bench, by FIELDS random fields of its sky. Raises InputError where it has no stars."""
+    """The scenes of a bench, chosen among FIELDS random fields of its sky. Raises InputError where it has no stars."""
     fields = normalise(np.random.default_rng(SEED).normal(size=(FIELDS, 4)))
     seen = [bench.sprites(q).data["electrons_per_s"] for q in fields]
     counts = np.array([len(rates) for rates in seen])
@@ -221,7 +221,7 @@ def exposure_s(bench: Bench) -> float:
 
 
 def shortened_line(bench: Bench) -> str | None:
-    """What is said where an exposure is longer than what is measured of it; None where it is not."""
+    """The note for an exposure that is longer than its measured part, or None."""
     whole_s, measured_s = bench.config.tracker.exposure_s, exposure_s(bench)
     if measured_s == whole_s:
         return None
@@ -265,7 +265,7 @@ def row_share(lit_s: FloatArray, scan: Scan, period_s: float, span_s: tuple[floa
 
 @dataclass(frozen=True, slots=True)
 class Marks:
-    """The combinations that stand for something: hilstar's defaults, `effort = "auto"`, and the bench file as it is."""
+    """The combinations with a name: hilstar's defaults, `effort = "auto"`, and the bench file as it is."""
 
     default: Combination
     auto: Combination

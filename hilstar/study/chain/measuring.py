@@ -1,9 +1,9 @@
-"""The study of the chain measured: each combination's error over some exposures, its time in turn with all others, its budget.
+"""Measurements of the study of the chain: error over some exposures, time in turn with all other combinations, error budget.
 
-A frame goes from the sender's samples to codes, and an exposure gathers their light. For the budget, steps are added one by
-one to a display that does everything exactly, in the order of the chain. Each is charged with what it changes in the measured
-stars; together they are the whole error, star by star. Cut sprites come last, because codes leave their cut dark: earlier it
-would be charged to both.
+A frame goes from the sender's samples to codes; an exposure sums the light of its frames. The budget starts from a display
+that does everything exactly and adds one step at a time, in the order of the chain. Each step is charged with what it changes
+in the measured stars; the steps add up to the whole error, star by star. Cut sprites come last, because codes leave the cut
+light dark: earlier it would be charged twice.
 """
 
 from __future__ import annotations
@@ -64,29 +64,29 @@ class DrawingChain:
     movement: Movement
 
     def attitude(self, light_ns: int) -> Attitude:
-        """The attitude for a frame's light, by the samples that are there when the frame is begun."""
+        """The attitude at a frame's light, predicted from the samples received when the frame is started."""
         samples = self.movement.samples(light_ns - lead_ns(self.bench.config))
         timeline = filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
         return attitude_at(timeline, light_ns)
 
     def rate(self, attitude: Attitude) -> FloatArray | None:
-        """The rate by which stars are drawn along their paths, None for points."""
+        """The rate along which stars are drawn as paths, rad/s; None where they are drawn as points."""
         return attitude.rate_cam_rad_s if self.combination.smear == "path" else None
 
     def draw(self, number: int, light_ns: int) -> Drawn:
-        """Draw the frame of a moment of light."""
+        """Draw the frame whose light is at `light_ns`."""
         attitude = self.attitude(light_ns)
         return self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude))
 
     def lit(self, number: int, light_ns: int) -> Lit:
-        """The pixels that a frame's codes light, and their light."""
+        """The pixels that a frame's codes light, and the light of each, electrons per second."""
         levels, panel = self.draw(number, light_ns).levels.ravel(), self.bench.panel
         place = np.flatnonzero(levels)
         light = panel.response.light[levels[place]] * panel.flux_at_white_e_per_s
         return place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
 
     def exposed(self, seen: PanelExposure) -> FloatArray:
-        """The mean light (H, W) over an exposure; one frame of a sky at rest stands for all that are like it."""
+        """The mean light (H, W) over an exposure; at rest one frame stands for all, except with `temporal`."""
         alike = not self.movement.turns and self.combination.quantisation != "temporal"
         return (seen.at_rest if alike else seen.mean)(self.lit, self.bench.camera.resolution_px)
 
@@ -153,7 +153,7 @@ QUICK = Rounds(exposures=1, time_s=0.5)
 
 @dataclass(frozen=True, slots=True)
 class Error:
-    """What a combination's stars are off by, rms: each star on its own, arcsec and mag, and all of them as one attitude."""
+    """The error of a combination's stars, rms: each star on its own, arcsec and mag, and all of them as one attitude."""
 
     arcsec: float
     mag: float
@@ -229,7 +229,7 @@ class SceneMeasurement:
         return sum(len(judge) for judge in self.judges)
 
     def chain(self, combination: Combination, exposure_number: int = 0) -> DrawingChain:
-        """A combination, ready to draw what an exposure sees."""
+        """A combination with the movement of one exposure."""
         return DrawingChain(combination, self.parts.bench(combination), self.judges[exposure_number].movement)
 
     def _moved(self, number: int) -> Movement:
@@ -265,7 +265,7 @@ class SceneMeasurement:
 
 
 def rms_of_known(values: Sequence[float]) -> float:
-    """The rms of the values that are numbers, NaN for none."""
+    """The rms of the finite values; NaN where there is none."""
     known = [value for value in values if math.isfinite(value)]
     return math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
 

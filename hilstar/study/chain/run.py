@@ -109,7 +109,7 @@ class CombinationRow:
 
 
 def said(flag: bool) -> str:
-    """A flag as the table has it."""
+    """A flag as it is written in the table."""
     return "true" if flag else "false"
 
 
@@ -136,7 +136,7 @@ def auto_of(rows: Sequence[CombinationRow]) -> int:
 
 
 def left_to_effort(row: CombinationRow, own: CombinationRow) -> bool:
-    """Whether a row has what the bench file and its sender say as `auto` has it."""
+    """Whether a row shares with `own` the choices that belong to the bench file and the sender."""
     given = ("bit_stealing", "faintest_v_mag", "prediction")
     return all(getattr(row, name) == getattr(own, name) for name in given)
 
@@ -202,7 +202,7 @@ def _row(scene: SceneMeasurement, one: CombinationOutcome) -> CombinationRow:
 def scene_line(
     rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], busy: bool = False
 ) -> str:
-    """What `auto` takes in a scene and is off by, whether it is on the front, and what its error and time are made of."""
+    """One scene: the choice of `auto`, its error and time, its place relative to the front, and the largest part of each."""
     own, stands = rows[auto_of(rows)], NOT_JUDGED if busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
     largest, longest = max(steps, key=lambda part: part.error_arcsec), max(stages, key=lambda one: one.time_ms)
@@ -231,7 +231,7 @@ def is_right(rows: Sequence[CombinationRow]) -> bool:
 
 
 def standing(rows: Sequence[CombinationRow]) -> str:
-    """Whether `auto` is on the front of all, or within the noise of it; else what beats it, why, and how it is without that."""
+    """Whether `auto` is on the front or within its noise; else what beats it, why, and its place among effort's choices."""
     beyond, within = beating(rows)
     own = rows[auto_of(rows)]
     if not beyond:
@@ -283,7 +283,7 @@ def why_not(own: CombinationRow, other: CombinationRow) -> str:
 
 
 def _nearest(rows: Sequence[CombinationRow]) -> CombinationRow:
-    """Of what beats `auto`, that with the smallest error, and of these the fastest."""
+    """The row with the smallest error; the fastest of several."""
     return min(rows, key=lambda row: (row.error_arcsec, row.time_ms))
 
 
@@ -362,7 +362,7 @@ def _scatter(axes: Axes, rows: Sequence[CombinationRow]) -> None:
 
 
 def short_words(row: CombinationRow, own: CombinationRow) -> str:
-    """A row's combination where its sprites go without saying, and its depth where it is that of `own`."""
+    """A row's combination for a chart: without its sprites, and with its depth only where that differs from `own`."""
     shallow = ", fewer stars" if row.faintest_v_mag < own.faintest_v_mag else ""
     moving = f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
     return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"

@@ -1,8 +1,8 @@
-"""What the bench's virtual tracker measures of its stars: of the sky itself, and of what the display makes of it.
+"""Stars as the bench's virtual tracker measures them, in the sky itself and on the display.
 
-At rest the stars are found by the bench's own centroider (`[verify] centroider`). Stars that leave paths are measured as the
-centre of mass of the pixels about the path, which is long enough for a late attitude. Light is float64 and without noise: the
-detector's noise is not the display's.
+At rest the bench's own centroider finds the stars (`[verify] centroider`). A star that leaves a path is measured as the centre
+of mass of the pixels around the path, extended so that a late attitude stays within it. Light is float64 and without noise:
+detector noise is not the display's.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Instants:
 
 
 def instants(bench: Bench, movement: Movement, seen: PanelExposure) -> Instants:
-    """So many that every star's path is exact; one at rest."""
+    """Enough instants to integrate every star's path exactly; one at rest."""
     if not movement.turns:
         return Instants((seen.middle_ns(),), np.ones(1))
     path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
@@ -61,7 +61,7 @@ def points(bench: Bench, q_icrs_to_cam: FloatArray) -> Sprites:
 
 
 def sky_light(bench: Bench, movement: Movement, at: Instants) -> FloatArray:
-    """The mean light (H, W) that the sky itself has over the exposure, electrons per second."""
+    """The sky's own mean light (H, W) over the exposure, electrons per second."""
     total = np.zeros(bench.camera.resolution_px[::-1])
     for t_ns, share in zip(at.t_ns, at.share, strict=True):
         add_light(total, points(bench, movement.at(t_ns)), bench.config.render.sprite_sigma_px, float(share))
@@ -69,7 +69,7 @@ def sky_light(bench: Bench, movement: Movement, at: Instants) -> FloatArray:
 
 
 def linear_light(bench: Bench, sprites: Sprites) -> Lit:
-    """The pixels that a frame's sprites light, and their light, rounded to nothing."""
+    """The pixels that a frame's sprites light, and the light of each before any quantisation."""
     image = np.zeros(bench.camera.resolution_px[::-1])
     add_light(image, sprites, bench.config.render.sprite_sigma_px)
     place = np.flatnonzero(image)
@@ -110,7 +110,7 @@ class MeasuredStars:
 
 @dataclass(frozen=True, slots=True)
 class Off:
-    """How far stars (n,) of one measurement are from another's, arcsec and mag; and whether they are lost."""
+    """Differences of stars (n,) between two measurements, arcsec and mag, and which stars are lost."""
 
     arcsec: FloatArray
     mag: FloatArray
@@ -180,7 +180,7 @@ class StarJudge:
         return self._measured(match, self.judged)
 
     def _whole(self, star: IntArray) -> BoolArray:
-        """Stars that the panel's `exact` shows and that clip nowhere."""
+        """Stars bright enough for the panel's `exact` that clip at no sub-pixel phase."""
         bench = self.tracker.bench
         rates = bench.stars.electrons_per_s[star]
         white = bench.flux_at_white_e_per_s * bench.darkest
@@ -205,16 +205,16 @@ class StarJudge:
         return MeasuredStars(np.where(found[:, None], self._directions(*places), np.nan), light_e)
 
     def _margin_px(self) -> float:
-        """How far from the edge of the detector a star is whole."""
+        """Distance from the detector's edge beyond which a star is complete."""
         return self._reach_px + 1 if self.movement.turns else self.tracker.finder.settings.radius_px + MATCH_PX
 
     @property
     def _reach_px(self) -> int:
-        """How far from a path its star's light is summed."""
+        """Distance from a path within which its star's light is summed."""
         return math.ceil(REACH_SIGMAS * max(self.tracker.sigma_px)) + 1
 
     def _choose_paths(self, sky_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> None:
-        """The stars about whose path (k, n), longer by all that an attitude can be late, hardly any light is another's."""
+        """Choose the stars whose paths (k, n), extended for a late attitude, receive hardly any light from other stars."""
         reach_px = self._reach_px
         y, x = np.mgrid[-reach_px : reach_px + 1, -reach_px : reach_px + 1]
         disc = (x * x + y * y <= reach_px**2).nonzero()
@@ -233,12 +233,12 @@ class StarJudge:
 
     @property
     def _late_s(self) -> float:
-        """By how much an attitude can be late."""
+        """The largest delay of an attitude."""
         return lead_ns(self.tracker.bench.config) / NS_PER_S + 1 / PACKET_HZ
 
     @property
     def _path_px(self) -> float:
-        """How far a star goes in the exposure, and while an attitude can be late before and after it."""
+        """Length of a star's path over the exposure, extended at both ends by the largest delay of an attitude."""
         span_s = self.seen.length_s + 2 * self._late_s
         return math.radians(abs(self.movement.rate_deg_s)) * span_s * self.tracker.camera.scales_px_rad()[1]
 
@@ -280,7 +280,7 @@ class StarJudge:
 
 
 def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
-    """How far the stars of a measurement are from where and what they should be.
+    """Errors of the stars of a measurement in place and light.
 
     A lost one is off by all its light, and by 3 px or its path, whichever is longer: to lose a star is no better than to
     find it late.
@@ -293,7 +293,7 @@ def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
 
 
 def attitude_off_arcsec(shown: MeasuredStars, wanted: MeasuredStars) -> tuple[float, float]:
-    """By how much the camera is turned across the boresight and about it, by least squares of the stars found; NaN for few."""
+    """Attitude error across the boresight and about it, least squares over the found stars; NaN for fewer than two."""
     found = ~(shown.lost | wanted.lost)
     true, seen = wanted.directions[found], shown.directions[found]
     if len(true) < 2:

@@ -183,7 +183,7 @@ def gauss(order: int, *curves: Curve) -> tuple[FloatArray, FloatArray]:
 
 
 def shared_knots(*curves: Curve) -> FloatArray:
-    """Wavelengths, nm, where one of the curves bends, over the range that all share."""
+    """Knots of all curves, nm, within the range that they share."""
     low, high = max(c.wavelength_nm[0] for c in curves), min(c.wavelength_nm[-1] for c in curves)
     knots = np.unique(np.concatenate([c.wavelength_nm for c in curves]))
     return np.asarray(knots[(knots >= low) & (knots <= high)])
@@ -261,7 +261,7 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
 
 
 def _centre_remark() -> str:
-    """What the two sums hide of a profile that is sampled at pixel centres."""
+    """The error of a profile sampled at pixel centres that its sums hide."""
 
     def flux(sigma_px: float, phase_px: np.ndarray) -> FloatArray:
         offset_px = np.arange(-TILE_PX, TILE_PX + 1) - phase_px[:, None]
@@ -338,7 +338,7 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
 
 
 def _each_remark(trials: list[Trial]) -> str:
-    """What other centroiders than the PSF fit find with the method that is taken."""
+    """The largest error of the default method by each centroider."""
     taken = next(trial for trial in trials if trial.is_default)
     each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
     return f"by each centroider '{taken.method}' is off by at most: {each} px"

@@ -131,7 +131,7 @@ def in_cells(stars: Stars, cell_deg: float, by_centres: bool = False) -> Stars:
 
 
 def _by_cells(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
-    """The road of `make_sprites`."""
+    """As `make_sprites` finds them."""
     margin_px = footprint_px(SIGMA_PX) / 2 + 1
     near = stars.grid.near(turn[2], camera.field_radius_rad(margin_px), camera.edges(margin_px) @ turn)
     return _project(stars, near, turn, camera), len(near)

@@ -16,7 +16,7 @@ from hilstar.rotation import conjugate, multiply, to_rotation_vector
 from hilstar.run.record.commanded import Commanded
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
-BLOCKS, MIN_IN_BLOCK, DRAWS = 40, 5, 1000  # of the bootstrap
+BLOCKS, MIN_IN_BLOCK, DRAWS = 40, 5, 1000  # the bootstrap's blocks and draws
 COVERED = (2.5, 97.5)  # percent
 HALF_OF_95 = 1.96  # sigmas of a normal distribution
 UNUSUAL_SIGMAS = 5.0

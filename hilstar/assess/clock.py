@@ -33,7 +33,7 @@ from hilstar.run.record.commanded import Commanded, Moments
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
 # Coarse.
-STEP_S = 0.5  # of the grid on which speeds are compared; larger for slow telemetry
+STEP_S = 0.5  # step of the grid on which speeds are compared; larger for slow telemetry
 MAX_BINS, MIN_BINS = 2_000_000, 8
 MIN_OVERLAP = 0.1  # smallest overlap, as a share of the shorter recording
 TRIED = 12  # offsets tried

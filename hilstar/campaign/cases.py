@@ -40,8 +40,8 @@ from hilstar.twin.simulator import Exposure, FaultyExposure, Simulator
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
-AXIS_STREAM = 2  # of a case's seed, for the axis of a rate across the boresight
-SEED_BITS = 63  # of a FITS header, a Parquet column of int64 and `simulate --seed`
+AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
+SEED_BITS = 63  # what a FITS header, a Parquet column of int64 and `simulate --seed` hold
 Kind = Literal["int64", "float64", "bool", "text"]
 Row = dict[str, Any]
 

@@ -63,7 +63,7 @@ MAX_OWN = {"rate_deg_s": 360.0, "misalignment_arcsec": 36_000.0, "time_s": 9e9, 
 WHOLE = ("noise_seed",)
 SCENARIO = "scenario"  # the path of a file of faults; empty for none
 Value = float | int | bool | str
-ATTITUDE_STREAM = 1  # of a case's seed, for the attitudes of a grid
+ATTITUDE_STREAM = 1  # stream of a case's seed for the attitudes of a grid
 SOBOL_BITS = 30
 MAX_HYPERCUBE_VALUES = 200_000_000  # 1.6 GB: a Latin hypercube is made as a whole
 

@@ -17,10 +17,10 @@ from hilstar.errors import HilstarError, InputError, MachineError
 from hilstar.process.pool import ProcessPool, WorkerProcess
 from hilstar.reading import size_text
 
-FIRST_CASES, MAX_TASK_CASES = 1, 1000  # of a task
+FIRST_CASES, MAX_TASK_CASES = 1, 1000  # cases in a task
 # A task lasts at least so long for each worker there is: one driver and one scheduler keep up with 50 tasks a second.
 A_WORKER_S = 0.02
-TASK_S = 0.5  # of work in a task: a kill loses about as much per worker
+TASK_S = 0.5  # seconds of work in a task: a kill loses about as much per worker
 SMOOTHING = 0.3
 MAX_DEATHS = 3  # a case alone in its task that ends so many workers is taken for the cause
 MAX_STARTS_LOST = 5  # processes in succession that died before they were ready

@@ -10,7 +10,7 @@ from hilstar.monitor.response import Levels, Response
 
 CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
 GRID_PX = 100
-LINE_SHARE = 96 / 255  # of white: visible, but darker than a star's core
+LINE_SHARE = 96 / 255  # share of white: visible, but darker than a star's core
 
 
 def level_of_code(response: Response, code: int) -> int:

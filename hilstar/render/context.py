@@ -16,10 +16,10 @@ from hilstar.units import GL_VERSIONS
 
 EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
-MIN_COMPUTE_VERSION = 430  # of OpenGL, for compute shaders
+MIN_COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
 Context = moderngl.Context
 SOFTWARE = ("llvmpipe", "softpipe")
-# Of llvmpipe: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
+# llvmpipe's limits: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
 MAX_WRITTEN_BYTES, MAX_ROUNDS = 2**27, 60_000
 MAX_GPUS = 32
 

@@ -40,7 +40,7 @@ RESETS = {
     0x92BB: "its memory was purged",  # GL_PURGED_CONTEXT_RESET_NV
 }
 RESET_STATUS = {"GL_KHR_robustness": "glGetGraphicsResetStatus", "GL_ARB_robustness": "glGetGraphicsResetStatusARB"}
-RESET_STATUS_VERSION = 450  # of OpenGL, with glGetGraphicsResetStatus
+RESET_STATUS_VERSION = 450  # the OpenGL that has glGetGraphicsResetStatus
 
 
 def sleep_in_waits() -> None:

@@ -48,11 +48,11 @@ def build_compute(
 
 MAX_SIDES = 8  # as in star.vert
 MAX_RATE = 3e38  # in float32
-PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
-SPRITE_PIXEL_COST = 4  # of a pixel encoded under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
-# Of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
+PLACES = "2i 8x 1f"  # SPRITE_DTYPE's places and rates
+SPRITE_PIXEL_COST = 4  # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
+# Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
 MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
-IMAGES_VERSION = 420  # of OpenGL, for images in shaders
+IMAGES_VERSION = 420  # the OpenGL that has images in shaders
 # A level is missed only where the wings of more stars than this meet outside all of their own squares (see `lit_sides`).
 MEETING_WINGS = 16
 # In frames that are not in units (see `LightUnits`) and whose stars are apart, `round` cuts each star's light at a square.

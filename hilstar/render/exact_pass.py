@@ -28,15 +28,22 @@ from hilstar.render.star_passes import StarPasses
 from hilstar.scene.sprites import Sprites
 
 MAX_NEAR = 128  # pixels of a star that the shader has bits for: sprites up to a sigma of 1.8 px
-MAX_SIZE = 63  # of a footprint whose places fit into their six bits
+MAX_SIZE = 63  # largest footprint whose places fit into six bits
 IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
 OVERRATED = 1.0001  # rounding
-RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # of stars that are sorted by light; runs times half octaves fill 16 bits
-PARTS = ("sums", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices")  # of the shader, before exact.comp
+RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # runs of stars are sorted by light; runs times half octaves fill 16 bits
+PARTS = (
+    "sums",
+    "exact/inputs",
+    "shares",
+    "exact/stars",
+    "exact/pixels",
+    "exact/choices",
+)  # the shader's parts before exact.comp
 LOCAL_SIZE = 32  # as in exact.comp
-FIRST_BINDING = 4  # of a Memory's buffers
+FIRST_BINDING = 4  # first binding of a Memory's buffers
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
 SUMS_BYTES = 4 * SUMS
 
@@ -168,7 +175,7 @@ class Memory:
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
-        self._star: IntArray | None = None  # of the last frame
+        self._star: IntArray | None = None  # the last frame's stars
         self._room = 0
         self._begins, self._before, self._left = (self._reserved(size) for size in (BEGIN_DTYPE.itemsize, *2 * (SUMS_BYTES,)))
 
@@ -257,7 +264,7 @@ def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
     # A float's exponent and the first bit of its mantissa: in half an octave a star's reach grows by a pixel or two.
     half_octaves = (electrons_per_s.view(np.int32) >> 22) - (np.float32(step_e_per_s).view(np.int32) >> 22)
     key = np.arange(count) * runs // max(count, 1) * HALF_OCTAVES + np.clip(half_octaves, 0, HALF_OCTAVES - 1)
-    return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))  # of 16 bits: by radix
+    return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))  # 16-bit keys are sorted by radix
 
 
 def stretches_of(star: IntArray) -> IntArray:

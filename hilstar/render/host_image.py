@@ -20,12 +20,12 @@ from hilstar.render.splat import set_sigma, share_define
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 PINNED_MEMORY = "GL_AMD_pinned_memory"
-EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA  # of that extension, and of OpenGL
-BANDS = 16  # of rows, each of one thread at a time; an even number
-FEW_PX = 12_800  # of sprites, which one thread draws while more would begin
+EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA  # constants of that extension and of OpenGL
+BANDS = 16  # bands of rows, each drawn by one thread at a time; an even number
+FEW_PX = 12_800  # sprites' pixels that one thread draws before more threads would have begun
 FIRST_CAPACITY = 1024  # sprites
 STEP = 8  # as in linear.comp
-# Of the image: beyond it a clear is faster than making sprites black (llvmpipe, 1080p and 4K).
+# Share of the image: beyond it a clear is faster than making sprites black (llvmpipe, 1080p and 4K).
 MAX_ERASED = 0.06
 ROW_DTYPE = np.uint16  # sorted by digits: in a tenth of the time of larger numbers
 RowArray = npt.NDArray[np.uint16]
@@ -51,7 +51,7 @@ class HostImage:
         self._capacity = FIRST_CAPACITY  # sprites that fit into half of the buffer
         self._half = 0  # the half with the last frame's
         self._sprites = self._reserved()
-        self._rows: RowArray = np.empty(0, dtype=ROW_DTYPE)  # of the last frame's sprites, as they are in the buffer
+        self._rows: RowArray = np.empty(0, dtype=ROW_DTYPE)  # the last frame's sprites, as they are in the buffer
         edges_px = np.arange(BANDS + 1) * resolution_px[1] // BANDS
         # A sprite's row here is that of its last pixels; its first are footprint - 1 rows before.
         self._first_row, self._end_row = edges_px[:-1], edges_px[1:] + footprint_px - 1
@@ -125,7 +125,7 @@ class HostImage:
         self._sprites.bind_to_storage_buffer(0)
         self._light.bind_to_storage_buffer(1)
         rows = -(-min(self._footprint_px, -(-height // bands)) // STEP)
-        rounds = 2 + (rows + 1) + rows * (self._footprint_px + 1)  # of a star: the end of a loop is one too
+        rounds = 2 + (rows + 1) + rows * (self._footprint_px + 1)  # rounds for a star: the end of a loop is one too
         at_once = max(MAX_ROUNDS // rounds, 1)
         program["at_once"] = at_once
         for done in range(0, longest, at_once):

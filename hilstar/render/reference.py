@@ -10,7 +10,7 @@ from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
 
 RAYS_ACROSS = 5  # a pixel, along either axis: a limb is then within 0.02 px
-REACH_SIGMAS = 5  # of a disc's light from beyond its rectangle
+REACH_SIGMAS = 5  # reach of a disc's light beyond its rectangle
 
 
 def linear_image(

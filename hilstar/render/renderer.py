@@ -136,7 +136,7 @@ class Renderer:
         self._eraser = Eraser(ctx, target.resolution_px, of_levels=False)
         self._level_eraser = Eraser(ctx, target.resolution_px, of_levels=True)
         self._extended = ExtendedLayer(ctx, target.resolution_px)
-        self._regions: tuple[Rectangle, ...] = ()  # of extended light that is on the images
+        self._regions: tuple[Rectangle, ...] = ()  # where extended light is on the images
         self._cut_sides = target.sides
         self._build_levels()
         set_sides(self._splat, self._cut_sides)
@@ -201,7 +201,7 @@ class Renderer:
         layout = [(self._buffer, "2i 2f 1f", "pixel", "fraction_px", "electrons_per_s")]
         self._splat_vao = self._ctx.vertex_array(self._splat, layout)
         self._unit_vao = None if self._unit_splat is None else self._ctx.vertex_array(self._unit_splat, layout)
-        self._last_count: int | None = None  # of the sprites that are in the buffer and on the images
+        self._last_count: int | None = None  # sprites in the buffer and on the images
         for eraser in (self._eraser, self._level_eraser):
             eraser.take_places_from(self._buffer, self.footprint_px)
         if self._encoder is not None:

@@ -22,7 +22,7 @@ from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 LOCAL_SIZE = 32  # as in light.comp
 STEPS_BINDING, SUMS_BINDING = 1, 7
 MAX_SUM = 2**31 - 2**24  # what an int holds, less what a float32 that large is rounded by
-# Of the light that lights a pixel. Where stars are so many and so bright that a unit would be more, their light is blended.
+# Share of the light that lights a pixel. Where stars are so many and so bright that a unit would be more, their light is blended.
 MAX_UNIT = 1 / 64
 # A star's light ends where a pixel has one part in WINGS of what lights one, and where footprints cover the whole image one in
 # WINGS * DENSER_WINGS. A star alone has the same levels; of 10 000 on 1080p eleven of 82 000 lit pixels are one level lower,
@@ -31,7 +31,7 @@ WINGS, DENSER_WINGS = 128, 8
 # A square that is large enough at its worst phase, and in its corners, leaves out as little as an ellipse with so many times
 # the wings: with 4, streaks at 10 deg/s were off by 1.4 arcsec rms and 0.004 mag, by squares 0.6 and 0.001.
 SQUARE_WINGS = 16
-# Of the image: where footprints cover more, a clear of levels and sums is faster (llvmpipe, 1080p and 4K).
+# Share of the image: where footprints cover more, a clear of levels and sums is faster (llvmpipe, 1080p and 4K).
 MAX_ERASED = 0.1
 MAX_ERASED_KEPT = 0.1  # with the sums, and all pixels among which `exact` chooses
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
@@ -102,7 +102,7 @@ class StarPasses:
         self._gain = None if gain is None else ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
         thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
         self._sums = ctx.buffer(np.zeros(self._size_px[0] * self._size_px[1], dtype=np.int32))
-        self._unit_e_per_s = 0.0  # of the sums
+        self._unit_e_per_s = 0.0  # unit of the sums
         self.sprites = ctx.buffer(reserve=SPRITE_DTYPE.itemsize, dynamic=True)
         self._drawn: int | None = None  # sprites that are in the buffer and on the images; None: it is not known
         self._build(code_table(thresholds), sigma_px)

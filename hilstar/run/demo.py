@@ -35,11 +35,11 @@ SEND_HZ = 100.0
 SLEW_LOG = "slew.jsonl"
 # From Orion's belt to Sirius and on to Procyon, with the roll that a real manoeuvre drags along.
 WAYPOINTS_DEG = ((84.057, -1.2, 0.0), (101.287, -16.716, 25.0), (114.825, 5.225, -10.0))
-SETTLE_FRACTION = 0.15  # of each leg, at rest at its end
+SETTLE_FRACTION = 0.15  # share of each leg, at rest at its end
 JITTER_ARCSEC = (1.5, 1.5, 6.0)  # 1 sigma about cam x, y, z: a good wheel-controlled satellite
 JITTER_SECONDS = 0.4  # its correlation time
 REST_S = 5.0  # at the slew's end: a busy machine's loop may end later than its sender's slew
-PICTURES_AT = (0.0625, 0.25, 0.5, 0.9375)  # of the run
+PICTURES_AT = (0.0625, 0.25, 0.5, 0.9375)  # shares of the run
 LISTENER_WITHIN_S = 120.0
 
 

@@ -38,7 +38,7 @@ class FaultyFrames:
 
     def __init__(self, source: FaultSource, view: FaultView) -> None:
         self.dropped = self.frozen = 0
-        self.now: tuple[Now, ...] = ()  # of the last frame that was asked about
+        self.now: tuple[Now, ...] = ()  # faults of the last frame that was asked about
         self._source, self._view = source, view
         self._held: Held | None = None
 

@@ -79,7 +79,7 @@ def _hilstar() -> str:
 
 
 def _machine() -> str:
-    model = _text(SYS / "firmware/devicetree/base/model") or _cpu()  # of a Raspberry Pi or a Jetson
+    model = _text(SYS / "firmware/devicetree/base/model") or _cpu()  # a Raspberry Pi or a Jetson
     with contextlib.suppress(OSError):
         system = platform.freedesktop_os_release()["PRETTY_NAME"]
         return f"{model}, {os.cpu_count()} cores, {platform.machine()}; {system}, Linux {_version(platform.release())}"

@@ -19,7 +19,7 @@ from hilstar.run.pacer import Operator
 from hilstar.run.shown import HEADLESS, OnScreen
 from hilstar.units import NS_PER_S
 
-PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of white
+PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of white
 _BITS = {"blank": BLANK, "grid": GRID, "crosshair": CROSSHAIR}
 SWITCHES = ("blank", "pause", "patch", "crosshair", "grid")
 

@@ -137,7 +137,7 @@ class GpuWatch:
     def __init__(self, renderer: Renderer, notices: Notices, stop: threading.Event, clock: HostClock = HOST_CLOCK) -> None:
         self._renderer, self._notices, self._stop, self._clock = renderer, notices, stop, clock
         renderer.remember_tables()
-        if fault := renderer.fault():  # of what was done before the run
+        if fault := renderer.fault():  # a fault from before the run
             notices.tell("gpu-error", f"before the first frame {fault}")
         self._asleep_ns = clock.asleep_ns()
         self._next_ns = clock.now_ns() + GPU_LOOK_NS

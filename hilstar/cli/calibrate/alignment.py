@@ -13,7 +13,7 @@ from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
 from hilstar.files import TOML, check_ending
 
-MAX_OFFSET_S = 4e9  # of int64 nanoseconds
+MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 
 
 def alignment(

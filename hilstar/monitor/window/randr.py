@@ -20,7 +20,7 @@ from hilstar.monitor.window.x11 import X11_LIBRARY, Survival, has_extension
 XRANDR_LIBRARY = "libXrandr.so.2"
 ROTATE_0 = 1  # randr.h
 FIXED_ONE = 65536.0  # XFixed
-MAX_ITEMS = 4096  # of four bytes
+MAX_ITEMS = 4096  # items of four bytes
 NVIDIA_S = 3.0
 BYTE_BITS = 8
 _Pointer, _Id, _Ids = ctypes.c_void_p, ctypes.c_ulong, ctypes.POINTER(ctypes.c_ulong)

@@ -23,10 +23,10 @@ from hilstar.units import NS_PER_MS
 GATE_FRAMES = 120
 REFRESH_TOLERANCE = 0.01
 DROPPED = 1.5  # periods
-MAX_DROPPED = 2  # of GATE_FRAMES: a desktop that is still busy with the new window
-BURSTS, BURST = 3, 8  # of swaps, to find how many are queued
-BURST_AT = 0.25  # of a period after a swap: far from the next one
-OFF_GRID = (0.125, 0.75)  # of a period: where a burst ends on a variable refresh, from the grid of a fixed one
+MAX_DROPPED = 2  # among GATE_FRAMES: a desktop that is still busy with the new window
+BURSTS, BURST = 3, 8  # bursts of swaps, to find how many are queued
+BURST_AT = 0.25  # share of a period after a swap: far from the next one
+OFF_GRID = (0.125, 0.75)  # in periods: where a burst ends on a variable refresh, off the grid of a fixed one
 DRAINED = 6  # periods after which no queue has a frame
 # The first is today's and serves most drivers; a 4K display or a slow X server needs more.
 GUARDS_MS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
@@ -34,7 +34,7 @@ GUARD_TRIALS = 4
 PLAIN_BITS = 8
 VRR_FRAMES = 5
 VRR_AT, VRR_UNDER = 1.5, 1.75  # periods after a swap: when the next frame is submitted, and the latest that it is shown with
-UNPACED = 0.1  # of the period that the system knows of: swaps faster by more do not wait for it
+UNPACED = 0.1  # share of the known period: swaps faster by more do not wait for it
 log = logging.getLogger(__name__)
 
 

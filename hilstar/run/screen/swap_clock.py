@@ -47,7 +47,7 @@ class DrawBudget:
     FRAMES = 120
     SLOW = 3  # the third slowest counts: two outliers in two seconds are late rather than all others early
     GUARD_NS = 1.0 * NS_PER_MS
-    MORE = 1.25  # of the time that a driver was seen to need
+    MORE = 1.25  # factor on the time that a driver was seen to need
 
     def __init__(self, period_ns: float, guard_ns: float = GUARD_NS) -> None:
         self._period_ns = period_ns

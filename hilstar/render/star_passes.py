@@ -22,7 +22,7 @@ from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 LOCAL_SIZE = 32  # as in light.comp
 STEPS_BINDING, SUMS_BINDING = 1, 7
 MAX_SUM = 2**31 - 2**24  # what an int holds, less what a float32 that large is rounded by
-# Share of the light that lights a pixel. Where stars are so many and so bright that a unit would be more, their light is blended.
+# Share of the first level's light. Where stars are so many and so bright that a unit would be more, their light is blended.
 MAX_UNIT = 1 / 64
 # A star's light ends where a pixel has one part in WINGS of what lights one, and where footprints cover the whole image one in
 # WINGS * DENSER_WINGS. A star alone has the same levels; of 10 000 on 1080p eleven of 82 000 lit pixels are one level lower,

@@ -22,6 +22,7 @@ from hilstar.bench.bench_file import BenchFile, dated
 from hilstar.bench.scenario import Scenario, read_scenario
 from hilstar.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
 from hilstar.campaign.solvers import Answer, CentroidErrors
+from hilstar.campaign.store import Row
 from hilstar.errors import InputError
 from hilstar.frame.view import View
 from hilstar.reading import parse_toml
@@ -43,7 +44,6 @@ ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
 SEED_BITS = 63  # what a FITS header, a Parquet column of int64 and `simulate --seed` hold
 Kind = Literal["int64", "float64", "bool", "text"]
-Row = dict[str, Any]
 
 DONE, FAILED = "done", "failed"
 AXES = ("x", "y", "z")

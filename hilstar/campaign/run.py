@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 
@@ -14,7 +14,7 @@ from hilstar.campaign.cases import CaseMaker, columns, failed, first_row
 from hilstar.campaign.plan import Design, Plan, grid_levels, parse_plan
 from hilstar.campaign.pool import MAX_DEATHS, Backlog, Task
 from hilstar.campaign.session import Answered, Identity, Job, Session, files_sha256
-from hilstar.campaign.store import About, Directory, Journal, require_parquet, schema_of, write_table
+from hilstar.campaign.store import About, Directory, Journal, Row, require_parquet, schema_of, write_table
 from hilstar.errors import InputError
 from hilstar.reading import MAX_TOML_BYTES, read_text
 
@@ -90,7 +90,7 @@ class Campaign:
             done = journal.done
             on_done(done)
 
-            def keep(rows: list[dict[str, Any]]) -> None:
+            def keep(rows: list[Row]) -> None:
                 nonlocal done
                 done += journal.append(rows)
                 on_done(done)
@@ -107,7 +107,7 @@ class Campaign:
         finally:
             journal.close()
 
-    def _blocks(self, journal: Journal) -> Iterator[list[dict[str, Any]]]:
+    def _blocks(self, journal: Journal) -> Iterator[list[Row]]:
         for block in range(journal.blocks):
             yield journal.rows(block)
 

@@ -12,7 +12,7 @@ import hashlib
 import os
 import time
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -22,10 +22,11 @@ import hilstar
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.config import BenchConfig
-from hilstar.campaign.cases import Case, CaseMaker, CaseTally, Kind, Row, columns, failed, first_row
+from hilstar.campaign.cases import Case, CaseMaker, CaseTally, Kind, columns, failed, first_row
 from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.campaign.plan import SCENARIO, Plan, parse_plan
 from hilstar.campaign.solvers import CENTROIDS, SolverFault, choose_solver
+from hilstar.campaign.store import Row
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import make_directory
 from hilstar.frame.view import View
@@ -102,7 +103,7 @@ class Job(msgspec.Struct, frozen=True):
 class Answered(msgspec.Struct, frozen=True):
     """The rows of some cases, the seconds that they took, and the worker's peak of memory."""
 
-    rows: list[dict[str, Any]]
+    rows: list[Row]
     seconds: float
     peak_bytes: int
 

@@ -37,7 +37,7 @@ BLOCK_CASES = 16_384
 OPEN, FULL = ".jsonl", ".full.jsonl"
 CHECKSUM_CHARACTERS = 8
 
-Row = dict[str, Any]
+Row = dict[str, Any]  # a case's values by column; which columns there are depends on the plan
 ABOUT, LOCK, JOURNAL, TABLE = "campaign.json", "campaign.lock", "journal", "cases.parquet"
 MAX_ABOUT_BYTES = 50_000_000
 ANOTHER = "write another directory after -o, or delete this one"
@@ -59,7 +59,7 @@ def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> pa.Schema
     return pa.schema([pa.field(name, kinds[kind]) for name, kind in columns.items()], metadata=dict(about))
 
 
-def write_table(path: Path, schema: pa.Schema, blocks: Iterator[list[dict[str, Any]]]) -> None:
+def write_table(path: Path, schema: pa.Schema, blocks: Iterator[list[Row]]) -> None:
     """Write blocks of rows, each as a row group, whole or not at all. Raises InputError where it cannot be written."""
     import pyarrow as pa
     import pyarrow.parquet as pq

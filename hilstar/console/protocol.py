@@ -65,7 +65,7 @@ class AttitudeSource(msgspec.Struct, frozen=True):
     endpoint: str
 
 
-class SenderClock(msgspec.Struct, frozen=True, kw_only=True):
+class ShownClock(msgspec.Struct, frozen=True, kw_only=True):
     """The sender's clock against this machine's."""
 
     offset_ms: float | None
@@ -121,7 +121,7 @@ class PageState(msgspec.Struct, frozen=True, kw_only=True):
     health: SkyHealth
     attitude: ShownAttitude | None
     source: AttitudeSource
-    clock: SenderClock | None
+    clock: ShownClock | None
     counts: RunCounts
     pacing: Pacing | None
     frame: NewestFrame

@@ -29,8 +29,8 @@ from hilstar.console.protocol import (
     PageText,
     PictureFormat,
     RunCounts,
-    SenderClock,
     ShownAttitude,
+    ShownClock,
     SkyHealth,
     StarMark,
     Truth,
@@ -253,7 +253,7 @@ class RunReader:
             source=self.setup.source,
             clock=None
             if clock is None
-            else SenderClock(
+            else ShownClock(
                 offset_ms=clock.offset_ms,
                 sigma_ms=clock.uncertainty_ms,
                 drift_ppm=clock.drift_ppm,

@@ -18,7 +18,7 @@ from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
-from hilstar.frame.layers import light_of, seen_in, sky_layers
+from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
 from hilstar.frame.truth import StarInView, brightest_in_view
 from hilstar.frame.view import Canvas, View
 from hilstar.monitor.balance import Seen
@@ -48,23 +48,23 @@ def load(path: str | Path) -> Bench:
 
 def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
     """Assemble the bench of a file, in a window's `context` if one is given. Raises InputError or MachineError (no OpenGL)."""
-    moving = bench_moving(file.config, file.folder)
-    return assembled(file, bench_stars(file.config, file.folder, moving), context, moving)
+    sources = bench_sources(file.config, file.folder)
+    return assembled(file, bench_stars(file.config, file.folder, sources.moving), context, sources)
 
 
-def assembled(file: BenchFile, stars: Stars, context: Context | None = None, moving: MovingSky | None = None) -> Bench:
+def assembled(file: BenchFile, stars: Stars, context: Context | None = None, sources: Sources = NO_SOURCES) -> Bench:
     """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError or MachineError."""
     if context is not None:  # a window's context, which the window frees
-        return _assembled(file, stars, context, moving)
+        return _assembled(file, stars, context, sources)
     context = create_context(file.config.render.gpu)
     try:
-        return _assembled(file, stars, context, moving)
+        return _assembled(file, stars, context, sources)
     except BaseException:
         context.release()
         raise
 
 
-def _assembled(file: BenchFile, stars: Stars, context: Context, moving: MovingSky | None) -> Bench:
+def _assembled(file: BenchFile, stars: Stars, context: Context, sources: Sources) -> Bench:
     calibration = bench_calibration(file.config, file.folder)
     white_e_per_s = _white_e_per_s(file.config.render, stars)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
@@ -101,10 +101,10 @@ def _assembled(file: BenchFile, stars: Stars, context: Context, moving: MovingSk
         darkest=darkest,
         flux_at_white_e_per_s=white_e_per_s,
         faintest_shown_e_per_s=faintest,
-        stars=moved(stars, moving),
-        shown_stars=moved(shown, moving),
+        stars=moved(stars, sources.moving),
+        shown_stars=moved(shown, sources.moving),
         faint_stars=faint,
-        moving=moving,
+        sources=sources,
         renderer=Renderer(_target(config, panel, effort, light.seen), context),
     )
 
@@ -158,6 +158,11 @@ def bench_optics(tracker: Tracker, folder: Path) -> Optics:
     )
 
 
+def bench_sources(config: BenchConfig, folder: Path) -> Sources:
+    """The light of a bench's sky beside its stars. Raises InputError or MachineError."""
+    return Sources(bench_moving(config, folder))
+
+
 def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
     """The bodies and the observer of a bench, None where its file has neither. Raises InputError or MachineError."""
     if not has_observer(config):
@@ -192,12 +197,13 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
 def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
     """The `count` brightest stars and bodies that a bench's tracker sees in a view, the brightest first.
 
-    Raises InputError or MachineError (see `bench_moving`).
+    Raises InputError or MachineError (see `bench_sources`).
     """
     canvas = Canvas(tracker_camera(file.config.tracker, file.folder), 1, file.config.tracker.psf_sigma_px)
-    moving = bench_moving(file.config, file.folder)
-    stars = seen_in(view, moved(bench_stars(file.config, file.folder, moving), moving), moving)
-    light = light_of(canvas, sky_layers(canvas, moving), stars, view)
+    sources = bench_sources(file.config, file.folder)
+    stars = moved(bench_stars(file.config, file.folder, sources.moving), sources.moving)
+    stars = seen_in(view, stars, sources.moving)
+    light = light_of(canvas, sky_layers(canvas, sources), stars, view)
     return brightest_in_view(light, stars, canvas.camera, view.q_icrs_to_cam, count)
 
 

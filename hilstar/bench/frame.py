@@ -18,7 +18,7 @@ from hilstar.bench.config import BenchConfig, Vector
 from hilstar.bench.effort import Effort
 from hilstar.errors import InputError
 from hilstar.frame.bodies import BodyLayer, disc_stars
-from hilstar.frame.layers import light_of, seen_in, sky_layers
+from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
 from hilstar.frame.satellites import SatelliteLayer
 from hilstar.frame.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table
 from hilstar.frame.view import STILL, Canvas, Layer, View
@@ -98,7 +98,7 @@ class Bench:
     `config` is that of `file` with everything chosen that the file left to its tolerance (`effort`, None where it left
     nothing). Of `stars` those from `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are
     `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of white, None where that is 1 everywhere, and
-    `darkest` its minimum. `moving` places bodies among `stars` and `shown_stars`, None where the sky stands still.
+    `darkest` its minimum. `sources` are the sky's light beside stars, whose bodies have places among `stars` and `shown_stars`.
     `output` says how the display's output is set that its frames are shown on; {} without one.
     """
 
@@ -116,13 +116,18 @@ class Bench:
     shown_stars: Stars
     faint_stars: Stars
     renderer: Renderer
-    moving: MovingSky | None = None
+    sources: Sources = NO_SOURCES
     output: dict[str, object] = field(default_factory=dict, repr=False)
 
     def with_stars(self, stars: Stars) -> Bench:
         """The same bench, and renderer, with other stars, all of which are shown."""
         shown, none = split_by_rate(stars, 0.0)
-        return replace(self, stars=stars, shown_stars=shown, faint_stars=none, moving=None)
+        return replace(self, stars=stars, shown_stars=shown, faint_stars=none, sources=NO_SOURCES)
+
+    @property
+    def moving(self) -> MovingSky | None:
+        """The bodies, the satellites and the observer; None where the sky stands still."""
+        return self.sources.moving
 
     @property
     def panel(self) -> Panel:
@@ -142,11 +147,11 @@ class Bench:
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
         """The layers of what the monitor can show: `shown_stars`, bodies, and satellites as bright."""
-        return sky_layers(self.canvas, self.moving, self.faintest_shown_e_per_s, self.shown_stars)
+        return sky_layers(self.canvas, self.sources, self.faintest_shown_e_per_s, self.shown_stars)
 
     @cached_property
     def _all_layers(self) -> tuple[Layer, ...]:
-        return sky_layers(self.canvas, self.moving)
+        return sky_layers(self.canvas, self.sources)
 
     @cached_property
     def _bodies(self) -> BodyLayer | None:

@@ -82,7 +82,7 @@ class DisplayTracker:
             dn = self._detector.expose(mean_e, exposure_s, rng)
         stars = self._bench.seen(self._bench.stars, view)
         canvas = detector_canvas(self.config.tracker, self.camera)
-        light = light_of(canvas, sky_layers(canvas, self._bench.moving, paths=False), stars, view)
+        light = light_of(canvas, sky_layers(canvas, self._bench.sources, paths=False), stars, view)
         truth = exposure_truth(canvas, view, stars, light, mean_e)
         truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
         return Exposure(view, dn, mean_e, truth)

@@ -19,6 +19,16 @@ if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
 
 
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """The light of a bench's sky beside its stars: bodies, satellites and the observer, None where the sky stands still."""
+
+    moving: MovingSky | None = None
+
+
+NO_SOURCES = Sources()
+
+
 def seen_in(view: View, stars: Stars, moving: MovingSky | None) -> Stars:
     """A bench's stars as a view has them; bodies are moved to their places in the arrays of `stars`."""
     return stars.seen_at(view.velocity_km_s) if moving is None else moving.seen(stars, *view.observer)
@@ -26,7 +36,7 @@ def seen_in(view: View, stars: Stars, moving: MovingSky | None) -> Stars:
 
 def sky_layers(
     canvas: Canvas,
-    moving: MovingSky | None = None,
+    sources: Sources = NO_SOURCES,
     faintest_e_per_s: float = 0.0,
     frequent: Stars | None = None,
     *,
@@ -37,6 +47,7 @@ def sky_layers(
     For `frequent` and `paths` see `StarLayer`.
     """
     layers: list[Layer] = [StarLayer(canvas, frequent, paths)]
+    moving = sources.moving
     if moving is not None and moving.names:
         layers.append(BodyLayer(moving, canvas))
     if moving is not None and moving.satellites is not None:

@@ -10,14 +10,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_moving, bench_optics, bench_stars, moved
+from hilstar.bench.build import bench_optics, bench_sources, bench_stars, moved
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig, Tracker
 from hilstar.bench.fault_views import tracker_view
@@ -43,6 +43,9 @@ from hilstar.sky.stars import Stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import MAX_E, DetectorSettings
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
 
 # The attitude at a time of the run, ns.
 AttitudeAt = Callable[[int], FloatArray]
@@ -93,7 +96,7 @@ class Simulator:
         self.renderer = Renderer(target, context or create_context(self.config.render.gpu))
 
     def _load_sky(self) -> None:
-        self.moving = bench_moving(self.config, self.file.folder)
+        self.sources = bench_sources(self.config, self.file.folder)
         self.stars = moved(bench_stars(self.config, self.file.folder, self.moving), self.moving)
 
     def _load_tracker(self) -> None:
@@ -121,6 +124,11 @@ class Simulator:
             self.renderer = Renderer(target, create_context(self.config.render.gpu))
 
     @property
+    def moving(self) -> MovingSky | None:
+        """The bodies, the satellites and the observer; None where the sky stands still."""
+        return self.sources.moving
+
+    @property
     def gl_renderer(self) -> str:
         """The name of the GL renderer, as the driver gives it."""
         return self.renderer.gl_renderer
@@ -140,7 +148,7 @@ class Simulator:
         """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
         exposure_s, canvas = self.config.tracker.exposure_s, self.canvas
         stars = seen_in(view, self.stars, self.moving)
-        layers = sky_layers(canvas, self.moving)
+        layers = sky_layers(canvas, self.sources)
         if faults is None:
             light = light_of(canvas, layers, stars, view)
             mean_e = self._linear(light) * exposure_s + self.background_e

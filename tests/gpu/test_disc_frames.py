@@ -92,7 +92,7 @@ def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
     assert shot.linear.sum() == pytest.approx(shot.truth["electrons_per_s"].sum(), rel=FLUX_LIMIT)
     assert bench.losses_mag(shot)["Moon"] > 3
     view, canvas = View(q), Canvas(bench.camera, 1, SIGMA)
-    stars, layers = bench.seen(bench.stars, view), sky_layers(canvas, bench.moving)
+    stars, layers = bench.seen(bench.stars, view), sky_layers(canvas, bench.sources)
     for seen, behind in ((layers, set()), (layers[:1], set(BEEHIVE))):
         found = brightest_in_view(light_of(canvas, seen, stars, view), stars, bench.camera, q, 500)
         assert {star.hip for star in found} & set(BEEHIVE) == behind

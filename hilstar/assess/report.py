@@ -213,7 +213,7 @@ def write_page(path: Path, found: Assessment) -> None:
 
 def _sections(found: Assessment) -> Iterator[str]:
     yield _table(("", ""), lines_of(found))
-    yield "<h2>AssessmentFigures</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>"
+    yield "<h2>Budget</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>"
     rows: list[tuple[object, ...]] = [(*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)]
     yield _table(("quantity", "axis", "value", "unit", "low", "high"), rows)
     yield "<h2>Errors over the run</h2>" + _over_time(found)

@@ -56,6 +56,8 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path
     due = (planted.tau_s[-1] - planted.tau_s[0]) / 0.1 + 1
     assert found["availability"] == pytest.approx((len(planted.tau_s) - 5) / due, abs=2e-3)
     text = (out / "budget.html").read_text()
+    titles = ["Budget", "Errors over the run", "What repeats with the place in the field", "Noise", "By rate"]
+    assert re.findall("<h2>(.*?)</h2>", text)[:5] == titles
     assert text.count("data:image/svg+xml;base64,") == len(drawn) == 3 and "prefers-color-scheme: dark" in text
     assert not re.search(r"(src|href)=.(https?:)?//|<td>1</td>", text)
     for figure in drawn:

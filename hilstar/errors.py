@@ -30,6 +30,10 @@ class MachineError(HilstarError):
     exit_code = 3
 
 
+class GpuError(MachineError):
+    """The GPU or its driver no longer answers, or has lost what it held."""
+
+
 def cannot_read(path: object, reason: object, advice: str) -> InputError:
     """The refusal of an input: `reason` is words or the error that came, `advice` what to give instead."""
     return InputError(f"{path}: cannot be read ({_in_words(reason)}); {advice}")

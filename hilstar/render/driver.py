@@ -13,7 +13,7 @@ from typing import Any
 
 import moderngl
 
-from hilstar.errors import MachineError
+from hilstar.errors import GpuError
 from hilstar.units import NS_PER_S
 
 # NVIDIA's driver yields in a loop while it waits, which at real-time priority keeps a core busy ("OpenGL Environment
@@ -76,7 +76,7 @@ class Driver:
         return self._reset is not None
 
     def wait(self) -> None:
-        """Wait until the GPU has done all that was asked of it. Raises MachineError where it does not within 10 s."""
+        """Wait until the GPU has done all that was asked of it. Raises GpuError where it does not within 10 s."""
         fence = self._fence(GL_SYNC_GPU_COMMANDS_COMPLETE, 0)
         try:
             result = self._ask(fence, GL_SYNC_FLUSH_COMMANDS_BIT, 0)
@@ -88,10 +88,10 @@ class Driver:
             self._delete(fence)
         if result == GL_TIMEOUT_EXPIRED:
             self.check()
-            raise MachineError(f"the GPU has not finished a frame for {MAX_SLICES * SLICE_NS // NS_PER_S} s; see dmesg")
+            raise GpuError(f"the GPU has not finished a frame for {MAX_SLICES * SLICE_NS // NS_PER_S} s; see dmesg")
         if result == GL_WAIT_FAILED:
             self.check()
-            raise MachineError("the GPU's driver cannot wait for it; see dmesg")
+            raise GpuError("the GPU's driver cannot wait for it; see dmesg")
 
     def take_back_buffer(self) -> None:
         """Wait for a back buffer of the window that is bound, by clearing a pixel: no clear by moderngl frees the lock."""
@@ -111,6 +111,6 @@ class Driver:
         return f"the GL driver reports {', '.join(dict.fromkeys(errors))}" if errors else ""
 
     def check(self) -> None:
-        """Raise MachineError where the GPU is not well."""
+        """Raise GpuError where the GPU is not well."""
         if fault := self.fault():
-            raise MachineError(f"{fault}; begin the run again, and see dmesg where it happens again")
+            raise GpuError(f"{fault}; begin the run again, and see dmesg where it happens again")

@@ -17,7 +17,7 @@ from msgspec import UNSET, UnsetType
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
-from hilstar.errors import MachineError
+from hilstar.errors import GpuError
 from hilstar.frame.faults import FaultLayer
 from hilstar.notices import Notices
 from hilstar.run.faulty_frames import FaultyFrames
@@ -93,7 +93,7 @@ class FrameLoop:
             self.on_frame(number, moment.starts_ns)
         try:
             return self._draw(number, t_ns, attitude, moment)
-        except MachineError as error:
+        except GpuError as error:
             self._gpu.lost(str(error))
             raise
         finally:

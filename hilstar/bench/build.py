@@ -24,11 +24,10 @@ from hilstar.frame.view import Canvas, View
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel
-from hilstar.render.context import Context, create_context, has_compute
-from hilstar.render.presenter import Orientation
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target, has_compute
+from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
-from hilstar.scene.frame_motion import Scan
+from hilstar.scene.frame_motion import Orientation, Scan
 from hilstar.scene.psf import peak_share
 from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import load_curve
@@ -36,35 +35,37 @@ from hilstar.sky.star_table import TableChoice, choose_catalog
 from hilstar.sky.stars import Stars, aberrate, make_stars, split_by_rate, unit_vectors_icrs
 
 if TYPE_CHECKING:
+    from hilstar.render.context import Context
     from hilstar.sky.bodies.moving import MovingSky
 
 S_PER_MS = 1e-3
 
 
 def load(path: str | Path) -> Bench:
-    """Assemble the bench that a file describes. Raises InputError or MachineError (no OpenGL)."""
+    """Assemble the bench that a file describes; NumPy draws where OpenGL is missing. Raises InputError."""
     return open_bench(read_bench_file(Path(path)))
 
 
 def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
-    """Assemble the bench of a file, in a window's `context` if one is given. Raises InputError or MachineError (no OpenGL)."""
+    """Assemble the bench of a file, in a `context` if one is given; NumPy draws where OpenGL is missing. Raises InputError."""
     sources = bench_sources(file.config, file.folder)
     return assembled(file, bench_stars(file.config, file.folder, sources.moving), context, sources)
 
 
 def assembled(file: BenchFile, stars: Stars, context: Context | None = None, sources: Sources = NO_SOURCES) -> Bench:
-    """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError or MachineError."""
+    """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError."""
     if context is not None:  # a window's context, which the window frees
         return _assembled(file, stars, context, sources)
-    context = create_context(file.config.render.gpu)
+    context = headless_context(file.config.render.gpu)
     try:
         return _assembled(file, stars, context, sources)
     except BaseException:
-        context.release()
+        if context is not None:
+            context.release()
         raise
 
 
-def _assembled(file: BenchFile, stars: Stars, context: Context, sources: Sources) -> Bench:
+def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: Sources) -> Bench:
     calibration = bench_calibration(file.config, file.folder)
     white_e_per_s = _white_e_per_s(file.config.render, stars)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
@@ -105,7 +106,7 @@ def _assembled(file: BenchFile, stars: Stars, context: Context, sources: Sources
         shown_stars=moved(shown, sources.moving),
         faint_stars=faint,
         sources=sources,
-        renderer=Renderer(_target(config, panel, effort, light.seen), context),
+        renderer=open_backend(_target(config, panel, effort, light.seen), context),
     )
 
 

@@ -16,8 +16,7 @@ from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.phases import UNLIKE, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.monitor.quantise import EXPOSURE_FRAMES, Panel, Quantisation
 from hilstar.monitor.response import Response
-from hilstar.render.encoder import MAX_SIDES, SpriteSide, SpriteSides
-from hilstar.render.exact_pass import ExactPass
+from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, exact_shader_takes
 from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, outside_share, peak_share, pixel_share
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge
@@ -136,7 +135,7 @@ class Light:
         """The time that `round` or `exact` takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
         lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
         exact_ms = EXACT_MS_A_STAR if self.has_compute else NUMPY_EXACT_MS_A_STAR
-        if not ExactPass.takes(sigma_px):
+        if not exact_shader_takes(sigma_px):
             exact_ms = WIDE_EXACT_MS_A_STAR
         a_star_ms = exact_ms if method == "exact" else ROUND_MS_A_STAR
         return a_star_ms * self.sky_share * float(np.count_nonzero(lit))

@@ -26,7 +26,7 @@ from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap, star_losses_mag
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import Codes, Levels, code_dtype
-from hilstar.render.renderer import Renderer
+from hilstar.render.backend import Backend
 from hilstar.rotation import normalise
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Scan
@@ -69,7 +69,7 @@ class Frame:
 class Drawn:
     """A frame on the GPU: its sprites (None: blank), and what is too bright for the monitor, by HIP number or a body's name."""
 
-    def __init__(self, renderer: Renderer, sprites: Sprites | None, clipped_hip: tuple[int | str, ...] = ()) -> None:
+    def __init__(self, renderer: Backend, sprites: Sprites | None, clipped_hip: tuple[int | str, ...] = ()) -> None:
         self.sprites = sprites
         self.clipped_hip = clipped_hip
         self.star_count = 0 if sprites is None else sprites.star_count
@@ -115,7 +115,7 @@ class Bench:
     stars: Stars
     shown_stars: Stars
     faint_stars: Stars
-    renderer: Renderer
+    renderer: Backend
     sources: Sources = NO_SOURCES
     output: dict[str, object] = field(default_factory=dict, repr=False)
 

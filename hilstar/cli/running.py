@@ -106,8 +106,9 @@ def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) ->
     """The bench and its screen; None when headless."""
     if headless:
         from hilstar.bench.build import open_bench
+        from hilstar.render.context import create_context
 
-        with open_bench(file) as bench:
+        with open_bench(file, create_context(file.config.render.gpu)) as bench:  # NumPy is too slow for a stream
             yield bench, None
         return
     from hilstar.run.screen.open_screen import open_screen

@@ -12,11 +12,10 @@ from glcontext import egl
 
 from hilstar.errors import InputError, MachineError, did_you_mean
 from hilstar.process.scheduling import drawing_threads_apart
+from hilstar.render.backend import EGL_LIBRARY, has_compute
 from hilstar.units import GL_VERSIONS
 
-EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
-MIN_COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
 Context = moderngl.Context
 SOFTWARE = ("llvmpipe", "softpipe")
 # llvmpipe's limits: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
@@ -104,6 +103,18 @@ def _context_on(index: int | None) -> moderngl.Context:
     raise MachineError(f"OpenGL 3.3 through EGL is missing ({refusal}); {INSTALL_EGL}")
 
 
+def described() -> str:
+    """The headless OpenGL of this machine for a person: who draws, and how. Raises MachineError with what to install."""
+    ctx = create_context()
+    try:
+        info = ctx.info
+        what = f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
+        exact = "compute shaders" if has_compute(ctx) else "NumPy (slow: their shaders need OpenGL 4.3)"
+        return f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'}, exact and temporal by {exact}"
+    finally:
+        ctx.release()
+
+
 def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprint_px: int, sigma: str) -> None:
     """Raise InputError where this GL cannot draw such an image, or points as large as its sprites; those are by `sigma`."""
     largest = int(min(ctx.info["GL_MAX_TEXTURE_SIZE"], *ctx.info["GL_MAX_VIEWPORT_DIMS"])) - 2 * footprint_px
@@ -112,11 +123,6 @@ def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprin
     points = ctx.info["GL_POINT_SIZE_RANGE"][1]
     if footprint_px > points:
         raise InputError(f"{sigma}: needs sprites of {footprint_px} px; this GL draws at most {points:g} px")
-
-
-def has_compute(ctx: Context) -> bool:
-    """Whether this GL has compute shaders (OpenGL 4.3); without them `exact` and `temporal` choose their levels in NumPy."""
-    return bool(ctx.version_code >= MIN_COMPUTE_VERSION)
 
 
 def computes_in_software(ctx: moderngl.Context) -> bool:

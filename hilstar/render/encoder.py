@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import moderngl
@@ -14,6 +13,7 @@ from hilstar.errors import InputError
 from hilstar.monitor.quantise import CodeTable, Panel, blue_noise, code_table, level_dtype
 from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
+from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import outside_share
@@ -46,7 +46,6 @@ def build_compute(
         return ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), *before, body]))
 
 
-MAX_SIDES = 8  # as in star.vert
 MAX_RATE = 3e38  # in float32
 PLACES = "2i 8x 1f"  # SPRITE_DTYPE's places and rates
 SPRITE_PIXEL_COST = 4  # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
@@ -60,17 +59,6 @@ MEETING_WINGS = 16
 # same levels; of 10 000 on 1080p three in a thousand have a pixel (twelve of 82 000 lit ones in all) that is one level lower,
 # where wings meet, and all have 0.002 mag rms.
 CUT_WINGS = 32
-
-
-@dataclass(frozen=True, slots=True)
-class SpriteSide:
-    """The side of the sprites of stars below a rate."""
-
-    below_e_per_s: float
-    side_px: int
-
-
-SpriteSides = tuple[SpriteSide, ...]
 
 
 def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:

@@ -21,14 +21,12 @@ from hilstar.monitor.exact import CARRIED, Left
 from hilstar.monitor.footprints import FEWEST, LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
-from hilstar.render.context import has_compute
+from hilstar.render.backend import exact_shader_takes, has_compute
 from hilstar.render.encoder import LevelTexture, LookupTable, build_compute
 from hilstar.render.splat import set_sigma, share_define
 from hilstar.render.star_passes import StarPasses
 from hilstar.scene.sprites import Sprites
 
-MAX_NEAR = 128  # pixels of a star that the shader has bits for: sprites up to a sigma of 1.8 px
-MAX_SIZE = 63  # largest footprint whose places fit into six bits
 IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
@@ -69,13 +67,7 @@ class ExactPass:
     @staticmethod
     def runs_on(ctx: moderngl.Context, sigma_px: tuple[float, float]) -> bool:
         """Whether this GL has compute shaders, and the shader bits enough for the sprites' pixels."""
-        return has_compute(ctx) and ExactPass.takes(sigma_px)
-
-    @staticmethod
-    def takes(sigma_px: tuple[float, float]) -> bool:
-        """Whether the shader has bits enough for the pixels of such sprites."""
-        order = PixelOrder(sigma_px)
-        return order.near <= MAX_NEAR and order.size <= MAX_SIZE
+        return has_compute(ctx) and exact_shader_takes(sigma_px)
 
     def _program(self, paths: bool, summed: bool) -> moderngl.ComputeShader:
         """The program for stars or paths, whose light is summed or in the linear image; made when it is first asked for."""

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import IntArray
-from hilstar.render.context import EGL_LIBRARY, MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
+from hilstar.render.backend import EGL_LIBRARY
+from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
 from hilstar.render.encoder import build_compute
 from hilstar.render.splat import set_sigma, share_define
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites

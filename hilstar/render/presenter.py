@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import moderngl
@@ -14,29 +14,11 @@ from hilstar.monitor.window.x11 import GL_LIBRARY, X11_LIBRARY
 from hilstar.render.context import is_software
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import TABLE_WIDTH, build_program
+from hilstar.scene.frame_motion import Orientation
 
 GL_DITHER = 0x0BD0
 MAX_LEVELS = 2**16
 PRIMARIES = {"grey": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
-
-
-@dataclass(frozen=True, slots=True)
-class Orientation:
-    """How the image lies on the screen: columns or rows reversed, and quarter turns clockwise."""
-
-    flip_x: bool = False
-    flip_y: bool = False
-    quarter_turns: int = 0
-
-    def screen_px(self, resolution_px: tuple[int, int]) -> tuple[int, int]:
-        """The screen that an image of `resolution_px` fills."""
-        return resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
-
-    @property
-    def down(self) -> tuple[int, int]:
-        """The direction of the screen's rows, from first to last, in image axes (x right, y down)."""
-        x, y = ((0, 1), (1, 0), (0, -1), (-1, 0))[self.quarter_turns % 4]
-        return (-x, -y) if self.flip_y else (x, y)
 
 
 def level_texture(context: moderngl.Context, levels: npt.NDArray[np.uint8 | np.uint16]) -> moderngl.Texture:
@@ -67,7 +49,7 @@ class ScreenView:
     resolution_px: tuple[int, int]
     screen_px: tuple[int, int]
     bits: int
-    orientation: Orientation = Orientation()
+    orientation: Orientation = field(default_factory=Orientation)
     cross_px: tuple[float, float] = (0.0, 0.0)
     triples: npt.NDArray[np.uint16] | None = None
 

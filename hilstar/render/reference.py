@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.scene.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
 from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
 
 RAYS_ACROSS = 5  # a pixel, along either axis: a limb is then within 0.02 px
+MAX_AT_ONCE_PX = 2**20  # pixels of sprites that are computed at once, which bounds memory
 REACH_SIGMAS = 5  # reach of a disc's light beyond its rectangle
 
 
@@ -20,18 +21,38 @@ def linear_image(
 
     `footprint_px` larger than the sprites' own shows what their footprints cut.
     """
-    width, height = resolution_px
-    size = sprites.footprint_px if footprint_px is None else footprint_px
-    image = np.zeros((height, width))
-    for light in sprites.extended:
-        _lay(light, image)
-    steps = np.arange(size) - (size - 1) // 2
-    for sprite, x_px, y_px in zip(sprites.data, sprites.x_px, sprites.y_px, strict=True):
-        columns, rows = sprite["pixel"][0] + steps, sprite["pixel"][1] + steps
-        columns, rows = columns[(columns >= 0) & (columns < width)], rows[(rows >= 0) & (rows < height)]
-        share_x, share_y = pixel_shares(columns - x_px, sigma_px[0]), pixel_shares(rows - y_px, sigma_px[1])
-        image[np.ix_(rows, columns)] += float(sprite["electrons_per_s"]) * np.outer(share_y, share_x)
+    image = extended_image(sprites.extended, resolution_px)
+    add_stars(image, sprites, sigma_px, sprites.footprint_px if footprint_px is None else footprint_px)
     return image
+
+
+def extended_image(lights: tuple[ExtendedLight, ...], resolution_px: tuple[int, int]) -> FloatArray:
+    """Electrons per second of each pixel, float64 (height, width), from discs, stray light and maps alone."""
+    width, height = resolution_px
+    image = np.zeros((height, width))
+    for light in lights:
+        _lay(light, image)
+    return image
+
+
+def add_stars(
+    image: FloatArray, sprites: Sprites, sigma_px: tuple[float, float], side_px: int, some: IntArray | slice = slice(None)
+) -> None:
+    """Add `some` of the sprites to an image (height, width), each within a square of `side_px`, one after the other."""
+    height, width = image.shape
+    steps = np.arange(side_px) - (side_px - 1) // 2
+    data, x_px, y_px = sprites.data[some], sprites.x_px[some], sprites.y_px[some]
+    at_once = max(1, MAX_AT_ONCE_PX // side_px**2)
+    for begin in range(0, len(data), at_once):
+        part = slice(begin, begin + at_once)
+        columns, rows = (data["pixel"][part, axis, None] + steps for axis in (0, 1))
+        share_x = pixel_shares(columns - x_px[part, None], sigma_px[0])
+        share_y = pixel_shares(rows - y_px[part, None], sigma_px[1])
+        light = data["electrons_per_s"][part, None, None].astype(np.float64) * (share_y[:, :, None] * share_x[:, None, :])
+        on_x, on_y = (columns >= 0) & (columns < width), (rows >= 0) & (rows < height)
+        inside = on_y[:, :, None] & on_x[:, None, :]
+        places = rows[:, :, None].astype(np.intp) * width + columns[:, None, :]
+        np.add.at(image.reshape(-1), places[inside], light[inside])
 
 
 def _lay(light: ExtendedLight, image: FloatArray) -> None:

@@ -7,20 +7,19 @@ from __future__ import annotations
 
 import zlib
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from types import TracebackType
-from typing import Literal, Self
+from typing import Self
 
 import moderngl
 import numpy as np
 
 from hilstar.arrays import Float32Array
-from hilstar.errors import InputError
-from hilstar.monitor.balance import AS_USUAL, Balance, Seen
+from hilstar.monitor.balance import Balance
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import Panel, Quantisation, mask_turn
-from hilstar.monitor.response import Levels, Response
+from hilstar.monitor.quantise import Panel, mask_turn
+from hilstar.monitor.response import Levels
 from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.render.backend import NO_FRAME, Path, Target
 from hilstar.render.context import Context, check_limits, create_context
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
@@ -29,7 +28,6 @@ from hilstar.render.encoder import (
     Encoder,
     Eraser,
     LevelTexture,
-    SpriteSides,
     lit_sides,
     most_covered_px,
     set_sides,
@@ -44,38 +42,7 @@ from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 FIRST_CAPACITY = 4096
-NO_FRAME = -1
 UNTIMED = nullcontext()
-Path = Literal["compute shaders", "points", "points, then compute shaders", "NumPy"]
-
-
-@dataclass(frozen=True, slots=True)
-class Target:
-    """What the renderer draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted.
-
-    `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere). `sides` are those
-    of fainter stars' sprites, by falling rates, of the same parity as the footprint. `seen` is how the tracker sees the
-    monitor, for `exact` and `temporal`.
-    """
-
-    resolution_px: tuple[int, int]
-    sigma_px: tuple[float, float]
-    response: Response | None = None
-    flux_at_white_e_per_s: float = 1.0
-    quantisation: Quantisation = "round"
-    uniformity: Float32Array | None = None
-    sides: SpriteSides = ()
-    seen: Seen = AS_USUAL
-
-    def panel(self) -> Panel | None:
-        """What turns light into levels, None without a response. Raises InputError for a map that does not fit."""
-        if self.response is None:
-            return None
-        width, height = self.resolution_px
-        if self.uniformity is not None and self.uniformity.shape != (height, width):
-            found = " x ".join(map(str, self.uniformity.shape[::-1]))
-            raise InputError(f"the uniformity map is {found} px and the monitor {width} x {height}; give one value per pixel")
-        return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
 
 
 class Renderer:
@@ -463,6 +430,10 @@ class Renderer:
         """The GL error since the last call, "GL_NO_ERROR" when there is none."""
         with self._ctx:
             return str(self._ctx.error)
+
+    def finish(self) -> None:
+        """Wait until everything that was asked for is drawn."""
+        self._ctx.finish()
 
     def close(self) -> None:
         """Free the GL context and everything in it."""

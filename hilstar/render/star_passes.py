@@ -13,8 +13,9 @@ import numpy as np
 
 from hilstar.monitor.footprints import PixelOrder
 from hilstar.monitor.quantise import CodeTable, Panel, code_table
+from hilstar.render.backend import SpriteSides
 from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
-from hilstar.render.encoder import LevelTexture, LookupTable, SpriteSides, build_compute
+from hilstar.render.encoder import LevelTexture, LookupTable, build_compute
 from hilstar.render.splat import set_sigma, share_define
 from hilstar.scene.psf import footprint_px, outside_share, peak_share, share_bound
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites

@@ -12,8 +12,9 @@ import moderngl
 import numpy as np
 
 from hilstar.monitor.response import Levels
+from hilstar.render.backend import Target
 from hilstar.render.encoder import build_program
-from hilstar.render.renderer import FIRST_CAPACITY, Renderer, Target
+from hilstar.render.renderer import FIRST_CAPACITY, Renderer
 from hilstar.render.splat import splat_program
 from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites

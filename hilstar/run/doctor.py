@@ -21,7 +21,7 @@ from hilstar.monitor.window.output_settings import OutputState, findings
 from hilstar.monitor.window.randr import lit_outputs
 from hilstar.monitor.window.window import displays, window_renderer
 from hilstar.notices import Notices
-from hilstar.render.context import computes_in_software, create_context, gpus, has_compute, leave_contexts
+from hilstar.render.context import described, gpus, leave_contexts
 from hilstar.resources import resource_path
 from hilstar.sky.catalog import load_catalog
 
@@ -94,14 +94,11 @@ def _python() -> str:
 
 
 def _gl() -> str:
-    ctx = create_context()
     try:
-        info = ctx.info
-        what = f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
-        exact = "compute shaders" if has_compute(ctx) else "NumPy (slow: their shaders need OpenGL 4.3)"
-        return f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'}, exact and temporal by {exact}"
-    finally:
-        ctx.release()
+        return described()
+    except MachineError as error:
+        until_then = "until then NumPy draws frame, simulate and verify, slower; serve, replay and demo need OpenGL"
+        raise MachineError(f"{error}; {until_then}") from error
 
 
 class _Unsaid(Notices):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import scipy.special  # noqa: F401 - takes 0.1 s, which the first star that might clip is not to cost its frame
 from msgspec import UNSET, UnsetType
@@ -20,6 +20,7 @@ from hilstar.bench.frame import Bench
 from hilstar.errors import GpuError
 from hilstar.frame.faults import FaultLayer
 from hilstar.notices import Notices
+from hilstar.render.renderer import Renderer
 from hilstar.run.faulty_frames import FaultyFrames
 from hilstar.run.pacer import AT_ONCE, ClockPacer, Moment, Pacer
 from hilstar.run.shown import FrameSink, OnScreen, Shown, ignore
@@ -79,7 +80,8 @@ class FrameLoop:
         self._presence = AttitudeWatch(self.notices, self.pacer.clock)
         self._faults = faults
         self.watch = FrameWatch(self._period_ns, self.notices, self.pacer.clock)
-        self._gpu = GpuWatch(bench.renderer, self.notices, self.stop, self.pacer.clock)
+        # A stream is opened with a GL context: NumPy never draws one.
+        self._gpu = GpuWatch(cast(Renderer, bench.renderer), self.notices, self.stop, self.pacer.clock)
 
     def draw(self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment = AT_ONCE) -> Shown | None:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank.

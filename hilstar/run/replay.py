@@ -111,7 +111,7 @@ class Play(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DrawnBy:
-    """Who draws a run's codes: the GL renderer and version as the driver names them, and the path (see `Renderer.path`)."""
+    """Who draws a run's codes: the GL renderer and version as the driver names them, and the path (see `Backend.path`)."""
 
     gl_renderer: str
     gl_version: str

@@ -10,7 +10,7 @@ from msgspec import UNSET, UnsetType
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import MESSAGE_REASONS, Reason
-from hilstar.render.renderer import Renderer
+from hilstar.render.backend import Backend
 from hilstar.run.sync import BeatSummary, SyncSummary
 from hilstar.running_statistics import Percentiles, RunningStatistics
 from hilstar.units import NS_PER_MS
@@ -139,7 +139,7 @@ class RunTally:
         stars = sorted(star for star in self.clipped_hip if isinstance(star, int))
         return ClippedSummary(self._clipped_max, stars, sorted(body for body in self.clipped_hip if isinstance(body, str)))
 
-    def summary(self, duration_s: float, counts: PacketCounts, renderer: Renderer) -> RunSummary:
+    def summary(self, duration_s: float, counts: PacketCounts, renderer: Backend) -> RunSummary:
         """What all kinds of run say; figures without a sample are None."""
         refused_by = {name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS}
         return RunSummary(

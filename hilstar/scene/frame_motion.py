@@ -36,6 +36,25 @@ EVERY = slice(None)
 
 
 @dataclass(frozen=True, slots=True)
+class Orientation:
+    """How the image lies on the screen: columns or rows reversed, and quarter turns clockwise."""
+
+    flip_x: bool = False
+    flip_y: bool = False
+    quarter_turns: int = 0
+
+    def screen_px(self, resolution_px: tuple[int, int]) -> tuple[int, int]:
+        """The screen that an image of `resolution_px` fills."""
+        return resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
+
+    @property
+    def down(self) -> tuple[int, int]:
+        """The direction of the screen's rows, from first to last, in image axes (x right, y down)."""
+        x, y = ((0, 1), (1, 0), (0, -1), (-1, 0))[self.quarter_turns % 4]
+        return (-x, -y) if self.flip_y else (x, y)
+
+
+@dataclass(frozen=True, slots=True)
 class Scan:
     """How a screen lights up: its rows in turn over `scanout_s`, each for `hold_s`.
 

@@ -19,7 +19,8 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.build import load
 from hilstar.bench.frame import Bench
 from hilstar.charts import BLUE, INK, MUTED, SERIES, capital, chart, label_ends, plain_ticks, value_bars, write_records
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscView, ExtendedLight, Pose, disc_lights

@@ -14,7 +14,8 @@ from hilstar.charts import BLUE, INK, MUTED, ORANGE, SMALL_PT, chart, label_ends
 from hilstar.monitor.phases import SIGMA_PX, WHITE
 from hilstar.monitor.quantise import EXPOSURE_FRAMES
 from hilstar.monitor.response import srgb_response
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.study.codes import (
     AIM_PX,

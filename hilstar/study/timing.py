@@ -23,7 +23,8 @@ from hilstar.bench.build import load
 from hilstar.bench.cameras import tracker_camera
 from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.quantise import shown_light
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
 from hilstar.scene.camera import Camera

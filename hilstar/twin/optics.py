@@ -16,7 +16,8 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.monitor.quantise import Panel
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import pack_sprites
 
@@ -68,7 +69,7 @@ class TwinOptics:
         self.geometry = geometry
         side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px / SUB
         sigma_x, sigma_y = (math.hypot(sigma, side_px / math.sqrt(12)) for sigma in psf_sigma_px)
-        self._renderer = Renderer(Target(geometry.tracker.resolution_px, (sigma_x, sigma_y)))
+        self._renderer = open_backend(Target(geometry.tracker.resolution_px, (sigma_x, sigma_y)), headless_context())
 
     def image_e_per_s(self, light_e_per_s: FloatArray) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of each monitor pixel (H, W), float64."""

@@ -30,8 +30,8 @@ from hilstar.frame.faults import FaultLayer
 from hilstar.frame.layers import light_of, seen_in, sky_layers
 from hilstar.frame.truth import TRUTH_DTYPE, added_truth, truth_table
 from hilstar.frame.view import STILL, Canvas, View
-from hilstar.render.context import Context, create_context
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.rotation import propagate
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import MIDDLE_S
@@ -45,6 +45,7 @@ from hilstar.tracker.settings import MAX_E, DetectorSettings
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 if TYPE_CHECKING:
+    from hilstar.render.context import Context
     from hilstar.sky.bodies.moving import MovingSky
 
 # The attitude at a time of the run, ns.
@@ -93,7 +94,7 @@ class Simulator:
         self._load_sky()
         self._load_tracker()
         target = Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px)
-        self.renderer = Renderer(target, context or create_context(self.config.render.gpu))
+        self.renderer = open_backend(target, context or headless_context(self.config.render.gpu))
 
     def _load_sky(self) -> None:
         self.sources = bench_sources(self.config, self.file.folder)
@@ -121,7 +122,7 @@ class Simulator:
         target = Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px)
         if target != self.renderer.target:
             self.renderer.close()
-            self.renderer = Renderer(target, create_context(self.config.render.gpu))
+            self.renderer = open_backend(target, headless_context(self.config.render.gpu))
 
     @property
     def moving(self) -> MovingSky | None:

@@ -19,9 +19,10 @@ from hilstar.frame.truth import brightest_in_view
 from hilstar.frame.view import Canvas, View
 from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels
 from hilstar.monitor.response import srgb_response
+from hilstar.render.backend import Target
 from hilstar.render.extended import ExtendedLayer, disc_tiles
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights

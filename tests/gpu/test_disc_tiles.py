@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import hilstar.render.extended as layer
+from hilstar.render.backend import Target
 from hilstar.render.extended import AIR_SMOOTH, MIN_TILED_PX, SMOOTH, disc_tiles
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, Shear
 from hilstar.sky.bodies.disc import EQUATOR_KM, Disc, earth_disc

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from hilstar.monitor.response import gamma_response
+from hilstar.render.backend import Target
 from hilstar.render.context import create_context
 from hilstar.render.driver import Driver
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.psf import footprint_px
 from tests.support.stars import sprites_at
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscView, Pose, disc_lights
 from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, Disc, earth_disc

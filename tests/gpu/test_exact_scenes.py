@@ -10,7 +10,8 @@ import pytest
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import srgb_response
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import pack_sprites
 from tests.support.exact_scenes import (

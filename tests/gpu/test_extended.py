@@ -9,7 +9,8 @@ import pytest
 
 from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels, shown_light
 from hilstar.monitor.response import srgb_response
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import GlowLight, LightMap
 from tests.support.stars import sprites_at

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hilstar.render import host_image
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.extended import LightMap
 from tests.support.stars import sprites_at

@@ -11,8 +11,9 @@ from hilstar.errors import InputError
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, dither_levels, round_levels, shown_light, turned_mask
 from hilstar.monitor.response import bit_stealing_response, gamma_response, srgb_response
+from hilstar.render.backend import Target
 from hilstar.render.encoder import CUT_WINGS
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.psf import footprint_px
 from tests.support.stars import sprites_at
 

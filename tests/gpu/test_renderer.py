@@ -11,8 +11,9 @@ import pytest
 from hilstar.errors import InputError, MachineError
 from hilstar.monitor.response import encode, srgb_response
 from hilstar.render import context as context_module
+from hilstar.render.backend import Target
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.psf import MAX_CUT, footprint_px
 from hilstar.scene.sprites import Sprites
 from tests.support.stars import sprites_at

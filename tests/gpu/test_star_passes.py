@@ -9,8 +9,8 @@ import pytest
 
 from hilstar.monitor.quantise import round_levels
 from hilstar.monitor.response import gamma_response, srgb_response
-from hilstar.render.encoder import SpriteSide
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import SpriteSide, Target
+from hilstar.render.renderer import Renderer
 from hilstar.render.star_passes import MAX_UNIT, WINGS
 from hilstar.scene.extended import LightMap
 from hilstar.scene.psf import footprint_px, outside_share, pixel_shares, share_bound

@@ -10,8 +10,9 @@ import pytest
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import gamma_response, srgb_response, table_response
 from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.render.backend import Target
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.extended import LightMap
 from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.scene.sprites import pack_sprites

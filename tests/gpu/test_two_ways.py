@@ -14,9 +14,9 @@ import pytest
 from hilstar.bench.build import load
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.notices import Notices
+from hilstar.render.backend import SpriteSide, Target
 from hilstar.render.context import computes_in_software
-from hilstar.render.encoder import SpriteSide
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.render.star_passes import StarPasses
 from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.replay import OTHER_CODES, DrawnBy, Wanted, plan_play, replay

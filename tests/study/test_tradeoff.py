@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from hilstar.errors import InputError
+from hilstar.render.backend import Target
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Target
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE

@@ -26,9 +26,10 @@ from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.render.context import leave_contexts
-from hilstar.render.presenter import Orientation, Presenter, ScreenView, level_texture, window_context
+from hilstar.render.presenter import Presenter, ScreenView, level_texture, window_context
 from hilstar.run.screen.gate import Timing, pass_gate
 from hilstar.run.screen.screen import Screen
+from hilstar.scene.frame_motion import Orientation
 
 if TYPE_CHECKING:
     from hilstar.monitor.window.window import Window

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
+from typing import cast
 
 from hilstar.bench.build import orientation_of
 from hilstar.bench.frame import Bench
 from hilstar.monitor.window.output_settings import OutputState
 from hilstar.monitor.window.window import Window
 from hilstar.render.presenter import Presenter, ScreenView, changed_codes
+from hilstar.render.renderer import Renderer
 from hilstar.run.operator import Aids
 from hilstar.run.screen.photodiode import marker_light
 from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
@@ -45,8 +47,9 @@ class Screen:
             cross_px=bench.camera.boresight_px,
             triples=bench.calibration.response.rgb,
         )
-        self._presenter = Presenter(bench.renderer.codes_texture, view)
-        bench.renderer.tables.append(self._presenter.table)
+        self._renderer = cast(Renderer, bench.renderer)  # a window's bench has the window's context
+        self._presenter = Presenter(self._renderer.codes_texture, view)
+        self._renderer.tables.append(self._presenter.table)
 
     def keep_time(self, period_ms: float, by_screen: bool, swap_ns: int) -> None:
         """Predict swaps from the one at `swap_ns`, by the screen's own period where the screen keeps time."""
@@ -73,7 +76,7 @@ class Screen:
 
     def changed_codes(self) -> str:
         """Which codes the driver draws otherwise than they are; "" for none."""
-        return changed_codes(self.bench.renderer.context, self.window.size_px, self.bench.config.monitor.bits)
+        return changed_codes(self._renderer.context, self.window.size_px, self.bench.config.monitor.bits)
 
     def present(self, number: int) -> int | None:
         """Draw the bench's last frame on the back buffer; the photodiode square's light in frame `number`, None without one."""

@@ -120,7 +120,7 @@ class Stopwatch:
         sprites = bench.light(bench.view(attitude.q_icrs_to_cam, chain.rate(attitude)))
         marks.append(time.perf_counter())
         drawn = bench.draw_sprites(sprites, number)
-        bench.renderer.context.finish()
+        bench.renderer.finish()
         marks.append(time.perf_counter())
         _ = drawn.levels
         marks.append(time.perf_counter())

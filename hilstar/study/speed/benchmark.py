@@ -29,7 +29,8 @@ from hilstar.bench.build import open_bench
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.process.interrupts import held
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.render.variants import StagedRenderer
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.psf import SQRT2

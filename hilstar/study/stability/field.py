@@ -22,7 +22,8 @@ from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.quantise import Quantisation
 from hilstar.monitor.response import srgb_response
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.rotation import (
     angle_between_rad,
     direction_of,

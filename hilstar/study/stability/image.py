@@ -14,9 +14,10 @@ from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 from hilstar.monitor.quantise import Panel, Quantisation, shown_light
 from hilstar.monitor.response import Levels, Response, srgb_response
+from hilstar.render.backend import Target
 from hilstar.render.context import create_context
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.scene.psf import MAX_CUT, SQRT2, cut_share, footprint_px, peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
 from hilstar.study.stability import FailureCase, Figures

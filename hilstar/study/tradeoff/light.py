@@ -17,8 +17,9 @@ from hilstar.bench.build import bench_calibration, brightest_peak_e_per_s
 from hilstar.bench.cameras import ideal_monitor
 from hilstar.bench.config import Monitor, RenderSettings, SkySettings
 from hilstar.monitor.phases import WHITE, fainter, measure
+from hilstar.render.backend import Target
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Renderer
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import MAX_CUT, footprint_px, peak_share

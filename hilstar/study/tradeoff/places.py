@@ -21,8 +21,8 @@ from hilstar.bench.cameras import ideal_monitor
 from hilstar.bench.config import BenchConfig, RenderSettings, read_config
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.phases import measure
+from hilstar.render.backend import Target
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Target
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.resources import resource_path
 from hilstar.rotation import angle_between_rad, normalise, to_matrix

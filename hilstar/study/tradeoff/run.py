@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, title_lines, two_digits, write_csv
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.backend import Target
+from hilstar.render.renderer import Renderer
 from hilstar.study.tradeoff.light import brightness, depth, psf, quantisation, spectrum
 from hilstar.study.tradeoff.places import SIGMA_PX, culling, prediction, projection, smear
 from hilstar.study.tradeoff.table import Figure, MethodRow, TradeoffStep, Trials, measured

@@ -27,7 +27,7 @@ from hilstar.calibrate.first_light.records import KeyChange, StepOutcome, rewrit
 from hilstar.calibrate.first_light.session import FirstLightSession, SessionStep
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.render.presenter import Orientation
+from hilstar.scene.frame_motion import Orientation
 from hilstar.twin.optics import BenchGeometry
 from tests.support.benches import bench_text
 from tests.support.damage import NO_JSON

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.render.presenter import Orientation
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.scene import sprites as sprites_module
-from hilstar.scene.frame_motion import EXTRA_SPRITES, CameraTurn, Scan, swept_sprites
+from hilstar.scene.frame_motion import EXTRA_SPRITES, CameraTurn, Orientation, Scan, swept_sprites
 from hilstar.scene.paths import MAX_NODES
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import clipped_sprites, make_sprites

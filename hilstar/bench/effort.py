@@ -14,7 +14,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.config import RenderSettings
 from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.phases import UNLIKE, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
-from hilstar.monitor.quantise import EXPOSURE_FRAMES, Panel, Quantisation
+from hilstar.monitor.quantise import EXPOSURE_FRAMES, QUANTISERS, Panel, Quantisation
 from hilstar.monitor.response import Response
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, exact_shader_takes
 from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, outside_share, peak_share, pixel_share
@@ -259,7 +259,7 @@ def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> 
     sizes = range(full % 2 or 2, full, 2)
     largest = next((s for s in sizes if cut_mag(s, sigma_px) <= allowed_mag and cut_px(s, sigma_px) <= allowed_px), full)
     sides = [(math.inf, largest)]
-    if method in ("round", "exact", "temporal"):
+    if not QUANTISERS[method].dithered:
         unlit = UNLIT * float(light.response.threshold[0]) * light.white_e_per_s
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
         sides += [(unlit / outside_share(size, sigma_px), size) for size in sizes[::-1] if size < largest]

@@ -24,7 +24,7 @@ from hilstar.frame.truth import clipped_in, designations, sprite_names, sprite_t
 from hilstar.frame.view import STILL, Canvas, Layer, View
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap, star_losses_mag
-from hilstar.monitor.quantise import Panel, shown_light
+from hilstar.monitor.quantise import QUANTISERS, Panel, Quantiser, shown_light
 from hilstar.monitor.response import Codes, Levels, code_dtype
 from hilstar.render.backend import Backend
 from hilstar.rotation import normalise
@@ -133,6 +133,11 @@ class Bench:
     def panel(self) -> Panel:
         """The monitor's light by its levels."""
         return Panel(self.calibration.response, self.flux_at_white_e_per_s, self.uniformity)
+
+    @property
+    def quantiser(self) -> Quantiser:
+        """How its light becomes levels."""
+        return QUANTISERS[self.renderer.target.quantisation]
 
     @property
     def _sigma_px(self) -> tuple[float, float]:

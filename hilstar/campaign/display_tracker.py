@@ -91,7 +91,7 @@ class DisplayTracker:
         """The mean light (H, W) of the display over the exposure."""
         count, moving = 1, self._bench.moving
         streaks = moving is not None and moving.satellites is not None
-        if streaks or view.turn.rate_cam_rad_s.any() or self.config.render.quantisation == "temporal":
+        if streaks or view.turn.rate_cam_rad_s.any() or self._bench.quantiser.over_frames:
             count = max(1, round(view.exposure_s * self.config.monitor.refresh_hz))
         total: FloatArray | None = None
         for frame in range(count):

@@ -9,9 +9,8 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.monitor.balance import Balance
-from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import Panel, Quantisation, dither_levels, round_levels, shown_light
-from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.monitor.quantise import QUANTISERS, Panel, Quantisation, dither_levels, round_levels, shown_light
+from hilstar.monitor.temporal import star_quantiser
 from hilstar.scene.psf import footprint_px, peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.units import flux_ratio, magnitude
@@ -108,13 +107,14 @@ def shown_by(
     `balance` is that of `exact`, with the sprites' sigma.
     """
     size = linear.shape[1], linear.shape[0]
-    if method == "exact":
-        return shown_light(ExactQuantiser(panel, size, balance.sigma_px, balance.seen).levels(sprites), panel)
-    if method == "temporal":
-        quantiser = TemporalQuantiser(panel, size, balance.sigma_px, balance.seen)
-        for _ in range(FRAMES_BEFORE):
-            quantiser.levels(sprites)
-        frames = (shown_light(quantiser.levels(sprites), panel) for _ in range(exposure_frames))
-        return np.asarray(sum(frames) / exposure_frames)
-    levels = round_levels if method == "round" else dither_levels
-    return shown_light(levels(linear, panel), panel)
+    does = QUANTISERS[method]
+    if not does.by_star:
+        levels = dither_levels if does.dithered else round_levels
+        return shown_light(levels(linear, panel), panel)
+    quantiser = star_quantiser(method)(panel, size, balance.sigma_px, balance.seen)
+    if not does.over_frames:
+        return shown_light(quantiser.levels(sprites), panel)
+    for _ in range(FRAMES_BEFORE):
+        quantiser.levels(sprites)
+    frames = (shown_light(quantiser.levels(sprites), panel) for _ in range(exposure_frames))
+    return np.asarray(sum(frames) / exposure_frames)

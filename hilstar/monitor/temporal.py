@@ -16,6 +16,7 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, IntArray
 from hilstar.monitor.exact import Carried, ExactQuantiser, Left, nothing_carried
+from hilstar.monitor.quantise import QUANTISERS, Quantisation
 from hilstar.monitor.response import Levels
 from hilstar.scene.sprites import Sprites
 
@@ -82,3 +83,8 @@ def first_phases(star: IntArray, before: IntArray) -> Float32Array:
     """The part of a step (n,), -0.5 to 0.5, that new stars have in hand; 0 for those that were there before."""
     turned = (star.astype(np.uint64) * np.uint64(GOLDEN) & np.uint64(0xFFFFFFFF)).astype(np.float64) / 2**32 - 0.5
     return np.where(before == NONE_BEFORE, turned, 0.0).astype(np.float32)
+
+
+def star_quantiser(method: Quantisation) -> type[ExactQuantiser]:
+    """The NumPy oracle of a quantisation that chooses star by star."""
+    return TemporalQuantiser if QUANTISERS[method].over_frames else ExactQuantiser

@@ -15,9 +15,9 @@ import numpy as np
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import MachineError
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import Panel, dither_levels, mask_turn, round_levels
+from hilstar.monitor.quantise import QUANTISERS, Panel, dither_levels, mask_turn, round_levels
 from hilstar.monitor.response import Levels
-from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.monitor.temporal import star_quantiser
 from hilstar.render.backend import EGL_LIBRARY, NO_FRAME, Backend, Path, Target
 from hilstar.render.reference import add_stars, extended_image
 from hilstar.scene.extended import ExtendedLight
@@ -89,9 +89,10 @@ class NumpyBackend:
         self._lights: tuple[ExtendedLight, ...] = ()
         self._lights_image: FloatArray | None = None
         self._chooser: ExactQuantiser | None = None
-        if self._panel is not None and target.quantisation in ("exact", "temporal"):
-            kind = TemporalQuantiser if target.quantisation == "temporal" else ExactQuantiser
-            self._chooser = kind(self._panel, target.resolution_px, target.sigma_px, target.seen)
+        self._quantiser = QUANTISERS[target.quantisation]
+        if self._panel is not None and self._quantiser.by_star:
+            chooser = star_quantiser(target.quantisation)
+            self._chooser = chooser(self._panel, target.resolution_px, target.sigma_px, target.seen)
 
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw `sprites` (None: blank); see `Backend.draw`."""
@@ -106,10 +107,10 @@ class NumpyBackend:
         """The levels of a frame by the target's quantisation."""
         if self._chooser is None:
             image = self._image(sprites, shrunk=True)
-            return dither_levels(image, panel) if self.target.quantisation == "dither" else round_levels(image, panel)
+            return dither_levels(image, panel) if self._quantiser.dithered else round_levels(image, panel)
         floor = None
         if sprites is not None and sprites.extended:  # stars are added to its dithered light
-            turn = mask_turn(frame) if self.target.quantisation == "temporal" else 0.0
+            turn = mask_turn(frame) if self._quantiser.over_frames else 0.0
             floor = dither_levels(self._extended(sprites).astype(np.float32), panel, turn)
         return self._chooser.levels(sprites, floor)
 

@@ -16,9 +16,9 @@ import numpy as np
 from hilstar.arrays import Float32Array
 from hilstar.monitor.balance import Balance
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import Panel, mask_turn
+from hilstar.monitor.quantise import QUANTISERS, Panel, mask_turn
 from hilstar.monitor.response import Levels
-from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.monitor.temporal import star_quantiser
 from hilstar.render.backend import NO_FRAME, Path, Target
 from hilstar.render.context import Context, check_limits, create_context
 from hilstar.render.driver import Driver
@@ -55,7 +55,8 @@ class Renderer:
         self.footprint_px = footprint_px(target.sigma_px)
         self._undrawn: tuple[Sprites | None, bool] | None = None
         self._by_numpy = False
-        self._star_by_star = target.response is not None and target.quantisation in ("exact", "temporal")
+        self._quantiser = QUANTISERS[target.quantisation]
+        self._star_by_star = target.response is not None and self._quantiser.by_star
         self._last_frame = NO_FRAME
         self._ctx = context or create_context()
         try:
@@ -135,10 +136,10 @@ class Renderer:
             return
         self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
         if self._star_by_star and ExactPass.runs_on(self._ctx, target.sigma_px):
-            balance = Balance(target.sigma_px, target.seen, over_frames=target.quantisation == "temporal")
+            balance = Balance(target.sigma_px, target.seen, over_frames=self._quantiser.over_frames)
             self._exact_pass = ExactPass(self._linear, self._levels, panel, balance)
         if not self._star_by_star or self._exact_pass is not None:
-            dithered = target.quantisation == "dither"
+            dithered = self._quantiser.dithered
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
             self._lit_sides = () if dithered else target.sides or lit_sides(panel, target.sigma_px, self.footprint_px)
             self._encoder.shrink(self._lit_sides)
@@ -276,14 +277,12 @@ class Renderer:
         target, panel, levels = self.target, self.target.panel(), self._levels
         if panel is None or levels is None:
             return
-        temporal = target.quantisation == "temporal"
         if self._exact is None:
-            quantiser = TemporalQuantiser if temporal else ExactQuantiser
-            self._exact = quantiser(panel, target.resolution_px, target.sigma_px, target.seen)
+            self._exact = star_quantiser(target.quantisation)(panel, target.resolution_px, target.sigma_px, target.seen)
         if self._exact_pass is not None and (left := self._exact_pass.left) is not None:
             self._exact.left, self._exact_pass.left = left, None
         lights = () if sprites is None else sprites.extended
-        floor = self._floor(lights, mask_turn(frame) if temporal else 0.0, panel, levels) if lights else None
+        floor = self._floor(lights, mask_turn(frame) if self._quantiser.over_frames else 0.0, panel, levels) if lights else None
         self._exact_levels = self._exact.levels(sprites, floor)
         levels.write(self._exact_levels)
 

@@ -24,7 +24,7 @@ from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, printable
-from hilstar.monitor.quantise import Quantisation
+from hilstar.monitor.quantise import QUANTISERS, Quantisation
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import NO_RECORDING, Recording, read_recording, replayed_faults
@@ -38,10 +38,6 @@ from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
 
 MAX_FRAMES = 100_000_000
-# Largest share of a frame's lit pixels whose codes may be one off where another renderer draws the same light. Measured with
-# light that is off by 2.4e-7, as by another driver's exp2, over ten skies: 3e-6 of `round`, 1.1e-3 of `exact`, 1.9e-3 of
-# `temporal`. A choice of `exact` has ties that the last bit decides, and takes a star's other pixels with it.
-OTHER_CODES: dict[Quantisation, float] = {"round": 1e-4, "dither": 1e-4, "exact": 5e-3, "temporal": 5e-3}
 # `exact` in NumPy is another program than its shader: of two choices that are as good it may take the other.
 OTHER_CODES_BY_NUMPY = 0.35
 
@@ -126,7 +122,7 @@ class DrawnBy:
         if self == other:
             return 0.0
         by_numpy = (self.path == "NumPy") != (other.path == "NumPy")
-        return OTHER_CODES_BY_NUMPY if by_numpy else OTHER_CODES[quantisation]
+        return OTHER_CODES_BY_NUMPY if by_numpy else QUANTISERS[quantisation].other_codes
 
 
 @dataclass(frozen=True, slots=True)

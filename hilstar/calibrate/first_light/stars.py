@@ -166,7 +166,7 @@ def see_stars(context: StepContext) -> StarsSeen:
 
 def _levels(bench: Bench, frame: Frame) -> tuple[Levels, ...]:
     """The levels of a frame, or with `temporal` of all frames of an exposure."""
-    if bench.config.render.quantisation != "temporal":
+    if not bench.quantiser.over_frames:
         return (frame.levels,)
     return tuple(Levels(bench.draw(frame.q_icrs_to_cam, k).levels.copy()) for k in range(bench.config.exposure_frames))
 

@@ -44,7 +44,7 @@ def exposure_lights(
 
     With `temporal` that is one of the first PHASES frames of a sequence, which `frame` is the first of.
     """
-    if bench.config.render.quantisation != "temporal":
+    if not bench.quantiser.over_frames:
         return [shown_light(frame.levels, panel) for panel in panels]
     before, count = first_frame % PHASES, max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
     lights = [np.zeros(frame.levels.shape) for _ in panels]

@@ -6,13 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import api_page
-import bench_page
 import command_page
 import drawings
 
+from hilstar.bench.config import reference
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES: dict[str, Callable[[], str]] = {
-    "bench-file.md": bench_page.page,
+    "bench-file.md": reference.page,
     "commands.md": command_page.page,
     "python-api.md": api_page.page,
     **drawings.DRAWINGS,

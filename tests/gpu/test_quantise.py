@@ -228,7 +228,7 @@ def block_sums(image, side=16):
 
 
 def test_without_compute_shaders_exact_is_numpy_s(monkeypatch, rng):
-    monkeypatch.setattr("hilstar.render.context.MIN_COMPUTE_VERSION", 999)
+    monkeypatch.setattr("hilstar.render.backend.MIN_COMPUTE_VERSION", 999)
     target = target_of(RESPONSES["srgb8"], "exact")
     with Renderer(target) as gl:
         for count in (300, 20):

@@ -94,7 +94,7 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
 
 
 def test_without_compute_shaders_it_is_numpy_s(monkeypatch):
-    monkeypatch.setattr("hilstar.render.context.MIN_COMPUTE_VERSION", 999)
+    monkeypatch.setattr("hilstar.render.backend.MIN_COMPUTE_VERSION", 999)
     target = Target(SIZE, SIGMA, srgb_response(8), WHITE, "temporal")
     oracle, sprites = TemporalQuantiser(target.panel(), SIZE, SIGMA), stars(*places(), SIX_MAG)
     with Renderer(target) as gl:

@@ -13,7 +13,7 @@ FRAME = """
 import json, threading, time
 import moderngl, numpy as np
 from hilstar.monitor.window.window import Window, WindowSettings
-from hilstar.render.presenter import Presenter, View, level_texture, window_context
+from hilstar.render.presenter import Presenter, ScreenView, level_texture, window_context
 
 TRIANGLE = "void main() { gl_Position = vec4(gl_VertexID / 2 * 4.0 - 1.0, gl_VertexID % 2 * 4.0 - 1.0, 0.0, 1.0); }"
 SINES = "float x = gl_FragCoord.x; for (int i = 0; i < 400; i++) x = sin(x) + 1.1;"
@@ -28,7 +28,7 @@ size = (320, 240)
 with Window(WindowSettings(size, 8)) as window:
     context = window_context()
     texture = level_texture(context, np.zeros(size[::-1], np.uint8))
-    presenter = Presenter(texture, View(size, window.size_px, 8))
+    presenter = Presenter(texture, ScreenView(size, window.size_px, 8))
     program = context.program(
         vertex_shader=f"#version 330\\n{TRIANGLE}",
         fragment_shader=f"#version 330\\nout uint level; void main() {{ {SINES} level = x > 9.0 ? 1u : 2u; }}",

@@ -12,9 +12,9 @@ import pytest
 from msgspec.structs import FieldInfo
 
 from hilstar.bench.config import BenchConfig, read_config
+from hilstar.bench.config.reference import is_table, page, tables_of
 from hilstar.toml_tables import plain
 from tests.support.benches import SMALL_BENCH
-from tools.bench_page import is_table, page, tables_of
 
 KEYS = [
     (name, field)

@@ -1,4 +1,4 @@
-"""bench-file.md, the reference of the bench file: `python tools/make_pages.py` writes it.
+"""The reference of the bench file, docs/bench-file.md: `python -m hilstar.bench.config.reference` prints it.
 
 All of it comes from the classes of the tables: keys, types, units, limits, defaults and meanings.
 """
@@ -162,3 +162,7 @@ def toml(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(toml, value))}]"
     return msgspec.json.encode(value).decode()
+
+
+if __name__ == "__main__":
+    print(page(), end="")

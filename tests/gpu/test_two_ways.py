@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hilstar.bench.build import load
+from hilstar.monitor.quantise import QUANTISERS
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.notices import Notices
 from hilstar.render.backend import SpriteSide, Target
@@ -19,7 +20,7 @@ from hilstar.render.context import computes_in_software
 from hilstar.render.renderer import Renderer
 from hilstar.render.star_passes import StarPasses
 from hilstar.run.record.ledger import Ledger, LedgerSwitch
-from hilstar.run.replay import OTHER_CODES, DrawnBy, Wanted, plan_play, replay
+from hilstar.run.replay import DrawnBy, Wanted, plan_play, replay
 from hilstar.run.serve import Outlet
 from hilstar.scene.extended import LightMap
 from hilstar.scene.psf import footprint_px, outside_share
@@ -173,10 +174,10 @@ def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_i
     monkeypatch.setattr(StarPasses, "runs_on", staticmethod(lambda context: False))
     by_points, told, now = replayed(path, ledger)
     assert len(told) == 1 and str(before) in told[0] and str(now) in told[0]
-    assert before.other_codes(now, quantisation) == OTHER_CODES[quantisation]
+    assert before.other_codes(now, quantisation) == QUANTISERS[quantisation].other_codes
     for number, codes in first.items():
         assert np.abs(codes.astype(int) - by_points[number]).max() <= 1
-        assert np.count_nonzero(codes != by_points[number]) <= OTHER_CODES[quantisation] * np.count_nonzero(codes)
+        assert np.count_nonzero(codes != by_points[number]) <= QUANTISERS[quantisation].other_codes * np.count_nonzero(codes)
     assert max(codes.max() for codes in first.values()) > 0
 
 
@@ -213,4 +214,6 @@ def test_another_driver_s_codes_are_within_what_replay_says(tmp_path, quantisati
     for number in first.files:
         assert np.count_nonzero(first[number]) > 100
         assert np.abs(first[number].astype(int) - second[number]).max() <= 1
-        assert np.count_nonzero(first[number] != second[number]) <= OTHER_CODES[quantisation] * np.count_nonzero(first[number])
+        assert np.count_nonzero(first[number] != second[number]) <= QUANTISERS[quantisation].other_codes * np.count_nonzero(
+            first[number]
+        )

@@ -12,9 +12,10 @@ import pytest
 from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.bench.config import parse_config
 from hilstar.errors import InputError
+from hilstar.monitor.quantise import QUANTISERS
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
-from hilstar.run.replay import OTHER_CODES, OTHER_CODES_BY_NUMPY, DrawnBy, Wanted, plan_play
+from hilstar.run.replay import OTHER_CODES_BY_NUMPY, DrawnBy, Wanted, plan_play
 from tests.support.benches import SMALL_BENCH
 
 MAX = math.inf
@@ -149,6 +150,6 @@ def test_another_renderer_s_codes_may_be_others_and_the_same_one_s_may_not():
     here = DrawnBy("llvmpipe", "4.5", "compute shaders")
     assert here.other_codes(DrawnBy("llvmpipe", "4.5", "compute shaders"), "exact") == 0
     for other in (replace(here, gl_renderer="zink"), replace(here, gl_version="4.6"), replace(here, path="points")):
-        assert here.other_codes(other, "round") == OTHER_CODES["round"]
-        assert here.other_codes(other, "exact") == OTHER_CODES["exact"]
+        assert here.other_codes(other, "round") == QUANTISERS["round"].other_codes
+        assert here.other_codes(other, "exact") == QUANTISERS["exact"].other_codes
     assert here.other_codes(replace(here, path="NumPy"), "exact") == OTHER_CODES_BY_NUMPY

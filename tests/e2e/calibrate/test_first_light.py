@@ -194,7 +194,7 @@ def ended_at(process, folder, image, ending):
 
 def untouched(taken):
     """How many of the images are as they were; the last one may have been cut short, and is taken again."""
-    return sum(path.stat().st_mtime_ns == when for path, when in taken.items())
+    return sum(path.exists() and path.stat().st_mtime_ns == when for path, when in taken.items())
 
 
 def test_a_session_killed_half_way_goes_on_where_it_was(tmp_path):

@@ -45,7 +45,7 @@ def events(ledger: Path) -> list[EventRecord]:
 
 def test_health_says_what_is_wrong_and_turns_within_half_a_second(run):
     served, page, _ = run
-    assert page.json("/health")["reasons"] == ["no attitude has come yet"]
+    wait_for(lambda: page.json("/health")["reasons"] == ["no attitude has come yet"], served.lines)
     with connected(served.port) as sender:
         for attempt in range(CHANCES):
             with talking(sender, first=1 + 10_000 * attempt):

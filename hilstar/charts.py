@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -25,8 +26,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
 Record = TypeVar("Record")
+SideNames = Sequence[tuple[str, tuple[float, float], str]]  # name, place in the data, colour
 Share = Literal["row", "col"]
 
 WIDTH_INCH = 7.6  # 730 CSS pixels: a column of text
@@ -52,6 +55,7 @@ DARK = {
     TEAL: "#56cfe0",
     RED: "#ff7b7b",
 }
+_SIDE_NAMES: WeakKeyDictionary[Any, list[tuple[Any, SideNames]]] = WeakKeyDictionary()  # of figures that are being drawn
 STYLE: Any = {
     "font.size": TEXT_PT,
     "text.color": INK,
@@ -146,16 +150,38 @@ def panels_of(
 
 
 def finish(figure: Figure) -> None:
-    """Make ticks and labels uniform: plain figures on logarithmic axes, a capital first."""
+    """Make labels, ticks and names at the side uniform, and lay the figure out: to know its panels' sizes, then for good."""
     from matplotlib.ticker import LogLocator
 
-    figure.draw_without_rendering()
-    for axes in figure.axes:
-        for axis, length_px, apart_px in ((axes.xaxis, axes.bbox.width, 45), (axes.yaxis, axes.bbox.height, 25)):
-            if isinstance(axis.get_major_locator(), LogLocator):
-                log_ticks(axis, length_px / apart_px)
+    panels, side_names = figure.axes, _SIDE_NAMES.pop(figure, [])
+    for axes in panels:
+        for axis in (axes.xaxis, axes.yaxis):
             axis.set_label_text(capital(axis.get_label_text()))
         axes.set_title(capital(axes.get_title(loc="left")))
+    log_axes = [
+        axis for axes in panels for axis in (axes.xaxis, axes.yaxis) if isinstance(axis.get_major_locator(), LogLocator)
+    ]
+    drafts = [text for axes, named in side_names for text in _name_at_side(axes, named, arrows=False)]
+    for axis in log_axes:
+        axis.set_ticks([], minor=True)
+    if side_names or log_axes:
+        _lay_out(figure)
+    for text in drafts:
+        text.remove()
+    for axes, named in side_names:
+        _name_at_side(axes, named)
+    for axis in log_axes:
+        box = axis.axes.bbox
+        log_ticks(axis, box.width / 45 if axis.axis_name == "x" else box.height / 25)
+    _lay_out(figure)
+    figure.set_layout_engine("none")  # each file that is written would repeat it
+
+
+def _lay_out(figure: Figure) -> None:
+    """Give the panels the sizes that their texts leave."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
 
 
 def capital(text: str) -> str:
@@ -217,10 +243,17 @@ def log_ticks(axis: Axis, room: float) -> None:
 
 
 def label_ends(*panels: Axes) -> None:
-    """Names of lines in their colours, right of each panel where each line ends, in place of a legend, when all is drawn."""
-    panels[0].figure.draw_without_rendering()  # type: ignore[union-attr]
+    """Names of lines in their colours, right of each panel where each line ends, in place of a legend."""
     for axes in panels:
-        _name_at_side(axes, list(_line_ends(axes)))
+        name_at_side(axes, [])
+
+
+def name_at_side(axes: Axes, named: SideNames) -> None:
+    """Names of points (x, y) of the data, with their colours, in a column right of the axes, level where there is room.
+
+    Without any, lines are named where they end. The names are placed when the chart is finished.
+    """
+    _SIDE_NAMES.setdefault(axes.figure, []).append((axes, named))
 
 
 def _line_ends(axes: Axes) -> Iterator[tuple[str, tuple[float, float], str]]:
@@ -236,33 +269,30 @@ def _line_ends(axes: Axes) -> Iterator[tuple[str, tuple[float, float], str]]:
             yield str(line.get_label()), place, str(line.get_color())
 
 
-def name_at_side(axes: Axes, named: Sequence[tuple[str, tuple[float, float], str]]) -> None:
-    """Names of points (x, y) of the data, with their colours, in a column right of the axes, level where there is room."""
-    axes.figure.draw_without_rendering()  # type: ignore[union-attr]
-    _name_at_side(axes, named)
-
-
-def _name_at_side(axes: Axes, named: Sequence[tuple[str, tuple[float, float], str]]) -> None:
-    """`name_at_side` on a figure that is laid out."""
+def _name_at_side(axes: Axes, named: SideNames, arrows: bool = True) -> list[Text]:
+    """The names of a panel, apart as its height now asks for, with arrows to what is far."""
     gap = 1.3 * SMALL_PT / 72 * axes.figure.dpi / axes.bbox.height
-    at = {each: axes.transAxes.inverted().transform(axes.transData.transform(each[1])) for each in named}
-    falling = sorted(named, key=lambda each: -at[each][1])
+    texts: list[Text] = []
+    at = {each: axes.transAxes.inverted().transform(axes.transData.transform(each[1])) for each in named or _line_ends(axes)}
+    falling = sorted(at, key=lambda each: -at[each][1])
     for each, height in zip(falling, spread([float(at[one][1]) for one in falling], gap), strict=True):
         name, place, colour = each
         far = abs(height - at[each][1]) > gap / 3 or at[each][0] < 0.93
-        axes.annotate(
-            name,
-            place,
-            (1.035 if far else 1.015, height),
-            textcoords="axes fraction",
-            va="center",
-            fontsize=SMALL_PT,
-            color=colour,
-            arrowprops={"arrowstyle": "-", "color": colour, "alpha": 0.5, "lw": 0.8, "shrinkB": 3, "relpos": (0, 0.5)}
-            if far
-            else None,
-            annotation_clip=False,
+        arrow = {"arrowstyle": "-", "color": colour, "alpha": 0.5, "lw": 0.8, "shrinkB": 3, "relpos": (0, 0.5)}
+        texts.append(
+            axes.annotate(
+                name,
+                place,
+                (1.035 if far else 1.015, height),
+                textcoords="axes fraction",
+                va="center",
+                fontsize=SMALL_PT,
+                color=colour,
+                arrowprops=arrow if far and arrows else None,
+                annotation_clip=False,
+            )
         )
+    return texts
 
 
 def spread(heights: Sequence[float], gap: float) -> list[float]:

@@ -14,8 +14,12 @@ VALID = "valid"
 FLAGS = {"": True, "1": True, "0": False, "true": True, "false": False}
 
 
-def read_rows(path: Path, columns: tuple[str, ...], advice: str, limit_bytes: int) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers with the cells of `columns` and of `valid`, "" where that is not there; blank rows and comments are skipped.
+def read_rows(
+    path: Path, columns: tuple[str, ...], advice: str, limit_bytes: int, more: tuple[str, ...] = (VALID,)
+) -> Iterator[tuple[int, list[str]]]:
+    """Line numbers with the cells of `columns` and of `more`, "" where these are not there.
+
+    Blank rows and comments are skipped.
 
     Raises InputError, with `advice`, for a column that is missing or there twice, and for a row that is cut short.
     """
@@ -28,13 +32,11 @@ def read_rows(path: Path, columns: tuple[str, ...], advice: str, limit_bytes: in
             wrong += [f"{name} is there twice" for name in columns if header.count(name) > 1]
             if wrong:
                 raise InputError(f"{path}:{max(reader.line_num, 1)}: column {wrong[0]}; {advice}")
-            places = [header.index(name) for name in columns]
-            flag = header.index(VALID) if VALID in header else None
+            places = [header.index(name) if name in header else None for name in (*columns, *more)]
             for row in rows:
                 if len(row) < len(header):
                     raise InputError(f"{path}:{reader.line_num}: {len(row)} cells and {len(header)} columns; {advice}")
-                cells = [row[place].strip() for place in places]
-                yield reader.line_num, [*cells, "" if flag is None else row[flag].strip()]
+                yield reader.line_num, ["" if place is None else row[place].strip() for place in places]
         except csv.Error as error:
             raise InputError(f"{path}:{reader.line_num}: not CSV ({error}); {advice}") from error
 

@@ -316,15 +316,21 @@ def written(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         write(file)
 
 
-def open_lock(path: Path) -> int:
-    """The descriptor of a lock file, made where there is none, and never that of a file which a link there leads to.
+def lock_alone(path: Path, held: str) -> int:
+    """The descriptor of a lock file, made where there is none, and locked until it is closed or its process ends.
 
-    Raises InputError.
+    A link there is not followed. Raises InputError, with `held` where another process has the lock.
     """
     try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
     except (OSError, ValueError) as error:
         raise cannot_write(path, error) from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(lock)
+        raise InputError(f"{path.parent}: {held}") from error
+    return lock
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from hilstar.charts import read_records
 from hilstar.study import codes, timing
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import ROUNDING_MAG
-from hilstar.study.tradeoff.table import Figure, MethodRow, TradeoffStep
+from hilstar.study.tradeoff.table import Figure, Trial, Trials
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
@@ -21,23 +21,26 @@ TRADEOFF_STEP = "psf"
 TRUE = "True"
 
 
-def tradeoff_step(name: str) -> TradeoffStep:
+def tradeoff_step(name: str) -> Trials:
     """A step of tradeoff.csv as the study measured it, whose errors below ROUNDING_MAG are none."""
     with (HERE / "tradeoff.csv").open(encoding="utf-8", newline="") as file:
         table = [row for row in csv.DictReader(file) if row["step"] == name]
     error, second = (Figure(table[0][f"{key}_is"], table[0][f"{key}_unit"], ROUNDING_MAG) for key in ("error", "second"))
-    rows = [
-        MethodRow(
+    trials = [
+        Trial(
             row["method"],
             float(row["error"]),
             float(row["second"]),
-            float(row["time_ms"]),
-            (float(row["quartile_1_ms"]), float(row["quartile_3_ms"])),
-            *(row[flag] == TRUE for flag in ("default", "exact", "front")),
+            lambda: None,
+            row["default"] == TRUE,
+            row["exact"] == TRUE,
+            time_ms=float(row["time_ms"]),
+            quartiles_ms=(float(row["quartile_1_ms"]), float(row["quartile_3_ms"])),
+            on_front=row["front"] == TRUE,
         )
         for row in table
     ]
-    return TradeoffStep(name, table[0]["work"], error, second, tuple(rows))
+    return Trials(name, table[0]["work"], error, second, "", trials)
 
 
 if __name__ == "__main__":

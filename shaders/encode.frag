@@ -2,7 +2,7 @@
 // Light to level: the number of thresholds at or under the pixel's light.
 // Bits of a positive float rise with its value, so their leading part indexes a table that starts the count.
 // With STEPS no bin holds more than one threshold, so the bin's own is the only one to ask, in a block of STEPS rows.
-// With DITHER the thresholds are the lights of levels 1, 2, ..., and a mask decides between the level found and the next.
+// With RISES the thresholds are the edges of another quantiser, whose shader says whether a pixel gets the next level instead.
 // With UNIFORMITY each pixel's light is first multiplied by its gain.
 // With IMAGES light is loaded from an image (OpenGL 4.2): on llvmpipe in two thirds of the time of a texture's texel.
 #ifdef IMAGES
@@ -29,9 +29,8 @@ uniform int white;
 #ifdef UNIFORMITY
 uniform sampler2D gain;
 #endif
-#ifdef DITHER
-uniform sampler2D mask;  // thresholds between 0 and 1
-uniform float shift;     // a turn of all of them, from 0 to under 1
+#ifdef RISES
+bool rises(ivec2 pixel, float light, float low, float high);
 #endif
 
 out uint code;
@@ -65,12 +64,8 @@ void main() {
     int bin = clamp((floatBitsToInt(light) >> BIN_SHIFT) - first_bin, 0, last_bin);
     int k = int(texelFetch(first_code, place(bin), 0).r);
     while (k < white && light >= threshold(k)) k++;
-#ifdef DITHER
-    if (k < white) {
-        float low = k == 0 ? 0.0 : threshold(k - 1);
-        float turned = fract(texelFetch(mask, pixel % textureSize(mask, 0), 0).r + shift);
-        if (light - low > turned * (threshold(k) - low)) k++;
-    }
+#ifdef RISES
+    if (k < white && rises(pixel, light, k == 0 ? 0.0 : threshold(k - 1), threshold(k))) k++;
 #endif
     code = uint(k);
 #endif

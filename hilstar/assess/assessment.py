@@ -23,7 +23,7 @@ from hilstar.calibrate.attitude_pairs import COMMANDED, Pairs, refuse_convention
 from hilstar.errors import HilstarError, InputError
 from hilstar.rotation import to_matrix, to_rotation_vector
 from hilstar.run.record.commanded import Commanded, CommandedRun, read_commanded
-from hilstar.run.record.ledger_reader import config_of, read_head
+from hilstar.run.record.ledger_records import config_of, read_head
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 AGREE_RAD = np.radians(1.0)  # half of the answers of one sky lie this near to one rotation

@@ -2,85 +2,48 @@
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.assess.assessment import Assessment, WrongAnswer
+from hilstar.assess.assessment import Assessment
 from hilstar.assess.bench_effects import Slice
 from hilstar.assess.budget import Axes
 from hilstar.assess.places import axes_of
-from hilstar.charts import BLUE, DARK, GRID, INK, MUTED, PAPER, label_ends, panels_of, svg, write_csv
+from hilstar.charts import BLUE, INK, MUTED, label_ends, panels_of, svg, write_csv
 from hilstar.files import write_whole
+from hilstar.html_pages import escaped, page_of, picture_of, table_of
 
 COUNT = "1"  # the unit of counts and shares in the tables
 MAX_NAMED = 10
 MAX_POINTS = 4000
 MAX_ROWS = 200
-DIGITS = 4
-PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-:root {{ color-scheme: light dark; --ink: {ink}; --paper: {paper}; --rule: {rule}; --note: #fff6df }}
-@media (prefers-color-scheme: dark) {{ :root {{
-  --ink: {dark_ink}; --paper: {dark_paper}; --rule: {dark_rule}; --note: #3d3520 }} }}
-body {{ font: 15px/1.45 sans-serif; max-width: 1020px; margin: 2em auto; padding: 0 1em;
-  color: var(--ink); background: var(--paper) }}
-table {{ border-collapse: collapse; margin: 1em 0 }}
-td, th {{ padding: 3px 14px 3px 0; border-bottom: 1px solid var(--rule); vertical-align: top; text-align: left }}
-td.n {{ text-align: right; font-variant-numeric: tabular-nums }}
-img {{ max-width: 100% }}
-.note {{ background: var(--note); padding: .4em .8em; margin: .4em 0 }}
-</style></head><body><h1>{title}</h1>{notes}{body}</body></html>
-"""
-COLOURS = {"ink": INK, "paper": PAPER, "rule": GRID}
-COLOURS |= {f"dark_{name}": DARK[colour] for name, colour in COLOURS.items()}
 AXES = ("x", "y", "about the boresight")
 
 
-class Clock(msgspec.Struct, frozen=True):
-    """The tracker's clock minus the run's at the run's start, and its excess rate; null where the motion does not tell."""
+def budget_of(found: Assessment) -> dict[str, Any]:
+    """The JSON object of `hilstar assess`.
 
-    offset_ms: float | None
-    drift_ppm: float | None
-    sigma_ms: float
-
-
-class AssessmentFigures(msgspec.Struct, frozen=True):
-    """The JSON object of `hilstar assess`."""
-
-    bias_arcsec: tuple[float, float, float]
-    fov_arcsec: Axes
-    pixel_arcsec: Axes
-    noise_arcsec: Axes
-    clock: Clock
-    availability: float
-    wrong: tuple[WrongAnswer, ...]
-
-
-def budget_of(found: Assessment) -> AssessmentFigures:
-    """The figures of an assessment."""
-    clock = found.found.clock
-    x, y, z = found.found.bias_arcsec.tolist()
-    return AssessmentFigures(
-        bias_arcsec=(x, y, z),
-        fov_arcsec=found.found.fov_arcsec,
-        pixel_arcsec=found.found.pixel_arcsec,
-        noise_arcsec=found.noise_arcsec,
-        clock=Clock(
-            offset_ms=1e3 * found.offset_s if clock.offset_told else None,
-            drift_ppm=1e6 * clock.drift if clock.drift_told else None,
-            sigma_ms=1e3 * clock.sigma_offset_s,
-        ),
-        availability=found.lock.availability,
-        wrong=found.wrong,
-    )
+    `clock` is the tracker's minus the run's at the run's start, and its excess rate; null where the motion does not tell.
+    """
+    parts, clock = found.found, found.found.clock
+    return {
+        "bias_arcsec": parts.bias_arcsec.tolist(),
+        "fov_arcsec": parts.fov_arcsec,
+        "pixel_arcsec": parts.pixel_arcsec,
+        "noise_arcsec": found.noise_arcsec,
+        "clock": {
+            "offset_ms": 1e3 * found.offset_s if clock.offset_told else None,
+            "drift_ppm": 1e6 * clock.drift if clock.drift_told else None,
+            "sigma_ms": 1e3 * clock.sigma_offset_s,
+        },
+        "availability": found.lock.availability,
+        "wrong": found.wrong,
+    }
 
 
 class FigureRow(NamedTuple):
@@ -206,44 +169,29 @@ def _number(value: float | None) -> str:
 def write_page(path: Path, found: Assessment) -> None:
     """Write the page of an assessment as one file that needs no other. Raises InputError."""
     title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
-    notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in found.notes)
-    text = PAGE.format(title=html.escape(title), notes=notes, body="".join(_sections(found)), **COLOURS)
-    write_whole(path, text.encode(errors="replace"))
+    notes = (f'<p class="note">{escaped(note)}</p>' for note in found.notes)
+    write_whole(path, page_of(title, [*notes, *_sections(found)]))
 
 
 def _sections(found: Assessment) -> Iterator[str]:
-    yield _table(("", ""), lines_of(found))
+    yield table_of(lines_of(found), ("", ""))
     yield "<h2>Budget</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>"
     rows: list[tuple[object, ...]] = [(*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)]
-    yield _table(("quantity", "axis", "value", "unit", "low", "high"), rows)
+    yield table_of(rows, ("quantity", "axis", "value", "unit", "low", "high"))
     yield "<h2>Errors over the run</h2>" + _over_time(found)
     yield "<h2>What repeats with the place in the field</h2>" + _field_map(found)
     detail = found.found.components.pixel.detail or found.found.components.pixel.reason
-    yield f"<p>Pixel error: {html.escape(detail)}.</p>"
+    yield f"<p>Pixel error: {escaped(detail)}.</p>"
     yield "<h2>Noise</h2>" + _histogram(found)
     for name, unit, slices in (("rate", "deg/s", found.by_rate), ("magnitude of the field", "V mag", found.by_magnitude)):
         if slices:
             yield f"<h2>By {name}</h2>" + _slices(unit, slices)
     if found.wrong:
         rows = [(each.row, each.t_s, each.run_s, each.off_deg) for each in found.wrong[:MAX_ROWS]]
-        yield "<h2>Wrong answers</h2>" + _table(("row", "t_s", "run s", "off by, deg"), rows)
+        yield "<h2>Wrong answers</h2>" + table_of(rows, ("row", "t_s", "run s", "off by, deg"))
     if found.lock.outages:
         outages = [(o.start_s, o.length_s, "yes" if o.lost else "", o.rows, o.wrong) for o in found.lock.outages[:MAX_ROWS]]
-        yield "<h2>Outages</h2>" + _table(("run s", "length, s", "lock lost", "rows", "wrong"), outages)
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
-    body = "".join("<tr>" + "".join(_cell(value) for value in row) + "</tr>" for row in rows)
-    return f"<table><tr>{head}</tr>{body}</table>"
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return "<td>-</td>"
-    if isinstance(value, float):
-        return f'<td class="n">{value:.{DIGITS}g}</td>'
-    return f'<td class="n">{value}</td>' if isinstance(value, int) else f"<td>{html.escape(str(value))}</td>"
+        yield "<h2>Outages</h2>" + table_of(outages, ("run s", "length, s", "lock lost", "rows", "wrong"))
 
 
 def _slices(unit: str, slices: Sequence[Slice]) -> str:
@@ -252,12 +200,11 @@ def _slices(unit: str, slices: Sequence[Slice]) -> str:
         (s.low, s.high, s.answers, s.noise_cross_arcsec, s.noise_roll_arcsec, s.rms_cross_arcsec, s.rms_roll_arcsec)
         for s in slices
     ]
-    return _table(header, rows) + "<p>Arcsec; the error's rms is about the bias.</p>"
+    return table_of(rows, header) + "<p>Arcsec; the error's rms is about the bias.</p>"
 
 
 def _image(figure: Any, alt: str) -> str:
-    data = base64.b64encode(svg(figure).encode()).decode()
-    return f'<p><img alt="{html.escape(alt)}" src="data:image/svg+xml;base64,{data}"></p>'
+    return picture_of(svg(figure).encode(), "svg+xml", alt)
 
 
 def _over_time(found: Assessment) -> str:
@@ -294,7 +241,7 @@ def _field_map(found: Assessment) -> str:
     seen = axes[some] @ (mean / max(size, 1e-9))
     if parts.fov.reason or seen[:, 2].min() < 0.3:
         reason = parts.fov.reason or "the run goes over too much of the sky for one map: see the chart over time"
-        return f"<p>{html.escape(reason)}.</p>"
+        return f"<p>{escaped(reason)}.</p>"
     place = scale.focal_px * seen[:, :2] / seen[:, 2:]
     largest = np.abs(parts.fov.fitted).max(axis=0)
     finding = f"It is up to {largest[0]:.2g} arcsec in x, {largest[1]:.2g} in y and {largest[2]:.2g} about the boresight"

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -19,6 +18,7 @@ from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
 from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Packet, Reason, Refusal, Status, TimeReply, TimeRequest
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.notices import Notices
+from hilstar.process.scheduling import HOST_CLOCK
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -52,7 +52,7 @@ class BackChannel:
     The receiver's thread calls it, but for `post`.
     """
 
-    def __init__(self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = HOST_CLOCK.now_ns) -> None:
         self._link, self._now_ns = link, now_ns
         self._send: Callable[[Packet], None] = link.send
         self._traffic = traffic
@@ -151,7 +151,7 @@ class Receiver:
         notices: Notices | None = None,
         *,
         wrong_rates: WrongRates = "use-quaternions",
-        now_ns: Callable[[], int] = time.monotonic_ns,
+        now_ns: Callable[[], int] = HOST_CLOCK.now_ns,
     ) -> None:
         self.counts = PacketCounts()
         self._now_ns = now_ns

@@ -22,7 +22,7 @@ from typing import Any
 
 import msgspec
 
-from hilstar.bench.config import GEOCENTRE, SOURCE, AttitudeSettings, BenchConfig, config_of, parse_config
+from hilstar.bench.config import GAUSSIAN, GEOCENTRE, SOURCE, AttitudeSettings, BenchConfig, config_of, parse_config
 from hilstar.bench.config.bench_config import HEADS, UNIX, today, with_dates
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import place_of
@@ -90,22 +90,29 @@ def at_moment(file: BenchFile, t_ns: int | None) -> BenchFile:
 def _sha256(config: BenchConfig, folder: Path) -> str:
     digest = hashlib.sha256(msgspec.json.encode(config, order="sorted"))
     tracker = config.tracker
-    curves = (tracker.quantum_efficiency, tracker.transmission)
-    files = (config.monitor.calibration, config.collimator.geometry, tracker.distortion)
+    curves = (*tracker.quantum_efficiencies.values(), tracker.transmission)
+    files = (
+        config.monitor.calibration,
+        config.monitor.primaries.file,
+        config.collimator.geometry,
+        tracker.distortion,
+        tracker.optics.psf,
+    )
     true = (config.verify.true_calibration, config.verify.true_geometry)
     orbit = None if config.spacecraft.orbit in {GEOCENTRE, SOURCE} else config.spacecraft.orbit
     bodies = config.sky.bodies
     named: tuple[str | float | None, ...] = (*curves, *files, *true, orbit, bodies.satellites, bodies.satellite_magnitudes)
     for name in named:
-        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):
+        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos", GAUSSIAN):
             digest.update(_named_bytes(folder / name))
-    if config.sky.catalogue != "hipparcos":
-        digest.update(_catalogue_bytes(folder / config.sky.catalogue))
+    for large in (config.sky.catalogue, config.sky.diffuse.map):
+        if large not in ("hipparcos", None):
+            digest.update(_large_bytes(folder / large))
     return digest.hexdigest()
 
 
-def _catalogue_bytes(path: Path) -> bytes:
-    """The SHA-256 of a catalogue's file, which may be large; nothing where it cannot be read."""
+def _large_bytes(path: Path) -> bytes:
+    """The SHA-256 of a catalogue's or a map's file, which may be large; nothing where it cannot be read."""
     try:
         return file_sha256(path, "").encode()
     except InputError:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
 from msgspec.structs import replace
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.bench.cameras import bench_camera, tracker_camera
+from hilstar.bench.cameras import bench_camera, display_psf, tracker_camera, tracker_psf
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, RenderSettings, Tracker
-from hilstar.bench.config.bench_config import epoch_utc_ns, has_observer
+from hilstar.bench.config.bench_config import epoch_utc_ns, has_observer, sky_jd
+from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
-from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
+from hilstar.bench.effort import Effort, Light, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
@@ -24,19 +27,23 @@ from hilstar.frame.view import Canvas, View
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel
-from hilstar.render.backend import Target, has_compute
+from hilstar.monitor.quantisers import QUANTISERS
+from hilstar.render.backend import Target, level_cost
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Orientation, Scan
-from hilstar.scene.psf import peak_share
-from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate, tabulate_pickles
-from hilstar.sky.spectrum import load_curve
+from hilstar.scene.psf import Psf
+from hilstar.sky.catalog import Catalog
+from hilstar.sky.electrons import Optics, Photometry, all_channels, star_temperatures_k, tabulate, tabulate_pickles
+from hilstar.sky.spectral_types import star_types, tabulate_types
+from hilstar.sky.spectrum import Curve, load_curve
 from hilstar.sky.star_table import TableChoice, choose_catalog
-from hilstar.sky.stars import Stars, aberrate, make_stars, split_by_rate, unit_vectors_icrs
+from hilstar.sky.stars import Stars, aberrate, make_stars, split_by_rate, total_and_colours, unit_vectors_icrs
 
 if TYPE_CHECKING:
     from hilstar.render.context import Context
     from hilstar.sky.bodies.moving import MovingSky
+    from hilstar.sky.diffuse import TangentImage
 
 S_PER_MS = 1e-3
 
@@ -81,16 +88,16 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
         can_steal_bits=finer,
         sky_share=sky_share,
         refresh_hz=refresh_hz,
-        seen=seen_by(file.config.tracker, camera),
+        seen=seen_by(file, camera),
         centroider=file.config.verify.centroider,
         exposure_frames=file.config.exposure_frames,
-        has_compute=has_compute(context),
+        cost=partial(level_cost, context=context),
     )
     effort = _effort(file.config.render, light)
     config = _chosen(file.config, effort)
-    faintest = faintest_shown_e_per_s(config.render.quantisation, light, config.render.sprite_sigma_px)
+    target = _target(config, Panel(calibration.response, white_e_per_s, uniformity), effort, light.seen)
+    faintest = QUANTISERS[target.quantisation].faintest_e_per_s(light.panel, target.psf)
     shown, faint = split_by_rate(stars, faintest)
-    panel = Panel(calibration.response, white_e_per_s, uniformity)
     return Bench(
         file=file,
         config=config,
@@ -106,14 +113,16 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
         shown_stars=moved(shown, sources.moving),
         faint_stars=faint,
         sources=sources,
-        renderer=open_backend(_target(config, panel, effort, light.seen), context),
+        tracker_psf=tracker_psf(config.tracker, file.folder),
+        renderer=open_backend(target, context),
     )
 
 
-def seen_by(tracker: Tracker, camera: Camera) -> Seen:
+def seen_by(file: BenchFile, camera: Camera) -> Seen:
     """How the tracker sees the monitor at the boresight: its blur and its pixel in monitor pixels."""
+    tracker = file.config.tracker
     pixel_px = camera.focal_length_px * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
-    return Seen(blur_px=math.sqrt(math.prod(tracker.psf_sigma_px)) * pixel_px, pixel_px=pixel_px)
+    return Seen(blur_px=math.sqrt(math.prod(tracker_psf(tracker, file.folder).width_px)) * pixel_px, pixel_px=pixel_px)
 
 
 def _target(config: BenchConfig, panel: Panel, effort: Effort | None, seen: Seen) -> Target:
@@ -122,7 +131,7 @@ def _target(config: BenchConfig, panel: Panel, effort: Effort | None, seen: Seen
         raise AssertionError("the effort's plan has chosen")
     return Target(
         resolution_px=config.monitor.resolution_px,
-        sigma_px=render.sprite_sigma_px,
+        psf=display_psf(render),
         response=panel.response,
         flux_at_white_e_per_s=panel.flux_at_white_e_per_s,
         quantisation=render.quantisation,
@@ -150,18 +159,36 @@ def _chosen(config: BenchConfig, effort: Effort | None) -> BenchConfig:
     return replace(config, render=render)
 
 
-def bench_optics(tracker: Tracker, folder: Path) -> Optics:
-    """The tracker's light-gathering part; curve paths are relative to `folder`."""
-    return Optics(
-        aperture_mm=tracker.aperture_mm,
-        quantum_efficiency=load_curve(tracker.quantum_efficiency, "[tracker] quantum_efficiency", folder),
-        transmission=load_curve(tracker.transmission, "[tracker] transmission", folder),
+def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
+    """The tracker's light-gathering part by channel: what it tells apart; curve paths are relative to `folder`."""
+    efficiencies = [load_curve(source, f"[tracker] {key}", folder) for key, source in tracker.quantum_efficiencies.items()]
+    transmission = load_curve(tracker.transmission, "[tracker] transmission", folder)
+    return tuple(
+        Optics(tracker.aperture_mm, Curve(one.wavelength_nm, one.value * tracker.detector.fill_factor), transmission)
+        for one in efficiencies
     )
+
+
+def bench_optics(tracker: Tracker, folder: Path) -> Optics:
+    """The same of all channels together."""
+    return all_channels(bench_channels(tracker, folder))
 
 
 def bench_sources(config: BenchConfig, folder: Path) -> Sources:
     """The light of a bench's sky beside its stars. Raises InputError or MachineError."""
-    return Sources(bench_moving(config, folder))
+    return Sources(bench_moving(config, folder), bench_diffuse(config, folder))
+
+
+def bench_diffuse(config: BenchConfig, folder: Path) -> tuple[TangentImage, ...]:
+    """The map of diffuse light of a bench, electrons/s/sr; () without one. Raises InputError or MachineError."""
+    diffuse = config.sky.diffuse
+    if diffuse.map is None:
+        return ()
+    from hilstar.sky.diffuse import read_diffuse_map  # WCS and coordinates take 200 ms, which only a map needs
+
+    one = np.ones(1)
+    v0_e_per_s = np.float32(star_rates(config, folder)(0 * one, diffuse.bv_mag * one, np.nan * one)[0])
+    return tuple(dataclasses.replace(face, image=face.image * v0_e_per_s) for face in read_diffuse_map(folder / diffuse.map))
 
 
 def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
@@ -170,7 +197,7 @@ def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
         return None
     from hilstar.bench.moving import moving_sky  # importing the ephemeris takes 50 ms, which only bodies and an observer need
 
-    return moving_sky(config, folder, bench_optics(config.tracker, folder))
+    return moving_sky(config, folder, bench_channels(config.tracker, folder))
 
 
 def moved(stars: Stars, moving: MovingSky | None) -> Stars:
@@ -184,6 +211,8 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     epoch_utc_ns(config)  # which refuses one that a source was to give
     source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
     chosen = choose_catalog(TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
+    if sky.variables == "phase":
+        chosen = chosen.at_phase(sky_jd(config, None))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
     if moving is not None:
@@ -191,8 +220,13 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     elif any(sky.observer_velocity_km_s):
         vectors = aberrate(vectors, sky.observer_velocity_km_s)
     temperature_k = star_temperatures_k(catalog.bv_mag, sky.temperature)
-    rates = star_rates(config, folder)(catalog.v_mag, catalog.bv_mag, catalog.vi_mag)
-    return make_stars(catalog, vectors, temperature_k, rates)
+    kind = star_kinds(config, catalog)
+    if kind is not None:
+        unread = int(np.isnan(kind).any(axis=1).sum())
+        note = f"{unread} of {len(catalog)} stars have no MK type of O to M, and their spectra by colour alone"
+        catalog = dataclasses.replace(catalog, notes=(*catalog.notes, note))
+    flux = star_flux(config, folder)(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind)
+    return make_stars(catalog, vectors, temperature_k, flux)
 
 
 def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
@@ -200,26 +234,51 @@ def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
 
     Raises InputError or MachineError (see `bench_sources`).
     """
-    canvas = Canvas(tracker_camera(file.config.tracker, file.folder), 1, file.config.tracker.psf_sigma_px)
+    canvas = Canvas(tracker_camera(file.config.tracker, file.folder), tracker_psf(file.config.tracker, file.folder))
     sources = bench_sources(file.config, file.folder)
     stars = moved(bench_stars(file.config, file.folder, sources.moving), sources.moving)
     stars = seen_in(view, stars, sources.moving)
-    light = light_of(canvas, sky_layers(canvas, sources), stars, view)
+    light = light_of(canvas, sky_layers(canvas, Sources(sources.moving)), stars, view)
     return brightest_in_view(light, stars, canvas.camera, view.q_icrs_to_cam, count)
 
 
-# Electron rates (n,) of stars by their V, B-V and V-I, which may be NaN.
-StarRates = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+class StarRates(Protocol):
+    """Electron rates of stars (n,) by their V, B-V, V-I (NaN where unknown) and, if it is used, `kind` of `star_kinds`."""
+
+    def __call__(
+        self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None = None, /
+    ) -> FloatArray:
+        """The rates (n,), or by channel (n, channels)."""
+
+
+def star_kinds(config: BenchConfig, catalog: Catalog) -> FloatArray | None:
+    """The types (n, 2) of stars, as `star_types` reads them, where a bench's spectra follow types; None elsewhere."""
+    return star_types(catalog) if (config.sky.brightness, config.sky.spectrum) == ("dgs", "mk") else None
 
 
 def star_rates(config: BenchConfig, folder: Path) -> StarRates:
-    """The electron rates of stars on a bench's tracker, by tables that are made here, once."""
-    sky, optics = config.sky, bench_optics(config.tracker, folder)
+    """The electron rates (n,) of stars on a bench's tracker, in all channels together."""
+    flux = star_flux(config, folder)
+    return lambda *columns: total_and_colours(flux(*columns)).electrons_per_s
+
+
+def star_flux(config: BenchConfig, folder: Path) -> StarRates:
+    """The electron rates (n, channels) of stars on a bench's tracker, by tables that are made here, once."""
+    rates = [_channel_rates(config.sky, optics) for optics in bench_channels(config.tracker, folder)]
+    return lambda *columns: np.stack([channel(*columns) for channel in rates], axis=1)
+
+
+def _channel_rates(sky: SkySettings, optics: Optics) -> StarRates:
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     if sky.brightness == "dgs" and sky.spectrum == "pickles":
-        return tabulate_pickles(optics, photometry).electrons_per_s
+        by_colour = tabulate_pickles(optics, photometry)
+        return lambda v_mag, bv_mag, vi_mag, _kind=None: by_colour.electrons_per_s(v_mag, bv_mag, vi_mag)
+    if sky.brightness == "dgs" and sky.spectrum == "mk":
+        return tabulate_types(optics, photometry).electrons_per_s
     by_temperature = tabulate(sky.brightness, optics, photometry)
-    return lambda v_mag, bv_mag, _: by_temperature.electrons_per_s(v_mag, star_temperatures_k(bv_mag, sky.temperature))
+    return lambda v_mag, bv_mag, vi_mag, kind=None: by_temperature.electrons_per_s(
+        v_mag, star_temperatures_k(bv_mag, sky.temperature)
+    )
 
 
 def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:
@@ -231,12 +290,10 @@ def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:
 
 def _white_e_per_s(render: RenderSettings, stars: Stars) -> float:
     given = render.flux_at_white_e_per_s
-    return given or brightest_peak_e_per_s(stars, render.sprite_sigma_px, render.brightest_v_mag)
+    return given or brightest_peak_e_per_s(stars, display_psf(render), render.brightest_v_mag)
 
 
-def brightest_peak_e_per_s(
-    stars: Stars, sigma_px: tuple[float, float], brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG
-) -> float:
+def brightest_peak_e_per_s(stars: Stars, psf: Psf, brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG) -> float:
     """Full scale where the file gives no flux for it: the brightest pixel of the brightest star at or below that magnitude.
 
     Brighter stars may clip. With the default magnitude and a catalogue of brighter stars alone, none does. Raises InputError
@@ -249,7 +306,7 @@ def brightest_peak_e_per_s(
     if not len(wanted):
         key, better = ("[render] brightest_v_mag", "smaller") if len(stars) else ("[sky] faintest_v_mag", "larger")
         raise InputError(f"{key} leaves no star; write a {better} magnitude, or [render] flux_at_white_e_per_s")
-    peak_e_per_s = float(wanted.max()) * peak_share(sigma_px)
+    peak_e_per_s = float(wanted.max()) * psf.peak_share
     if not MIN_POSITIVE <= peak_e_per_s <= MAX_NUMBER:
         raise InputError(
             f"[tracker] aperture_mm, quantum_efficiency and transmission: the brightest star to show gives {peak_e_per_s:.3g}"

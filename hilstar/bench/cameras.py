@@ -6,21 +6,24 @@ The fields of view tell a length in the wrong unit: no lens and no pixel is ten 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
 
-from hilstar.bench.config import BenchConfig, Tracker
+from hilstar.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, RenderSettings, Tracker
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import load_distortion, load_geometry, monitor_camera
 from hilstar.scene.camera import Camera, bounded
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf, Psf, read_psf
 
+log = logging.getLogger(__name__)
 NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
 MIN_SEEN, MIN_FILLED = 0.1, 0.5  # share of the screen that the tracker sees; share of the tracker's field that the screen fills
 MAX_PIXELS = 10.0  # tracker pixels to a monitor pixel, or the reverse
@@ -62,10 +65,29 @@ def ideal_monitor(config: BenchConfig) -> Camera:
     )
 
 
+def display_psf(render: RenderSettings) -> Psf:
+    """How a star is drawn on the monitor."""
+    return GaussianPsf(render.sprite_sigma_px)
+
+
+def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
+    """How the tracker's optics spread a star over its detector. Raises InputError for a file that is no PSF."""
+    if tracker.optics.psf == GAUSSIAN:
+        return GaussianPsf(tracker.psf_sigma_px)
+    if tracker.psf_sigma_px != DEFAULT_PSF_SIGMA_PX:
+        _say_once(f"[tracker] psf_sigma_px is not used: [tracker.optics] psf is {tracker.optics.psf}")
+    return read_psf(folder / tracker.optics.psf)
+
+
+@lru_cache(maxsize=1)
+def _say_once(line: str) -> None:
+    log.warning("%s", line)
+
+
 def real_monitor(config: BenchConfig, path: Path) -> Camera:
     """The monitor as a geometry file has it, bounded to what sprites on it need. Raises InputError."""
     camera = load_geometry(path, config.monitor.resolution_px)
-    return _bounded(camera, footprint_px(config.render.sprite_sigma_px) / 2 + 1, path)
+    return _bounded(camera, display_psf(config.render).footprint_px / 2 + 1, path)
 
 
 def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
@@ -76,7 +98,7 @@ def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
     if tracker.distortion is None:
         return camera
     path = folder / tracker.distortion
-    return _bounded(load_distortion(path, camera), footprint_px(tracker.psf_sigma_px) / 2 + 1, path)
+    return _bounded(load_distortion(path, camera), tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
 
 
 def _bounded(camera: Camera, margin_px: float, path: Path) -> Camera:

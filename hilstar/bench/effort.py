@@ -6,35 +6,32 @@ Half of the tolerance is for the codes, a quarter for the sprites' edges and a q
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.cameras import display_psf
 from hilstar.bench.config import RenderSettings
 from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.phases import UNLIKE, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
-from hilstar.monitor.quantise import EXPOSURE_FRAMES, QUANTISERS, Panel, Quantisation
+from hilstar.monitor.quantise import EXPOSURE_FRAMES, LevelCost, Panel, Quantiser
+from hilstar.monitor.quantisers import BY_COST, QUANTISERS, Quantisation
 from hilstar.monitor.response import Response
-from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, exact_shader_takes
-from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, outside_share, peak_share, pixel_share
+from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, level_cost
+from hilstar.scene.psf import MAX_CUT, Psf
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge
 from hilstar.units import flux_ratio
 
 CODES_SHARE, EDGES_SHARE, MOTION_SHARE = 0.5, 0.25, 0.25
-BY_COST: tuple[Quantisation, ...] = ("round", "exact")
 PHASES = 12
 MAGNITUDES = 5  # at which codes are judged, from white down to the faintest star
 MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
-# A whole frame, for each of 2500 to 5000 stars, 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe cores. Without compute
-# shaders (before OpenGL 4.3) `exact` takes NumPy's time (0.03 to 0.06 of 150 to 1800 stars), and so do sprites that are too
-# wide for the shader. A field of the Milky Way has twice the stars of an average one.
-ROUND_MS_A_STAR = 0.002
-EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
 IN_TIME_SHARE = 0.5  # share of a refresh period that a frame may take
 
 
@@ -111,8 +108,8 @@ class Light:
 
     `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
     whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider` what it finds stars by: None
-    where the bench does not say, and then all of them judge. Its exposure has `exposure_frames`. `has_compute` is whether
-    this OpenGL has the compute shaders that choose codes for `exact`.
+    where the bench does not say, and then all of them judge. Its exposure has `exposure_frames`. `cost` is what a quantiser
+    costs where the bench is drawn.
     """
 
     response: Response
@@ -124,21 +121,22 @@ class Light:
     seen: Seen = AS_USUAL
     centroider: Centroider | None = None
     exposure_frames: int = EXPOSURE_FRAMES
-    has_compute: bool = True
+    cost: Callable[[type[Quantiser], Psf], LevelCost] = level_cost
+
+    @property
+    def panel(self) -> Panel:
+        """What turns it into levels, where the screen is darkest."""
+        return Panel(self.response, self.white_e_per_s)
 
     @property
     def judges(self) -> tuple[Centroider, ...]:
         """The centroiders that judge where codes show a star."""
         return FAMILY if self.centroider is None else (self.centroider,)
 
-    def field_ms(self, method: Quantisation, sigma_px: tuple[float, float]) -> float:
-        """The time that `round` or `exact` takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
+    def field_ms(self, method: Quantisation, psf: Psf) -> float:
+        """The time that a method takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
         lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
-        exact_ms = EXACT_MS_A_STAR if self.has_compute else NUMPY_EXACT_MS_A_STAR
-        if not exact_shader_takes(sigma_px):
-            exact_ms = WIDE_EXACT_MS_A_STAR
-        a_star_ms = exact_ms if method == "exact" else ROUND_MS_A_STAR
-        return a_star_ms * self.sky_share * float(np.count_nonzero(lit))
+        return self.cost(QUANTISERS[method], psf).a_star_ms * self.sky_share * float(np.count_nonzero(lit))
 
     @property
     def refresh_ms(self) -> float:
@@ -189,8 +187,9 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
 
     `auto` does not take `exact` where that would be late in fields of many stars and `round` would not.
     """
-    round_ms, exact_ms = (light.field_ms(method, render.sprite_sigma_px) for method in BY_COST)
-    in_time = exact_ms <= IN_TIME_SHARE * light.refresh_ms or round_ms > IN_TIME_SHARE * light.refresh_ms
+    cheap, best = BY_COST[0], BY_COST[-1]
+    cheap_ms, best_ms = (light.field_ms(method, display_psf(render)) for method in (cheap, best))
+    in_time = best_ms <= IN_TIME_SHARE * light.refresh_ms or cheap_ms > IN_TIME_SHARE * light.refresh_ms
     wanted = (BY_COST if in_time else BY_COST[:1]) if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
     stars = _CodeStars(render, light)
@@ -202,17 +201,18 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
     error = f"{errors.flux_mag:.4f} mag and {errors.place_px:.4f} px maximum, {_by_whom(errors, light)}"
     if not within and render.quantisation == "auto" and not in_time:
         price = (
-            f"{exact_ms:.0f} ms of {light.refresh_ms:.0f} (round {round_ms:.0f}) for an average field at 1 deg/s without a GPU"
+            f"{best_ms:.0f} ms of {light.refresh_ms:.0f} ({cheap} {cheap_ms:.0f}) for an average field at 1 deg/s without a GPU"
         )
-        price += "" if light.has_compute else ", in NumPy: its compute shaders need OpenGL 4.3"
-        error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "exact" is nearer and takes {price})'
+        why = light.cost(QUANTISERS[best], display_psf(render)).why
+        price += f", {why}" if why else ""
+        error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "{best}" is nearer and takes {price})'
     elif not within:
         ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
         error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"
-    longer = exact_ms / round_ms if round_ms else 1.0
-    saving = f"exact takes {longer:.2g} times as long" if method == "round" else "nothing saved"
-    if method == "exact":
-        saving = f"an average field at 1 deg/s takes {exact_ms:.2g} ms of {light.refresh_ms:.3g} on two cores without a GPU"
+    longer = best_ms / cheap_ms if cheap_ms else 1.0
+    saving = f"{best} takes {longer:.2g} times as long" if method == cheap else "nothing saved"
+    if method == best:
+        saving = f"an average field at 1 deg/s takes {best_ms:.2g} ms of {light.refresh_ms:.3g} on two cores without a GPU"
     return ChosenCodes(method, errors, Choice("codes", method, error, saving))
 
 
@@ -225,14 +225,14 @@ class _CodeStars:
     """Stars at every sub-pixel phase, from full scale to the faintest of a bench, and the tracker that looks at them."""
 
     def __init__(self, render: RenderSettings, light: Light) -> None:
-        sigma_px, seen = render.sprite_sigma_px, light.seen
-        self._frames, self._balance, self._kinds = light.exposure_frames, Balance(sigma_px, seen), light.judges
+        psf, seen = display_psf(render), light.seen
+        self._frames, self._balance, self._kinds = light.exposure_frames, Balance(psf, seen), light.judges
         self._panel = Panel(light.response, WHITE)
-        self._sprites, _ = phase_grid(PHASES, sigma_px, UNLIKE)
-        self._bright = phase_image(self._sprites, sigma_px)
-        self._judge = Judge(self._bright, line_places(self._sprites), sigma_px, seen.blur_px, seen.pixel_px)
+        self._sprites, _ = phase_grid(PHASES, psf, UNLIKE)
+        self._bright = phase_image(self._sprites, psf)
+        self._judge = Judge(self._bright, line_places(self._sprites), psf.width_px, seen.blur_px, seen.pixel_px)
         faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
-        deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / peak_share(sigma_px) / faintest))
+        deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / psf.peak_share / faintest))
         self._mags = np.linspace(0.0, deepest, MAGNITUDES).tolist()
 
     def errors(self, method: Quantisation, limit_mag: float) -> CodeErrors:
@@ -253,57 +253,45 @@ class _CodeStars:
 
 def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> ChosenSides:
     """The smallest sprites whose edges stay within their part of the tolerance."""
-    sigma_px = render.sprite_sigma_px
-    full = footprint_px(sigma_px)
+    psf = display_psf(render)
+    full = psf.footprint_px
     allowed_mag, allowed_px = EDGES_SHARE * render.tolerance_mag, EDGES_SHARE * render.tolerance_px
     sizes = range(full % 2 or 2, full, 2)
-    largest = next((s for s in sizes if cut_mag(s, sigma_px) <= allowed_mag and cut_px(s, sigma_px) <= allowed_px), full)
+    largest = next((s for s in sizes if cut_mag(s, psf) <= allowed_mag and cut_px(s, psf) <= allowed_px), full)
     sides = [(math.inf, largest)]
-    if not QUANTISERS[method].dithered:
-        unlit = UNLIT * float(light.response.threshold[0]) * light.white_e_per_s
+    if unlit := UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel):
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
-        sides += [(unlit / outside_share(size, sigma_px), size) for size in sizes[::-1] if size < largest]
+        sides += [(unlit / psf.outside_share(size), size) for size in sizes[::-1] if size < largest]
     kept = tuple(SpriteSide(min(rate, 3e38), size) for rate, size in sides[:MAX_SIDES])
     rates = light.rates_e_per_s
     area = np.full(len(rates), full**2)
     for side in kept:
         area[rates < side.below_e_per_s] = side.side_px**2
-    cut = (cut_mag(largest, sigma_px), cut_px(largest, sigma_px)) if largest < full else (MAG_PER_SHARE * MAX_CUT, 0.0)
+    cut = (cut_mag(largest, psf), cut_px(largest, psf)) if largest < full else (MAG_PER_SHARE * MAX_CUT, 0.0)
     mean = float(area.mean()) if len(area) else float(full**2)
     chosen = f"{min(side.side_px for side in kept)} to {largest} px a side instead of {full}"
     error = f"{cut[0]:.1e} mag and {cut[1]:.1e} px cut"
     return ChosenSides(kept, *cut, Choice("sprites", chosen, error, f"{full**2 / mean:.1f} times fewer pixels"))
 
 
-def cut_mag(size_px: int, sigma_px: tuple[float, float]) -> float:
+def cut_mag(size_px: int, psf: Psf) -> float:
     """The flux lost outside a square sprite at the worst phase, magnitudes."""
-    return MAG_PER_SHARE * cut_share(size_px, sigma_px)
+    return MAG_PER_SHARE * psf.cut_share(size_px)
 
 
-def cut_px(size_px: int, sigma_px: tuple[float, float]) -> float:
+def cut_px(size_px: int, psf: Psf) -> float:
     """How far a square sprite's edge shifts the centroid at the worst phase, px, both axes combined."""
-    return math.hypot(*(_cut_px(size_px, sigma) for sigma in sigma_px))
-
-
-def _cut_px(size_px: int, sigma_px: float) -> float:
-    worst = 0.0
-    first = -((size_px - 1) // 2)
+    worst, offsets = np.zeros(2), np.arange(size_px) - (size_px - 1) // 2
     for fraction in np.linspace(0.0, 1.0, CUT_PHASES) - (0.5 if size_px % 2 else 0.0):
-        offsets = np.arange(first, first + size_px) - fraction
-        shares = np.array([pixel_share(float(offset), sigma_px) for offset in offsets])
-        worst = max(worst, abs(float((shares * offsets).sum() / shares.sum())))
-    return worst
+        at = offsets - fraction
+        shares = psf.shares(at[None, :], at[:, None])
+        moments = np.array([(shares @ at).sum(), (at @ shares).sum()])
+        worst = np.maximum(worst, np.abs(moments / shares.sum()))
+    return math.hypot(*worst)
 
 
-def faintest_shown_e_per_s(method: str, light: Light, sigma_px: tuple[float, float]) -> float:
-    """The rate below which a single star lights no pixel at any phase; 0 where dithering may always light one."""
-    if method == "round":
-        return float(light.response.threshold[0]) * light.white_e_per_s / peak_share(sigma_px)
-    return light.response.half_step * light.white_e_per_s if method == "exact" else 0.0
-
-
-def _star_choice(render: RenderSettings, light: Light, method: str) -> Choice:
-    limit = faintest_shown_e_per_s(method, light, render.sprite_sigma_px)
+def _star_choice(render: RenderSettings, light: Light, method: Quantisation) -> Choice:
+    limit = QUANTISERS[method].faintest_e_per_s(light.panel, display_psf(render))
     dark = light.rates_e_per_s < limit
     share = float(light.rates_e_per_s[dark].sum() / light.rates_e_per_s.sum()) if dark.any() else 0.0
     saving = f"{int(dark.sum())} of {len(dark)} stars in the sky are not drawn"

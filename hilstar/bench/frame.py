@@ -24,13 +24,15 @@ from hilstar.frame.truth import clipped_in, designations, sprite_names, sprite_t
 from hilstar.frame.view import STILL, Canvas, Layer, View
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap, star_losses_mag
-from hilstar.monitor.quantise import QUANTISERS, Panel, Quantiser, shown_light
+from hilstar.monitor.quantise import Panel, Quantiser, shown_light
+from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Codes, Levels, code_dtype
-from hilstar.render.backend import Backend
+from hilstar.render.backend import Backend, linear_light
 from hilstar.rotation import normalise
 from hilstar.scene.camera import Camera
+from hilstar.scene.extended import LightMap
 from hilstar.scene.frame_motion import Scan
-from hilstar.scene.psf import peak_share
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import CLIP_TOLERANCE, Sprites, clipped_sprites
 from hilstar.sky.stars import Stars, split_by_rate
 from hilstar.units import magnitude
@@ -50,20 +52,25 @@ NAMED_STARS = 5
 class Frame:
     """One frame: what each monitor pixel should cause, the codes that ask for it, and the stars behind it.
 
-    `linear` is float32 (height, width), electrons per second; `levels`, uint8 or uint16 of the same shape, are indices into
-    the response's table; `codes` are the code values, the same array or with bit stealing (height, width, 3);
-    `truth` is a structured array of TRUTH_DTYPE, a row for each star whose sprite touches the monitor, and `star` (n,) the
-    places of the same stars in the bench's, negative for light that a fault adds. `t_ns` is the moment for which bodies were
-    placed.
+    `light` is float32 (channels, height, width), electrons per second, and `linear` (height, width) all channels together;
+    `levels`, uint8 or uint16 (height, width), are indices into the response's table; `codes` are the code values, the same
+    array or with bit stealing (height, width, 3); `truth` is a structured array of TRUTH_DTYPE, a row for each star whose
+    sprite touches the monitor, and `star` (n,) the places of the same stars in the bench's, negative for light that a fault
+    adds. `t_ns` is the moment for which bodies were placed.
     """
 
     q_icrs_to_cam: FloatArray
-    linear: Float32Array
+    light: Float32Array
     levels: Levels
     codes: Codes
     truth: npt.NDArray[np.void]
     star: IntArray
     t_ns: int | None = None
+
+    @property
+    def linear(self) -> Float32Array:
+        """The light of all channels together, float32 (height, width), electrons per second."""
+        return self.light[0] if len(self.light) == 1 else np.asarray(self.light.sum(axis=0))
 
 
 class Drawn:
@@ -98,7 +105,8 @@ class Bench:
     `config` is that of `file` with everything chosen that the file left to its tolerance (`effort`, None where it left
     nothing). Of `stars` those from `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are
     `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of white, None where that is 1 everywhere, and
-    `darkest` its minimum. `sources` are the sky's light beside stars, whose bodies have places among `stars` and `shown_stars`.
+    `darkest` its minimum. `tracker_psf` is how its optics spread a star.
+    `sources` are the sky's light beside stars, whose bodies have places among `stars` and `shown_stars`.
     `output` says how the display's output is set that its frames are shown on; {} without one.
     """
 
@@ -115,6 +123,7 @@ class Bench:
     stars: Stars
     shown_stars: Stars
     faint_stars: Stars
+    tracker_psf: Psf
     renderer: Backend
     sources: Sources = NO_SOURCES
     output: dict[str, object] = field(default_factory=dict, repr=False)
@@ -135,19 +144,21 @@ class Bench:
         return Panel(self.calibration.response, self.flux_at_white_e_per_s, self.uniformity)
 
     @property
-    def quantiser(self) -> Quantiser:
+    def quantiser(self) -> type[Quantiser]:
         """How its light becomes levels."""
         return QUANTISERS[self.renderer.target.quantisation]
 
     @property
-    def _sigma_px(self) -> tuple[float, float]:
-        return self.config.render.sprite_sigma_px
+    def psf(self) -> Psf:
+        """How a star is drawn on the monitor."""
+        return self.renderer.target.psf
 
     @cached_property
     def canvas(self) -> Canvas:
         """The monitor as layers draw on it; white is that of its darkest pixel."""
         white_e_per_s = self.flux_at_white_e_per_s * self.darkest
-        return Canvas(self.camera, self.renderer.footprint_px, self._sigma_px, white_e_per_s)
+        first_step = float(self.calibration.response.threshold[0])
+        return Canvas(self.camera, self.psf, white_e_per_s, first_step_e_per_s=first_step * white_e_per_s)
 
     @cached_property
     def layers(self) -> tuple[Layer, ...]:
@@ -242,8 +253,11 @@ class Bench:
 
     def warm_up(self) -> None:
         """Draw once with paths, with stars and with none: a driver compiles its shaders at first use, 60 ms on llvmpipe."""
-        if self._bodies is not None:
-            self.renderer.draw(replace(self.sprites(WARM_UP_ATTITUDE), extended=self._bodies.any_lights()))
+        lights = () if self._bodies is None else self._bodies.any_lights()
+        if self.sources.diffuse:
+            lights = (*lights, LightMap(np.zeros((1, 1), dtype=np.float32), lasting=False))
+        if lights:
+            self.renderer.draw(replace(self.sprites(WARM_UP_ATTITUDE), extended=lights))
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
         self.renderer.begin_anew()
@@ -268,12 +282,11 @@ class Bench:
         self.renderer.begin_anew()
         self.renderer.draw(shown, number)
         levels = Levels(self.renderer.levels().copy())
-        if len(self.faint_stars) or self.renderer.target.sides or len(sprites) != len(shown):
-            self.renderer.draw_linear(sprites)
-        linear = self.renderer.linear().copy()
+        drawn = len(sprites) == len(shown) and not (len(self.faint_stars) or self.renderer.target.sides)
+        light = linear_light(self.renderer, sprites, self.stars, drawn)
         truth, star = self._truth(view, sprites)
         order = np.argsort(truth["v_mag"], kind="stable")
-        return Frame(view.q_icrs_to_cam, linear, levels, self.code_values(levels), truth[order], star[order], t_ns)
+        return Frame(view.q_icrs_to_cam, light, levels, self.code_values(levels), truth[order], star[order], t_ns)
 
     def _truth(self, view: View, sprites: Sprites) -> tuple[npt.NDArray[np.void], IntArray]:
         """Rows of TRUTH_DTYPE for what sprites and discs are of, and its indices (n,)."""
@@ -298,7 +311,7 @@ class Bench:
             return {}
         view = self.view(frame.q_icrs_to_cam, None, frame.t_ns)
         sprites = self.light(view, faults)
-        footprints = FootprintMap(self.camera.resolution_px, self._sigma_px)
+        footprints = FootprintMap(self.camera.resolution_px, self.psf)
         loss_mag = star_losses_mag(sprites, self.panel, footprints, frame.levels)
         names = sprite_names(self.shown_stars, sprites)
         losses = dict(zip(names, loss_mag.tolist(), strict=True)) | self._disc_losses_mag(frame, view, sprites)
@@ -328,7 +341,7 @@ class Bench:
 
     def _clipped(self, sprites: Sprites) -> IntArray:
         size_px = self.camera.resolution_px
-        return clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s, size_px, self.uniformity, self.darkest)
+        return clipped_sprites(sprites, self.psf, self.flux_at_white_e_per_s, size_px, self.uniformity, self.darkest)
 
     def close(self) -> None:
         """Free the GL context."""
@@ -354,7 +367,7 @@ def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
 
 def clipping_hip(bench: Bench) -> list[int | str]:
     """Stars and bodies that clip when centred on the darkest pixel, brightest first: HIP numbers, and names of bodies."""
-    peak_e_per_s = bench.stars.electrons_per_s * peak_share(bench.config.render.sprite_sigma_px)
+    peak_e_per_s = bench.stars.electrons_per_s * bench.psf.peak_share
     order = np.argsort(-peak_e_per_s, kind="stable")
     clips = peak_e_per_s[order] > bench.flux_at_white_e_per_s * bench.darkest * (1 + CLIP_TOLERANCE)
     return bench.stars.designations(order[clips])

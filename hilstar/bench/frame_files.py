@@ -22,6 +22,7 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.bench.frame import Bench, Frame
 from hilstar.files import as_text, whole_file, written
+from hilstar.frame.truth import with_errors
 from hilstar.monitor.response import Codes
 from hilstar.rotation import to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
@@ -173,7 +174,7 @@ def _tan_error_px(camera: Camera) -> float:
 def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     """The linear image (electron/s, float32) with attitude, epoch, bench hash and a world coordinate system.
 
-    The first row of the array is the top of the monitor.
+    The first row of the array is the top of the monitor. Light of several channels is a cube, whose third axis is CHANNEL.
     """
     from astropy.io import fits
 
@@ -183,7 +184,10 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     header["NSTARS"] = (len(frame.truth), "stars in view")
     header["CALNAME"] = (bench.calibration.name, "monitor calibration")
     header["CALSHA"] = bench.calibration.sha256
-    write_fits(path, fits.PrimaryHDU(frame.linear, header))
+    if len(frame.light) > 1:
+        header.update({"CTYPE3": "CHANNEL", "CRPIX3": 1.0, "CRVAL3": 1.0, "CD3_3": 1.0})
+        header.update({f"CHANNEL{k}": key for k, key in enumerate(bench.config.tracker.quantum_efficiencies, 1)})
+    write_fits(path, fits.PrimaryHDU(frame.light if len(frame.light) > 1 else frame.linear, header))
 
 
 def write_fits(path: Path, hdus: Any) -> None:
@@ -218,12 +222,18 @@ def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, c
     return header
 
 
-def write_truth_csv(path: Path, frame: Frame) -> None:
-    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0, an unknown figure is nan."""
+def write_truth_csv(path: Path, frame: Frame, bench: Bench | None = None) -> None:
+    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0, an unknown figure is nan.
+
+    The errors of its stars are those that the catalogue of its `bench` has.
+    """
+    truth = frame.truth
+    if bench is not None:
+        truth = with_errors(truth, bench.stars.catalog, bench.config.sky.epoch_jyear)
     with whole_file(path) as whole, as_text(whole) as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(frame.truth.dtype.names or ())
-        for row in frame.truth.tolist():
+        writer.writerow(truth.dtype.names or ())
+        for row in truth.tolist():
             writer.writerow([int(v) if isinstance(v, bool) else v for v in row])
 
 

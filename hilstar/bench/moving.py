@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
 from hilstar.bench.config.bench_config import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
@@ -17,6 +20,7 @@ from hilstar.sky.bodies.light import bodies_bv_mag, bodies_electrons_per_s
 from hilstar.sky.bodies.moving import PLANETS, YEAR_NS, BodyLight, MovingSky
 from hilstar.sky.bodies.orbit import TLE_ADVICE, VERSION_KEY, Geocentre, OemOrbit, Orbit, TleOrbit
 from hilstar.sky.electrons import Optics, Photometry
+from hilstar.sky.stars import total_and_colours
 from hilstar.units import ARCSEC_PER_RAD
 
 if TYPE_CHECKING:
@@ -30,7 +34,7 @@ MAX_TLE_AGE_DAYS = 7.0
 MAX_ARCSEC, MANY_PX = 7200.0, 1000.0  # wider bodies are given in degrees, and without a count of pixels
 
 
-def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
+def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) -> MovingSky:
     """The bodies of a bench file that has a date, and its observer.
 
     Raises InputError for an orbit or a date that cannot be used, MachineError where the extra is not installed.
@@ -47,9 +51,15 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
     observer = Geocentre() if orbit in {GEOCENTRE, SOURCE} else orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
     names = body_names(config)
     sky = config.sky
-    rates = bodies_electrons_per_s(names, sky.brightness, optics, Photometry(sky.zero_point, sky.passband_weighting))
-    moving = MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates), start_ns, unix)
-    moving.satellites = bench_satellites(config, folder, observer, (utc_ns, utc_ns + start_ns), optics)
+    photometry = Photometry(sky.zero_point, sky.passband_weighting)
+    lit = (*names, "Sun")  # and whatever sunlight falls on
+    rates, colours = total_and_colours(
+        np.stack([bodies_electrons_per_s(lit, sky.brightness, optics, photometry) for optics in channels], axis=1)
+    )
+    shares = (None, None) if colours is None else (colours[:-1], colours[-1])
+    bodies = BodyLight(names, bodies_bv_mag(names), rates[:-1], *shares)
+    moving = MovingSky(Kernel(), observer, utc_ns, bodies, start_ns, unix)
+    moving.satellites = bench_satellites(config, folder, observer, (utc_ns, utc_ns + start_ns), float(rates[-1]))
     return moving
 
 
@@ -77,17 +87,18 @@ def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
 
 
 def bench_satellites(
-    config: BenchConfig, folder: Path, orbit: Orbit, zero_and_start_ns: tuple[int, int], optics: Optics
+    config: BenchConfig, folder: Path, orbit: Orbit, zero_and_start_ns: tuple[int, int], v0_e_per_s: float
 ) -> Satellites | None:
     """The satellites that a bench file names, None where it names none; UTCs of t_ns = 0 and of the start.
 
+    `v0_e_per_s` is the electron rate of sunlight of V = 0.
+
     Raises InputError for a list or a table that is wrong, MachineError without SGP4.
     """
-    from hilstar.sky.bodies.light import bodies_electrons_per_s
     from hilstar.sky.bodies.passes import Satellites
     from hilstar.sky.bodies.satellites import LIST_FORM, TABLE_FORM, brightness_of, read_satellites, read_table
 
-    sky, bodies, (zero_ns, start_ns) = config.sky, config.sky.bodies, zero_and_start_ns
+    bodies, (zero_ns, start_ns) = config.sky.bodies, zero_and_start_ns
     if bodies.satellites is None:
         return None
     path = folder / bodies.satellites
@@ -96,8 +107,6 @@ def bench_satellites(
     if bodies.satellite_magnitudes is not None:
         table = folder / bodies.satellite_magnitudes
         rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
-    photometry = Photometry(sky.zero_point, sky.passband_weighting)
-    v0_e_per_s = float(bodies_electrons_per_s(("Sun",), sky.brightness, optics, photometry)[0])
     brightness = brightness_of(found, rows, bodies.satellite_standard_mag, v0_e_per_s)
     satellites = Satellites(found, brightness, v0_e_per_s, orbit, zero_ns)
     satellites.listed = sum(one.number in rows for one in found)

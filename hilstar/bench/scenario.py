@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from hilstar.errors import InputError, shortened
@@ -170,14 +168,6 @@ class Timetable:
             if not stuck:
                 return since_ns
             since_ns = min(at_ns - one.since_ns for one in stuck)
-
-    def moments_ns(self) -> list[int]:
-        """A moment of each time in which the same faults are on, in order; none of those in which nothing is."""
-        marks = sorted({mark for e in self._entries for mark in (e.begin_ns, e.end_ns) if mark is not None})
-        if any(e.end_ns is None for e in self._entries):
-            marks.append(marks[-1] + 2 * self._exposure_ns)
-        middles = (int(np.mean(pair)) for pair in itertools.pairwise(marks))
-        return [middle for middle in middles if self.on(middle)]
 
 
 def _loses_all(fault: Fault) -> bool:

@@ -10,8 +10,9 @@ The residual is judged by attitudes that were repeated: their scatter is noise, 
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -236,31 +237,7 @@ def _f_limit(above: float, below: float) -> float:
     return float(fdtri(above, below, 1 - FALSE_ALARM))
 
 
-@dataclass(frozen=True, slots=True)
-class AlignmentSummary:
-    """The alignment in figures, and the files written; the field names are the keys of --json.
-
-    `rotation_arcsec` is the rotation vector from the commanded to the reported attitude, cam axes, with `sigma_arcsec` of each
-    axis. `wild_rows` are lines of the file. `repeat_arcsec` and `unexplained_arcsec` are None where too few attitudes repeat.
-    """
-
-    pairs: int
-    used: int
-    wild: int
-    wild_rows: tuple[int, ...]
-    skipped: int
-    attitudes: int
-    rotation_arcsec: tuple[float, float, float]
-    sigma_arcsec: tuple[float, float, float]
-    residual_arcsec: AxesArcsec
-    repeat_arcsec: AxesArcsec | None
-    unexplained_arcsec: AxesArcsec | None
-    q_cam_to_mon: tuple[float, ...]
-    notes: tuple[str, ...]
-    written: tuple[str, ...] = ()
-
-
-def write_alignment(path: Path, found: Aligned, file: BenchFile) -> AlignmentSummary:
+def write_alignment(path: Path, found: Aligned, file: BenchFile) -> None:
     """Write the bench's present geometry with the alignment that was found. Raises InputError where it cannot be written."""
     name = file.config.collimator.geometry
     if name is None:
@@ -271,27 +248,30 @@ def write_alignment(path: Path, found: Aligned, file: BenchFile) -> AlignmentSum
         notes = load_notes(file.folder / name)
         lens_of = f"{Path(name).name}, {notes.made.when or 'no date'}"
     write_geometry(path, camera, found.q_cam_to_mon, _notes(found, notes, lens_of))
-    return summary_of(found, (str(path),))
 
 
-def summary_of(found: Aligned, written: tuple[str, ...] = ()) -> AlignmentSummary:
-    """An alignment in figures."""
-    return AlignmentSummary(
-        pairs=len(found.pairs),
-        used=int(found.fit.used.sum()),
-        wild=len(found.wild),
-        wild_rows=found.wild,
-        skipped=found.pairs.skipped,
-        attitudes=found.residual.attitudes,
-        rotation_arcsec=found.rotation_arcsec,
-        sigma_arcsec=found.sigma_arcsec,
-        residual_arcsec=found.residual.rms,
-        repeat_arcsec=found.residual.repeat,
-        unexplained_arcsec=found.residual.unexplained,
-        q_cam_to_mon=tuple(found.q_cam_to_mon.tolist()),
-        notes=_remarks(found),
-        written=written,
-    )
+def summary_of(found: Aligned) -> dict[str, Any]:
+    """An alignment in figures, by the keys of --json.
+
+    `rotation_arcsec` is the rotation vector from the commanded to the reported attitude, cam axes, with `sigma_arcsec` of each
+    axis. `wild_rows` are lines of the file. `repeat_arcsec` and `unexplained_arcsec` are None where too few attitudes repeat.
+    """
+    residual = found.residual
+    return {
+        "pairs": len(found.pairs),
+        "used": int(found.fit.used.sum()),
+        "wild": len(found.wild),
+        "wild_rows": found.wild,
+        "skipped": found.pairs.skipped,
+        "attitudes": residual.attitudes,
+        "rotation_arcsec": found.rotation_arcsec,
+        "sigma_arcsec": found.sigma_arcsec,
+        "residual_arcsec": asdict(residual.rms),
+        "repeat_arcsec": None if residual.repeat is None else asdict(residual.repeat),
+        "unexplained_arcsec": None if residual.unexplained is None else asdict(residual.unexplained),
+        "q_cam_to_mon": found.q_cam_to_mon.tolist(),
+        "notes": remarks_of(found),
+    }
 
 
 def _notes(found: Aligned, lens: Notes, lens_of: str) -> Notes:
@@ -312,7 +292,8 @@ def _notes(found: Aligned, lens: Notes, lens_of: str) -> Notes:
     return Notes(lens.sigma | dict(zip(axes, found.sigma_arcsec, strict=True)), error, made)
 
 
-def _remarks(found: Aligned) -> tuple[str, ...]:
+def remarks_of(found: Aligned) -> tuple[str, ...]:
+    """What the figures alone do not say."""
     residual = found.residual
     remarks = []
     unexplained = residual.unexplained
@@ -327,25 +308,24 @@ def _remarks(found: Aligned) -> tuple[str, ...]:
     return (*remarks, *residual.causes)
 
 
-def lines_of(summary: AlignmentSummary) -> list[str]:
+def lines_of(found: Aligned) -> list[str]:
     """The alignment for a person."""
-    x, y, z = (
-        f"{value:.2f} +- {sigma:.2f}" for value, sigma in zip(summary.rotation_arcsec, summary.sigma_arcsec, strict=True)
-    )
-    named = ", ".join(map(str, summary.wild_rows[:MAX_NAMED])) + (", ..." if summary.wild > MAX_NAMED else "")
-    skipped = f", {summary.skipped} skipped" if summary.skipped else ""
-    of = "all of one attitude" if summary.attitudes == 1 else f"of {summary.attitudes} attitudes"
+    residual, wild, pairs = found.residual, found.wild, found.pairs
+    parts = zip(found.rotation_arcsec, found.sigma_arcsec, strict=True)
+    x, y, z = (f"{value:.2f} +- {sigma:.2f}" for value, sigma in parts)
+    named = ", ".join(map(str, wild[:MAX_NAMED])) + (", ..." if len(wild) > MAX_NAMED else "")
+    skipped = f", {pairs.skipped} skipped" if pairs.skipped else ""
+    of = "all of one attitude" if residual.attitudes == 1 else f"of {residual.attitudes} attitudes"
     rows = [
-        ("pairs", f"{summary.used} of {summary.pairs} used, {of}{skipped}"),
-        ("wild", f"{summary.wild}, on lines {named}" if summary.wild else "none"),
+        ("pairs", f"{int(found.fit.used.sum())} of {len(pairs)} used, {of}{skipped}"),
+        ("wild", f"{len(wild)}, on lines {named}" if wild else "none"),
         ("reported - commanded", f"x {x}, y {y}, about the boresight {z} arcsec"),
-        ("residual", _both(summary.residual_arcsec)),
+        ("residual", _both(residual.rms)),
     ]
-    if summary.repeat_arcsec is not None and summary.unexplained_arcsec is not None:
-        rows.append(("repeats of an attitude", _both(summary.repeat_arcsec)))
-        rows.append(("not a rotation", _both(summary.unexplained_arcsec)))
+    if residual.repeat is not None and residual.unexplained is not None:
+        rows += [("repeats of an attitude", _both(residual.repeat)), ("not a rotation", _both(residual.unexplained))]
     width = max(len(name) for name, _ in rows) + 2
-    return [f"{name:{width}}{text}" for name, text in rows] + list(summary.notes)
+    return [f"{name:{width}}{text}" for name, text in rows] + list(remarks_of(found))
 
 
 def _both(axes: AxesArcsec) -> str:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
-import tomllib
 from array import array
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +16,13 @@ from hilstar.attitude.clock.sender_clock import OneWayFilter
 from hilstar.attitude.wire.serial_link import read_lines
 from hilstar.bench.bench_file import with_key
 from hilstar.bench.config import BenchConfig, Monitor
-from hilstar.charts import BLUE, ORANGE, chart
+from hilstar.charts import BLUE, ORANGE, chart, write_csv
+from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError, shortened
 from hilstar.files import make_directory, write_whole
-from hilstar.reading import MAX_TOML_BYTES, read_text
-from hilstar.run.record.ledger_reader import NO_FRAMES, config_of, read_head, run_records
-from hilstar.run.record.ledger_records import FrameRecord, RunRecord
-from hilstar.run.sync import Beat, beat, exposures_of
+from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
+from hilstar.run.record.ledger_records import NO_FRAMES, FrameRecord, RunRecord, config_of, read_head, run_records
+from hilstar.run.sync import beat, exposures_of
 from hilstar.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 INT64 = range(-(2**63), 2**63)
@@ -75,16 +73,15 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
 
 def read_edges(path: Path) -> Edges:
     """Read edges from a CSV file with the columns host_ns and level. Raises InputError."""
-    text = read_text(path, "give a file of edges", MAX_EDGE_BYTES)
-    rows, reader = [], csv.DictReader(io.StringIO(text, newline=""))
-    try:
-        for row in reader:
-            rows.append((int(row["host_ns"]), int(row["level"])))
+    rows = []
+    for line, cells in read_rows(path, ("host_ns", "level"), f"{EDGE_FORM} under that header", MAX_EDGE_BYTES, ()):
+        try:
+            rows.append((int(cells[0]), int(cells[1])))
             if rows[-1][0] not in INT64:
                 raise ValueError("host_ns does not fit 64 bits")
-    except (ValueError, KeyError, TypeError, csv.Error) as error:
-        where = f"{path}:{reader.line_num}"
-        raise InputError(f"{where}: not a file of edges ({shortened(repr(error))}); {EDGE_FORM} under that header") from error
+        except ValueError as error:
+            wrong = f"not a file of edges ({shortened(repr(error))}); {EDGE_FORM} under that header"
+            raise InputError(f"{path}:{line}: {wrong}") from error
     if len(rows) < MIN_EDGES or any(level not in {0, 1} for _, level in rows):
         raise InputError(f"{path}: at least {MIN_EDGES} edges are needed, each of level 0 or 1; {EDGE_FORM}")
     table = np.array(rows, dtype=np.int64)
@@ -93,8 +90,7 @@ def read_edges(path: Path) -> Edges:
 
 def save_edges(path: Path, edges: Edges) -> None:
     """Write edges as `read_edges` reads them. Raises InputError where that cannot be done."""
-    lines = (f"{host},{level}" for host, level in zip(edges.host_ns.tolist(), edges.level.tolist(), strict=True))
-    write_whole(path, "\n".join(["host_ns,level", *lines]) + "\n")
+    write_csv(path, ("host_ns", "level"), zip(edges.host_ns.tolist(), edges.level.tolist(), strict=True))
 
 
 def square_edges(records: Iterable[RunRecord]) -> Edges:
@@ -192,57 +188,28 @@ def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
     return (best + 0.5) * BIN_NS - MAX_EARLY_NS, bool((likely > likely[0] + 4).any())
 
 
-@dataclass(frozen=True, slots=True)
-class LatencyPercentiles:
-    """Latencies, ms."""
+def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
+    """The figures of a latency measurement, by the keys of `hilstar latency --json`.
 
-    p1: float
-    p50: float
-    p99: float
-    max: float
-
-
-@dataclass(frozen=True, slots=True)
-class LatencySummary:
-    """The figures of `hilstar latency`; its fields are the keys of the JSON object.
-
-    `swap_to_square_ms` is the scan-out down to the square, `panel_delay_ms` the rest of the median latency: the panel's own.
-    """
-
-    edges: int
-    unmatched: int
-    ambiguous: bool
-    latency_ms: LatencyPercentiles
-    jitter_ms: float
-    rise_ms: float | None
-    fall_ms: float | None
-    swap_to_square_ms: float
-    panel_delay_ms: float
-    beat: Beat
-
-
-def summarise(paired: Paired, config: BenchConfig) -> LatencySummary:
-    """The figures of a latency measurement.
-
-    The square is at the foot of the screen and lights almost a scan-out after the swap, which is subtracted from the delay.
+    The square is at the foot of the screen and lights almost a scan-out after the swap, `swap_to_square_ms`, which is
+    subtracted from the median: the rest is the panel's own, `panel_delay_ms`.
     """
     ms = paired.latency_ns / NS_PER_MS
-    monitor = config.monitor
-    to_square_ms = swap_to_square_ms(monitor)
+    to_square_ms = swap_to_square_ms(config.monitor)
     p1, p50, p99 = (float(value) for value in np.percentile(ms, [1, 50, 99]))
-    rise, fall = ms[paired.level == 1], ms[paired.level == 0]
-    return LatencySummary(
-        edges=len(ms),
-        unmatched=paired.unmatched,
-        ambiguous=paired.ambiguous,
-        latency_ms=LatencyPercentiles(p1, p50, p99, float(ms.max())),
-        jitter_ms=float(ms.std()),
-        rise_ms=float(np.median(rise)) if len(rise) else None,
-        fall_ms=float(np.median(fall)) if len(fall) else None,
-        swap_to_square_ms=to_square_ms,
-        panel_delay_ms=p50 - to_square_ms,
-        beat=beat(exposures_of(config)),
-    )
+    rise, fall = (ms[paired.level == level] for level in (1, 0))
+    return {
+        "edges": len(ms),
+        "unmatched": paired.unmatched,
+        "ambiguous": paired.ambiguous,
+        "latency_ms": {"p1": p1, "p50": p50, "p99": p99, "max": float(ms.max())},
+        "jitter_ms": float(ms.std()),
+        "rise_ms": float(np.median(rise)) if len(rise) else None,
+        "fall_ms": float(np.median(fall)) if len(fall) else None,
+        "swap_to_square_ms": to_square_ms,
+        "panel_delay_ms": p50 - to_square_ms,
+        "beat": asdict(beat(exposures_of(config))),
+    }
 
 
 def swap_to_square_ms(monitor: Monitor) -> float:
@@ -267,25 +234,17 @@ def write_panel_delay(path: Path, panel_delay_ms: float) -> None:
     Raises InputError where the light came before the scan-out that the file assumes, and for a file that cannot be changed.
     """
     value = checked_delay_ms(panel_delay_ms)
-    try:
-        text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
-        changed = with_key(text, "monitor", "panel_delay_ms", value)
-        if tomllib.loads(changed).get("monitor", {}).get("panel_delay_ms") != value:
-            raise InputError(
-                f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: the table is not in plain form"
-            )
-        write_whole(path, changed)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be changed ({error.strerror}); write panel_delay_ms = {value} yourself") from error
-    except ValueError as error:  # tomllib's own, and that of an integer of thousands of digits
-        raise InputError(f"{path}: not TOML: {shortened(error)}") from error
+    text = with_key(read_text(path, "give the path of a bench file", MAX_TOML_BYTES), "monitor", "panel_delay_ms", value)
+    if parse_toml(path, text).get("monitor", {}).get("panel_delay_ms") != value:
+        raise InputError(f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: the table is not in plain form")
+    write_whole(path, text)
 
 
 BINS = 80
 LEVEL_NAMES = {1: "dark to light", 0: "light to dark"}
 
 
-def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> LatencySummary:
+def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> dict[str, Any]:
     """The figures of `hilstar latency`, and the chart `latency` in a directory where one is given.
 
     Raises InputError for a ledger or edges that do not fit each other.
@@ -303,29 +262,30 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> Laten
     return summary
 
 
-def latency_lines(summary: LatencySummary) -> list[str]:
+def latency_lines(summary: dict[str, Any]) -> list[str]:
     """The figures as lines of text."""
-    latency, turn = summary.latency_ms, summary.beat
-    every = "none" if turn.period_s is None else f"every {turn.period_s:.3g} s"
-    cost = "-" if turn.worst_arcsec_per_deg_s is None else f"at most {turn.worst_arcsec_per_deg_s:.2g} arcsec at 1 deg/s"
-    rise, fall = ("-" if value is None else f"{value:.2f}" for value in (summary.rise_ms, summary.fall_ms))
+    latency, turn = summary["latency_ms"], summary["beat"]
+    every = "none" if turn["period_s"] is None else f"every {turn['period_s']:.3g} s"
+    worst = turn["worst_arcsec_per_deg_s"]
+    cost = "-" if worst is None else f"at most {worst:.2g} arcsec at 1 deg/s"
+    rise, fall = ("-" if value is None else f"{value:.2f}" for value in (summary["rise_ms"], summary["fall_ms"]))
     figures = {
-        "edges": f"{summary.edges} paired, {summary.unmatched} without a frame",
-        "swap to light": f"{latency.p1:.2f} / {latency.p50:.2f} / {latency.p99:.2f} ms (p1 / p50 / p99)",
+        "edges": f"{summary['edges']} paired, {summary['unmatched']} without a frame",
+        "swap to light": f"{latency['p1']:.2f} / {latency['p50']:.2f} / {latency['p99']:.2f} ms (p1 / p50 / p99)",
         "rise, fall": f"{rise}, {fall} ms (medians)",
-        "jitter": f"{summary.jitter_ms:.3f} ms (standard deviation)",
-        "beat with the exposure": f"{turn.refreshes_per_exposure:.3f} refreshes in one; {every}; {cost}",
-        "of this, scan-out": f"{summary.swap_to_square_ms:.2f} ms to the square",
-        "panel_delay_ms": f"{summary.panel_delay_ms:.3f}",
+        "jitter": f"{summary['jitter_ms']:.3f} ms (standard deviation)",
+        "beat with the exposure": f"{turn['refreshes_per_exposure']:.3f} refreshes in one; {every}; {cost}",
+        "of this, scan-out": f"{summary['swap_to_square_ms']:.2f} ms to the square",
+        "panel_delay_ms": f"{summary['panel_delay_ms']:.3f}",
     }
-    if summary.ambiguous:
+    if summary["ambiguous"]:
         figures["note"] = 'a latency longer by whole pairs of frames fits too; [monitor] photodiode = "code" tells which'
     return [f"{what:24}{how_much}" for what, how_much in figures.items()]
 
 
-def draw_latency(path: Path, paired: Paired, summary: LatencySummary) -> None:
+def draw_latency(path: Path, paired: Paired, summary: dict[str, Any]) -> None:
     """Draw a histogram of the latencies by level."""
-    middle, jitter = summary.latency_ms.p50, summary.jitter_ms
+    middle, jitter = summary["latency_ms"]["p50"], summary["jitter_ms"]
     with chart(path, f"From swap to light: {middle:.2f} ms, jitter {jitter:.3f} ms") as (axes,):
         ms = paired.latency_ns / NS_PER_MS
         bins = np.linspace(ms.min(), max(ms.max(), ms.min() + 1e-3), BINS).tolist()

@@ -298,70 +298,12 @@ class Provenance:
     unit: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class RepeatCounts:
-    """Minimum and maximum number of readings of a level."""
-
-    min: int
-    max: int
-
-
-@dataclass(frozen=True, slots=True)
-class FittedBlack:
-    """The light of code 0, relative to white, and in the unit of measurement."""
-
-    relative: float
-    unit: float
-
-
-@dataclass(frozen=True, slots=True)
-class HeldOutLevels:
-    """The errors of levels held out of the fit, from white to three decades below; light is above black."""
-
-    rms_percent: float
-    p95_percent: float
-    max_percent: float
-    rms_mag: float
-    max_mag: float
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelSummary:
-    """One channel's figures; `error_percent` is the standard error of its response at each decade below white."""
-
-    codes: int
-    repeats: RepeatCounts
-    black_level: FittedBlack
-    noise_relative: float
-    shape: str
-    parameters: float
-    error_percent: dict[str, float]
-    holdout: HeldOutLevels
-
-
-@dataclass(frozen=True, slots=True)
-class PhotometricSummary:
-    """What was fitted and written; `first` is the channel that comes first in the calibration file."""
-
-    bits: int
-    channels: dict[str, ChannelSummary]
-    first: ChannelSummary
-    noise_relative: float
-    additivity_percent: float | None
-    drift_percent: float | None
-    written: tuple[str, ...]
-    sha256: str
-
-    def json(self) -> dict[str, Any]:
-        """The JSON object of `hilstar calibrate photometric`, the first channel's figures among the others."""
-        figures = asdict(self)
-        return {**figures.pop("first"), **figures}
-
-
 def calibrate_photometric(
     measured: Path, output: Path, provenance: Provenance | None = None, bits: int | None = None
-) -> PhotometricSummary:
-    """Fit a response to MEASURED.csv and write MONITOR.toml with its CSV beside it.
+) -> dict[str, Any]:
+    """Fit a response to MEASURED.csv and write MONITOR.toml with its CSV beside it; the figures of what was found.
+
+    They are each channel's under `channels`, and those of the first in the calibration file among the others.
 
     Raises InputError for files that cannot be read or written, and for data that are too few, saturated, falling or drifting.
     """
@@ -374,32 +316,21 @@ def calibrate_photometric(
     text = f"fitted to {measured.name}, sha256 {data.sha256}"
     if output.with_suffix(".csv").resolve() == measured.resolve():
         raise InputError(f"{output}: its response would be written over {measured}; choose another name")
-    head = _head(data.bits, output, provenance or Provenance())
+    stated = {name: text or NOT_STATED for name, text in asdict(provenance or Provenance()).items()}
+    if stated["when"] == NOT_STATED:
+        stated["when"] = datetime.date.today().isoformat()
+    head = CalibrationHead(kind="photometric", bits=data.bits, response=output.with_suffix(".csv").name, **stated)
     table = write_calibration(output, head, columns, noise, NotesTable(drift=drift_note, text=text))
-    written = load_calibration(output, data.bits)
-    channels = {name: _channel_summary(fit) for name, fit in fits.items()}
-    return PhotometricSummary(
-        bits=data.bits,
-        channels=channels,
-        first=channels[next(iter(columns))],
-        noise_relative=noise,
-        additivity_percent=additivity_percent(fits),
-        drift_percent=None if math.isnan(drift) else 100 * drift,
-        written=(str(output), str(table)),
-        sha256=written.sha256,
-    )
-
-
-def _head(bits: int, output: Path, provenance: Provenance) -> CalibrationHead:
-    return CalibrationHead(
-        kind="photometric",
-        who=provenance.who or NOT_STATED,
-        when=provenance.when or datetime.date.today().isoformat(),
-        instrument=provenance.instrument or NOT_STATED,
-        unit=provenance.unit or NOT_STATED,
-        bits=bits,
-        response=output.with_suffix(".csv").name,
-    )
+    channels = {name: _channel_figures(fit) for name, fit in fits.items()}
+    return channels[next(iter(columns))] | {
+        "bits": data.bits,
+        "channels": channels,
+        "noise_relative": noise,
+        "additivity_percent": additivity_percent(fits),
+        "drift_percent": None if math.isnan(drift) else 100 * drift,
+        "written": [str(output), str(table)],
+        "sha256": load_calibration(output, data.bits).sha256,
+    }
 
 
 def fit_all(data: Measurements) -> dict[str, ChannelFit]:
@@ -426,28 +357,30 @@ def additivity_percent(fits: dict[str, ChannelFit]) -> float | None:
     return 100 * (sum(fits[name].white for name in PRIMARIES) / fits["w"].white - 1)
 
 
-def _channel_summary(fit: ChannelFit) -> ChannelSummary:
+def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
+    """One channel's figures: its black level over white and in the unit of measurement, and errors at decades below white."""
     count = fit.levels.count
     log_light = np.log(np.maximum(fit.light, 1e-12))
     places = {decade: int(np.argmin(np.abs(log_light + decade * math.log(10)))) for decade in DECADES}
-    return ChannelSummary(
-        codes=len(count),
-        repeats=RepeatCounts(int(count.min()), int(count.max())),
-        black_level=FittedBlack(fit.black / fit.white, fit.black),
-        noise_relative=fit.noise_relative,
-        shape=fit.shape,
-        parameters=fit.parameters,
-        error_percent={f"1e-{decade}": 100 * float(fit.error[place]) for decade, place in places.items()},
-        holdout=held_out(fit),
-    )
+    return {
+        "codes": len(count),
+        "repeats": {"min": int(count.min()), "max": int(count.max())},
+        "black_level": {"relative": fit.black / fit.white, "unit": fit.black},
+        "noise_relative": fit.noise_relative,
+        "shape": fit.shape,
+        "parameters": fit.parameters,
+        "error_percent": {f"1e-{decade}": 100 * float(fit.error[place]) for decade, place in places.items()},
+        "holdout": held_out(fit),
+    }
 
 
-def held_out(fit: ChannelFit) -> HeldOutLevels:
-    """The errors of a fit's levels, each held out of the fit."""
+def held_out(fit: ChannelFit) -> dict[str, float]:
+    """The errors of a fit's levels, each held out of the fit, from white to three decades below; light is above black."""
     shown = fit.light[fit.levels.code[1:]] >= 10.0 ** -DECADES[-1]
     residual = np.abs(fit.residual[shown])
-    rms, p95, largest = float(np.sqrt((residual**2).mean())), float(np.percentile(residual, 95)), float(residual.max())
-    return HeldOutLevels(100 * rms, 100 * p95, 100 * largest, MAG_PER_RELATIVE * rms, MAG_PER_RELATIVE * largest)
+    found = {"rms": np.sqrt((residual**2).mean()), "p95": np.percentile(residual, 95), "max": residual.max()}
+    percent = {f"{name}_percent": 100 * float(value) for name, value in found.items()}
+    return percent | {f"{name}_mag": MAG_PER_RELATIVE * float(found[name]) for name in ("rms", "max")}
 
 
 MIN_DRAWN_LIGHT = 1e-5  # relative to white, as drawn
@@ -461,11 +394,11 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
     Raises InputError for the same data as the fit does, and where the PNG cannot be written.
     """
     fits = fit_all(read_measurements(measured, bits))
-    worst = max(fits, key=lambda name: held_out(fits[name]).rms_percent)
-    left, known = held_out(fits[worst]), fits[worst].noise_relative
+    worst = max(fits.values(), key=lambda fit: held_out(fit)["rms_percent"])
+    left = held_out(worst)
     finding = (
-        f"Levels held out of the fit are {left.rms_percent:.2g} % ({left.rms_mag:.2g} mag) rms off, {left.max_percent:.2g} % at"
-        f" the maximum; a patch repeats to {100 * known:.2g} %"
+        f"Levels held out of the fit are {left['rms_percent']:.2g} % ({left['rms_mag']:.2g} mag) rms off,"
+        f" {left['max_percent']:.2g} % at the maximum; a patch repeats to {100 * worst.noise_relative:.2g} %"
     )
     note = "Lines: the fit. Dots: measured above, held out of the fit below. Dotted: black. Bands: the fit's error."
     with chart(path, finding, panels=2, note=note) as (response, residual):

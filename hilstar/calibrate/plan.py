@@ -19,7 +19,8 @@ from hilstar.errors import InputError, MachineError
 from hilstar.files import make_directory, write_whole
 from hilstar.monitor.response import code_dtype
 from hilstar.reading import read_text
-from hilstar.render.presenter import Presenter, ScreenView, level_texture, window_context
+from hilstar.render.backend import ScreenView
+from hilstar.render.presenter import Presenter, level_texture, window_context
 
 if TYPE_CHECKING:
     from hilstar.monitor.window.window import Window

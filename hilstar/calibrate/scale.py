@@ -13,7 +13,6 @@ from hilstar.bench.config import read_config
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.files import write_whole
-from hilstar.scene.psf import peak_share
 from hilstar.units import magnitude
 
 UNSURE_MAG = 0.05  # readings that disagree by more are wrong for another reason than the scale
@@ -62,7 +61,7 @@ def _rate_of(bench: Bench, hip: int) -> float:
     if not len(place):
         raise InputError(f"--reading {hip}: the bench has no such star; take one of [sky] catalogue within faintest_v_mag")
     rate = float(bench.stars.electrons_per_s[place[0]])
-    if rate * peak_share(bench.config.render.sprite_sigma_px) > bench.flux_at_white_e_per_s:
+    if rate * bench.psf.peak_share > bench.flux_at_white_e_per_s:
         raise InputError(f"--reading {hip}: the star clips on the monitor; take a fainter one")
     if rate < bench.faintest_shown_e_per_s:
         raise InputError(f"--reading {hip}: the star is too faint for the monitor to show; take a brighter one")

@@ -48,51 +48,26 @@ Kind = Literal["int64", "float64", "bool", "text"]
 DONE, FAILED = "done", "failed"
 AXES = ("x", "y", "z")
 
-BEFORE: tuple[tuple[str, Kind], ...] = (
-    ("case", "int64"),
-    ("status", "text"),
-    ("why", "text"),
-    ("noise_seed", "int64"),
-    ("bench_sha256", "text"),
-    ("image_sha256", "text"),
-    ("image", "text"),
-    ("t_ns", "int64"),
-    ("qw", "float64"),
-    ("qx", "float64"),
-    ("qy", "float64"),
-    ("qz", "float64"),
-    ("ra_deg", "float64"),
-    ("dec_deg", "float64"),
-    ("roll_deg", "float64"),
+Q = ("qw", "qx", "qy", "qz")
+TEXTS = {"status", "why", "bench_sha256", "image_sha256", "image"}
+WHOLE = {"case", "noise_seed", "t_ns", "frames", "stars_in_view", "solved", "wrong"}
+WHOLE |= {"stars", "found", "matched", "false", "measured"}
+BEFORE = (
+    *("case", "status", "why", "noise_seed", "bench_sha256", "image_sha256", "image", "t_ns"),
+    *(*Q, "ra_deg", "dec_deg", "roll_deg"),
 )
-AFTER: tuple[tuple[str, Kind], ...] = (
-    ("frames", "int64"),
-    ("stars_in_view", "int64"),
-    ("limit_v_mag", "float64"),
-    ("solved", "int64"),
-    ("wrong", "int64"),
-    ("solved_qw", "float64"),
-    ("solved_qx", "float64"),
-    ("solved_qy", "float64"),
-    ("solved_qz", "float64"),
-    ("error_x_arcsec", "float64"),
-    ("error_y_arcsec", "float64"),
-    ("error_z_arcsec", "float64"),
-    ("scatter_x_arcsec", "float64"),
-    ("scatter_y_arcsec", "float64"),
-    ("scatter_z_arcsec", "float64"),
+AFTER = (
+    *("frames", "stars_in_view", "limit_v_mag", "solved", "wrong", *(f"solved_{name}" for name in Q)),
+    *(f"{what}_{axis}_arcsec" for what in ("error", "scatter") for axis in AXES),
 )
-CENTROIDS: tuple[tuple[str, Kind], ...] = (
-    ("stars", "int64"),
-    ("found", "int64"),
-    ("matched", "int64"),
-    ("false", "int64"),
-    ("measured", "int64"),
-    ("centroid_dx_px", "float64"),
-    ("centroid_dy_px", "float64"),
-    ("centroid_sigma_x_px", "float64"),
-    ("centroid_sigma_y_px", "float64"),
+CENTROIDS = (
+    *("stars", "found", "matched", "false", "measured"),
+    *("centroid_dx_px", "centroid_dy_px", "centroid_sigma_x_px", "centroid_sigma_y_px"),
 )
+
+
+def _kinds(names: tuple[str, ...]) -> dict[str, Kind]:
+    return {name: "text" if name in TEXTS else "int64" if name in WHOLE else "float64" for name in names}
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +230,7 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
 def columns(parameters: list[Parameter], with_centroids: bool) -> dict[str, Kind]:
     """The columns of a campaign's rows, in their order."""
     varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
-    return dict(BEFORE) | varied | dict(AFTER) | (dict(CENTROIDS) if with_centroids else {})
+    return _kinds(BEFORE) | varied | _kinds(AFTER) | (_kinds(CENTROIDS) if with_centroids else {})
 
 
 def value_kind(parameter: Parameter) -> Kind:
@@ -276,21 +251,17 @@ def first_row(case: Case, plan_columns: dict[str, Kind]) -> Row:
     q = case.first.q_icrs_to_cam
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q)
     row |= {"case": case.number, "status": DONE, "why": "", "noise_seed": case.noise_seed, "t_ns": case.first.t_ns}
-    row |= dict(zip(("qw", "qx", "qy", "qz"), q.tolist(), strict=True))
+    row |= dict(zip(Q, q.tolist(), strict=True))
     row |= {"ra_deg": ra_deg, "dec_deg": dec_deg, "roll_deg": roll_deg}
     for key, value in case.values.items():
         name = f"vary.{key}"
-        row[name] = _as_text(value) if plan_columns[name] == "text" else value
+        row[name] = str(value) if plan_columns[name] == "text" else value
     return row
 
 
 def failed(row: Row, why: str) -> Row:
     """The row of a case that failed."""
     return row | {"status": FAILED, "why": why}
-
-
-def _as_text(value: Any) -> str:
-    return value if isinstance(value, str) else str(value)
 
 
 @dataclass(slots=True)
@@ -334,7 +305,7 @@ class CaseTally:
         row = row | {"why": self.why, "image_sha256": self._digest.hexdigest(), "frames": self.frames}
         row |= {"stars_in_view": self.stars_in_view, "solved": self.wrong + len(self.errors_arcsec), "wrong": self.wrong}
         if self.first_q is not None:
-            row |= dict(zip(("solved_qw", "solved_qx", "solved_qy", "solved_qz"), self.first_q.tolist(), strict=True))
+            row |= dict(zip((f"solved_{name}" for name in Q), self.first_q.tolist(), strict=True))
         if self.errors_arcsec:
             errors = np.array(self.errors_arcsec)
             row |= _by_axis("error", errors.mean(axis=0))
@@ -350,11 +321,8 @@ class CaseTally:
         }
         row["measured"] = len(dx_px)
         if len(dx_px):
-            row |= {
-                "limit_v_mag": float(v_mag.max()),
-                "centroid_dx_px": float(dx_px.mean()),
-                "centroid_dy_px": float(dy_px.mean()),
-            }
+            row |= {"centroid_dx_px": float(dx_px.mean()), "centroid_dy_px": float(dy_px.mean())}
+            row["limit_v_mag"] = float(v_mag.max())
         if len(dx_px) > 1:
             row |= {"centroid_sigma_x_px": float(dx_px.std(ddof=1)), "centroid_sigma_y_px": float(dy_px.std(ddof=1))}
         return row

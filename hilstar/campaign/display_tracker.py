@@ -12,13 +12,13 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
-from hilstar.frame.layers import light_of, sky_layers
+from hilstar.frame.layers import Sources, light_of, sky_layers
 from hilstar.frame.view import View
 from hilstar.monitor.quantise import shown_light
 from hilstar.rotation import propagate
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import TwinOptics
-from hilstar.twin.simulator import Exposure, background_e, detector_canvas, exposure_truth
+from hilstar.twin.simulator import Exposure, TrackerBackground, detector_canvas, exposure_truth
 from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
 
@@ -46,7 +46,7 @@ class DisplayTracker:
         """Switch to another bench file of the same folder, rebuilding only what changed."""
         if file.config == self.config:
             return
-        before, self.file, self.config = self.config, file, file.config
+        before, psf, self.file, self.config = self.config, self.canvas.psf, file, file.config
         if _shown_keys(before) != _shown_keys(self.config) or self._bench.moving is not None:
             self._bench.close()
             self._bench = open_bench(file)
@@ -54,7 +54,7 @@ class DisplayTracker:
             config = msgspec.structs.replace(file.config, render=self._bench.config.render)
             self._bench = replace(self._bench, file=file, config=config)
         self._load()
-        if _optics_keys(before) != _optics_keys(self.config):
+        if _optics_keys(before) != _optics_keys(self.config) or psf != self.canvas.psf:
             self._optics.close()
             self._load_optics()
         else:
@@ -62,37 +62,37 @@ class DisplayTracker:
 
     def _load(self) -> None:
         tracker = self.config.tracker
-        self.camera = tracker_camera(tracker, self.file.folder)
+        self.camera, self.stars = tracker_camera(tracker, self.file.folder), self._bench.stars
+        self.canvas = detector_canvas(self.file, self.camera)
         self._panel = true_panel(self._bench)
-        self._background_e = background_e(self.config, self.file.folder)
+        self._background = TrackerBackground(self.config, self.file.folder, self.camera)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
     def _load_optics(self) -> None:
-        self._optics = TwinOptics(true_geometry(self._bench, self.camera), self.config.tracker.psf_sigma_px)
+        self._optics = TwinOptics(true_geometry(self._bench, self.camera), self.canvas.psf)
         self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
 
     def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
         """One exposure of the display, without noise if there is no generator. Raises InputError as the detector does."""
         exposure_s = view.exposure_s
         light_e = self._optics.image_e_per_s(self._light_e_per_s(view)) * exposure_s
-        mean_e = light_e + self._glow_e_per_s * exposure_s + self._background_e
+        mean_e = light_e + self._glow_e_per_s * exposure_s + self._background.of_view_e(view)
         if rng is None:
             dn = self._detector.expose_noiseless(mean_e, exposure_s)
         else:
             dn = self._detector.expose(mean_e, exposure_s, rng)
         stars = self._bench.seen(self._bench.stars, view)
-        canvas = detector_canvas(self.config.tracker, self.camera)
-        light = light_of(canvas, sky_layers(canvas, self._bench.sources, paths=False), stars, view)
-        truth = exposure_truth(canvas, view, stars, light, mean_e)
+        light = light_of(self.canvas, sky_layers(self.canvas, Sources(self._bench.moving), paths=False), stars, view)
+        truth = exposure_truth(self.canvas, view, stars, light, mean_e)
         truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
         return Exposure(view, dn, mean_e, truth)
 
     def _light_e_per_s(self, view: View) -> FloatArray:
         """The mean light (H, W) of the display over the exposure."""
-        count, moving = 1, self._bench.moving
+        count, moving = max(1, round(view.exposure_s * self.config.monitor.refresh_hz)), self._bench.moving
         streaks = moving is not None and moving.satellites is not None
-        if streaks or view.turn.rate_cam_rad_s.any() or self._bench.quantiser.over_frames:
-            count = max(1, round(view.exposure_s * self.config.monitor.refresh_hz))
+        if not streaks and not view.turn.rate_cam_rad_s.any():
+            count = len(self._bench.quantiser.exposure(0, count))
         total: FloatArray | None = None
         for frame in range(count):
             seconds = ((frame + 0.5) / count - 0.5) * view.exposure_s
@@ -113,12 +113,13 @@ class DisplayTracker:
 def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
     """The keys that decide the bench's frames; of the tracker those of its light gathering and exposure."""
     tracker = config.tracker
-    gathers = tracker.aperture_mm, tracker.quantum_efficiency, tracker.transmission, tracker.exposure_s
-    return config.sky, config.spacecraft, config.monitor, config.collimator, config.render, gathers
+    gathers = tracker.aperture_mm, tracker.quantum_efficiencies, tracker.transmission, tracker.exposure_s
+    open_part = tracker.detector.fill_factor
+    return config.sky, config.spacecraft, config.monitor, config.collimator, config.render, gathers, open_part
 
 
 def _optics_keys(config: BenchConfig) -> tuple[object, ...]:
-    """The keys that decide how the display's light falls onto the detector."""
+    """The keys that decide where the display's light falls onto the detector."""
     tracker = config.tracker
     lens = (
         tracker.focal_length_mm,
@@ -127,4 +128,4 @@ def _optics_keys(config: BenchConfig) -> tuple[object, ...]:
         tracker.principal_point_px,
         tracker.distortion,
     )
-    return config.monitor, config.collimator, config.verify, lens, tracker.psf_sigma_px
+    return config.monitor, config.collimator, config.verify, lens

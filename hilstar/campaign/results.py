@@ -15,11 +15,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import rankdata
@@ -89,58 +88,31 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
         raise InputError(f"{path}: is no table of a campaign ({error}); delete it, and run the same command again") from error
 
 
-@dataclass(frozen=True, slots=True)
-class CentroidFigures:
-    """The centroider alone: mean error and one sigma, px, the share of stars found, and false finds per frame."""
-
-    bias_x_px: float
-    bias_y_px: float
-    sigma_x_px: float
-    sigma_y_px: float
-    found_share: float
-    false_a_frame: float
-
-
-@dataclass(frozen=True, slots=True)
-class CaseBudget:
-    """The budget of the cases, as `hilstar assess` has it; `scatter_arcsec` is that within cases of several frames.
+def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -> tuple[dict[str, Any], Decomposed | None]:
+    """The budget of a campaign's cases by the keys of --json, and its parts, as `hilstar assess` has them.
 
     A figure that too few answers determine is None, and a note says why.
     """
-
-    scatter_arcsec: Axes | None
-    availability: float
-    wrong: int
-    centroids: CentroidFigures | None
-    notes: tuple[str, ...]
-    parts: Decomposed | None = None
-
-    @property
-    def bias_arcsec(self) -> tuple[float, ...] | None:
-        """The mean error, cam axes."""
-        return None if self.parts is None else tuple(self.parts.bias_arcsec.tolist())
-
-
-def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -> CaseBudget:
-    """The budget of a campaign's cases."""
-    asked = float(np.nansum(cases.numbers["frames"]))
-    solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("solved", "wrong"))
-    budget = CaseBudget(
-        scatter_arcsec=_scatter(cases),
-        availability=(solved - wrong) / asked if asked else 0.0,
-        wrong=int(wrong),
-        centroids=_centroids(cases),
-        notes=(),
-    )
+    asked, solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("frames", "solved", "wrong"))
     tracker = config.tracker
     scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
     commanded, reported = cases.vectors("q{}", "wxyz"), reported_attitudes(cases)
     step = -(-len(commanded) // MAX_FITTED_CASES)
+    parts: Decomposed | None = None
     try:
         parts = assess_cases(commanded[::step], reported[::step], scale, rng)
+        notes = parts.notes
     except InputError as error:
-        return replace(budget, notes=(str(error),))
-    return replace(budget, parts=parts, notes=parts.notes)
+        notes = (str(error),)
+    return {
+        "bias_arcsec": None if parts is None else parts.bias_arcsec.tolist(),
+        **{f"{name}_arcsec": None if parts is None else getattr(parts, f"{name}_arcsec") for name in PARTS},
+        "scatter_arcsec": _scatter(cases),
+        "availability": (solved - wrong) / asked if asked else 0.0,
+        "wrong": int(wrong),
+        "centroids": _centroids(cases),
+        "notes": notes,
+    }, parts
 
 
 def reported_attitudes(cases: Columns) -> FloatArray:
@@ -163,7 +135,8 @@ def _scatter(cases: Columns) -> Axes | None:
     return Axes(math.sqrt((variance[0] + variance[1]) / 2), math.sqrt(variance[2]))
 
 
-def _centroids(cases: Columns) -> CentroidFigures | None:
+def _centroids(cases: Columns) -> dict[str, float] | None:
+    """The centroider alone: mean error and one sigma, px, the share of stars found, and false finds per frame."""
     numbers = cases.numbers
     if "measured" not in numbers:
         return None
@@ -175,26 +148,24 @@ def _centroids(cases: Columns) -> CentroidFigures | None:
     def mean(values: FloatArray) -> float:
         return float(np.average(values[some], weights=weight[some]))
 
-    bias_px = [mean(numbers[f"centroid_d{axis}_px"]) for axis in "xy"]
-    spread = [numbers[f"centroid_sigma_{axis}_px"] ** 2 + numbers[f"centroid_d{axis}_px"] ** 2 for axis in "xy"]
-    sigma_px = [math.sqrt(max(0.0, mean(values) - bias**2)) for values, bias in zip(spread, bias_px, strict=True)]
-    return CentroidFigures(
-        bias_x_px=bias_px[0],
-        bias_y_px=bias_px[1],
-        sigma_x_px=sigma_px[0],
-        sigma_y_px=sigma_px[1],
-        found_share=float(np.nansum(numbers["matched"]) / max(np.nansum(numbers["stars"]), 1.0)),
-        false_a_frame=float(np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)),
-    )
+    off_px = {axis: numbers[f"centroid_d{axis}_px"] for axis in "xy"}
+    bias_px = {axis: mean(off) for axis, off in off_px.items()}
+    square_px2 = {axis: mean(numbers[f"centroid_sigma_{axis}_px"] ** 2 + off**2) for axis, off in off_px.items()}
+    return {
+        **{f"bias_{axis}_px": bias for axis, bias in bias_px.items()},
+        **{f"sigma_{axis}_px": math.sqrt(max(0.0, square_px2[axis] - bias**2)) for axis, bias in bias_px.items()},
+        "found_share": float(np.nansum(numbers["matched"]) / max(np.nansum(numbers["stars"]), 1.0)),
+        "false_a_frame": float(np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)),
+    }
 
 
-def write_budget(path: Path, budget: CaseBudget) -> None:
+def write_budget(path: Path, budget: dict[str, Any], parts: Decomposed | None) -> None:
     """The budget as a table, with the columns of `hilstar assess`. Raises InputError where it cannot be written."""
-    write_csv(path, FigureRow._fields, [["" if value is None else value for value in row] for row in _rows(budget)])
+    write_csv(path, FigureRow._fields, [["" if value is None else value for value in row] for row in _rows(budget, parts)])
 
 
-def _rows(budget: CaseBudget) -> Iterator[FigureRow]:
-    parts, unknown = budget.parts, (None, None)
+def _rows(budget: dict[str, Any], parts: Decomposed | None) -> Iterator[FigureRow]:
+    unknown = (None, None)
     for k, axis in enumerate("xyz"):
         value = None if parts is None else float(parts.bias_arcsec[k])
         ends = unknown if parts is None else parts.intervals.bias[:, k].tolist()
@@ -204,14 +175,13 @@ def _rows(budget: CaseBudget) -> Iterator[FigureRow]:
         for k, axis in enumerate(("cross", "roll")):
             ends = unknown if parts is None else getattr(parts.intervals, part)[:, k].tolist()
             yield FigureRow(name, axis, axes and getattr(axes, axis), "arcsec", *ends)
-    scatter = budget.scatter_arcsec or Axes(None, None)
+    scatter = budget["scatter_arcsec"] or Axes(None, None)
     yield FigureRow(SCATTER, "cross", scatter.cross, "arcsec")
     yield FigureRow(SCATTER, "roll", scatter.roll, "arcsec")
-    yield FigureRow("availability", "", budget.availability)
-    yield FigureRow("wrong answers", "", budget.wrong)
-    if budget.centroids is not None:
-        for name, value in asdict(budget.centroids).items():
-            yield FigureRow(f"centroids: {name}", "", value, "px" if name.endswith("_px") else "1")
+    yield FigureRow("availability", "", budget["availability"])
+    yield FigureRow("wrong answers", "", budget["wrong"])
+    for name, value in (budget["centroids"] or {}).items():
+        yield FigureRow(f"centroids: {name}", "", value, "px" if name.endswith("_px") else "1")
 
 
 @dataclass(frozen=True)
@@ -411,35 +381,15 @@ def draw_costs(path: Path, found: list[Cost]) -> None:
             axis.set_ylabel("share" if cost.unit == "1" else f"{cost.unit}, median")
 
 
-class CampaignSummary(msgspec.Struct, frozen=True):
-    """The JSON object of `hilstar campaign`."""
-
-    cases: int
-    failed: int
-    failed_because: dict[str, int]
-    table: str
-    sha256: str
-    bias_arcsec: tuple[float, ...] | None
-    fov_arcsec: Axes | None
-    pixel_arcsec: Axes | None
-    noise_arcsec: Axes | None
-    scatter_arcsec: Axes | None
-    availability: float
-    wrong: int
-    centroids: CentroidFigures | None
-    notes: tuple[str, ...]
-    findings: tuple[str, ...]
-
-
-def write_results(table: Path, config: BenchConfig, seed: int) -> CampaignSummary:
-    """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies beside a campaign's table.
+def write_results(table: Path, config: BenchConfig, seed: int) -> dict[str, Any]:
+    """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies; the JSON object of `hilstar campaign`.
 
     Raises InputError where the table cannot be read, or a file not be written.
     """
     because = failures(table)
     cases = read_cases(table)
-    budget = case_budget(cases, config, np.random.default_rng(seed))
-    write_budget(table.with_name("budget.csv"), budget)
+    budget, parts = case_budget(cases, config, np.random.default_rng(seed))
+    write_budget(table.with_name("budget.csv"), budget, parts)
     found = costs(cases)
     write_costs(table.with_name("sensitivity.csv"), found)
     findings = []
@@ -448,42 +398,33 @@ def write_results(table: Path, config: BenchConfig, seed: int) -> CampaignSummar
         if max(float(cost.level.max()) for cost in of_it) > 0:
             draw_costs(table.with_name(f"sensitivity_{measure}.png"), of_it)
             findings.append(finding(of_it))
-    parts = budget.parts
-    return CampaignSummary(
-        cases=cases.cases,
-        failed=sum(because.values()),
-        failed_because=because,
-        table=str(table),
-        sha256=file_sha256(table),
-        bias_arcsec=budget.bias_arcsec,
-        fov_arcsec=None if parts is None else parts.fov_arcsec,
-        pixel_arcsec=None if parts is None else parts.pixel_arcsec,
-        noise_arcsec=None if parts is None else parts.noise_arcsec,
-        scatter_arcsec=budget.scatter_arcsec,
-        availability=budget.availability,
-        wrong=budget.wrong,
-        centroids=budget.centroids,
-        notes=budget.notes,
-        findings=tuple(findings),
-    )
+    return {
+        "cases": cases.cases,
+        "failed": sum(because.values()),
+        "failed_because": because,
+        "table": str(table),
+        "sha256": file_sha256(table),
+        **budget,
+        "findings": findings,
+    }
 
 
-def lines_of(summary: CampaignSummary) -> list[str]:
+def lines_of(summary: dict[str, Any]) -> list[str]:
     """The summary's lines on the terminal."""
-    lines = [f"{summary.cases} cases in {summary.table}, sha256 {summary.sha256}"]
-    lines += [f"{count} failed: {line}" for line, count in list(summary.failed_because.items())[:MAX_REASONS]]
-    lines.append(f"{'availability':20}{100 * summary.availability:.4g} %, {summary.wrong} wrong answers")
-    if summary.bias_arcsec is not None:
-        lines.append(f"{'bias':20}{', '.join(f'{value:.3g}' for value in summary.bias_arcsec)} arcsec about x, y, z")
+    lines = [f"{summary['cases']} cases in {summary['table']}, sha256 {summary['sha256']}"]
+    lines += [f"{count} failed: {line}" for line, count in list(summary["failed_because"].items())[:MAX_REASONS]]
+    lines.append(f"{'availability':20}{100 * summary['availability']:.4g} %, {summary['wrong']} wrong answers")
+    if summary["bias_arcsec"] is not None:
+        lines.append(f"{'bias':20}{', '.join(f'{value:.3g}' for value in summary['bias_arcsec'])} arcsec about x, y, z")
         for part, name in (*PARTS.items(), ("scatter", SCATTER)):
-            axes: Axes | None = getattr(summary, f"{part}_arcsec")
+            axes: Axes | None = summary[f"{part}_arcsec"]
             if axes is not None:
                 values = ("-" if value is None else f"{value:.3g} arcsec {axis}" for axis, value in asdict(axes).items())
                 lines.append(f"{name:20}{', '.join(values)}")
-    if summary.centroids is not None:
-        found = summary.centroids
+    found = summary["centroids"]
+    if found is not None:
         lines.append(
-            f"{'centroids':20}{found.sigma_x_px:.3g}, {found.sigma_y_px:.3g} px one sigma,"
-            f" {100 * found.found_share:.3g} % of stars found, {found.false_a_frame:.3g} false a frame"
+            f"{'centroids':20}{found['sigma_x_px']:.3g}, {found['sigma_y_px']:.3g} px one sigma,"
+            f" {100 * found['found_share']:.3g} % of stars found, {found['false_a_frame']:.3g} false a frame"
         )
-    return [*lines, *summary.notes, *summary.findings]
+    return [*lines, *summary["notes"], *summary["findings"]]

@@ -5,28 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.campaign.cases import CaseMaker, columns, failed, first_row
 from hilstar.campaign.plan import Design, Plan, grid_levels, parse_plan
-from hilstar.campaign.pool import MAX_DEATHS, Backlog, Task
-from hilstar.campaign.session import Answered, Identity, Job, Session, files_sha256
+from hilstar.campaign.pool import MAX_DEATHS, Backlog, Pool, Task
+from hilstar.campaign.session import Identity, Job, Session, files_sha256
 from hilstar.campaign.store import About, Directory, Journal, Row, require_parquet, schema_of, write_table
 from hilstar.errors import InputError
 from hilstar.reading import MAX_TOML_BYTES, read_text
 
-
-class Workers(Protocol):
-    """A runner of cases in tasks of about `task_s` seconds: the pool, or a cluster."""
-
-    task_s: float
-
-    def run(self, backlog: Backlog, done: Callable[[Task, Answered], None], lost: Callable[[Task, int | None], None]) -> None:
-        """Run all cases of a backlog."""
-        ...
+if TYPE_CHECKING:
+    from hilstar.campaign.cluster import Cluster
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +73,7 @@ class Campaign:
         identity = msgspec.to_builtins(self.identity)
         return About(plan, self.file.sha256, self.job.files_sha256, self.asked.solver, self.asked.images, identity)
 
-    def run(self, directory: Directory, workers: Workers, on_done: Callable[[int], None]) -> None:
+    def run(self, directory: Directory, workers: Pool | Cluster, on_done: Callable[[int], None]) -> None:
         """Run the missing cases, and write the table once none is missing. `on_done` gets the number of finished cases.
 
         Raises InputError where nothing can be written, and what the workers raise. The same call resumes from there.

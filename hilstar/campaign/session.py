@@ -12,7 +12,6 @@ import hashlib
 import os
 import time
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -21,7 +20,6 @@ import scipy
 import hilstar
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, bench_file_of
-from hilstar.bench.config import BenchConfig
 from hilstar.campaign.cases import Case, CaseMaker, CaseTally, Kind, columns, failed, first_row
 from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.campaign.plan import SCENARIO, Plan, parse_plan
@@ -29,12 +27,10 @@ from hilstar.campaign.solvers import CENTROIDS, SolverFault, choose_solver
 from hilstar.campaign.store import Row
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import make_directory
-from hilstar.frame.view import View
 from hilstar.reading import CHUNK_BYTES, open_regular
 from hilstar.resources import resource_path
-from hilstar.scene.camera import Camera
 from hilstar.twin.pictures import write_exposure_fits
-from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
+from hilstar.twin.simulator import FrameNoise, Simulator
 
 IMAGES = "images"
 IMAGES_A_FOLDER = 1000
@@ -108,29 +104,7 @@ class Answered(msgspec.Struct, frozen=True):
     peak_bytes: int
 
 
-class Imaging(Protocol):
-    """A tracker that exposes, of the sky or of the display."""
-
-    file: BenchFile
-    config: BenchConfig
-    camera: Camera
-
-    @property
-    def gl_renderer(self) -> str:
-        """The name of the GL renderer."""
-        ...
-
-    def change(self, file: BenchFile) -> None:
-        """Switch to another bench file."""
-        ...
-
-    def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
-        """One exposure."""
-        ...
-
-    def close(self) -> None:
-        """Free the GL contexts."""
-        ...
+Imaging = Simulator | DisplayTracker  # a tracker that exposes, of the sky or of the display
 
 
 class Session:

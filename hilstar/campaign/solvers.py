@@ -24,16 +24,15 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.bench.config import BenchConfig
+from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.campaign.plan import Centroiding
 from hilstar.errors import InputError, did_you_mean, one_line, shortened
 from hilstar.files import temporary_folder
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.rotation import from_matrix, multiply, normalise
-from hilstar.scene.camera import Camera
 from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars
 from hilstar.twin.pictures import write_dn_picture
-from hilstar.twin.simulator import Exposure
+from hilstar.twin.simulator import Exposure, Simulator
 from hilstar.twin.verify.star_finder import crowded, nearest
 
 MAX_NORM_ERROR = 1e-3  # a quaternion is unit but for its decimals
@@ -49,11 +48,7 @@ class SolverFault(Exception):
     """A solver failed: it raised, ended with an error, took too long, or answered what is no attitude."""
 
 
-class SolvedTracker(Protocol):
-    """The tracker whose images are solved."""
-
-    config: BenchConfig
-    camera: Camera
+SolvedTracker = Simulator | DisplayTracker  # whose images are solved
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,10 +116,9 @@ class CentroidSolver:
         index = _matched(found, truth["x_px"], truth["y_px"])
         is_matched = index >= 0
         good = is_matched & ~truth["clipped"] & ~found.at_edge[index] if len(found) else is_matched
-        sigma_px = tracker.config.tracker.psf_sigma_px
         flux = truth["electrons_per_s"]
         if len(truth):
-            good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, sigma_px)
+            good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, tracker.canvas.psf)
         x_px, y_px = truth["x_px"][good], truth["y_px"][good]
         errors = CentroidErrors(
             stars=len(truth),
@@ -143,13 +137,13 @@ class CentroidSolver:
         return Answer(multiply(turn, exposure.view.q_icrs_to_cam), "", errors)
 
     def _settings(self, tracker: SolvedTracker) -> CentroidSettings:
-        wanted, psf = self._wanted, tracker.config.tracker.psf_sigma_px
+        wanted, width_px = self._wanted, tracker.canvas.psf.width_px
         return CentroidSettings(
             threshold_sigma=wanted.threshold_sigma,
             minimum_pixels=wanted.minimum_pixels,
             window=wanted.window,
-            window_sigma_px=wanted.window_sigma_px or max(1.0, *psf),
-            psf_sigma_px=psf if wanted.remove_s_curve else None,
+            window_sigma_px=wanted.window_sigma_px or max(1.0, *width_px),
+            psf_sigma_px=width_px if wanted.remove_s_curve else None,
         )
 
 
@@ -231,7 +225,7 @@ def tracker_facts(tracker: SolvedTracker) -> dict[str, Any]:
         "focal_length_px": focal_length_px,
         "principal_point_px": settings.principal_point_px or ((width - 1) / 2, (height - 1) / 2),
         "fov_deg": math.degrees(2 * math.atan(width / 2 / focal_length_px)),
-        "psf_sigma_px": settings.psf_sigma_px,
+        "psf_sigma_px": tracker.canvas.psf.width_px,
         "exposure_s": settings.exposure_s,
         "epoch_jyear": tracker.config.sky.epoch_jyear,
     }

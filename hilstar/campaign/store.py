@@ -13,7 +13,6 @@ The table has one row per case, in their order. The same rows give the same byte
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import os
 import zlib
@@ -24,14 +23,13 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from hilstar.errors import InputError, MachineError, cannot_read, cannot_write, shortened
-from hilstar.files import make_directory, open_lock, whole_file, write_whole
+from hilstar.files import lock_alone, make_directory, whole_file, write_whole
 from hilstar.reading import NOT_JSON, read_bytes
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 COMPRESSION, COMPRESSION_LEVEL = "zstd", 3
-CHUNK_BYTES = 1 << 20
 INSTALL = "install it: pip install 'hilstar[campaign]'"
 BLOCK_CASES = 16_384
 OPEN, FULL = ".jsonl", ".full.jsonl"
@@ -40,6 +38,7 @@ CHECKSUM_CHARACTERS = 8
 Row = dict[str, Any]  # a case's values by column; which columns there are depends on the plan
 ABOUT, LOCK, JOURNAL, TABLE = "campaign.json", "campaign.lock", "journal", "cases.parquet"
 MAX_ABOUT_BYTES = 50_000_000
+RUNNING = "another campaign is running in it; wait for its end, or write another directory"
 ANOTHER = "write another directory after -o, or delete this one"
 
 
@@ -99,11 +98,8 @@ def failures(path: Path) -> dict[str, int]:
 
 def file_sha256(path: Path) -> str:
     """The SHA-256 of a file."""
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while chunk := file.read(CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class Journal:
@@ -261,7 +257,7 @@ class Directory:
 
     def __init__(self, path: Path) -> None:
         self.path = make_directory(path)
-        self._lock = _locked(path / LOCK)
+        self._lock = lock_alone(path / LOCK, RUNNING)
 
     @property
     def table(self) -> Path:
@@ -294,18 +290,6 @@ class Directory:
     def close(self) -> None:
         """Release the directory."""
         os.close(self._lock)
-
-
-def _locked(path: Path) -> int:
-    fd = open_lock(path)
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(fd)
-        raise InputError(
-            f"{path.parent}: another campaign is running in it; wait for its end, or write another directory"
-        ) from error
-    return fd
 
 
 def _changed(before: About, now: About) -> str:

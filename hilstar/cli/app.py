@@ -12,24 +12,21 @@ from hilstar.cli.assess import assess
 from hilstar.cli.attitude import attitude
 from hilstar.cli.benchmark import benchmark
 from hilstar.cli.budget import budget
-from hilstar.cli.calibrate.alignment import alignment
-from hilstar.cli.calibrate.dots import dots
-from hilstar.cli.calibrate.first_light import first_light
-from hilstar.cli.calibrate.geometric import geometric
-from hilstar.cli.calibrate.latency import latency
-from hilstar.cli.calibrate.photometric import photometric
-from hilstar.cli.calibrate.plan import plan
-from hilstar.cli.calibrate.scale import scale
+from hilstar.cli.calibrate import alignment, dots, geometric, photometric, plan, scale
 from hilstar.cli.campaign import campaign
+from hilstar.cli.catalogue import catalogue
 from hilstar.cli.compare import compare
 from hilstar.cli.convert import convert
 from hilstar.cli.demo import demo
 from hilstar.cli.doctor import doctor
+from hilstar.cli.first_light import first_light
 from hilstar.cli.frame import frame
 from hilstar.cli.keys import keys
+from hilstar.cli.latency import latency
 from hilstar.cli.replay import replay
 from hilstar.cli.report import report
 from hilstar.cli.send import send
+from hilstar.cli.sensor import import_, measure
 from hilstar.cli.serve import serve
 from hilstar.cli.service import install, uninstall
 from hilstar.cli.simulate import simulate
@@ -40,7 +37,7 @@ from hilstar.version import __version__
 COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
     "Attitude streams": (send, attitude, convert, keys),
-    "Check what is shown": (simulate, verify, compare, budget, report),
+    "Check what is shown": (simulate, verify, compare, budget, catalogue, report),
     "Test the tracker": (assess, campaign),
     "Calibrate": (first_light, latency),
     "Study": (study, benchmark),
@@ -82,6 +79,7 @@ app = typer.Typer(
 calibrate = typer.Typer(
     help="Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by stars."
 )
+sensor = typer.Typer(help="A tracker's sensor for the bench file, from its EMVA 1288 data sheet or its own frames.")
 service = typer.Typer()
 
 
@@ -112,6 +110,9 @@ for panel, commands in COMMANDS.items():
 for command in (dots, geometric, alignment, plan, photometric, scale):
     calibrate.command()(command)
 app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")
+sensor.command("import")(import_)
+sensor.command()(measure)
+app.add_typer(sensor, name="sensor", rich_help_panel="Calibrate")
 service.command()(install)
 service.command()(uninstall)
 app.add_typer(service, name="service", rich_help_panel="This machine")

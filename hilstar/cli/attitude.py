@@ -7,19 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from hilstar.cli.options import (
-    LOG_HELP,
-    BodyName,
-    EpochUtc,
-    Json,
-    KernelFiles,
-    MountingText,
-    PlaceText,
-    ReferenceName,
-    TopicName,
-    parse_mounting,
-    parse_place,
-)
+from hilstar.cli import options
 from hilstar.console.terminal import print_json, say
 
 if TYPE_CHECKING:
@@ -33,7 +21,7 @@ SHOWN_STARS = 3
 
 def attitude(
     source: Annotated[
-        Path, typer.Argument(metavar="INPUT", help=f"{LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
+        Path, typer.Argument(metavar="INPUT", help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
     ],
     at: Annotated[
         str | None,
@@ -48,17 +36,17 @@ def attitude(
         typer.Option(metavar="BENCH.toml", help="Whose tracker, mounting and sky to use; by default the demo's tracker."),
     ] = None,
     wait: Annotated[float, typer.Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)] = 10.0,
-    kernel: KernelFiles = None,
-    topic: TopicName = None,
-    body: BodyName = None,
-    reference: ReferenceName = None,
-    epoch_utc: EpochUtc = None,
-    place: PlaceText = None,
-    mounting: MountingText = None,
+    kernel: options.KernelFiles = None,
+    topic: options.TopicName = None,
+    body: options.BodyName = None,
+    reference: options.ReferenceName = None,
+    epoch_utc: options.EpochUtc = None,
+    place: options.PlaceText = None,
+    mounting: options.MountingText = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
     ] = False,
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Say where a log or a live stream points: quaternion, RA, Dec, roll, and the brightest stars in view."""
     from hilstar.attitude.logs.entries import Stated
@@ -72,13 +60,13 @@ def attitude(
     file = read_bench_file(bench) if live and bench is not None else first
     if live and mounting is not None:
         raise InputError(f"--mounting {mounting}: write it into {source} as [tracker] q_body_to_cam")
-    mounted = Mounting(first.config.tracker.q_body_to_cam) if mounting is None else parse_mounting(mounting)
+    mounted = Mounting(first.config.tracker.q_body_to_cam) if mounting is None else options.parse_mounting(mounting)
     if live:
         sample, conventions, held = _live(first, at, wait)
         for _, line in mounted.told if conventions.of_body else ():
             say(line)
     else:
-        stated = Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
+        stated = Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, options.parse_place(place))
         sample, conventions, held = _of_log(source, at, stated)
     file = dated(file, conventions.scale, sample.t_ns)
     told = {"source": conventions.source, "held": held, **_pointing(sample, file)}

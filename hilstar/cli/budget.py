@@ -1,4 +1,4 @@
-"""hilstar budget: which magnitudes a bench can show, and how well."""
+"""hilstar budget: which magnitudes a bench can show and how well, or the noise of its tracker's stars."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from hilstar.cli.options import BenchFile, Json
+from hilstar.cli.options import BenchFile, Json, RadecText, parse_attitude
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError, did_you_mean, shortened
-from hilstar.files import check_directory
+from hilstar.files import check_directory, make_directory
 
 
 def budget(
@@ -26,17 +26,27 @@ def budget(
             "all of them; what the bench has under verify, or fit, unless given."
         ),
     ] = None,
+    noise: Annotated[
+        bool, typer.Option("--noise", help="The noise of the tracker's own stars by source, and the limits that it sets.")
+    ] = False,
+    radec: RadecText = None,
     as_json: Json = False,
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
     from hilstar.bench.build import load
     from hilstar.bench.frame import shares_line
-    from hilstar.files import make_directory
     from hilstar.tracker.centroiders import FAMILY
     from hilstar.twin.budget import By, budget_lines, write_report
     from hilstar.twin.budget import budget as find_budget
 
     check_directory("-o", output)
+    if noise:
+        if centroider is not None:
+            raise InputError("budget --noise: has every centroider; leave out --centroider")
+        star_noise(bench_file, output, radec, as_json)
+        return
+    if radec is not None:
+        raise InputError("budget --radec: names a field of stars whose noise is wanted; add --noise")
     choices: tuple[By, ...] = (*FAMILY, "all")
     by = next((choice for choice in choices if choice == centroider), None)
     if centroider is not None and by is None:
@@ -52,3 +62,21 @@ def budget(
         typer.echo("\n".join(budget_lines(found)))
     if assumed is not None:
         say(assumed)
+
+
+def star_noise(bench_file: Path, output: Path | None, radec: str | None, as_json: bool) -> None:
+    """The noise of the tracker's own stars."""
+    import numpy as np
+
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.tracker.centroids import CentroidSettings
+    from hilstar.twin.noise import noise_budget, noise_lines, write_noise
+
+    attitude = None if radec is None else parse_attitude("budget", radec, None)
+    found = noise_budget(read_bench_file(bench_file), attitude, CentroidSettings(), np.random.default_rng(0))
+    if output is not None:
+        write_noise(make_directory(output), found)
+    if as_json:
+        print_json(asdict(found))
+    else:
+        typer.echo("\n".join(noise_lines(found)))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from hilstar.cli.options import MAX_SEED, Json
-from hilstar.cli.running import Console, ConsoleName, Control, Token, followed, optional_ledger, page_listener
+from hilstar.cli.running import Console, ConsoleName, Control, Token, followed, optional_ledger, page_listener, refuse_lost_gpu
 from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.terminal import progress, report, say
 from hilstar.files import check_directory
@@ -19,8 +19,8 @@ from hilstar.notices import Notices
 if TYPE_CHECKING:
     from hilstar.bench.frame import Bench
     from hilstar.console.listener import PageListener
+    from hilstar.run.pacer import FrameSink
     from hilstar.run.serve import Outlet
-    from hilstar.run.shown import FrameSink
     from hilstar.run.summary import RunSummary
 
 HZ = 60  # the demo bench's refresh
@@ -93,3 +93,4 @@ def _watching(
         page = RunDescription("demo", bench.config.attitude.source, endpoint)
         with followed(listener, control, page, parts, status, advance) as (sink, follower, requests):
             yield sink, Outlet(None, kept, notices, follower=follower, requests=requests)
+    refuse_lost_gpu(notices)

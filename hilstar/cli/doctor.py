@@ -26,8 +26,7 @@ Report = Annotated[
 
 def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = False) -> None:
     """Check this machine's OpenGL, displays, links and files, and say what is missing; of a bench file, what it means."""
-    from hilstar.run.doctor import examine, examine_bench
-    from hilstar.run.machine_row import row, table
+    from hilstar.run.doctor import examine, examine_bench, row, table
 
     if report:
         cells = row()

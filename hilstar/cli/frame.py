@@ -7,18 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import (
-    AtSeconds,
-    BenchFile,
-    Explain,
-    Json,
-    QuaternionText,
-    RadecText,
-    ScenarioFile,
-    check_files,
-    parse_at,
-    parse_attitude,
-)
+from hilstar.cli import options
 from hilstar.cli.running import explain_bench, optional_scenario, say_units
 from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
@@ -26,9 +15,9 @@ from hilstar.files import CSV, FITS, PNG, check_ending
 
 
 def frame(
-    bench_file: BenchFile,
-    radec: RadecText = None,
-    quaternion: QuaternionText = None,
+    bench_file: options.BenchFile,
+    radec: options.RadecText = None,
+    quaternion: options.QuaternionText = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="The linear image, electrons per second.")
     ] = None,
@@ -37,10 +26,10 @@ def frame(
     ] = None,
     codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
     preview: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
-    at: AtSeconds = None,
-    scenario: ScenarioFile = None,
-    explain: Explain = False,
-    as_json: Json = False,
+    at: options.AtSeconds = None,
+    scenario: options.ScenarioFile = None,
+    explain: options.Explain = False,
+    as_json: options.Json = False,
 ) -> None:
     """Draw one frame and write it to files."""
     import numpy as np
@@ -52,7 +41,7 @@ def frame(
     from hilstar.bench.fault_views import faults_at
     from hilstar.frame.truth import clipped_in
 
-    q = parse_attitude("frame", radec, quaternion)
+    q = options.parse_attitude("frame", radec, quaternion)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
     if not targets:
         raise InputError("frame: no output was asked for; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
@@ -61,9 +50,9 @@ def frame(
     check_ending("--codes", codes, PNG)
     check_ending("--preview", preview, PNG)
     file = read_bench_file(bench_file)
-    t_ns, wrong = parse_at("frame", at, file.config, scenario is not None), optional_scenario(scenario)
+    t_ns, wrong = options.parse_at("frame", at, file.config, scenario is not None), optional_scenario(scenario)
     file = at_moment(file, t_ns)
-    check_files([scenario], targets, file)
+    options.check_files([scenario], targets, file)
     fields = fields_of_view(file.config, file.folder)
     with open_bench(file) as bench:
         if explain:
@@ -73,7 +62,7 @@ def frame(
         if output is not None:
             files.write_frame_fits(output, bench, shot)
         if truth is not None:
-            files.write_truth_csv(truth, shot)
+            files.write_truth_csv(truth, shot, bench)
         if codes is not None:
             files.write_codes_png(codes, shot.codes, bench.config.monitor.bits)
         if preview is not None:

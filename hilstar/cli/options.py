@@ -117,10 +117,14 @@ def check_files(
 
 
 def with_values(words: list[str]) -> list[str]:
-    """The command line with a share after each fault option that stands alone, and an address after --console."""
+    """The command line with a share after each fault option that stands alone, an address after --console, --darks for each."""
     complete: list[str] = []
+    several = False  # --darks takes files up to the next option
     for k, word in enumerate(words):
         following = "".join(words[k + 1 : k + 2])
+        several = word == "--darks" or (several and not word.startswith("-"))
+        if several and word != "--darks" and words[k - 1] != "--darks":
+            complete.append("--darks")
         complete.append(word)
         if word in SHARE_OPTIONS and not re.match(r"[\d.]+%?$", following):
             complete.append(USUAL_SHARE)

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from hilstar.run.faults import AnyFaults, Recording
     from hilstar.run.frame_pulse import FramePulse
     from hilstar.run.operator import SwitchRequests
+    from hilstar.run.pacer import FrameSink, Shown
     from hilstar.run.record.ledger import LedgerSwitch
     from hilstar.run.serve import Follower, Running
-    from hilstar.run.shown import FrameSink, Shown
     from hilstar.run.summary import RunSummary
     from hilstar.run.sync import BeatSummary
 
@@ -82,6 +82,7 @@ def explain_bench(bench: Any, t_ns: int | None = None) -> None:
     """Explain the source of the stars, the choices within the tolerance, and which bodies are discs at a time."""
     from hilstar.bench.effort import explain
     from hilstar.bench.moving import observer_lines, satellite_lines, wide_bodies
+    from hilstar.frame.diffuse import DiffuseLayer
 
     for note in bench.stars.catalog.notes:
         say(note)
@@ -91,6 +92,7 @@ def explain_bench(bench: Any, t_ns: int | None = None) -> None:
         *observer_lines(bench.config),
         *wide_bodies(moving, bench.camera, t_ns),
         *satellite_lines(moving, t_ns),
+        *(layer.line() for layer in bench.layers if isinstance(layer, DiffuseLayer)),
     ]:
         say(line)
 
@@ -111,7 +113,7 @@ def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) ->
         with open_bench(file, create_context(file.config.render.gpu)) as bench:  # NumPy is too slow for a stream
             yield bench, None
         return
-    from hilstar.run.screen.open_screen import open_screen
+    from hilstar.run.screen.gate import open_screen
 
     with open_screen(file, windowed=windowed, force=force) as screen:
         yield screen.bench, screen
@@ -187,17 +189,18 @@ def run_with_faults(
     bench: Any, scenario: Scenario | None, notices: Notices, ledger: LedgerSwitch, recording: Recording | None = None
 ) -> Iterator[AnyFaults | None]:
     """The faults of a run, from its scenario and stream or from the run that is replayed; None for none."""
-    from hilstar.run.faults import replayed_faults, run_faults
+    from hilstar.bench.scenario import NO_SCENARIO
+    from hilstar.run.faults import ReplayedFaults, RunFaults
 
     if recording is not None and recording.faults:
         if scenario is not None:
             raise InputError(f"--scenario {scenario.path}: the run that is replayed has faults of its own; leave it out")
-        yield replayed_faults(bench, recording, ledger)
+        yield ReplayedFaults(bench, recording, ledger)
         return
-    faults = run_faults(bench, scenario, notices, ledger)
-    if faults is None:
+    if scenario is None and bench.config.faults.endpoint is None:
         yield None
         return
+    faults = RunFaults(bench, scenario or NO_SCENARIO, notices, ledger)
     with faults.listening(bench.config.faults, bench.file.folder) as endpoint:
         if scenario is not None:
             timed = sum(fault.at_s is not None for fault in scenario.faults)
@@ -212,17 +215,22 @@ def end_of_run(summary: RunSummary, screen: Any, ledger: LedgerSwitch, notices: 
 
     Raises MachineError where the window went away or the GPU was lost.
     """
-    from hilstar.run.watchdog import GPU_LOST
-
     if ledger.last is not None:
         summary = msgspec.structs.replace(summary, ledger=ledger.last.summary())
     report(summary, as_json)
     if screen is not None and screen.window.gone is not None:
         raise MachineError(f"the run ended early: {screen.window.gone}")
-    if lost := notices.lasting.get(GPU_LOST):
-        raise MachineError(f"{lost}; begin it again, and see dmesg where that happens again")
+    refuse_lost_gpu(notices)
     if ledger.failure is not None:
         raise typer.Exit(1)
+
+
+def refuse_lost_gpu(notices: Notices) -> None:
+    """Raise MachineError where the GPU was lost in a run."""
+    from hilstar.run.watchdog import GPU_LOST
+
+    if lost := notices.lasting.get(GPU_LOST):
+        raise MachineError(f"{lost}; begin it again, and see dmesg where that happens again")
 
 
 def fault_schedule(faults: AnyFaults | None) -> FaultSchedule | None:

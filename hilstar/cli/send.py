@@ -12,17 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import (
-    LOG_HELP,
-    MAX_SEED,
-    Json,
-    MountingText,
-    RadecText,
-    parse_mounting,
-    parse_radec,
-    parse_share,
-    parse_spin,
-)
+from hilstar.cli import options
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.process.interrupts import is_command, stop_on_signal
@@ -37,7 +27,7 @@ KeyFile = Annotated[Path | None, typer.Option(metavar="FILE", help="From `hilsta
 
 
 def send(
-    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help=LOG_HELP)] = None,
+    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help=options.LOG_HELP)] = None,
     spin: Annotated[str | None, typer.Option(metavar="AXIS,DEG_PER_S", help="A constant rotation instead of a log.")] = None,
     to: Annotated[
         str, typer.Option(metavar="TARGET", help="tcp://HOST:PORT, udp://HOST:PORT or serial:/dev/ttyX@BAUD.")
@@ -48,7 +38,7 @@ def send(
     connect: Annotated[
         bool, typer.Option("--connect", help="Connect instead of binding, for a bench file with bind = true.")
     ] = False,
-    radec: RadecText = None,
+    radec: options.RadecText = None,
     count: Annotated[int | None, typer.Option(help="Stop after this many packets.", min=1)] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this many seconds.", min=0)] = None,
     wait: Annotated[float, typer.Option(help="Seconds to wait for a listener.", min=0, max=1e6)] = 30.0,
@@ -58,14 +48,14 @@ def send(
     jitter: Annotated[
         float, typer.Option(metavar="MS", help="Delay each packet at random by up to this much.", min=0, max=1e6)
     ] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of the faults.", min=0, max=MAX_SEED)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the faults.", min=0, max=options.MAX_SEED)] = 0,
     secret_key: KeyFile = None,
     server_key: KeyFile = None,
     allowed_clients: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Directory of the public keys that may connect.")
     ] = None,
-    mounting: MountingText = None,
-    as_json: Json = False,
+    mounting: options.MountingText = None,
+    as_json: options.Json = False,
 ) -> None:
     """Send a log or a constant rotation over ZeroMQ, UDP or a serial line, with the faults of a bad cable on request."""
     import numpy as np
@@ -75,7 +65,11 @@ def send(
     from hilstar.run.send_log import send as send_samples
     from hilstar.run.sender import open_sender
 
-    shares = (parse_share(lose, "--lose"), parse_share(corrupt, "--corrupt"), parse_share(reorder, "--reorder"))
+    shares = (
+        options.parse_share(lose, "--lose"),
+        options.parse_share(corrupt, "--corrupt"),
+        options.parse_share(reorder, "--reorder"),
+    )
     if sum(shares) > 1:
         raise InputError("send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller fractions")
     samples, total = wanted_samples(log, spin, rate, radec, mounting)
@@ -120,8 +114,8 @@ def wanted_samples(
     if rate is not None and not 1e-3 <= rate <= 10_000:
         raise InputError(f"--rate {rate:g}: write packets per second, 0.001 to 10000")
     if spin is not None:
-        return spin_samples(parse_spin(spin), rate or 100.0, parse_radec(radec or "84.057,-1.2,0")), math.inf
-    read = open_log(log or Path(), Stated(parse_mounting(mounting)))
+        return spin_samples(options.parse_spin(spin), rate or 100.0, options.parse_radec(radec or "84.057,-1.2,0")), math.inf
+    read = open_log(log or Path(), Stated(options.parse_mounting(mounting)))
     recorded = read.samples
     for _, line in [*read.told, *log_joins(recorded).told]:
         say(line)

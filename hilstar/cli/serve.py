@@ -13,32 +13,8 @@ import typer
 from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
+from hilstar.cli import running
 from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files, parse_split
-from hilstar.cli.running import (
-    Console,
-    ConsoleName,
-    Control,
-    Force,
-    LedgerFile,
-    LedgerSplit,
-    Token,
-    Windowed,
-    dated_ledger,
-    end_of_run,
-    explain_bench,
-    explain_source,
-    fault_schedule,
-    followed,
-    optional_ledger,
-    optional_pulse,
-    optional_scenario,
-    page_listener,
-    run_with_faults,
-    say_beat,
-    say_of_light,
-    say_units,
-    shown_bench,
-)
 from hilstar.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.console.terminal import say, without_attitude
 from hilstar.errors import InputError
@@ -152,16 +128,16 @@ def serve(
     headless: Headless = False,
     duration: Annotated[float | None, typer.Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)] = None,
     frames: Annotated[int | None, typer.Option(help="Number of frames to draw.", min=1)] = None,
-    ledger: LedgerFile = None,
-    ledger_split: LedgerSplit = None,
+    ledger: running.LedgerFile = None,
+    ledger_split: running.LedgerSplit = None,
     scenario: ScenarioFile = None,
     overwrite: Overwrite = False,
-    windowed: Windowed = False,
-    force: Force = False,
-    console: Console = None,
-    control: Control = False,
-    token: Token = None,
-    console_name: ConsoleName = None,
+    windowed: running.Windowed = False,
+    force: running.Force = False,
+    console: running.Console = None,
+    control: running.Control = False,
+    token: running.Token = None,
+    console_name: running.ConsoleName = None,
     explain: Explain = False,
     as_json: Json = False,
     head_of: HeadOf = None,
@@ -174,7 +150,7 @@ def serve(
     if isinstance(file, HeadsFile):
         switches = {"--headless": headless, "--windowed": windowed, "--force": force, "--control": control}
         switches |= {"--overwrite": overwrite, "--explain": explain}
-        asked = HeadsAsked(duration, frames, dated_ledger(ledger), ledger_split, scenario, switches, console, token)
+        asked = HeadsAsked(duration, frames, running.dated_ledger(ledger), ledger_split, scenario, switches, console, token)
         serve_heads(file, asked, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
@@ -185,45 +161,45 @@ def serve(
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import serve as serve_stream
 
-    ledger = dated_ledger(ledger)
+    ledger = running.dated_ledger(ledger)
     check_ending("--ledger", ledger, MCAP)
-    faults = optional_scenario(scenario)
+    faults = running.optional_scenario(scenario)
     fields = fields_of_view(file.config, file.folder)
     check_files([scenario], [], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
     with (
-        page_listener(console, control, token, console_name) as listener,
+        running.page_listener(console, control, token, console_name) as listener,
         _source(file, fed_by, notices) as link,
-        optional_pulse(file, notices) as pulse,
-        shown_bench(file, headless, windowed, force) as (bench, screen),
-        optional_ledger(ledger, bench, notices, overwrite, split) as kept,
-        run_with_faults(bench, faults, notices, kept) as wrong,
+        running.optional_pulse(file, notices) as pulse,
+        running.shown_bench(file, headless, windowed, force) as (bench, screen),
+        running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
+        running.run_with_faults(bench, faults, notices, kept) as wrong,
     ):
         if explain:
-            explain_source(link.conventions, Mounting(file.config.tracker.q_body_to_cam))
-            explain_bench(bench)
+            running.explain_source(link.conventions, Mounting(file.config.tracker.q_body_to_cam))
+            running.explain_bench(bench)
         refresh_hz = bench.config.monitor.refresh_hz
         slots = math.inf if duration is None else round(duration * refresh_hz)
         limit = Limit(slots, math.inf if frames is None else frames)
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         say(fields.line())
-        say_units(fields)
-        say_of_light(bench)
-        beat = UNSET if file.config.attitude.lockstep else say_beat(bench, screen)
+        running.say_units(fields)
+        running.say_of_light(bench)
+        beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
         told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
         page = RunDescription(
             "serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock"
         )
         parts = PageParts(
-            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_schedule(wrong)
+            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, running.fault_schedule(wrong)
         )
-        with on_terminal(status), followed(listener, control, page, parts, status) as (sink, follower, requests):
+        with on_terminal(status), running.followed(listener, control, page, parts, status) as (sink, follower, requests):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse)
             summary = serve_stream(bench, link, limit, sink, outlet)
-    end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, notices, as_json)
+    running.end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, notices, as_json)
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets))
         raise typer.Exit(NO_ATTITUDE)

@@ -8,19 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from hilstar.cli.options import (
-    MAX_SEED,
-    AtSeconds,
-    BenchFile,
-    Json,
-    QuaternionText,
-    RadecText,
-    ScenarioFile,
-    check_files,
-    parse_at,
-    parse_attitude,
-    parse_rate,
-)
+from hilstar.cli import options
 from hilstar.cli.running import optional_scenario
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
@@ -31,26 +19,26 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    bench_file: BenchFile,
-    radec: RadecText = None,
-    quaternion: QuaternionText = None,
+    bench_file: options.BenchFile,
+    radec: options.RadecText = None,
+    quaternion: options.QuaternionText = None,
     rate: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s.")
     ] = None,
-    at: AtSeconds = None,
-    scenario: ScenarioFile = None,
+    at: options.AtSeconds = None,
+    scenario: options.ScenarioFile = None,
     log: Annotated[
         Path | None, typer.Option(metavar="LOG", help="Simulate frames along a log, into the directory given by -o.")
     ] = None,
     frames: Annotated[
         int | None, typer.Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1)
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the frame's noise.", min=0, max=MAX_SEED)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the frame's noise.", min=0, max=options.MAX_SEED)] = 0,
     noise: Annotated[Literal["full", "none"], typer.Option(help="The detector's full noise, or none.")] = "full",
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="The image in DN, uint16.")] = None,
     png: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
     dn_png: Annotated[Path | None, typer.Option(metavar="OUT.png|.tif", help="The DN themselves, as 16-bit greyscale.")] = None,
-    as_json: Json = False,
+    as_json: options.Json = False,
 ) -> None:
     """Simulate the virtual tracker's image of the sky, with noise."""
     import numpy as np
@@ -75,9 +63,12 @@ def simulate(
     check_ending("--dn-png", dn_png, PNG_OR_TIFF)
     file = read_bench_file(bench_file)
     wrong = optional_scenario(scenario)
-    check_files([scenario], targets, file)
-    q, t_ns = parse_attitude("simulate", radec, quaternion), parse_at("simulate", at, file.config, wrong is not None)
-    file, rate_rad_s = at_moment(file, t_ns), parse_rate(rate) if rate else np.zeros(3)
+    options.check_files([scenario], targets, file)
+    q, t_ns = (
+        options.parse_attitude("simulate", radec, quaternion),
+        options.parse_at("simulate", at, file.config, wrong is not None),
+    )
+    file, rate_rad_s = at_moment(file, t_ns), options.parse_rate(rate) if rate else np.zeros(3)
     with Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
         view = simulator.view(q, rate_rad_s, t_ns)

@@ -64,7 +64,7 @@ def verify(
         typer.echo("\n".join(summary_lines(summary)))
     proposed = _proposed(file, verdict, seed, write, as_json) if propose or write else {}
     if as_json:
-        print_json(asdict(summary) | proposed)
+        print_json(summary | proposed)
     mended = bool(proposed.get("written"))
     if strict and not verdict.passed and not mended:
         raise typer.Exit(1)

@@ -8,10 +8,9 @@ import re
 import secrets
 import socket
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self
 
 from hilstar.errors import InputError, shortened
+from hilstar.process.closing import Closing
 
 HOST, PORT = "127.0.0.1", 8765
 MAX_PORT = 2**16 - 1
@@ -68,7 +67,7 @@ def _is_host(text: str) -> bool:
     return NAME.fullmatch(text) is not None and ":" not in text and not re.fullmatch(r"[\d.]+", text)
 
 
-class PageListener:
+class PageListener(Closing):
     """The page's listening socket, its names and its token. Raises InputError where the address cannot be used.
 
     Where the page can be reached from other machines and no token is given, one is made (`made`). `names` has further names
@@ -109,12 +108,6 @@ class PageListener:
     def close(self) -> None:
         """Stop listening."""
         self.socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 def _bracketed(host: str) -> str:

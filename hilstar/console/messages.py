@@ -8,7 +8,16 @@ from typing import Literal, NamedTuple, Self
 
 import msgspec
 
-from hilstar.console.protocol import PATCH_SHARE, AttitudeSource, Hello, LedgerState
+from hilstar.console.protocol import (
+    PATCH_SHARE,
+    AttitudeSource,
+    Hello,
+    LedgerState,
+    NewestFrame,
+    RunCounts,
+    ShownAttitude,
+    ShownClock,
+)
 
 FRAME = struct.Struct("<12qI")
 _PICTURE = struct.Struct("<3q4I4d")
@@ -70,42 +79,15 @@ class PictureHead(NamedTuple):
         return cls(*_PICTURE.unpack_from(data))
 
 
-class AttitudeState(msgspec.Struct, frozen=True):
-    """The attitude of the newest frame: cam from ICRS, scalar first; the rate in cam, rad/s."""
-
-    q: tuple[float, float, float, float]
-    rate_rad_s: tuple[float, float, float] | None
-    age_ns: int
-
-
-class ClockState(msgspec.Struct, frozen=True):
-    """The sender's clock."""
-
-    mode: str
-    offset_ms: float | None
-    drift_ppm: float | None
-    uncertainty_ms: float | None
-
-
 class RunState(msgspec.Struct, frozen=True, kw_only=True):
     """The run at a host time, ns; `alive_ns` is when the frame loop last moved, 0 before it began."""
 
     host_ns: int
     alive_ns: int = 0
-    frame: int = -1
-    stale: bool = False
-    missing: bool = True
-    blank: bool = True
-    stars: int = 0
-    clipped: list[int | str] = []
-    attitude: AttitudeState | None = None
-    clock: ClockState | None = None
-    frames: int = 0
-    missed: int = 0
-    stale_frames: int = 0
-    given_up: int = 0
-    received: int = 0
-    refused: dict[str, int] = {}
+    frame: NewestFrame = NewestFrame()
+    attitude: ShownAttitude | None = None
+    clock: ShownClock | None = None
+    counts: RunCounts = RunCounts()
     operator: dict[str, bool] = {}
     operator_text: str = ""
     overlay: int = 0

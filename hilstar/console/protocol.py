@@ -78,13 +78,13 @@ class ShownClock(msgspec.Struct, frozen=True, kw_only=True):
 class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
     """Frames and packets since the run began; `refused` by reason."""
 
-    frames: int
-    missed: int
-    stale: int
-    given_up: int
-    received: int
-    accepted: int
-    refused: dict[str, int]
+    frames: int = 0
+    missed: int = 0
+    stale: int = 0
+    given_up: int = 0
+    received: int = 0
+    accepted: int = 0
+    refused: dict[str, int] = {}
 
 
 class Pacing(msgspec.Struct, frozen=True):
@@ -98,12 +98,12 @@ class Pacing(msgspec.Struct, frozen=True):
 class NewestFrame(msgspec.Struct, frozen=True, kw_only=True):
     """The newest frame; `clipped` has HIP numbers, and names of bodies."""
 
-    number: int
-    missing: bool
-    stale: bool
-    blank: bool
-    stars: int
-    clipped: list[int | str]
+    number: int = -1
+    missing: bool = True
+    stale: bool = False
+    blank: bool = True
+    stars: int = 0
+    clipped: list[int | str] = []
 
 
 class LedgerState(msgspec.Struct, frozen=True):

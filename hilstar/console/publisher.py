@@ -24,8 +24,6 @@ from hilstar.console.messages import (
     HAS_AGE,
     MISSING,
     STALE,
-    AttitudeState,
-    ClockState,
     Order,
     OrderAnswer,
     Pace,
@@ -35,24 +33,35 @@ from hilstar.console.messages import (
 )
 from hilstar.console.overlay import OverlayScene, overlay_of
 from hilstar.console.page_process import PageProcess
-from hilstar.console.protocol import SWITCHES, AttitudeSource, Hello, LedgerState
+from hilstar.console.protocol import (
+    SWITCHES,
+    AttitudeSource,
+    Hello,
+    LedgerState,
+    NewestFrame,
+    RunCounts,
+    ShownAttitude,
+    ShownClock,
+)
 from hilstar.console.shared_memory import MAX_SPRITES, PICTURE_HEAD_BYTES, SPRITE, SharedMemory
 from hilstar.errors import HilstarError, did_you_mean, one_line, printable
 from hilstar.notices import Listener, Notice
-from hilstar.run.operator import GAMMA, PATCHES, Overrides, SwitchRequest, SwitchRequests, aid_levels_of
+from hilstar.rotation import to_radec_roll_deg
+from hilstar.run.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests, aid_levels_of
 from hilstar.scene.sprites import brightest
-from hilstar.units import NS_PER_S
+from hilstar.units import NS_PER_MS, NS_PER_S
 from hilstar.version import __version__
 
 if TYPE_CHECKING:
+    from hilstar.attitude.clock.sender_clock import ClockSummary
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.fault_schedule import FaultSchedule
     from hilstar.calibrate.first_light.image_sources import Pattern
     from hilstar.notices import Notices
+    from hilstar.run.pacer import Shown
     from hilstar.run.record.ledger import Ledger, LedgerSwitch
     from hilstar.run.screen.screen import Screen
     from hilstar.run.serve import Running
-    from hilstar.run.shown import Shown
     from hilstar.scene.sprites import Sprites
 
 MIN_PICTURE_NS = NS_PER_S // 10
@@ -144,78 +153,112 @@ LEDGER_TROUBLES = {
 
 
 @dataclass(frozen=True, slots=True)
-class WatchedRun:
-    """The parts of a run that its state is read from."""
+class PageParts:
+    """The parts of a run; `make_ledger` begins a ledger at a path."""
 
-    feed: FramePublisher
+    bench: Bench
     notices: Notices
     ledger: LedgerSwitch
+    make_ledger: Callable[[Path], Ledger]
     screen: Screen | None = None
     faults: FaultSchedule | None = None
 
+
+class WatchedRun:
+    """The state of a run, read from its parts beside the frame loop."""
+
+    def __init__(self, feed: FramePublisher, parts: PageParts) -> None:
+        self._feed, self._parts, self._notices = feed, parts, parts.notices
+
     def listen(self, listener: Listener) -> None:
         """Pass every further event of the run to `listener`."""
-        self.notices.listen(listener)
+        self._notices.listen(listener)
 
     def tell(self, kind: str, line: str) -> None:
         """Record an event of the run."""
-        self.notices.tell(kind, line)
+        self._notices.tell(kind, line)
 
     def now(self) -> RunState:
         """The run's current state, read beside the frame loop."""
-        running, shown = self.feed.running, self.feed.shown
+        running, shown = self._feed.running, self._feed.shown
         if running is None:
             return RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
-        tally, operator = running.tally, running.loop.pacer.operator
-        aids = operator.aids if isinstance(operator, Overrides) else None
-        clock = None if running.clock is None else running.clock()
+        tally, aids, packets = running.loop.tally, running.loop.pacer.operator.aids, running.packets
+        screen, faults = self._parts.screen, self._parts.faults
         return RunState(
             host_ns=time.monotonic_ns(),
             alive_ns=running.loop.watch.alive_ns,
-            frame=-1 if shown is None else shown.number,
-            stale=shown is not None and shown.stale,
-            missing=shown is None or shown.missing,
-            blank=shown is None or shown.attitude is None,
-            stars=0 if shown is None else shown.drawn.star_count,
-            clipped=[] if shown is None else list(shown.drawn.clipped_hip[:MAX_CLIPPED]),
+            frame=NewestFrame() if shown is None else _newest(shown),
             attitude=_attitude(shown),
-            clock=None
-            if clock is None or clock.mode == "none"
-            else ClockState(clock.mode, clock.offset_ms, clock.drift_ppm, clock.uncertainty_ms),
-            frames=tally.frames,
-            missed=tally.missed_frames,
-            stale_frames=tally.stale_frames,
-            given_up=tally.given_up_frames,
-            received=running.packets.received,
-            refused={reason: count for reason, count in running.packets.refused_by.items() if count},
-            operator={} if aids is None else aids.states(),
-            operator_text="" if aids is None else aids.text,
-            overlay=0 if aids is None else aids.overlay,
-            patch_share=0.0 if aids is None else aids.patch_share,
+            clock=None if running.clock is None else _clock(running.clock()),
+            counts=RunCounts(
+                frames=tally.frames,
+                missed=tally.missed_frames,
+                stale=tally.stale_frames,
+                given_up=tally.given_up_frames,
+                received=packets.received,
+                accepted=packets.received - packets.refused,
+                refused={reason: count for reason, count in packets.refused_by.items() if count},
+            ),
+            operator=aids.states(),
+            operator_text=aids.text,
+            overlay=aids.overlay,
+            patch_share=aids.patch_share,
             hidden="" if shown is None else shown.on_screen.hidden,
-            display_lost="" if self.screen is None else self.screen.window.gone or "",
-            gamma=self.notices.lasting.get(GAMMA, ""),
+            display_lost="" if screen is None else screen.window.gone or "",
+            gamma=self._notices.lasting.get(GAMMA, ""),
             ledger=self._ledger(),
-            faults=[] if self.faults is None else self.faults.on(),
-            rates=self.notices.lasting.get(WRONG, ""),
+            faults=[] if faults is None else faults.on(),
+            rates=self._notices.lasting.get(WRONG, ""),
         )
 
     def _ledger(self) -> LedgerState | None:
-        ledger = self.ledger.current
+        ledger = self._parts.ledger.current
         if ledger is None:
             return None
-        troubles = [words for kind, words in LEDGER_TROUBLES.items() if kind in self.notices.active]
+        troubles = [words for kind, words in LEDGER_TROUBLES.items() if kind in self._notices.active]
         return LedgerState(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
 
 
-def _attitude(shown: Shown | None) -> AttitudeState | None:
+def _newest(shown: Shown) -> NewestFrame:
+    drawn = shown.drawn
+    return NewestFrame(
+        number=shown.number,
+        missing=shown.missing,
+        stale=shown.stale,
+        blank=shown.attitude is None,
+        stars=drawn.star_count,
+        clipped=list(drawn.clipped_hip[:MAX_CLIPPED]),
+    )
+
+
+def _attitude(shown: Shown | None) -> ShownAttitude | None:
     attitude = None if shown is None else shown.attitude
     if attitude is None:
         return None
     w, x, y, z = attitude.q_icrs_to_cam.tolist()
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
     rate = attitude.rate_cam_rad_s
-    rate_rad_s = None if rate is None else tuple(rate.tolist())
-    return AttitudeState((w, x, y, z), rate_rad_s, attitude.age_ns)
+    return ShownAttitude(
+        q=(w, x, y, z),
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
+        roll_deg=roll_deg,
+        rate_deg_s=None if rate is None else np.degrees(rate).tolist(),
+        age_ms=attitude.age_ns / NS_PER_MS,
+    )
+
+
+def _clock(clock: ClockSummary) -> ShownClock | None:
+    if clock.mode == "none":
+        return None
+    return ShownClock(
+        offset_ms=clock.offset_ms,
+        sigma_ms=clock.uncertainty_ms,
+        drift_ppm=clock.drift_ppm,
+        synchronised=clock.mode in {"exchange", "shared"},
+        mode=clock.mode,
+    )
 
 
 LOOP_WAITS_S = 2.0
@@ -224,46 +267,45 @@ MAX_MARK_CHARACTERS = 200
 MAX_WHO_CHARACTERS = 60
 
 
+Done = tuple[int, str]  # of an order: an HTTP status and a line
+
+
 class OrderHandler:
     """Checks an operator's order, has it done by the frame loop or beside it, and records it.
 
     Each call runs on its own thread and returns once the frame loop, or the disk, has taken the order.
     """
 
-    def __init__(self, requests: SwitchRequests, watched: WatchedRun, make_ledger: Callable[[Path], Ledger]) -> None:
-        self._requests, self._feed, self._faults = requests, watched.feed, watched.faults
-        self._ledger, self._notices = watched.ledger, watched.notices
-        self._make_ledger = make_ledger
+    def __init__(self, requests: SwitchRequests, feed: FramePublisher, parts: PageParts) -> None:
+        self._requests, self._feed, self._faults = requests, feed, parts.faults
+        self._ledger, self._notices, self._make_ledger = parts.ledger, parts.notices, parts.make_ledger
         self._ledger_lock = threading.Lock()
 
     def do(self, order: Order) -> OrderAnswer:
         """Carry out an order; the answer says what went wrong."""
         who = one_line(order.who)[:MAX_WHO_CHARACTERS]
         try:
-            answer = self._done(order, who)
+            status, line = self._done(order, who)
         except HilstarError as error:
-            return OrderAnswer(id=order.id, status=409, line=one_line(str(error)))
-        answer.line = printable(answer.line)  # a ledger may be called anything
-        return answer
+            status, line = 409, one_line(str(error))
+        return OrderAnswer(id=order.id, status=status, line=printable(line))  # a ledger may be called anything
 
-    def _done(self, order: Order, who: str) -> OrderAnswer:
+    def _done(self, order: Order, who: str) -> Done:
         if order.name in SWITCHES:
             return self._switch(order, who)
         if order.name == "ledger":
             return self._switch_ledger(order, who)
         return self._mark(order, who) if order.name == "mark" else self._fault(order, who)
 
-    def _switch(self, order: Order, who: str) -> OrderAnswer:
+    def _switch(self, order: Order, who: str) -> Done:
         if order.name == "patch" and order.on and order.level not in PATCHES:
-            return OrderAnswer(id=order.id, status=400, line=f"no such patch; write a level of {', '.join(map(str, PATCHES))}")
+            return 400, f"no such patch; write a level of {', '.join(map(str, PATCHES))}"
         request = SwitchRequest(order.name, order.on, who, order.level)
-        self._requests.ask(request)
+        self._requests.append(request)
         if self._waits_for(lambda: request.done):
-            return OrderAnswer(id=order.id, status=200, line=request.text)
+            return 200, request.text
         request.called_off = True
-        return OrderAnswer(
-            id=order.id, status=504, line=f"the frame loop did not take it within {LOOP_WAITS_S:g} s; nothing changed"
-        )
+        return 504, f"the frame loop did not take it within {LOOP_WAITS_S:g} s; nothing changed"
 
     def _waits_for(self, holds: Callable[[], bool]) -> bool:
         """Wait for a condition for at most LOOP_WAITS_S; whether it came to hold."""
@@ -274,24 +316,23 @@ class OrderHandler:
             time.sleep(POLL_S)
         return True
 
-    def _switch_ledger(self, order: Order, who: str) -> OrderAnswer:
+    def _switch_ledger(self, order: Order, who: str) -> Done:
         with self._ledger_lock:
             if order.on:
                 path = self._free_path()
                 was_on = self._ledger.on
                 ledger = self._ledger.begin(lambda: self._make_ledger(path))
-                if was_on:
-                    return OrderAnswer(id=order.id, status=200, line=f"ledger on: {ledger.path}")
-                self._notices.tell("operator", f"ledger on, by {who}: {ledger.path}", who)
-                return OrderAnswer(id=order.id, status=200, line=f"ledger on: {ledger.path}")
+                if not was_on:
+                    self._notices.tell("operator", f"ledger on, by {who}: {ledger.path}", who)
+                return 200, f"ledger on: {ledger.path}"
             ledger_now = self._ledger.current
             if ledger_now is None:
-                return OrderAnswer(id=order.id, status=200, line="ledger off")
+                return 200, "ledger off"
             self._notices.tell("operator", f"ledger off, by {who}: {ledger_now.path}", who)
             self._ledger.end()
             if ledger_now.failure is not None:
-                return OrderAnswer(id=order.id, status=500, line=f"{ledger_now.path}: {ledger_now.failure}")
-            return OrderAnswer(id=order.id, status=200, line=f"ledger off: {ledger_now.path} is whole")
+                return 500, f"{ledger_now.path}: {ledger_now.failure}"
+            return 200, f"ledger off: {ledger_now.path} is whole"
 
     def _free_path(self) -> Path:
         """A new file name, beside the newest ledger if there was one."""
@@ -303,28 +344,26 @@ class OrderHandler:
                 return path
         return folder / f"hilstar-{now:%Y%m%dT%H%M%S.%fZ}.mcap"
 
-    def _mark(self, order: Order, who: str) -> OrderAnswer:
+    def _mark(self, order: Order, who: str) -> Done:
         text = printable(" ".join(order.text.split()))[:MAX_MARK_CHARACTERS]
         if not text:
-            return OrderAnswer(id=order.id, status=400, line='a mark needs its text: {"text": "..."}')
+            return 400, 'a mark needs its text: {"text": "..."}'
         self._notices.tell("mark", f"mark, by {who}: {text}", who)
-        return OrderAnswer(
-            id=order.id, status=200, line="mark written" if self._ledger.on else "mark told; no ledger is being written"
-        )
+        return 200, "mark written" if self._ledger.on else "mark told; no ledger is being written"
 
-    def _fault(self, order: Order, who: str) -> OrderAnswer:
+    def _fault(self, order: Order, who: str) -> Done:
         faults = self._faults
         if faults is None or not faults.names():
-            return OrderAnswer(id=order.id, status=409, line="this run has no faults to start: give it some with --scenario")
+            return 409, "this run has no faults to start: give it some with --scenario"
         if order.fault not in faults.names():
             meant, known = did_you_mean(order.fault, faults.names()), ", ".join(faults.names())
-            return OrderAnswer(id=order.id, status=404, line=f"no fault of that name; {meant}write one of {known}")
+            return 404, f"no fault of that name; {meant}write one of {known}"
         before = self._feed.count
         act = faults.start if order.on else faults.stop
         act(order.fault, who)
         if self._waits_for(lambda: self._feed.count > before + 1):
-            return OrderAnswer(id=order.id, status=200, line=f"fault {order.fault} {'on' if order.on else 'off'}")
-        return OrderAnswer(id=order.id, status=504, line=f"asked for, but no frame was drawn within {LOOP_WAITS_S:g} s")
+            return 200, f"fault {order.fault} {'on' if order.on else 'off'}"
+        return 504, f"asked for, but no frame was drawn within {LOOP_WAITS_S:g} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -383,18 +422,6 @@ def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class PageParts:
-    """The parts of a run; `make_ledger` begins a ledger at a path."""
-
-    bench: Bench
-    notices: Notices
-    ledger: LedgerSwitch
-    make_ledger: Callable[[Path], Ledger]
-    screen: Screen | None = None
-    faults: FaultSchedule | None = None
-
-
 @contextmanager
 def opened_page(
     listener: PageListener, control: bool, description: RunDescription, parts: PageParts
@@ -404,11 +431,8 @@ def opened_page(
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
     memory = SharedMemory.make(picture_bytes)
     feed, requests = FramePublisher(memory), SwitchRequests()
-    watched = WatchedRun(feed, parts.notices, parts.ledger, parts.screen, parts.faults)
-    orders = OrderHandler(requests, watched, parts.make_ledger)
-    with PageProcess(
-        setup_of(listener, control, description, parts, picture_bytes), memory, listener.socket, watched, orders.do
-    ):
+    setup, orders = setup_of(listener, control, description, parts, picture_bytes), OrderHandler(requests, feed, parts)
+    with PageProcess(setup, memory, listener.socket, WatchedRun(feed, parts), orders.do):
         yield feed, requests
 
 
@@ -472,8 +496,8 @@ class SessionPublisher:
     def now(self) -> RunState:
         """The session's current state."""
         now_ns = time.monotonic_ns()
-        failed = list(self._failed.values())
-        return RunState(host_ns=now_ns, alive_ns=now_ns, frame=self._patterns, missing=False, blank=False, failed=failed)
+        failed, shown = list(self._failed.values()), NewestFrame(number=self._patterns, missing=False, blank=False)
+        return RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
 
     def do(self, order: Order) -> OrderAnswer:
         """Record a mark; a session takes no other order."""

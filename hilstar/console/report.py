@@ -26,12 +26,11 @@ from hilstar.files import make_directory, write_whole
 from hilstar.frame.fault_kinds import Freeze
 from hilstar.notices import Notices
 from hilstar.run.faults import Recording, read_recording
-from hilstar.run.record.ledger_reader import config_of, wrong_in_frame
-from hilstar.run.record.ledger_records import EventRecord, FrameRecord
+from hilstar.run.pacer import Shown
+from hilstar.run.record.ledger_records import EventRecord, FrameRecord, config_of, wrong_in_frame
 from hilstar.run.record.report import COUNTS, METRICS, RunFigures, RunReport, figures_of, summarise, table_rows
-from hilstar.run.replay import RunPlay, replay
+from hilstar.run.replay import played_again, replay
 from hilstar.run.serve import Outlet
-from hilstar.run.shown import Shown
 from hilstar.units import NS_PER_S
 from hilstar.version import __version__
 
@@ -159,7 +158,7 @@ def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> 
     if chosen:
         replay(
             bench,
-            RunPlay([record for record, _ in chosen], 0, paced=False, recording=recording),
+            played_again([record for record, _ in chosen], 0, False, recording),
             take,
             Outlet(notices=_Unreported()),
         )
@@ -322,7 +321,7 @@ def _process(run: RunFigures) -> dict[str, Any]:
 def _histograms(run: RunFigures) -> list[dict[str, Any]]:
     found = []
     for name, title in DISTRIBUTIONS.items():
-        values = run.samples.rows[:, METRICS.index(name)]
+        values = run.samples.rows[:, list(METRICS).index(name)]
         values = values[np.isfinite(values)]
         if not len(values):
             continue

@@ -21,9 +21,9 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from hilstar.run.pacer import Shown
     from hilstar.run.record.ledger import LedgerSwitch
     from hilstar.run.serve import Running
-    from hilstar.run.shown import Shown
     from hilstar.run.summary import RunTally
 
 LIVE_EACH_S = 0.5
@@ -84,7 +84,7 @@ class RunStatus:
         shown, running = self._shown, self._running
         if shown is None or running is None:
             return "no frame yet"
-        attitude, tally, packets = _attitude_line(shown), running.tally, running.packets
+        attitude, tally, packets = _attitude_line(shown), running.loop.tally, running.packets
         told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
         return f"attitude {attitude.text}; {told}"
 
@@ -93,7 +93,7 @@ class RunStatus:
         shown, running = self._shown, self._running
         if shown is None or running is None:
             return [StatusLine("frames", "none yet"), *self._about()]
-        tally, packets = running.tally, running.packets
+        tally, packets = running.loop.tally, running.packets
         then_ns, frames, received = self._before
         self._before = (now_ns, tally.frames, packets.received)
         seconds = max(now_ns - then_ns, 1) / NS_PER_S

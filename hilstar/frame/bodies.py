@@ -41,7 +41,7 @@ class BodyLayer:
         self.canvas, self._moving = canvas, moving
         px_rad = canvas.camera.scales_px_rad()
         self._px_sr, self._px_per_rad = px_rad[0] ** -2, px_rad[1]
-        self._reach_rad = canvas.camera.field_radius_rad(canvas.footprint_px / 2 + 1)
+        self._reach_rad = canvas.camera.field_radius_rad(canvas.psf.footprint_px / 2 + 1)
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
         """The light before without what discs hide, and with the light of the discs, which ends up farthest first."""
@@ -61,7 +61,7 @@ class BodyLayer:
     def on_image(self, view: View) -> list[Disc]:
         """Discs that touch the image of a camera at rest, nearest first."""
         camera, icrs_to_image = self.canvas.camera, view.icrs_to_image(self.canvas.camera)
-        lights = (DiscLight(disc, icrs_to_image, camera, self.canvas.sigma_px) for disc in self._near(view))
+        lights = (DiscLight(disc, icrs_to_image, camera, self.canvas.psf) for disc in self._near(view))
         return [light.disc for light in lights if light.region(camera.resolution_px) is not None]
 
     def alone(self, disc: Disc, view: View) -> tuple[ExtendedLight, ...]:
@@ -71,7 +71,7 @@ class BodyLayer:
     def any_lights(self) -> tuple[ExtendedLight, ...]:
         """Discs of several sizes in the middle of the image: for a driver that compiles a shader for each kind."""
         ahead = np.array([0.0, 0.0, 1.0])
-        radii_rad = np.array([2.0, 20.0, 100.0, 400.0]) * max(self.canvas.sigma_px) / self._px_per_rad
+        radii_rad = np.array([2.0, 20.0, 100.0, 400.0]) * max(self.canvas.psf.width_px) / self._px_per_rad
         discs = [Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert") for r in radii_rad.tolist()]
         return tuple(itertools.chain.from_iterable(self._lights(discs, self._still(np.eye(3)))))
 
@@ -104,23 +104,23 @@ class BodyLayer:
         return self._turning(view, 1 if large else MAX_POSES)
 
     def _still(self, icrs_to_image: FloatArray) -> DiscView:
-        return DiscView(self.canvas.camera, self.canvas.sigma_px, (Pose(icrs_to_image),))
+        return DiscView(self.canvas.camera, self.canvas.psf, (Pose(icrs_to_image),))
 
     def _exposed(self, view: View) -> DiscView:
         """The camera during an exposure: poses that follow one another along its turn, all with the exposure's mean light."""
         camera, exposure_s = self.canvas.camera, view.scan.hold_s
-        length_sigma = view.turn.speed_rad_s * exposure_s * self._px_per_rad / min(self.canvas.sigma_px)
+        length_sigma = view.turn.speed_rad_s * exposure_s * self._px_per_rad / min(self.canvas.psf.width_px)
         count = min(math.ceil(EXPOSED_PER_SIGMA * length_sigma) | 1, MAX_EXPOSED)
         place, weight = gauss_legendre(count)
         maps = view.motion.icrs_to_image(place / 2 * exposure_s, camera)
         poses = tuple(Pose(one, float(share / 2)) for one, share in zip(maps, weight, strict=True))
-        return DiscView(camera, self.canvas.sigma_px, poses)
+        return DiscView(camera, self.canvas.psf, poses)
 
     def _turning(self, view: View, max_poses: int) -> DiscView:
         """The camera while a screen's rows light up one after the other, each held for a time."""
         camera, scan = self.canvas.camera, view.scan
         turn, _ = slowed(view.turn, scan, camera)
-        length_sigma = turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.canvas.sigma_px)
+        length_sigma = turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.canvas.psf.width_px)
         count = 1
         if length_sigma > POINT_SIGMA:
             count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, max_poses)  # odd: one is in the middle
@@ -131,7 +131,7 @@ class BodyLayer:
         late_s = tuple(down * scan.scanout_s / size for down, size in zip(scan.down, camera.resolution_px, strict=True))
         middle = tuple((size - 1) / 2 for size in camera.resolution_px)
         shear = Shear(camera.cam_to_image @ turn.rate_cam_rad_s, (late_s[0], late_s[1]), (middle[0], middle[1]))
-        return DiscView(camera, self.canvas.sigma_px, poses, shear if scan.scanout_s else None)
+        return DiscView(camera, self.canvas.psf, poses, shear if scan.scanout_s else None)
 
     def _lights(self, discs: list[Disc], posed: DiscView) -> list[list[ExtendedLight]]:
         """The light of each of some discs, which are nearest first, in the order in which they are drawn."""

@@ -38,6 +38,7 @@ from hilstar.rotation import direction_of, to_matrix
 from hilstar.scene import extended
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Scan
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import AddedLight, Sprites, pack_sprites
 from hilstar.sky.catalog import star_names
 from hilstar.sky.stars import Stars
@@ -213,7 +214,7 @@ class FaultView:
             begin_s, hold_s = since_s + (float(late_s) if math.isfinite(late_s) else 0.0), scan.hold_s
         ends = [(np.array(place) + rate * seconds)[None] for seconds in (begin_s, begin_s + hold_s)]
         light = np.array([self.light_e_per_s(fault) * one.share])
-        return Lines(ends[0], ends[1], light).seen_by(by.canvas.camera, source, by.canvas.sigma_px)
+        return Lines(ends[0], ends[1], light).seen_by(by.canvas.camera, source, by.canvas.psf)
 
     def _burst(self, fault: CosmicRays, since_ns: int) -> PointChain:
         """The tracks of the exposure that a moment is in, counted from the burst's beginning."""
@@ -224,7 +225,7 @@ class FaultView:
             if len(self._tracks) >= KEPT_BURSTS:
                 self._tracks.clear()
             made = tracks(fault, by.tracker.resolution_px, by.exposure_s, self.rng(fault.name, TRACK_SEED, number))
-            self._tracks[key] = made.seen_by(by.canvas.camera, by.tracker, by.canvas.sigma_px)
+            self._tracks[key] = made.seen_by(by.canvas.camera, by.tracker, by.canvas.psf)
         return self._tracks[key]
 
     def gone(self, now: Sequence[Now], stars: Stars) -> list[tuple[int, float]]:
@@ -277,7 +278,7 @@ class FaultView:
         made, first = [], 0
         for chain in chains:
             star = -1 - first - chain.line
-            size_px, footprint_px = self.by.canvas.camera.resolution_px, self.by.canvas.footprint_px
+            size_px, footprint_px = self.by.canvas.camera.resolution_px, self.by.canvas.psf.footprint_px
             made.append(pack_sprites(chain.x_px, chain.y_px, chain.electrons_per_s, star, size_px, footprint_px))
             first += chain.lines
         return made
@@ -362,10 +363,10 @@ class Lines:
     end_px: FloatArray
     electrons_per_s: FloatArray
 
-    def seen_by(self, camera: Camera, source: Camera, sigma_px: tuple[float, float]) -> PointChain:
+    def seen_by(self, camera: Camera, source: Camera, psf: Psf) -> PointChain:
         """The lines in pixels of `source` as `camera` sees them; lines behind it or beyond its lens have no points."""
         ends = [np.stack(camera.pixels_from(source, *place.T)) for place in (self.begin_px, self.end_px)]
-        length_sigma = np.hypot(*((ends[1] - ends[0]) / np.array(sigma_px)[:, None]))
+        length_sigma = np.hypot(*((ends[1] - ends[0]) / np.array(psf.width_px)[:, None]))
         known = np.nan_to_num(length_sigma, nan=-1.0, posinf=-1.0)
         counts = np.where(known < 0, 0, np.minimum(np.ceil(known / STEP_SIGMA), MAX_STEPS - 1).astype(np.intp) + 1)
         line = np.repeat(np.arange(len(counts)), counts)

@@ -1,4 +1,4 @@
-"""The light of a view: stars, then bodies, then satellites, then faults."""
+"""The light of a view: stars, then diffuse light, bodies, then satellites, then faults."""
 
 from __future__ import annotations
 
@@ -17,13 +17,18 @@ from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
+    from hilstar.sky.diffuse import TangentImage
 
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """The light of a bench's sky beside its stars: bodies, satellites and the observer, None where the sky stands still."""
+    """The light of a bench's sky beside its stars.
+
+    That is bodies, satellites and the observer (`moving`, None where the sky stands still), and `diffuse` light, e-/s/sr.
+    """
 
     moving: MovingSky | None = None
+    diffuse: tuple[TangentImage, ...] = ()
 
 
 NO_SOURCES = Sources()
@@ -42,11 +47,15 @@ def sky_layers(
     *,
     paths: bool = True,
 ) -> tuple[Layer, ...]:
-    """The layers of the sky: a bench's stars, bodies, and satellites of at least `faintest_e_per_s`.
+    """The layers of the sky: a bench's stars, diffuse light, bodies, and satellites of at least `faintest_e_per_s`.
 
     For `frequent` and `paths` see `StarLayer`.
     """
     layers: list[Layer] = [StarLayer(canvas, frequent, paths)]
+    if sources.diffuse:
+        from hilstar.frame.diffuse import DiffuseLayer  # its libraries take 30 ms, which only a map needs
+
+        layers.append(DiffuseLayer(sources.diffuse, canvas))
     moving = sources.moving
     if moving is not None and moving.names:
         layers.append(BodyLayer(moving, canvas))
@@ -57,7 +66,7 @@ def sky_layers(
 
 def light_of(canvas: Canvas, layers: Iterable[Layer], stars: Stars, view: View) -> Sprites:
     """The light of a view, layer by layer; `stars` are as seen in it (see `seen_in`)."""
-    light = no_light(canvas.footprint_px)
+    light = no_light(canvas.psf.footprint_px)
     for layer in layers:
         light = layer.add(light, stars, view)
     return light
@@ -91,13 +100,13 @@ class StarLayer:
         camera = canvas.camera
         icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, camera)[0] if view.exposed else view.icrs_to_image(camera)
         candidates = self.candidates if stars is self.frequent else None
-        return make_sprites(stars, icrs_to_image, camera, canvas.footprint_px, candidates)
+        return make_sprites(stars, icrs_to_image, camera, canvas.psf.footprint_px, candidates)
 
     def _along_paths(self, stars: Stars, view: View) -> Sprites:
         canvas = self.canvas
         if view.exposed:
-            return smeared_sprites(stars, view.motion, canvas.camera, canvas.footprint_px, canvas.sigma_px)
+            return smeared_sprites(stars, view.motion, canvas.camera, canvas.psf)
         if not view.turns:
             return self._still(stars, view)
-        made = swept_sprites(stars, view.turn, view.scan, canvas.camera, canvas.footprint_px, canvas.sigma_px)
+        made = swept_sprites(stars, view.turn, view.scan, canvas.camera, canvas.psf)
         return replace(made, rate_cam_rad_s=view.rate_cam_rad_s)

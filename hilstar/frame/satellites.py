@@ -41,7 +41,7 @@ class SatelliteLayer:
         if not view.exposed:
             turn, _ = slowed(turn, view.scan, canvas.camera)
         longest_s = max(abs(view.begin_s), rows.longest_s)  # between the moment of the attitude and any light
-        margin_px = canvas.footprint_px / 2 + 1
+        margin_px = canvas.psf.footprint_px / 2 + 1
         reach_rad = canvas.camera.field_radius_rad(margin_px) + turn.speed_rad_s * longest_s
         seen = self._passing(view, reach_rad, longest_s)
         if seen is None or satellites is None:
@@ -86,7 +86,7 @@ class SatelliteLayer:
 
     def _brush(self, view: View) -> Brush:
         most, poses = (EXPOSURE_SPRITES, EXPOSURE_POSES) if view.exposed else (FRAME_SPRITES, FRAME_POSES)
-        return Brush(self.canvas.footprint_px, self.canvas.sigma_px, most, poses)
+        return Brush(self.canvas.psf, most, poses)
 
     def _lit(self, seen: Pass, path: TrailView, view: View) -> Lit:
         """When each satellite's row is lit."""

@@ -13,7 +13,11 @@ from hilstar.frame.bodies import disc_stars
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import Sprites
+from hilstar.sky.catalog import Catalog
+from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag
 from hilstar.sky.stars import Stars
+
+ERROR_DECIMALS = 4  # of the errors of a table that is written
 
 TRUTH_DTYPE = np.dtype(
     [
@@ -32,6 +36,8 @@ TRUTH_DTYPE = np.dtype(
         ("double", "U1"),
         ("separation_arcsec", "f8"),
         ("name", "U32"),
+        ("sigma_pos_mas", "f8"),
+        ("sigma_mag", "f8"),
     ]
 )
 
@@ -51,6 +57,7 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
     truth["temperature_k"] = stars.temperature_k[star]
     truth["electrons_per_s"] = stars.electrons_per_s[star]
     truth["drawn"] = True
+    truth["sigma_pos_mas"] = truth["sigma_mag"] = np.nan
     listed = stars.row[star] >= 0
     row, catalog = stars.row[star[listed]], stars.catalog
     truth["variable"][listed], truth["double"][listed] = catalog.variable[row], catalog.multiple[row]
@@ -59,6 +66,22 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
         # Back to the catalogue's decimals from float32.
         truth[name][listed] = np.round(getattr(catalog, name)[row].astype(np.float64), 3)
     return truth
+
+
+def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float) -> npt.NDArray[np.void]:
+    """Rows of TRUTH_DTYPE with the errors of their stars: of V, and of a place at `epoch_jyear`, rms of its two axes.
+
+    Both stay NaN for bodies, and for stars that have no errors in their `catalog`. Only a table that is written needs them.
+    """
+    listed = np.flatnonzero(truth["hip"] > 0)
+    order = np.argsort(catalog.hip)
+    stars = catalog.taken(order[np.searchsorted(catalog.hip, truth["hip"][listed], sorter=order)])
+    facts = errors_of(stars)
+    covariance = motion_at(stars, facts, epoch_jyear).covariance
+    found = truth.copy()
+    found["sigma_pos_mas"][listed] = np.round(np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2), ERROR_DECIMALS)
+    found["sigma_mag"][listed] = np.round(sigma_v_mag(facts, stars.bv_mag), ERROR_DECIMALS)
+    return found
 
 
 def designations(stars: Stars, sprites: Sprites, which: IntArray) -> tuple[int | str, ...]:
@@ -123,7 +146,7 @@ def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np
     for k, added in enumerate(sprites.added[-1 - index] for index in star.tolist()):
         rows[k]["name"], rows[k]["v_mag"], rows[k]["bv"] = added.name, added.v_mag, added.bv_mag
         rows[k]["electrons_per_s"] = added.electrons_per_s
-    for name in ("temperature_k", "range_mag", "period_d", "separation_arcsec"):
+    for name in ("temperature_k", "range_mag", "period_d", "separation_arcsec", "sigma_pos_mas", "sigma_mag"):
         rows[name] = np.nan
     rows["drawn"] = True
     rows["clipped"] = np.bincount(line, over[of_added], minlength=len(star)) > 0

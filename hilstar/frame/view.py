@@ -13,6 +13,7 @@ from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import Motion
 from hilstar.scene.frame_motion import CameraTurn, Scan
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 from hilstar.sky.stars import Stars
 
@@ -104,16 +105,17 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """An image on which layers draw: its camera, and the side and the sigmas of a point's sprite.
+    """An image on which layers draw: its camera, and how a point is spread on it.
 
-    A pixel shows up to `white_e_per_s` on a screen, or `full_e` electrons in a detector's exposure.
+    A pixel shows up to `white_e_per_s` on a screen, or `full_e` electrons in a detector's exposure. A screen shows nothing of
+    less light than its `first_step_e_per_s`.
     """
 
     camera: Camera
-    footprint_px: int
-    sigma_px: tuple[float, float]
+    psf: Psf
     white_e_per_s: float = math.inf
     full_e: float = math.inf
+    first_step_e_per_s: float = 0.0
 
     def white_in(self, view: View) -> float:
         """The largest rate that a pixel shows in a view, electrons per second."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
+from hilstar.scene.psf import Psf
 
-PIXEL_VARIANCE = 1 / 12  # a pixel's width adds to the sigma that it samples
 SUMS = 10
 BOX_REACH = 15  # px from a star's nearest pixel; the boxes' weights are tabulated up to there
 
@@ -60,21 +60,16 @@ AS_USUAL = Seen()
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """The ten sums of stars of one sprite sigma (x, y), seen by one tracker, in one frame or over several (`temporal`)."""
+    """The ten sums of stars of one PSF, seen by one tracker, by weights in one frame or over several (`temporal`)."""
 
-    sigma_px: tuple[float, float]
+    psf: Psf
     seen: Seen = AS_USUAL
-    over_frames: bool = False
-
-    @property
-    def weights(self) -> Weights:
-        """The weights of its sums."""
-        return OVER_FRAMES if self.over_frames else IN_A_FRAME
+    weights: Weights = IN_A_FRAME
 
     @property
     def window_px(self) -> tuple[float, float]:
         """The Gaussian's sigma along x and y."""
-        x, y = (math.sqrt(s**2 + PIXEL_VARIANCE + self.weights.window_blurs * self.seen.blur_px**2) for s in self.sigma_px)
+        x, y = (math.sqrt(v + self.weights.window_blurs * self.seen.blur_px**2) for v in self.psf.variance_px2)
         return x, y
 
     def in_box(self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array) -> FloatArray:
@@ -95,7 +90,7 @@ class Balance:
     def follows(self, side: int) -> tuple[float, float]:
         """How far a star's centre of mass in a box follows the box: 0 where it holds all light, 1 in an even field."""
         half = side * self.seen.pixel_px / 2
-        x, y = (_follows(half / math.sqrt(s**2 + PIXEL_VARIANCE + self.seen.blur_px**2)) for s in self.sigma_px)
+        x, y = (_follows(half / math.sqrt(v + self.seen.blur_px**2)) for v in self.psf.variance_px2)
         return x, y
 
     def arms(self, offset_px: Float32Array, fraction_px: Float32Array, steps: Float32Array) -> Float32Array:

@@ -11,6 +11,7 @@ This is the oracle of shaders/exact.comp, and what draws where that cannot run.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,10 +20,21 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, IntArray
-from hilstar.monitor.balance import AS_USUAL, SUMS, Balance, Seen
-from hilstar.monitor.footprints import FootprintMap, Footprints, PlaceArray
-from hilstar.monitor.quantise import Panel, ThresholdCounter, level_dtype
+from hilstar.monitor.balance import AS_USUAL, IN_A_FRAME, SUMS, Balance, Seen, Weights
+from hilstar.monitor.footprints import FEWEST, FootprintMap, Footprints, PixelOrder, PlaceArray
+from hilstar.monitor.quantise import (
+    FrameLight,
+    LevelCost,
+    Panel,
+    PixelQuantiser,
+    Quantiser,
+    RoundQuantiser,
+    ThresholdCounter,
+    dither_levels,
+    level_dtype,
+)
 from hilstar.monitor.response import Levels
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 KEPT = 8  # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
@@ -31,6 +43,12 @@ OFF = 0.6  # in steps, where steps are equal: beyond it one more pixel is turned
 SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal
 CARRIED = 32  # sprites of a path that hand on their errors; the next ones begin anew, beside them
 NONE = np.float32(1e30)  # the square of a choice that does not exist yet
+COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
+MAX_NEAR = 128  # pixels of a star that exact.comp has bits for: sprites up to a sigma of 1.8 px
+MAX_SIZE = 63  # largest footprint whose places fit into six bits
+# As MS_A_STAR. NumPy: 0.03 to 0.06 of 150 to 1800 stars, and more for sprites that are too wide for the shader. A field of the
+# Milky Way has twice the stars of an average one.
+EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,21 +96,80 @@ class Left:
     error: Float32Array
 
 
-class ExactQuantiser:
-    """Levels of sprites on a panel, one image after another; `sigma_px` is that of the sprites, `seen` the tracker's.
+class StarQuantiser(Quantiser):
+    """Looks at stars: `shader`, a compute shader, chooses the levels of each one together, over the nearest ones.
 
-    `left` is what the last frame left: always None where each stands by itself, and at the beginning of a sequence.
+    `weights` are those of its sums. One that `remembers` begins each star with what the last frame left, in `left`: always
+    None where each frame stands by itself, and at the beginning of a sequence.
     """
 
-    over_frames: ClassVar[bool] = False
+    shader = "exact.comp"
+    other_codes = 5e-3
+    weights: ClassVar[Weights] = IN_A_FRAME
+    remembers: ClassVar[bool] = False
     left: Left | None = None
 
-    def __init__(
-        self, panel: Panel, resolution_px: tuple[int, int], sigma_px: tuple[float, float], seen: Seen = AS_USUAL
-    ) -> None:
-        self._map = FootprintMap(resolution_px, sigma_px)
-        self._balance = Balance(sigma_px, seen, over_frames=self.over_frames)
-        self._panel = panel
+    @abstractmethod
+    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
+        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array.
+
+        Their light is added to that of the levels `floor` (height, width), None for black.
+        """
+
+    def draw(self, light: FrameLight) -> Levels:
+        """The levels of the next frame: its stars are added to its dithered extended light."""
+        if light.sprites is None or not light.sprites.extended:
+            return self.levels(light.sprites)
+        return self.levels(light.sprites, dither_levels(light.extended(), self._panel, self.floor_turn(light.number)))
+
+    def begin_anew(self) -> None:
+        """The next frame is the first of a sequence."""
+        self.left = None
+
+    @classmethod
+    def by_pixel(cls) -> type[PixelQuantiser]:
+        """The nearest levels, which its pass changes."""
+        return RoundQuantiser
+
+    @classmethod
+    def takes(cls, psf: Psf, gl_version: int) -> bool:
+        """Whether the shader runs on this OpenGL, and takes such sprites."""
+        return gl_version >= COMPUTE_VERSION and _fits(psf)
+
+    @classmethod
+    def cost(cls, psf: Psf, gl_version: int) -> LevelCost:
+        """That of the shader, or of NumPy."""
+        has_compute = gl_version >= COMPUTE_VERSION
+        by_numpy_ms = NUMPY_EXACT_MS_A_STAR if _fits(psf) else WIDE_EXACT_MS_A_STAR
+        why = "" if has_compute else "in NumPy: its compute shaders need OpenGL 4.3"
+        return LevelCost(EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why)
+
+    @classmethod
+    def fewest(cls, order: PixelOrder) -> int:
+        """The minimum number of a star's pixels to choose among."""
+        return min(FEWEST, order.near)
+
+    @classmethod
+    def floor_turn(cls, number: int) -> float:
+        """How far the mask that dithers extended light is turned in frame `number`, 0 to 1."""
+        return 0.0
+
+
+def _fits(psf: Psf) -> bool:
+    """Whether exact.comp has bits enough for the pixels of such sprites, and their shares are products, as it takes them."""
+    order = PixelOrder(psf)
+    return psf.separable and order.near <= MAX_NEAR and order.size <= MAX_SIZE
+
+
+class ExactQuantiser(StarQuantiser):
+    """Levels of sprites on a panel, one image after another; `psf` is that of the sprites, `seen` the tracker's."""
+
+    words = "all codes of a star are chosen together, so that its flux and centroid are right in a single frame."
+
+    def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
+        super().__init__(panel, resolution_px, psf, seen)
+        self._map = FootprintMap(resolution_px, psf)
+        self._balance = Balance(psf, seen, self.weights)
         response = panel.response
         self._light = np.append(response.light, response.light[-1])  # there is no step above white
         self._step_e_per_s = float(response.light[1]) * panel.flux_at_white_e_per_s
@@ -105,11 +182,13 @@ class ExactQuantiser:
         uniformity = panel.uniformity
         self._output = None if uniformity is None else np.append(uniformity.ravel(), np.float32(1))
 
-    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
-        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array.
+    @classmethod
+    def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
+        """That of half a step, whichever pixel would show it."""
+        return panel.response.half_step * panel.flux_at_white_e_per_s
 
-        Their light is added to that of the levels `floor` (height, width), None for black.
-        """
+    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
+        """See `StarQuantiser.levels`."""
         width, height = self._map.resolution_px
         if floor is None:
             self._flat[slice(None) if self._on_floor else self._lit] = 0
@@ -135,10 +214,7 @@ class ExactQuantiser:
     def _reach(self, of_star_e_per_s: Float32Array) -> IntArray:
         """How many pixels of stars of so much light (n,) are chosen, (n,)."""
         order = self._map.order
-        # Over frames all: pixels that stay dark are off the same way in each, and the others cannot make up for it.
-        if self.over_frames:
-            return np.full(len(of_star_e_per_s), order.near)
-        return order.reach(of_star_e_per_s / np.float32(self._step_e_per_s))
+        return np.maximum(order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order))
 
     def _carried(self, sprites: Sprites) -> Carried:
         """What each sprite begins with: nothing, in a frame that is right by itself."""

@@ -12,10 +12,9 @@ import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
-from hilstar.monitor.balance import PIXEL_VARIANCE
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import Levels
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 from hilstar.units import magnitude
 
@@ -30,31 +29,32 @@ FEWEST = 9  # minimum number of pixels to choose among
 
 
 class PixelOrder:
-    """The order for sprites of one sigma: `size` is the footprint's side, the first `near` pixels lie within reach.
+    """The order for sprites of one PSF: `size` is the footprint's side, the first `near` pixels lie within reach.
 
     `first` is the footprint's first column (and row), in whole pixels from the star's own; `row` and `column`
     (size^2, PHASES^2) count from there, nearest first. `bias` is added to a star's place in its pixel for its phase, and
     `area_px2` is 2 pi times the product of the sigmas, a pixel's width among them.
     """
 
-    def __init__(self, sigma_px: tuple[float, float]) -> None:
-        self.size = footprint_px(sigma_px)
+    def __init__(self, psf: Psf) -> None:
+        self.size = psf.footprint_px
         self.first = -((self.size - 1) // 2)
         self.bias = 0.5 if self.size % 2 else 0.0
-        distance = self._distances(sigma_px)
-        self._least_spread_px = float(_spread_px(sigma_px).min())
+        spread_px = np.sqrt(psf.variance_px2)
+        distance = self._distances(spread_px)
+        self._least_spread_px = float(spread_px.min())
         reach_sigmas = max(REACH_SIGMA, MIN_REACH_PX / self._least_spread_px)
         self.near = int((distance <= reach_sigmas).sum(axis=0).max())
         order = np.argsort(distance, axis=0, kind="stable")
         self._farthest_sigmas = float(np.take_along_axis(distance, order[self.near - 1 : self.near], axis=0).max())
-        self.area_px2 = 2 * np.pi * float(_spread_px(sigma_px).prod())
+        self.area_px2 = 2 * np.pi * float(spread_px.prod())
         self.row, self.column = (part.astype(np.int32) for part in np.divmod(order, self.size))
 
-    def _distances(self, sigma_px: tuple[float, float]) -> FloatArray:
+    def _distances(self, spread_px: FloatArray) -> FloatArray:
         """The footprint's pixels from a star of each phase, in sigmas, (size^2, PHASES^2)."""
         phase = (np.arange(PHASES) + 0.5) / PHASES - self.bias
         steps = np.arange(self.size) + self.first
-        x, y = (((steps[:, None] - phase) / s) ** 2 for s in _spread_px(sigma_px))
+        x, y = (((steps[:, None] - phase) / s) ** 2 for s in spread_px)
         return np.asarray(np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(self.size**2, PHASES**2))
 
     def near_sigmas(self, more_px: float = 0.0) -> float:
@@ -82,10 +82,6 @@ class PixelOrder:
         return np.stack([np.tile(middle, PHASES), np.repeat(middle, PHASES)])
 
 
-def _spread_px(sigma_px: tuple[float, float]) -> FloatArray:
-    return np.asarray(np.sqrt(np.square(sigma_px) + PIXEL_VARIANCE))
-
-
 @dataclass(frozen=True, slots=True)
 class Footprints:
     """Pixels of n stars, nearest first, each (pixels, n). A pixel that several stars light belongs to the brightest there.
@@ -103,30 +99,27 @@ class Footprints:
 
 
 class FootprintMap:
-    """Finds the footprints of sprites of one sigma on one image."""
+    """Finds the footprints of sprites of one PSF on one image."""
 
-    def __init__(self, resolution_px: tuple[int, int], sigma_px: tuple[float, float]) -> None:
+    def __init__(self, resolution_px: tuple[int, int], psf: Psf) -> None:
         self.resolution_px = resolution_px
         self.pixels = resolution_px[0] * resolution_px[1]
-        self._sigma_px = sigma_px
-        self.order = PixelOrder(sigma_px)
+        self._psf = psf
+        self.order = PixelOrder(psf)
         self._last_entry = np.empty(self.pixels + 1, dtype=np.int32)
         self._contested = np.zeros(self.pixels + 1, dtype=np.bool_)
 
     def find(self, sprites: Sprites) -> Footprints:
-        """The footprints of `sprites`. Raises InputError for sprites of another sigma's footprint."""
+        """The footprints of `sprites`. Raises InputError for sprites of another PSF's footprint."""
         order = self.order
         if sprites.footprint_px != order.size:
-            raise InputError(f"sprites of {sprites.footprint_px} px where the sigma needs {order.size} px")
+            raise InputError(f"sprites of {sprites.footprint_px} px where the PSF needs {order.size} px")
         data, count = sprites.data, len(sprites)
         fraction = data["fraction_px"].astype(np.float64).T
         cell = np.clip((fraction + order.bias) * PHASES, 0, PHASES - 1).astype(np.intp)
         row, column = (table.take(cell[1] * PHASES + cell[0], axis=1) for table in (order.row, order.column))
-        share_x, share_y = (self._shares(f, s) for f, s in zip(fraction, self._sigma_px, strict=True))
-        share_y *= data["electrons_per_s"]
-        star = np.arange(count, dtype=np.int32)
-        light = share_x.astype(np.float32).take(column * count + star)
-        light *= share_y.astype(np.float32).take(row * count + star)
+        stamps = self._psf.stamps(fraction, data["electrons_per_s"], order.size)
+        light = stamps.take((row * order.size + column) * count + np.arange(count, dtype=np.int32))
         row += order.first
         column += order.first
         place = self._places(data["pixel"], row, column)
@@ -135,13 +128,6 @@ class FootprintMap:
             self._settle(light, place)
         offset = np.stack([column, row]).astype(np.float32)
         return Footprints(light, place, offset, data["fraction_px"].T, data["electrons_per_s"])
-
-    def _shares(self, fraction_px: FloatArray, sigma_px: float) -> FloatArray:
-        """A star's share in each column (or row) of its footprint, (size, n)."""
-        from scipy.special import ndtr
-
-        edges = np.arange(self.order.size + 1)[:, None] + (self.order.first - 0.5) - fraction_px
-        return np.diff(ndtr(edges / sigma_px), axis=0)
 
     def _places(self, pixel: PlaceArray, row: PlaceArray, column: PlaceArray) -> PlaceArray:
         width, height = self.resolution_px

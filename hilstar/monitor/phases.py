@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.monitor.balance import Balance
-from hilstar.monitor.quantise import QUANTISERS, Panel, Quantisation, dither_levels, round_levels, shown_light
-from hilstar.monitor.temporal import star_quantiser
-from hilstar.scene.psf import footprint_px, peak_share, pixel_shares
+from hilstar.monitor.quantise import FrameLight, Panel, shown_light
+from hilstar.monitor.quantisers import QUANTISERS, Quantisation
+from hilstar.scene.psf import GaussianPsf, Psf
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.units import flux_ratio, magnitude
 
-SIGMA_PX = (0.85, 0.85)
+USUAL_PSF = GaussianPsf((0.85, 0.85))
 WHITE = 1.0
 MARGIN_PX = 2  # dark pixels between two stars
 FRAMES_BEFORE = 2  # frames of `temporal` before an exposure: the first of a sequence is no special case
@@ -33,19 +34,17 @@ class Errors:
     centroid_max_px: float
 
 
-def phase_grid(
-    count: int, sigma_px: tuple[float, float] = SIGMA_PX, first: tuple[float, float] = MIDDLES
-) -> tuple[Sprites, int]:
+def phase_grid(count: int, psf: Psf = USUAL_PSF, first: tuple[float, float] = MIDDLES) -> tuple[Sprites, int]:
     """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel; and the tile's side, px.
 
     The first phase along x and y is `first`, in steps of 1 / count px.
     """
-    tile, steps = footprint_px(sigma_px) + MARGIN_PX, np.arange(count)
+    tile, steps = psf.footprint_px + MARGIN_PX, np.arange(count)
     places = ((steps + 0.5) * tile + (steps + start) / count - 0.5 for start in first)
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(*places))
-    flux = np.full(count**2, WHITE / peak_share(sigma_px))
+    flux = np.full(count**2, WHITE / psf.peak_share)
     size_px = count * tile, count * tile
-    return pack_sprites(x_px, y_px, flux, np.arange(count**2), size_px, footprint_px(sigma_px)), tile
+    return pack_sprites(x_px, y_px, flux, np.arange(count**2), size_px, psf.footprint_px), tile
 
 
 def line_places(sprites: Sprites) -> tuple[FloatArray, FloatArray]:
@@ -54,17 +53,19 @@ def line_places(sprites: Sprites) -> tuple[FloatArray, FloatArray]:
     return sprites.x_px[:count], sprites.y_px[::count]
 
 
-def phase_image(sprites: Sprites, sigma_px: tuple[float, float]) -> FloatArray:
-    """The light (h, w) of the stars of a `phase_grid`: all are as bright, so their image is a column's times a row's."""
+def phase_image(sprites: Sprites, psf: Psf) -> FloatArray:
+    """The light (h, w) of the stars of a `phase_grid`: all are as bright, and stand in columns and rows."""
     count = math.isqrt(len(sprites))
     at = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
-    lines = []
-    for axis, (places, sigma) in enumerate(zip(line_places(sprites), sigma_px, strict=True)):
-        pixels = sprites.data["pixel"][:, axis][:: count if axis else 1][:count, None] + at
-        line = np.zeros(count * (sprites.footprint_px + MARGIN_PX))
-        line[pixels] = pixel_shares(pixels - places[:, None], sigma)
-        lines.append(line)
-    return np.outer(float(sprites.data["electrons_per_s"][0]) * lines[1], lines[0])
+    pixels, offsets = [], []
+    for axis, places in enumerate(line_places(sprites)):
+        line = sprites.data["pixel"][:, axis][:: count if axis else 1][:count, None] + at
+        pixels.append(line.ravel())
+        offsets.append((line - places[:, None]).ravel())
+    image = np.zeros((count * (sprites.footprint_px + MARGIN_PX),) * 2)
+    shares = psf.shares(offsets[0][None], offsets[1][:, None])
+    image[np.ix_(pixels[1], pixels[0])] = float(sprites.data["electrons_per_s"][0]) * shares
+    return image
 
 
 def fainter(sprites: Sprites, mag: float) -> Sprites:
@@ -84,12 +85,6 @@ def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
     return Errors(next(rms), float(flux.max()), next(rms), float(off.max()))
 
 
-def tiles_of(image: FloatArray, tile: int) -> FloatArray:
-    """The tiles of a square image, (tiles, tile, tile), row by row."""
-    count = len(image) // tile
-    return image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3).reshape(-1, tile, tile)
-
-
 def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Light and centroid (x, y), px, of each tile; the centroid is 0 where there is no light."""
     count = len(image) // tile
@@ -104,17 +99,10 @@ def shown_by(
 ) -> FloatArray:
     """The light (h, w) that a method shows for a linear image, with `temporal` the mean of `exposure_frames` frames.
 
-    `balance` is that of `exact`, with the sprites' sigma.
+    `balance` is that of `exact`, with the sprites' PSF.
     """
-    size = linear.shape[1], linear.shape[0]
-    does = QUANTISERS[method]
-    if not does.by_star:
-        levels = dither_levels if does.dithered else round_levels
-        return shown_light(levels(linear, panel), panel)
-    quantiser = star_quantiser(method)(panel, size, balance.sigma_px, balance.seen)
-    if not does.over_frames:
-        return shown_light(quantiser.levels(sprites), panel)
-    for _ in range(FRAMES_BEFORE):
-        quantiser.levels(sprites)
-    frames = (shown_light(quantiser.levels(sprites), panel) for _ in range(exposure_frames))
-    return np.asarray(sum(frames) / exposure_frames)
+    quantiser = QUANTISERS[method](panel, linear.shape[::-1], balance.psf, balance.seen)
+    exposed = quantiser.exposure(FRAMES_BEFORE, exposure_frames)
+    levels = (quantiser.draw(FrameLight(sprites, lambda: linear, lambda: linear, number)) for number in range(exposed.stop))
+    shown = (shown_light(each, panel) for each in islice(levels, exposed.start, None))
+    return np.asarray(sum(shown) / len(exposed))

@@ -1,4 +1,4 @@
-"""From a linear image to levels, pixel by pixel: `round` and `dither` (`exact` and `temporal` look at stars).
+"""What a quantisation is, and those that look at pixels alone: `round` and `dither` (`exact` and `temporal` look at stars).
 
 A pixel's light lies between those of two levels, k and k + 1. `round` shows the nearer one. `dither` works in light, not
 in code: k + 1 has the probability (L - L_k) / (L_k+1 - L_k), so that the mean light is the light wanted.
@@ -9,50 +9,30 @@ Counting thresholds is fast by a table: the bits of a positive float rise with i
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
+from hilstar.monitor.balance import AS_USUAL, Seen
 from hilstar.monitor.response import Levels, Response, encode
+from hilstar.scene.psf import Psf
+from hilstar.scene.sprites import Sprites
 
 MASK_FILE = Path(__file__).parent / "data" / "blue-noise.npy"  # made by tools/make_blue_noise.py
-
-Quantisation = Literal["round", "dither", "temporal", "exact"]
 
 EXPOSURE_FRAMES = 6  # over which `temporal` is judged unless a bench says otherwise: 100 ms at 60 Hz
 MASK_TURNS = 4096  # the mask has no more distinct thresholds
 MANTISSA_BITS = 23
 MAX_FINER = 4
-
-
-@dataclass(frozen=True, slots=True)
-class Quantiser:
-    """What a quantisation does: `by_star` it chooses the levels of a star together, else pixel by pixel.
-
-    `over_frames` a frame makes up for what the one before left; `dithered` a mask decides between two levels. `other_codes` is
-    the largest share of a frame's lit pixels whose codes may be one off where another renderer draws the same light. Measured
-    with light that is off by 2.4e-7, as by another driver's exp2, over ten skies: 3e-6 of `round`, 1.1e-3 of `exact`, 1.9e-3
-    of `temporal`. A choice of `exact` has ties that the last bit decides, and takes a star's other pixels with it.
-    """
-
-    by_star: bool = False
-    over_frames: bool = False
-    dithered: bool = False
-    other_codes: float = 1e-4
-
-
-QUANTISERS: dict[Quantisation, Quantiser] = {
-    "round": Quantiser(),
-    "dither": Quantiser(dithered=True),
-    "exact": Quantiser(by_star=True, other_codes=5e-3),
-    "temporal": Quantiser(by_star=True, over_frames=True, other_codes=5e-3),
-}
+MS_A_STAR = 0.002  # a whole frame of 2500 to 5000 stars, for each: 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe cores
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +63,163 @@ class Panel:
     def light_e_per_s(self) -> Float32Array:
         """The light of each level in the unit of the linear image, float32 (levels,)."""
         return np.asarray(self.response.light * self.flux_at_white_e_per_s, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLight:
+    """The light of one frame: its sprites (None: black), and functions that draw it all, and its discs and stray light alone.
+
+    Those give float32 (height, width), electrons per second, when a quantiser asks. `number` counts the frames shown.
+    """
+
+    sprites: Sprites | None
+    linear: Callable[[], Float32Array]
+    extended: Callable[[], Float32Array]
+    number: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LevelCost:
+    """The time of a whole frame for each of its stars, ms, and why it is long ("" where it is not)."""
+
+    a_star_ms: float
+    why: str = ""
+
+
+class Quantiser(ABC):
+    """A quantisation: its class says what it needs, costs and means; an instance is its NumPy oracle for one panel.
+
+    `words` describe it in the bench file's reference. `shader` is its own part of the GL pass (in shaders/, "" for none).
+    `other_codes` is the largest share of a frame's lit pixels whose codes may be one off where another renderer draws the same
+    light. Measured with light that is off by 2.4e-7, as by another driver's exp2, over ten skies: 3e-6 of `round`, 1.1e-3 of
+    `exact`, 1.9e-3 of `temporal`. A choice of `exact` has ties that the last bit decides, and takes a star's other pixels with
+    it.
+    """
+
+    words: ClassVar[str]
+    shader: ClassVar[str] = ""
+    other_codes: ClassVar[float] = 1e-4
+
+    def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
+        """For images of `resolution_px`, sprites of `psf`, and a tracker that sees the monitor as `seen`."""
+        self._panel = panel
+
+    @abstractmethod
+    def draw(self, light: FrameLight) -> Levels:
+        """The levels of the next frame (height, width); the next call may overwrite them."""
+
+    @abstractmethod
+    def begin_anew(self) -> None:
+        """Forget the frames so far: the next one is the first of a sequence."""
+
+    @classmethod
+    @abstractmethod
+    def by_pixel(cls) -> type[PixelQuantiser]:
+        """What the GL draws before it looks at stars: a PixelQuantiser draws itself, the others `round`."""
+
+    @classmethod
+    def cost(cls, psf: Psf, gl_version: int) -> LevelCost:
+        """What it costs on two cores without a GPU, by OpenGL `gl_version` (as 430)."""
+        return LevelCost(MS_A_STAR)
+
+    @classmethod
+    def lit_from_e_per_s(cls, panel: Panel) -> float:
+        """The light that a star needs in a pixel to light it from a level of 0; 0 where any may do."""
+        return float(panel.response.threshold[0]) * panel.flux_at_white_e_per_s
+
+    @classmethod
+    def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
+        """The rate below which a single star lights no pixel at any phase; 0 where it always may."""
+        return 0.0
+
+    @classmethod
+    def exposure(cls, before: int, count: int) -> range:
+        """The frames of a still sky whose mean an exposure of `count` frames after `before` others shows: the first for all."""
+        return range(1)
+
+
+class PixelQuantiser(Quantiser):
+    """Looks at each pixel alone: a table counts the `edges_e_per_s` at or below its light, and that is its level.
+
+    A `shader` may add one: `bool rises(ivec2 pixel, float light, float low, float high)`, of the edges about the light.
+    """
+
+    @abstractmethod
+    def levels(self, linear_e_per_s: Float32Array, number: int = 0) -> Levels:
+        """The levels of a linear image (height, width), which is that of frame `number`."""
+
+    def draw(self, light: FrameLight) -> Levels:
+        """The levels of the next frame."""
+        return self.levels(light.linear(), light.number)
+
+    def begin_anew(self) -> None:
+        """No frame knows of another."""
+
+    @classmethod
+    def by_pixel(cls) -> type[PixelQuantiser]:
+        """Itself."""
+        return cls
+
+    @classmethod
+    def edges_e_per_s(cls, panel: Panel) -> Float32Array:
+        """The rising lights of levels 1, 2, ... or what else pixels are counted by, float32 (levels - 1,)."""
+        return panel.light_e_per_s()[1:]
+
+    @classmethod
+    def masks(cls) -> dict[str, Float32Array]:
+        """The float32 textures (height, width) of its shader, by name."""
+        return {}
+
+    @classmethod
+    def uniforms(cls, number: int) -> dict[str, float]:
+        """The uniforms of its shader in frame `number`, by name."""
+        return {}
+
+
+class RoundQuantiser(PixelQuantiser):
+    """The nearest level of each pixel."""
+
+    words = "the nearest code."
+
+    def levels(self, linear_e_per_s: Float32Array, number: int = 0) -> Levels:
+        """See `round_levels`."""
+        return round_levels(linear_e_per_s, self._panel)
+
+    @classmethod
+    def edges_e_per_s(cls, panel: Panel) -> Float32Array:
+        """The thresholds."""
+        return panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
+
+    @classmethod
+    def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
+        """That whose middle pixel reaches the first threshold at the best phase."""
+        return cls.lit_from_e_per_s(panel) / psf.peak_share
+
+
+class DitherQuantiser(PixelQuantiser):
+    """One of the two levels about each pixel's light, by a blue-noise mask."""
+
+    words = "blue noise, exact in the mean over pixels."
+    shader = "dither.glsl"
+
+    def levels(self, linear_e_per_s: Float32Array, number: int = 0) -> Levels:
+        """See `dither_levels`."""
+        return dither_levels(linear_e_per_s, self._panel)
+
+    @classmethod
+    def lit_from_e_per_s(cls, panel: Panel) -> float:
+        """Any light may."""
+        return 0.0
+
+    @classmethod
+    def masks(cls) -> dict[str, Float32Array]:
+        """Blue noise."""
+        return {"mask": blue_noise()}
+
+    @classmethod
+    def uniforms(cls, number: int) -> dict[str, float]:
+        """The mask stands still."""
+        return {"shift": 0.0}
 
 
 def level_dtype(response: Response) -> type[np.uint8] | type[np.uint16]:

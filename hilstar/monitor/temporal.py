@@ -10,14 +10,15 @@ in step. A star keeps its remainder for as long as every frame has it, and begin
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from hilstar.arrays import Float32Array, IntArray
+from hilstar.monitor.balance import OVER_FRAMES
 from hilstar.monitor.exact import Carried, ExactQuantiser, Left, nothing_carried
-from hilstar.monitor.quantise import QUANTISERS, Quantisation
+from hilstar.monitor.footprints import PixelOrder
+from hilstar.monitor.quantise import Panel, mask_turn
 from hilstar.monitor.response import Levels
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 # What a star is given to make up for, in its largest steps: more than the 3 that occur, little enough for one that cannot (its
@@ -30,7 +31,32 @@ NONE_BEFORE = -1
 class TemporalQuantiser(ExactQuantiser):
     """Levels of one frame after another, each of which makes up for what the last one left."""
 
-    over_frames: ClassVar[bool] = True
+    words = (
+        "and so that each frame makes up for what the one before left, by which the mean of any N frames is about N times as "
+        "right."
+    )
+    weights = OVER_FRAMES
+    remembers = True
+
+    @classmethod
+    def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
+        """Every star lights a pixel in some frame."""
+        return 0.0
+
+    @classmethod
+    def exposure(cls, before: int, count: int) -> range:
+        """Each frame is unlike the one before."""
+        return range(before, before + count)
+
+    @classmethod
+    def fewest(cls, order: PixelOrder) -> int:
+        """All: pixels that stay dark are off the same way in each frame, and the others cannot make up for it."""
+        return order.near
+
+    @classmethod
+    def floor_turn(cls, number: int) -> float:
+        """See `mask_turn`."""
+        return mask_turn(number)
 
     def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
         """The levels of the next frame, as `exact`'s."""
@@ -83,8 +109,3 @@ def first_phases(star: IntArray, before: IntArray) -> Float32Array:
     """The part of a step (n,), -0.5 to 0.5, that new stars have in hand; 0 for those that were there before."""
     turned = (star.astype(np.uint64) * np.uint64(GOLDEN) & np.uint64(0xFFFFFFFF)).astype(np.float64) / 2**32 - 0.5
     return np.where(before == NONE_BEFORE, turned, 0.0).astype(np.float32)
-
-
-def star_quantiser(method: Quantisation) -> type[ExactQuantiser]:
-    """The NumPy oracle of a quantisation that chooses star by star."""
-    return TemporalQuantiser if QUANTISERS[method].over_frames else ExactQuantiser

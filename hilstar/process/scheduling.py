@@ -1,5 +1,7 @@
 """When and where the kernel runs what must not wait: the frame loop, a process that stamps arrivals, llvmpipe's threads.
 
+`HostClock` waits for a moment of the host's clock.
+
 Mesa's llvmpipe begins as many threads as there are cores, once to rasterise and once to compute. They wait for work that takes
 a tenth of a millisecond, and Linux then often wakes two of them on one core. Frames of 1000 stars took 1.6 ms in place of 1.1
 ms, of 10 000 stars 9 ms in place of 6.5 (two cores, nothing else running); beside a busy process on each core they take the
@@ -15,6 +17,7 @@ import os
 import platform
 import struct
 import sys
+import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -37,7 +40,66 @@ NAMING_LOOK_S = 1e-3
 # A thread names itself, a little after it has begun: on a busy machine, when it is first given a core.
 NAMING_S, BUSY_NAMING_S = 0.02, 0.5
 
+MAX_WAIT_S = 3600.0  # the platform's own limit is some centuries; a longer wait is done in parts
+# An event wakes up to 0.1 ms late, and the thread then waits for Python's lock: the last of a wait is slept without either.
+COARSE_NS = 700_000
+NS_PER_S = 1_000_000_000
+
 Clock = Callable[[], float]
+
+
+class HostClock:
+    """The clock that times a run: `time.monotonic_ns()`."""
+
+    def now_ns(self) -> int:
+        """The time now."""
+        return time.monotonic_ns()
+
+    def asleep_ns(self) -> int:
+        """How long the machine has slept since it was switched on; CLOCK_MONOTONIC stands still meanwhile."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+
+    def realtime_ns(self) -> int:
+        """The time that the machine's calendar shows, ns since 1970; somebody may set it."""
+        return time.time_ns()
+
+    def sleep(self, seconds: float) -> None:
+        """Do nothing for a while; nothing for 0 or less."""
+        if seconds > 0:
+            time.sleep(seconds)
+
+    def within(self, seconds: float) -> Deadline:
+        """The moment that is so many seconds from now."""
+        return Deadline(self, self.now_ns() + round(seconds * 1e9))
+
+    def wait_until(self, due_ns: int, stop: threading.Event) -> bool:
+        """Wait until the clock reaches `due_ns`; True if stopped before that."""
+        while (wait_ns := due_ns - self.now_ns() - COARSE_NS) > 0:
+            if stop.wait(min(wait_ns / NS_PER_S, MAX_WAIT_S)):
+                return True
+        if (rest_ns := due_ns - self.now_ns()) > 0:
+            time.sleep(rest_ns / NS_PER_S)
+        return stop.is_set()
+
+
+class Deadline:
+    """A moment of a clock."""
+
+    def __init__(self, clock: HostClock, due_ns: int) -> None:
+        self._clock, self._due_ns = clock, due_ns
+
+    @property
+    def left_s(self) -> float:
+        """How long it is until then; 0 once it is past."""
+        return max(0, self._due_ns - self._clock.now_ns()) / 1e9
+
+    @property
+    def over(self) -> bool:
+        """Whether it has come."""
+        return self._clock.now_ns() >= self._due_ns
+
+
+HOST_CLOCK = HostClock()
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilstar.monitor.response import Levels, Response
+from hilstar.monitor.response import Codes, Levels, Response
 
 CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
 GRID_PX = 100
@@ -21,14 +21,14 @@ def level_of_code(response: Response, code: int) -> int:
     return int(np.argmin(away))
 
 
-def lay_over(levels: Levels, overlay: int, patch_level: int, line_level: int, cross_px: tuple[int, int]) -> None:
-    """Change levels (height, width) in place as the monitor's last pass does; `cross_px` is the crosshair's pixel."""
+def lay_over(levels: Levels | Codes, overlay: int, patch_level: int, line_level: int, cross_px: tuple[int, int]) -> None:
+    """Change levels (height, width), or codes (height, width, 3), in place; `cross_px` is the crosshair's pixel."""
     blank = bool(overlay & BLANK)
     on_patch = bool(overlay & PATCH) and not blank
     if blank or on_patch:
         levels[...] = patch_level if on_patch else 0
     dark = on_patch and patch_level >= line_level  # on a patch as bright as a line
-    height, width = levels.shape
+    height, width = levels.shape[:2]
     x, y = cross_px
     columns = [k for k in range(width) if _on_line(k - x, overlay)]
     rows = [k for k in range(height) if _on_line(k - y, overlay)]

@@ -5,16 +5,24 @@ Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from hilstar.arrays import Float32Array
 from hilstar.errors import InputError
 from hilstar.monitor.balance import AS_USUAL, Seen
-from hilstar.monitor.footprints import PixelOrder
-from hilstar.monitor.quantise import Panel, Quantisation
+from hilstar.monitor.exact import COMPUTE_VERSION
+from hilstar.monitor.quantise import LevelCost, Panel, Quantiser
+from hilstar.monitor.quantisers import Quantisation
 from hilstar.monitor.response import Levels, Response
-from hilstar.scene.sprites import Sprites
+from hilstar.scene.frame_motion import Orientation
+from hilstar.scene.psf import Psf
+from hilstar.scene.sprites import Sprites, by_channel
+from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
     from moderngl import Context
@@ -22,9 +30,6 @@ if TYPE_CHECKING:
 EGL_LIBRARY = "libEGL.so.1"
 NO_FRAME = -1  # before the first frame of a sequence
 MAX_SIDES = 8  # as in star.vert
-MIN_COMPUTE_VERSION = 430  # the OpenGL that has compute shaders
-MAX_NEAR = 128  # pixels of a star that exact.comp has bits for: sprites up to a sigma of 1.8 px
-MAX_SIZE = 63  # largest footprint whose places fit into six bits
 Path = Literal["compute shaders", "points", "points, then compute shaders", "NumPy"]
 
 
@@ -49,7 +54,7 @@ class Target:
     """
 
     resolution_px: tuple[int, int]
-    sigma_px: tuple[float, float]
+    psf: Psf
     response: Response | None = None
     flux_at_white_e_per_s: float = 1.0
     quantisation: Quantisation = "round"
@@ -68,69 +73,127 @@ class Target:
         return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
 
 
-class Backend(Protocol):
-    """Draws the frames of one Target. Free it with `close`."""
+@dataclass(frozen=True, slots=True)
+class ScreenView:
+    """What a screen shows: an image of `resolution_px`, on a screen of `screen_px`, codes of `bits` bits.
+
+    `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each level, None where level k
+    is code k in all channels.
+    """
+
+    resolution_px: tuple[int, int]
+    screen_px: tuple[int, int]
+    bits: int
+    orientation: Orientation = field(default_factory=Orientation)
+    cross_px: tuple[float, float] = (0.0, 0.0)
+    triples: npt.NDArray[np.uint16] | None = None
+
+
+class Backend(ABC):
+    """Draws the frames of one Target, and presents them on a screen. Free it with `close`.
+
+    `gl_renderer` and `gl_version` are the driver's names, or "NumPy" and its version; `path` is what draws the levels of frames
+    without extended light. `context` is the GL context, for another backend beside this one; None where NumPy draws.
+    """
 
     target: Target
-    footprint_px: int
+    gl_renderer: str
+    gl_version: str
+    path: Path
+    context: Context | None
 
-    @property
-    def gl_renderer(self) -> str:
-        """The name of the GL renderer as the driver gives it, or "NumPy"."""
-
-    @property
-    def gl_version(self) -> str:
-        """The version of OpenGL as the driver gives it, or NumPy's."""
-
-    @property
-    def path(self) -> Path:
-        """What draws the levels."""
-
-    @property
-    def context(self) -> Context | None:
-        """The GL context, for another backend beside this one; None where NumPy draws."""
-
+    @abstractmethod
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw the linear image and the levels of `sprites` (None: blank); read them with `linear` and `levels`.
 
         `frame` counts the frames shown, for `temporal` alone: a number not above the last one's begins a new sequence.
         """
 
+    @abstractmethod
     def draw_linear(self, sprites: Sprites) -> None:
         """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `levels` are undefined.
 
         What `temporal` carries from frame to frame stays as it is.
         """
 
+    @abstractmethod
     def linear(self) -> Float32Array:
         """The linear image of the last draw, electrons per second, float32 (height, width); the next draw overwrites it."""
 
+    @abstractmethod
     def levels(self) -> Levels:
         """The levels of the last draw (height, width), uint8 up to 256 levels, else uint16; the next draw overwrites them.
 
         A target without a response has none: TypeError.
         """
 
+    @abstractmethod
+    def show_on(self, view: ScreenView) -> None:
+        """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in."""
+
+    @abstractmethod
+    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+        """Draw the last levels on the screen's back buffer, turned and mirrored, as codes.
+
+        Over them lie the bits of `overlay` (see `aids`), with a patch of `patch_code`, and in the lower left corner the
+        photodiode's square: `marker` is its side, px, and code.
+        """
+
+    @abstractmethod
+    def take_back_buffer(self) -> None:
+        """Wait until the last swap is done, so that the next frame can be presented."""
+
+    def changed_codes(self) -> str:
+        """Which codes the screen's back buffer has otherwise than they are drawn, "" for none; it overwrites the buffer."""
+        return ""
+
+    def fault(self) -> str:
+        """What has become of the GPU since the last call: a reset or an error; "" where all is well. Some microseconds."""
+        return ""
+
+    @abstractmethod
+    def remember_tables(self) -> None:
+        """Take the checksums of what turns light into codes, for `changed_tables`."""
+
+    def changed_tables(self) -> int:
+        """How many of the tables that were remembered have other bytes now."""
+        return 0
+
+    def forget_images(self) -> None:
+        """Draw the next frame on black, with nothing kept from those before it: the GPU's memory may have been lost."""
+        self.begin_anew()
+
+    @abstractmethod
     def begin_anew(self) -> None:
         """Forget what `temporal` carries from frame to frame: the next frame is the first of a sequence."""
 
+    @abstractmethod
     def finish(self) -> None:
         """Wait until everything that was asked for is drawn."""
 
+    @abstractmethod
     def close(self) -> None:
         """Free what the backend holds."""
 
 
-def has_compute(context: Context | None) -> bool:
-    """Whether this GL has compute shaders (OpenGL 4.3); without them `exact` and `temporal` choose their levels in NumPy.
+def linear_light(backend: Backend, sprites: Sprites, stars: Stars, drawn: bool = False) -> Float32Array:
+    """The linear image of sprites by channel: float32 (channels, height, width), electrons per second, in memory of its own.
 
-    True where NumPy draws everything (None): no frame waits for a screen there, so the bench is planned, and its codes
-    chosen, as for a usual GL.
+    `stars` are those among which `sprites.star` has its places (see `by_channel`). One channel that is `drawn` already, whole,
+    is only read.
     """
-    return context is None or bool(context.version_code >= MIN_COMPUTE_VERSION)
+    channels = by_channel(sprites, stars)
+    images = np.empty((len(channels), *backend.target.resolution_px[::-1]), np.float32)
+    for image, light in zip(images, channels, strict=True):
+        if len(channels) > 1 or not drawn:
+            backend.draw_linear(light)
+        image[:] = backend.linear()
+    return images
 
 
-def exact_shader_takes(sigma_px: tuple[float, float]) -> bool:
-    """Whether exact.comp has bits enough for the pixels of such sprites."""
-    order = PixelOrder(sigma_px)
-    return order.near <= MAX_NEAR and order.size <= MAX_SIZE
+def level_cost(quantiser: type[Quantiser], psf: Psf, context: Context | None = None) -> LevelCost:
+    """What a quantiser costs by the OpenGL of a context.
+
+    Where NumPy draws everything (None) no frame waits for a screen, so the bench is planned as for a usual GL.
+    """
+    return quantiser.cost(psf, COMPUTE_VERSION if context is None else context.version_code)

@@ -11,8 +11,9 @@ import moderngl
 from glcontext import egl
 
 from hilstar.errors import InputError, MachineError, did_you_mean
+from hilstar.monitor.exact import COMPUTE_VERSION
 from hilstar.process.scheduling import drawing_threads_apart
-from hilstar.render.backend import EGL_LIBRARY, has_compute
+from hilstar.render.backend import EGL_LIBRARY
 from hilstar.units import GL_VERSIONS
 
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
@@ -109,7 +110,7 @@ def described() -> str:
     try:
         info = ctx.info
         what = f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
-        exact = "compute shaders" if has_compute(ctx) else "NumPy (slow: their shaders need OpenGL 4.3)"
+        exact = "compute shaders" if ctx.version_code >= COMPUTE_VERSION else "NumPy (slow: their shaders need OpenGL 4.3)"
         return f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'}, exact and temporal by {exact}"
     finally:
         ctx.release()
@@ -127,7 +128,7 @@ def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprin
 
 def computes_in_software(ctx: moderngl.Context) -> bool:
     """Whether this GL is a processor's and has compute shaders; a graphics card rasterises points in its stride."""
-    return has_compute(ctx) and is_software(ctx)
+    return bool(ctx.version_code >= COMPUTE_VERSION) and is_software(ctx)
 
 
 def is_software(ctx: moderngl.Context) -> bool:

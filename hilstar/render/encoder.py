@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import moderngl
@@ -10,25 +10,26 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.errors import InputError
-from hilstar.monitor.quantise import CodeTable, Panel, blue_noise, code_table, level_dtype
+from hilstar.monitor.quantise import CodeTable, Panel, PixelQuantiser, code_table, level_dtype
 from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
-from hilstar.scene.psf import outside_share
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 TABLE_WIDTH = 1024  # that of encode.frag
 
 
 def build_program(
-    ctx: moderngl.Context, vertex: str, fragment: str, defines: tuple[str, ...] = (), include: str = ""
+    ctx: moderngl.Context, vertex: str, fragment: str, defines: tuple[str, ...] = (), include: str = "", last: str = ""
 ) -> moderngl.Program:
-    """A program from two files of shaders/; the fragment shader is compiled with `defines`, after the file `include`."""
+    """A program from two files of shaders/; the fragment shader stands between its `defines`, `include` and the file `last`."""
     version, body = resource_path("shaders", fragment).read_text().split("\n", 1)
     before = [resource_path("shaders", include).read_text()] if include else []
-    lines = [version, *(f"#define {name}" for name in defines), *before, body]
+    after = [resource_path("shaders", last).read_text()] if last else []
+    lines = [version, *(f"#define {name}" for name in defines), *before, body, *after]
     with held():  # moderngl makes a program's members by Python, and an exception there ends the process
         return ctx.program(
             vertex_shader=resource_path("shaders", vertex).read_text(),
@@ -74,16 +75,16 @@ def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
     program["side_px"] = [side.side_px for side in padded]
 
 
-def lit_sides(panel: Panel, sigma_px: tuple[float, float], footprint_px: int, wings: int = MEETING_WINGS) -> SpriteSides:
+def lit_sides(panel: Panel, lit_e_per_s: float, psf: Psf, wings: int = MEETING_WINGS) -> SpriteSides:
     """The squares outside which no pixel of a star has 1 / `wings` of the light that lights one, by falling rates.
 
     There the level is 0 wherever the wings of no more stars than that meet.
     """
     gain = panel.gain()
-    light = panel.response.threshold[0] * panel.flux_at_white_e_per_s / (1.0 if gain is None else float(gain.max()))
-    sizes = range(footprint_px - 2, 0, -2)
+    light = lit_e_per_s / (1.0 if gain is None else float(gain.max()))
+    sizes = range(psf.footprint_px - 2, 0, -2)
     every = -(-len(sizes) // MAX_SIDES) or 1
-    rates = {size: float(light) / wings / outside_share(size, sigma_px) for size in sizes[::every]}
+    rates = {size: light / wings / psf.outside_share(size) for size in sizes[::every]}
     return tuple(SpriteSide(min(rate, MAX_RATE), size) for size, rate in rates.items())
 
 
@@ -195,36 +196,39 @@ class LookupTable:
 class Encoder:
     """Draws the levels of a linear image: only the sprites' footprints where that is less work than the whole image.
 
-    With `dithered` the mask decides between two levels. It lives in its renderer's context, which is current in every call.
+    It lives in its renderer's context, which is current in every call.
     """
 
     def __init__(
-        self, ctx: moderngl.Context, linear: moderngl.Texture, levels: LevelTexture, panel: Panel, dithered: bool
+        self,
+        ctx: moderngl.Context,
+        linear: moderngl.Texture,
+        levels: LevelTexture,
+        panel: Panel,
+        quantiser: type[PixelQuantiser],
     ) -> None:
         self._ctx = ctx
         self._fbo = levels.fbo
         self._size_px = linear.size
         self._footprint_px = 0
-        self._dithered = dithered
-        gain = panel.gain()
-        defines = (("DITHER",) if dithered else ()) + (("UNIFORMITY",) if gain is not None else ())
-        rising = panel.light_e_per_s()[1:] if dithered else panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
-        table = code_table(rising)
-        found = None if dithered else table.steps()
+        gain, rises = panel.gain(), quantiser.shader
+        defines = (("RISES",) if rises else ()) + (("UNIFORMITY",) if gain is not None else ())
+        table = code_table(quantiser.edges_e_per_s(panel))
+        found = None if rises else table.steps()
         steps = None if found is None else table_rows(found, ctx)
         defines += () if steps is None else (f"STEPS {len(steps)}",)
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
         defines += (f"BIN_SHIFT {table.bin_shift}", *(("IMAGES",) if self._linear_image is not None else ()))
-        self._sprites = build_program(ctx, "star.vert", "encode.frag", defines)
-        self._whole = build_program(ctx, "full.vert", "encode.frag", defines)
+        self._sprites, self._whole = (
+            build_program(ctx, vertex, "encode.frag", defines, last=rises) for vertex in ("star.vert", "full.vert")
+        )
         self._sprites["resolution_px"] = linear.size
         self._whole_vao = ctx.vertex_array(self._whole, [])
         self._sprite_vao: moderngl.VertexArray | None = None
         self._textures = {"linear_e_per_s": linear, **self._load_table(table, steps)}
         if gain is not None:
             self._textures["gain"] = self._texture(gain)
-        if dithered:
-            self._textures["mask"] = self._texture(blue_noise())
+        self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}
         for program in (self._sprites, self._whole):
             for unit, name in enumerate(self._textures):
                 program[name] = unit
@@ -280,13 +284,13 @@ class Encoder:
         count: int,
         per_star: int,
         covered_px: int,
-        shift: float = 0.0,
+        uniforms: Mapping[str, float],
         regions: Sequence[Rectangle] = (),
         is_black: bool = True,
     ) -> None:
         """Encode the linear image under the first `count` sprites of the buffer and in `regions`; the rest is black.
 
-        `shift` turns the mask of a dithering encoder. Each star has `per_star` sprites; together they cover `covered_px`, and
+        `uniforms` are the quantiser's of this frame. Each star has `per_star` sprites; together they cover `covered_px`, and
         where that is most of the image the pass covers all of it. `is_black` says that the levels were erased before.
         """
         width, height = self._size_px
@@ -302,8 +306,8 @@ class Encoder:
             self._linear_image.bind_to_image(0, read=True, write=False)
         if self._steps is not None:
             self._steps.bind_to_uniform_block(0)
-        if self._dithered:
-            self._sprites["shift"] = self._whole["shift"] = shift
+        for name, value in uniforms.items():
+            self._sprites[name] = self._whole[name] = value
         for region in regions:
             self._fbo.viewport = region
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)

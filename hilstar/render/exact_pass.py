@@ -1,6 +1,6 @@
-"""`exact` on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together (shaders/exact.comp).
+"""A StarQuantiser on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together.
 
-`temporal` is the same pass, with what each star leaves kept on the GPU from frame to frame.
+With `temporal` what each star leaves is kept on the GPU from frame to frame.
 """
 
 from __future__ import annotations
@@ -12,19 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, IntArray
-from hilstar.monitor.balance import (
-    PIXEL_VARIANCE,
-    SUMS,
-    Balance,
-)
-from hilstar.monitor.exact import CARRIED, Left
-from hilstar.monitor.footprints import FEWEST, LEAST_LIGHT, REACH_SIGMA, PixelOrder
+from hilstar.monitor.balance import SUMS, Balance
+from hilstar.monitor.exact import CARRIED, Left, StarQuantiser
+from hilstar.monitor.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
-from hilstar.render.backend import exact_shader_takes, has_compute
+from hilstar.render.backend import Target
 from hilstar.render.encoder import LevelTexture, LookupTable, build_compute
-from hilstar.render.splat import set_sigma, share_define
+from hilstar.render.splat import Shares
 from hilstar.render.star_passes import StarPasses
+from hilstar.scene.psf import PIXEL_VARIANCE
 from hilstar.scene.sprites import Sprites
 
 IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
@@ -49,25 +46,30 @@ SUMS_BYTES = 4 * SUMS
 class ExactPass:
     """Chooses the levels of sprites anew on a LevelTexture that has the nearest ones; it lives in its renderer's context."""
 
-    def __init__(self, linear: moderngl.Texture, levels: LevelTexture, panel: Panel, balance: Balance) -> None:
+    def __init__(
+        self,
+        quantiser: type[StarQuantiser],
+        target: Target,
+        panel: Panel,
+        linear: moderngl.Texture,
+        levels: LevelTexture,
+        shares: Shares,
+    ) -> None:
         ctx = self._ctx = linear.ctx
+        balance = Balance(target.psf, target.seen, quantiser.weights)
         self._linear, self._levels = linear, levels.texture
-        self._pixels = PixelOrder(balance.sigma_px)
+        self._pixels = PixelOrder(balance.psf)
+        self._shares = shares
         light = panel.light_e_per_s()
         self._order = LookupTable(ctx, "ORDER_ROWS", 1, _places(self._pixels, balance).ravel())
         self._light = LookupTable(ctx, "LIGHT_ROWS", 2, np.append(light, light[-1]))
         gain = panel.gain()
         self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
-        self._memory = Memory(ctx) if balance.over_frames else None
+        self._memory = Memory(ctx) if quantiser.remembers else None
         self._step_e_per_s = float(light[1])
         self._turns: moderngl.Buffer | None = None
-        self._panel, self._balance = panel, balance
+        self._quantiser, self._panel, self._balance = quantiser, panel, balance
         self._programs: dict[tuple[bool, bool], moderngl.ComputeShader] = {}
-
-    @staticmethod
-    def runs_on(ctx: moderngl.Context, sigma_px: tuple[float, float]) -> bool:
-        """Whether this GL has compute shaders, and the shader bits enough for the sprites' pixels."""
-        return has_compute(ctx) and exact_shader_takes(sigma_px)
 
     def _program(self, paths: bool, summed: bool) -> moderngl.ComputeShader:
         """The program for stars or paths, whose light is summed or in the linear image; made when it is first asked for."""
@@ -78,25 +80,25 @@ class ExactPass:
     def _build(self, paths: bool, summed: bool) -> moderngl.ComputeShader:
         order, panel, balance = self._pixels, self._panel, self._balance
         defines = [f"NEAR {order.near}", f"LEVELS r{8 * self._levels_bytes()}ui"]
-        defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.sigma_px) < NARROW_PX)
-        defines += share_define(balance.sigma_px, order.size)
+        defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.psf.width_px) < NARROW_PX)
+        defines += self._shares.defines
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
-        defines += ["TEMPORAL"] * balance.over_frames + ["SUMS"] * summed + [*self._order.define, *self._light.define]
-        program = build_compute(self._ctx, "exact.comp", defines, PARTS if summed else PARTS[1:])
-        set_sigma(program, balance.sigma_px)
+        defines += ["TEMPORAL"] * (self._memory is not None) + ["SUMS"] * summed + [*self._order.define, *self._light.define]
+        program = build_compute(self._ctx, self._quantiser.shader, defines, PARTS if summed else PARTS[1:])
+        self._shares.set(program)
         window, weights = balance.window_px, balance.weights
         values = {
             "footprint": order.size**2,
-            "overrated": overrated(balance.sigma_px) if paths else OVERRATED,
+            "overrated": overrated(balance.psf.width_px) if paths else OVERRATED,
             "reach_px2": order.area_px2,
             "reach_per_e": 1 / (order.area_px2 * LEAST_LIGHT * float(panel.light_e_per_s()[1])),
-            "fewest": order.near if balance.over_frames else min(FEWEST, order.near),
+            "fewest": self._quantiser.fewest(order),
             "white": panel.response.white,
             "first_threshold_e_per_s": float(panel.response.threshold[0] * panel.flux_at_white_e_per_s),
             "resolution_px": self._linear.size,
             "odd": order.bias,
             "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
-            "half_inverse_spread2": tuple(0.5 / (sigma**2 + PIXEL_VARIANCE) for sigma in balance.sigma_px),
+            "half_inverse_spread2": tuple(0.5 / variance for variance in balance.psf.variance_px2),
             "boxes": (weights.box_3 / IN_BOX, weights.box_5 / IN_BOX),
             "follows": (*balance.follows(3), *balance.follows(5)),
             "weights": (weights.light, weights.moments, weights.window_light, weights.window_moments),
@@ -224,24 +226,24 @@ def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
     return np.asarray(words, dtype=np.uint32)
 
 
-def overrated(sigma_px: tuple[float, float]) -> float:
+def overrated(width_px: tuple[float, float]) -> float:
     """Largest ratio of a path's light as the shader takes it to the true light in a pixel within reach.
 
-    The shader takes a Gaussian of the sigma and a pixel's variance together; where stars are narrow, the true light. Two stars
+    The shader takes a Gaussian of the width and a pixel's variance together; where stars are narrow, the true light. Two stars
     must never own the same pixel, or the order in which threads reach it would choose its level.
     """
-    if min(sigma_px) < NARROW_PX:
+    if min(width_px) < NARROW_PX:
         return OVERRATED
     away = np.linspace(0.0, REACH_SIGMA, 200)  # in sigmas, a pixel's width included
-    along_x, along_y = (np.maximum.accumulate([_ratio(float(place), sigma) for place in away]) for sigma in sigma_px)
+    along_x, along_y = (np.maximum.accumulate([_ratio(float(place), width) for place in away]) for width in width_px)
     rest = np.sqrt(REACH_SIGMA**2 - away**2)
     return OVERRATED * float((along_x * along_y[np.searchsorted(away, rest, side="right") - 1]).max())
 
 
-def _ratio(place: float, sigma_px: float) -> float:
+def _ratio(place: float, width_px: float) -> float:
     """A Gaussian's density of the sigma and a pixel together, over the light in the pixel, `place` wide sigmas off."""
-    wide = math.sqrt(sigma_px**2 + PIXEL_VARIANCE)
-    edges = [(place * wide + side) / (sigma_px * math.sqrt(2)) for side in (-0.5, 0.5)]
+    wide = math.sqrt(width_px**2 + PIXEL_VARIANCE)
+    edges = [(place * wide + side) / (width_px * math.sqrt(2)) for side in (-0.5, 0.5)]
     light = (math.erf(edges[1]) - math.erf(edges[0])) / 2
     return math.exp(-(place**2) / 2) / (math.sqrt(math.tau) * wide * light)
 

@@ -107,7 +107,7 @@ def _face(light: DiscLight, impact: FloatArray, lit: Mask, px_per_rad: float) ->
 
 def _margin(light: DiscLight, px_per_rad: float) -> float:
     """Maximum reach of the Gaussian, in radii."""
-    return float(REACH_SIGMAS * max(light.variance_px) ** 0.5 * light.disc.distance_radii / px_per_rad)
+    return float(REACH_SIGMAS * max(light.psf.variance_px2) ** 0.5 * light.disc.distance_radii / px_per_rad)
 
 
 def _parts(light: DiscLight, px_per_rad: float) -> int | None:
@@ -139,7 +139,7 @@ def _beside(light: DiscLight, directions: FloatArray, px_per_rad: float) -> Mask
     seen = directions @ disc.to_sphere.T
     angle = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
     rim = np.arcsin(min(1.0, (1 + AIR_TOP * disc.air_radii) / disc.distance_radii))
-    more_px = TILE_PX * np.sqrt(2) + REACH_SIGMAS * max(light.variance_px) ** 0.5
+    more_px = TILE_PX * np.sqrt(2) + REACH_SIGMAS * max(light.psf.variance_px2) ** 0.5
     return np.asarray(angle > rim + WIDER * more_px / px_per_rad)
 
 
@@ -258,7 +258,7 @@ class ExtendedLayer:
         disc = light.disc
         from_image = disc.to_sphere @ light.icrs_to_image.T
         program["to_sphere"] = tuple(from_image.T.ravel().tolist())  # column by column
-        program["variance_px"] = light.variance_px
+        program["variance_px"] = light.psf.variance_px2
         program["times"] = light.times
         program["covers"] = float(light.covers)
         shear = light.shear

@@ -17,7 +17,7 @@ from hilstar.arrays import IntArray
 from hilstar.render.backend import EGL_LIBRARY
 from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
 from hilstar.render.encoder import build_compute
-from hilstar.render.splat import set_sigma, share_define
+from hilstar.render.splat import Shares
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 PINNED_MEMORY = "GL_AMD_pinned_memory"
@@ -39,10 +39,10 @@ class HostImage:
     in one order, whatever the number of threads: the same sprites give the same bits.
     """
 
-    def __init__(
-        self, ctx: moderngl.Context, resolution_px: tuple[int, int], sigma_px: tuple[float, float], footprint_px: int
-    ) -> None:
-        self._ctx, self._size_px, self._footprint_px = ctx, resolution_px, footprint_px
+    def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares) -> None:
+        self._ctx, self._size_px, self._footprint_px = ctx, resolution_px, shares.footprint_px
+        self._shares = shares
+        footprint_px = shares.footprint_px
         width, height = resolution_px
         # Whole pages, which the array keeps for as long as somebody holds it.
         pages = mmap.mmap(-1, 4 * width * height, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
@@ -56,7 +56,7 @@ class HostImage:
         edges_px = np.arange(BANDS + 1) * resolution_px[1] // BANDS
         # A sprite's row here is that of its last pixels; its first are footprint - 1 rows before.
         self._first_row, self._end_row = edges_px[:-1], edges_px[1:] + footprint_px - 1
-        self._program = self._build(sigma_px)
+        self._program = self._build()
 
     @staticmethod
     def runs_on(ctx: moderngl.Context, resolution_px: tuple[int, int]) -> bool:
@@ -65,10 +65,10 @@ class HostImage:
         has = computes_in_software(ctx) and PINNED_MEMORY in ctx.extensions
         return has and 4 * width * height <= MAX_WRITTEN_BYTES
 
-    def _build(self, sigma_px: tuple[float, float]) -> moderngl.ComputeShader:
-        named = [*share_define(sigma_px, self._footprint_px), f"FOOTPRINT {self._footprint_px}", f"BANDS {BANDS}"]
+    def _build(self) -> moderngl.ComputeShader:
+        named = [*self._shares.defines, f"FOOTPRINT {self._footprint_px}", f"BANDS {BANDS}"]
         program = build_compute(self._ctx, "linear.comp", named, ["shares"])
-        set_sigma(program, sigma_px)
+        self._shares.set(program)
         program["resolution_px"] = self._size_px
         return program
 
@@ -123,6 +123,7 @@ class HostImage:
         program, (_, height) = self._program, self._size_px
         cast(moderngl.Uniform, program["stars"]).write(ranges)
         program["bands"] = bands
+        self._shares.bind()
         self._sprites.bind_to_storage_buffer(0)
         self._light.bind_to_storage_buffer(1)
         rows = -(-min(self._footprint_px, -(-height // bands)) // STEP)

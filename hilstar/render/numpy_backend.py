@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import ctypes
 import logging
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import MachineError
-from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import QUANTISERS, Panel, dither_levels, mask_turn, round_levels
+from hilstar.monitor.quantise import FrameLight
+from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
-from hilstar.monitor.temporal import star_quantiser
-from hilstar.render.backend import EGL_LIBRARY, NO_FRAME, Backend, Path, Target
+from hilstar.render.aids import LINE_SHARE, lay_over
+from hilstar.render.backend import EGL_LIBRARY, NO_FRAME, Backend, ScreenView, Target
 from hilstar.render.reference import add_stars, extended_image
 from hilstar.scene.extended import ExtendedLight
-from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import Sprites
 
 if TYPE_CHECKING:
@@ -70,29 +70,27 @@ def _say_once(why: str) -> None:
     log.warning("NumPy draws, slower than OpenGL would (%s); 'hilstar doctor' says what to install", why)
 
 
-class NumpyBackend:
-    """Draws sprites of one Target in NumPy."""
+class NumpyBackend(Backend):
+    """Draws sprites of one Target in NumPy; `back_buffer` has the codes (height, width, 3) that were presented."""
+
+    back_buffer: npt.NDArray[np.uint16]
 
     context = None
     gl_renderer = NUMPY
     gl_version = np.__version__
-    path: Path = "NumPy"
+    path = "NumPy"
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self.footprint_px = footprint_px(target.sigma_px)
-        self._panel = target.panel()
+        panel = target.panel()
+        made = QUANTISERS[target.quantisation]
+        self._quantiser = None if panel is None else made(panel, target.resolution_px, target.psf, target.seen)
         self._last_frame = NO_FRAME
         self._linear: Float32Array | None = None  # that of `_sprites`, once somebody asks
         self._sprites: Sprites | None = None
         self._levels: Levels | None = None
         self._lights: tuple[ExtendedLight, ...] = ()
         self._lights_image: FloatArray | None = None
-        self._chooser: ExactQuantiser | None = None
-        self._quantiser = QUANTISERS[target.quantisation]
-        if self._panel is not None and self._quantiser.by_star:
-            chooser = star_quantiser(target.quantisation)
-            self._chooser = chooser(self._panel, target.resolution_px, target.sigma_px, target.seen)
 
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw `sprites` (None: blank); see `Backend.draw`."""
@@ -100,19 +98,10 @@ class NumpyBackend:
             self.begin_anew()
         self._last_frame = frame
         self._sprites, self._linear = sprites, None
-        if self._panel is not None:
-            self._levels = self._chosen(sprites, frame, self._panel)
-
-    def _chosen(self, sprites: Sprites | None, frame: int, panel: Panel) -> Levels:
-        """The levels of a frame by the target's quantisation."""
-        if self._chooser is None:
-            image = self._image(sprites, shrunk=True)
-            return dither_levels(image, panel) if self._quantiser.dithered else round_levels(image, panel)
-        floor = None
-        if sprites is not None and sprites.extended:  # stars are added to its dithered light
-            turn = mask_turn(frame) if self._quantiser.over_frames else 0.0
-            floor = dither_levels(self._extended(sprites).astype(np.float32), panel, turn)
-        return self._chooser.levels(sprites, floor)
+        if self._quantiser is not None:
+            lights = () if sprites is None else sprites.extended
+            alone = lambda: self._extended(lights).astype(np.float32)  # noqa: E731
+            self._levels = self._quantiser.draw(FrameLight(sprites, partial(self._image, sprites, shrunk=True), alone, frame))
 
     def draw_linear(self, sprites: Sprites) -> None:
         """Draw the linear image of `sprites` alone; see `Backend.draw_linear`."""
@@ -130,11 +119,34 @@ class NumpyBackend:
             raise TypeError("this target has no monitor response, so no levels")
         return self._levels
 
+    def show_on(self, view: ScreenView) -> None:
+        """See `Backend.show_on`."""
+        self._screen = view
+
+    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+        """See `Backend.present`."""
+        view = self._screen
+        turn, (width, height) = view.orientation, view.orientation.screen_px(view.screen_px)
+        shown = self.levels()[:height, :width]
+        codes = np.zeros((height, width, 3), dtype=np.uint16)
+        codes[: len(shown), : shown.shape[1]] = shown[..., None] if view.triples is None else view.triples[shown]
+        cross_x, cross_y = map(round, view.cross_px)
+        lay_over(codes, overlay, patch_code, int(LINE_SHARE * (2**view.bits - 1)), (cross_x, cross_y))
+        codes = np.rot90(codes, -turn.quarter_turns)[:: -1 if turn.flip_y else 1, :: -1 if turn.flip_x else 1].copy()
+        codes[len(codes) - marker[0] :, : marker[0]] = marker[1]
+        self.back_buffer = codes
+
+    def take_back_buffer(self) -> None:
+        """Nothing swaps it."""
+
+    def remember_tables(self) -> None:
+        """The host's memory keeps them."""
+
     def begin_anew(self) -> None:
         """The next frame is the first of a sequence."""
         self._last_frame = NO_FRAME
-        if self._chooser is not None:
-            self._chooser.left = None
+        if self._quantiser is not None:
+            self._quantiser.begin_anew()
 
     def finish(self) -> None:
         """Nothing is ever under way."""
@@ -147,18 +159,17 @@ class NumpyBackend:
         width, height = self.target.resolution_px
         if sprites is None:
             return np.zeros((height, width), dtype=np.float32)
-        image = self._extended(sprites).copy()
-        sides_px = np.full(len(sprites), self.footprint_px)
+        image = self._extended(sprites.extended).copy()
+        sides_px = np.full(len(sprites), self.target.psf.footprint_px)
         rate = sprites.data["electrons_per_s"] * sprites.per_star
         for side in self.target.sides if shrunk else ():
             sides_px[rate < side.below_e_per_s] = side.side_px
         for side_px in np.unique(sides_px).tolist():
-            add_stars(image, sprites, self.target.sigma_px, side_px, np.flatnonzero(sides_px == side_px))
+            add_stars(image, sprites, self.target.psf, side_px, np.flatnonzero(sides_px == side_px))
         return image.astype(np.float32)
 
-    def _extended(self, sprites: Sprites) -> FloatArray:
+    def _extended(self, lights: tuple[ExtendedLight, ...]) -> FloatArray:
         """The light of discs and stray light alone (height, width); the same lights again are not drawn again."""
-        if self._lights_image is None or sprites.extended != self._lights:
-            self._lights_image = extended_image(sprites.extended, self.target.resolution_px)
-            self._lights = sprites.extended
+        if self._lights_image is None or lights != self._lights:
+            self._lights_image, self._lights = extended_image(lights, self.target.resolution_px), lights
         return self._lights_image

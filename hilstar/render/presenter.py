@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import moderngl
@@ -11,10 +10,10 @@ import numpy.typing as npt
 
 from hilstar.errors import MachineError
 from hilstar.monitor.window.x11 import GL_LIBRARY, X11_LIBRARY
+from hilstar.render.backend import ScreenView
 from hilstar.render.context import is_software
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import TABLE_WIDTH, build_program
-from hilstar.scene.frame_motion import Orientation
 
 GL_DITHER = 0x0BD0
 MAX_LEVELS = 2**16
@@ -36,22 +35,6 @@ def window_context() -> moderngl.Context:
         return moderngl.create_context(require=330, **settings)
     except Exception as error:  # moderngl and glcontext raise plain Exceptions here
         raise MachineError(f"the window's OpenGL is not there ({error}); install it: apt-get install libgl1") from error
-
-
-@dataclass(frozen=True, slots=True)
-class ScreenView:
-    """What a window shows: an image of `resolution_px`, on a screen of `screen_px`, codes of `bits` bits.
-
-    `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each level, None where level k
-    is code k in all channels.
-    """
-
-    resolution_px: tuple[int, int]
-    screen_px: tuple[int, int]
-    bits: int
-    orientation: Orientation = field(default_factory=Orientation)
-    cross_px: tuple[float, float] = (0.0, 0.0)
-    triples: npt.NDArray[np.uint16] | None = None
 
 
 def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: int) -> str:
@@ -142,7 +125,7 @@ class Presenter:
             self._driver.wait()
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
-        """Draw the last levels on the back buffer; `marker` is the photodiode square's side, px, and code."""
+        """Draw the last levels on the back buffer; see `Backend.present`."""
         with self._ctx:
             screen = self._ctx.screen
             screen.use()

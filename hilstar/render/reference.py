@@ -6,7 +6,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.scene.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
-from hilstar.scene.psf import pixel_shares
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 RAYS_ACROSS = 5  # a pixel, along either axis: a limb is then within 0.02 px
@@ -14,15 +14,13 @@ MAX_AT_ONCE_PX = 2**20  # pixels of sprites that are computed at once, which bou
 REACH_SIGMAS = 5  # reach of a disc's light beyond its rectangle
 
 
-def linear_image(
-    sprites: Sprites, resolution_px: tuple[int, int], sigma_px: tuple[float, float], footprint_px: int | None = None
-) -> FloatArray:
+def linear_image(sprites: Sprites, resolution_px: tuple[int, int], psf: Psf, footprint_px: int | None = None) -> FloatArray:
     """Electrons per second of each pixel, float64, shape (height, width): extended light, then sprites.
 
     `footprint_px` larger than the sprites' own shows what their footprints cut.
     """
     image = extended_image(sprites.extended, resolution_px)
-    add_stars(image, sprites, sigma_px, sprites.footprint_px if footprint_px is None else footprint_px)
+    add_stars(image, sprites, psf, sprites.footprint_px if footprint_px is None else footprint_px)
     return image
 
 
@@ -36,9 +34,9 @@ def extended_image(lights: tuple[ExtendedLight, ...], resolution_px: tuple[int, 
 
 
 def add_stars(
-    image: FloatArray, sprites: Sprites, sigma_px: tuple[float, float], side_px: int, some: IntArray | slice = slice(None)
+    image: FloatArray, sprites: Sprites, psf: Psf, side_px: int, some: IntArray | slice = slice(None), share: float = 1.0
 ) -> None:
-    """Add `some` of the sprites to an image (height, width), each within a square of `side_px`, one after the other."""
+    """Add a share of the light of `some` sprites to an image (height, width), each in a square of `side_px`, one by one."""
     height, width = image.shape
     steps = np.arange(side_px) - (side_px - 1) // 2
     data, x_px, y_px = sprites.data[some], sprites.x_px[some], sprites.y_px[some]
@@ -46,9 +44,8 @@ def add_stars(
     for begin in range(0, len(data), at_once):
         part = slice(begin, begin + at_once)
         columns, rows = (data["pixel"][part, axis, None] + steps for axis in (0, 1))
-        share_x = pixel_shares(columns - x_px[part, None], sigma_px[0])
-        share_y = pixel_shares(rows - y_px[part, None], sigma_px[1])
-        light = data["electrons_per_s"][part, None, None].astype(np.float64) * (share_y[:, :, None] * share_x[:, None, :])
+        of_pixels = psf.shares((columns - x_px[part, None])[:, None, :], (rows - y_px[part, None])[:, :, None])
+        light = share * data["electrons_per_s"][part, None, None].astype(np.float64) * of_pixels
         on_x, on_y = (columns >= 0) & (columns < width), (rows >= 0) & (rows < height)
         inside = on_y[:, :, None] & on_x[:, None, :]
         places = rows[:, :, None].astype(np.intp) * width + columns[:, None, :]
@@ -89,13 +86,13 @@ def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
     from scipy.ndimage import gaussian_filter
 
     left, top, width, height = region
-    margin = int(np.ceil(REACH_SIGMAS * max(light.sigma_px)))
+    margin = int(np.ceil(REACH_SIGMAS * max(light.psf.width_px)))
     columns, rows = (
         (np.arange((size + 2 * margin) * RAYS_ACROSS) + 0.5) / RAYS_ACROSS - 0.5 - margin + first
         for size, first in ((width, left), (height, top))
     )
     sharp = np.stack([_rays(light, columns, y) for y in rows], axis=1)
-    sigma = [RAYS_ACROSS * sigma_px for sigma_px in reversed(light.sigma_px)]
+    sigma = [RAYS_ACROSS * width_px for width_px in reversed(light.psf.width_px)]
     found = []
     for part in sharp:
         fine = gaussian_filter(part, sigma, mode="nearest", truncate=REACH_SIGMAS)

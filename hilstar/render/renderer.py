@@ -14,12 +14,11 @@ import moderngl
 import numpy as np
 
 from hilstar.arrays import Float32Array
-from hilstar.monitor.balance import Balance
-from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import QUANTISERS, Panel, mask_turn
+from hilstar.monitor.exact import StarQuantiser
+from hilstar.monitor.quantise import DitherQuantiser, Panel
+from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
-from hilstar.monitor.temporal import star_quantiser
-from hilstar.render.backend import NO_FRAME, Path, Target
+from hilstar.render.backend import NO_FRAME, Backend, ScreenView, Target
 from hilstar.render.context import Context, check_limits, create_context
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
@@ -35,63 +34,42 @@ from hilstar.render.encoder import (
 from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
 from hilstar.render.host_image import HostImage
-from hilstar.render.splat import splat_program
+from hilstar.render.presenter import Presenter, changed_codes
+from hilstar.render.splat import Shares, splat_program
 from hilstar.render.star_passes import LightUnits, StarPasses
 from hilstar.scene.extended import ExtendedLight, Rectangle
-from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 FIRST_CAPACITY = 4096
 UNTIMED = nullcontext()
 
 
-class Renderer:
+class Renderer(Backend):
     """Draws sprites of one Target, in a context of its own or in a window's. Free it with `close`."""
 
+    context: Context
     ON_HOST = True  # whether a linear image alone may be drawn in the process's memory, where this GL can
 
     def __init__(self, target: Target, context: Context | None = None) -> None:
         self.target = target
-        self.footprint_px = footprint_px(target.sigma_px)
+        self.footprint_px = target.psf.footprint_px
         self._undrawn: tuple[Sprites | None, bool] | None = None
         self._by_numpy = False
-        self._quantiser = QUANTISERS[target.quantisation]
-        self._star_by_star = target.response is not None and self._quantiser.by_star
+        quantiser = QUANTISERS[target.quantisation]
+        self._by_pixel = quantiser.by_pixel()
+        self._by_star = quantiser if target.response is not None and issubclass(quantiser, StarQuantiser) else None
         self._last_frame = NO_FRAME
-        self._ctx = context or create_context()
+        self.context = self._ctx = context or create_context()
+        self.gl_renderer, self.gl_version = (str(self._ctx.info[f"GL_{what}"]) for what in ("RENDERER", "VERSION"))
         try:
             with self._ctx:
                 self._driver = Driver(self._ctx)
                 key = "sprite_sigma_px" if target.response else "psf_sigma_px"
-                check_limits(self._ctx, target.resolution_px, self.footprint_px, f"{key} = {list(target.sigma_px)}")
+                check_limits(self._ctx, target.resolution_px, self.footprint_px, f"{key} = {list(target.psf.width_px)}")
                 self._build()
         except BaseException:
             self._ctx.release()
             raise
-
-    @property
-    def gl_renderer(self) -> str:
-        """The name of the GL renderer, as the driver gives it."""
-        return str(self._ctx.info["GL_RENDERER"])
-
-    @property
-    def gl_version(self) -> str:
-        """The version of OpenGL, as the driver gives it."""
-        return str(self._ctx.info["GL_VERSION"])
-
-    @property
-    def path(self) -> Path:
-        """By what levels are drawn here; those of frames with extended light (discs, stray light) by points or NumPy."""
-        if self._star_by_star and self._exact_pass is None:
-            return "NumPy"
-        if self._passes is not None:
-            return "compute shaders"
-        return "points, then compute shaders" if self._exact_pass is not None else "points"
-
-    @property
-    def context(self) -> Context:
-        """The GL context, for another renderer beside this one; it ends with this one."""
-        return self._ctx
 
     def _build(self) -> None:
         ctx, target = self._ctx, self.target
@@ -100,7 +78,8 @@ class Renderer:
         self._linear = ctx.texture(target.resolution_px, 1, dtype="f4")
         self._linear.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._linear_fbo = ctx.framebuffer([self._linear])
-        self._splat = splat_program(ctx, target.resolution_px, target.sigma_px, self.footprint_px)
+        self._shares = Shares(ctx, target.psf)
+        self._splat = splat_program(ctx, target.resolution_px, self._shares)
         self._eraser = Eraser(ctx, target.resolution_px, of_levels=False)
         self._level_eraser = Eraser(ctx, target.resolution_px, of_levels=True)
         self._extended = ExtendedLayer(ctx, target.resolution_px)
@@ -112,7 +91,7 @@ class Renderer:
         width, height = target.resolution_px
         self._linear_image = np.empty((height, width), dtype=np.float32)
         on_host = self.ON_HOST and target.response is None and HostImage.runs_on(ctx, target.resolution_px)
-        self._host = HostImage(ctx, target.resolution_px, target.sigma_px, self.footprint_px) if on_host else None
+        self._host = HostImage(ctx, target.resolution_px, self._shares) if on_host else None
         self._on_host = False  # where the last draw is
 
     def _build_levels(self) -> None:
@@ -120,6 +99,7 @@ class Renderer:
         # What turns light into codes; a window adds its own.
         self.tables: list[moderngl.Texture | moderngl.Buffer] = []
         self._checksums: list[tuple[moderngl.Texture | moderngl.Buffer, int]] = []
+        self.path = "points"
         self._levels: LevelTexture | None = None
         self._levels_black = True  # but for the last frame
         self._encoder: Encoder | None = None
@@ -128,36 +108,42 @@ class Renderer:
         self._passes: StarPasses | None = None
         self._unit_splat: moderngl.Program | None = None  # where points are in units
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
-        self._exact: ExactQuantiser | None = None
+        self._exact: StarQuantiser | None = None
         self._floor_encoder: Encoder | None = None
         self._floor_key: tuple[tuple[ExtendedLight, ...], float] = ((), 0.0)
         self._floor_levels: Levels | None = None
         if panel is None:
             return
         self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
-        if self._star_by_star and ExactPass.runs_on(self._ctx, target.sigma_px):
-            balance = Balance(target.sigma_px, target.seen, over_frames=self._quantiser.over_frames)
-            self._exact_pass = ExactPass(self._linear, self._levels, panel, balance)
-        if not self._star_by_star or self._exact_pass is not None:
-            dithered = self._quantiser.dithered
-            self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
-            self._lit_sides = () if dithered else target.sides or lit_sides(panel, target.sigma_px, self.footprint_px)
+        if self._by_star is not None and self._by_star.takes(target.psf, self._ctx.version_code):
+            self._exact_pass = ExactPass(self._by_star, target, panel, self._linear, self._levels, self._shares)
+        if self._by_star is None or self._exact_pass is not None:
+            self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, self._by_pixel)
+            lit_e_per_s = self._by_pixel.lit_from_e_per_s(panel)
+            self._lit_sides = () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
             self._encoder.shrink(self._lit_sides)
-            if not dithered and not target.sides:
-                self._cut_sides = lit_sides(panel, target.sigma_px, self.footprint_px, CUT_WINGS)
-            if not dithered and LightUnits.takes(panel, target.resolution_px, self.footprint_px):
+            if lit_e_per_s and not target.sides:
+                self._cut_sides = lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS)
+            # The passes count thresholds alone.
+            if not self._by_pixel.shader and LightUnits.takes(panel, target.resolution_px, self.footprint_px):
                 self._build_units(self._levels, panel, self._encoder)
         for made in (self._encoder, self._exact_pass, self._passes):
             self.tables += [] if made is None else made.tables
+        if self._by_star is not None and self._exact_pass is None:
+            self.path = "NumPy"
+        elif self._passes is not None:
+            self.path = "compute shaders"
+        elif self._exact_pass is not None:
+            self.path = "points, then compute shaders"
 
     def _build_units(self, levels: LevelTexture, panel: Panel, encoder: Encoder) -> None:
         """What draws light in whole units: the passes of a software OpenGL, else sprites."""
         target = self.target
-        units = self._units = LightUnits(panel, target.resolution_px, target.sigma_px, target.sides)
+        units = self._units = LightUnits(panel, target.resolution_px, target.psf, target.sides)
         if StarPasses.runs_on(self._ctx):
-            self._passes = StarPasses(levels, panel, target.sigma_px, self._star_by_star, units)
+            self._passes = StarPasses(levels, panel, target.psf, self._shares, self._by_star is not None, units)
             return
-        self._unit_splat = splat_program(self._ctx, target.resolution_px, target.sigma_px, self.footprint_px, in_units=True)
+        self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, in_units=True)
         self._unit_splat["most_e_per_s"] = units.white_e_per_s
         for program in (self._unit_splat, encoder.sprite_program):
             program["reach_px2"], program["largest_px"] = units.axes_px2, units.side_px
@@ -176,16 +162,13 @@ class Renderer:
             self._encoder.take_places_from(self._buffer, self.footprint_px)
 
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
-        """Draw the linear image and the codes of `sprites` (None: blank); read them with `linear` and `levels`.
-
-        `frame` counts the frames shown, for `temporal` alone: a frame whose number is not above the last one's begins anew.
-        """
+        """See `Backend.draw`."""
         with self._ctx:
             if frame <= self._last_frame:
                 self.begin_anew()
             self._last_frame = frame
             extended = sprites is not None and bool(sprites.extended)
-            self._by_numpy = self._star_by_star and (self._exact_pass is None or extended)
+            self._by_numpy = self._by_star is not None and (self._exact_pass is None or extended)
             units = None if self._by_numpy or extended else self._units
             unit_e_per_s = None if units is None else units.unit_for(sprites)
             if self._passes is not None and unit_e_per_s is not None:
@@ -201,15 +184,12 @@ class Renderer:
                 self._draw_by_points(sprites, unit_e_per_s)
 
     def draw_linear(self, sprites: Sprites) -> None:
-        """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `levels` are undefined.
-
-        What `temporal` carries from frame to frame stays as it is.
-        """
+        """See `Backend.draw_linear`."""
         with self._ctx:
             self._draw_linear(sprites, whole=True)
 
     def begin_anew(self) -> None:
-        """Forget what `temporal` carries from frame to frame: the next frame is the first of a sequence."""
+        """See `Backend.begin_anew`."""
         self._last_frame = NO_FRAME
         for chooser in (self._exact, self._exact_pass):
             if chooser is not None:
@@ -235,12 +215,12 @@ class Renderer:
         units, encoder, splat = self._units, self._encoder, self._unit_splat
         if units is None or encoder is None or splat is None:
             return False
-        in_units = sprites is not None and unit_e_per_s is not None
-        reach_per_e = units.reach_per_e(sprites) if sprites is not None and unit_e_per_s is not None else 0.0
-        encoder.sprite_program["reach_per_e"] = splat["reach_per_e"] = reach_per_e
-        if in_units:
-            splat["unit_e_per_s"] = unit_e_per_s
-        return in_units
+        if sprites is None or unit_e_per_s is None:
+            encoder.sprite_program["reach_per_e"] = 0.0
+            return False
+        encoder.sprite_program["reach_per_e"] = splat["reach_per_e"] = units.reach_per_e(sprites)
+        splat["unit_e_per_s"] = unit_e_per_s
+        return True
 
     def _draw_by_passes(self, passes: StarPasses, sprites: Sprites | None, unit_e_per_s: float) -> None:
         """Levels star by star; the linear image is drawn only when it is read."""
@@ -274,21 +254,22 @@ class Renderer:
 
     def _draw_by_numpy(self, sprites: Sprites | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
-        target, panel, levels = self.target, self.target.panel(), self._levels
-        if panel is None or levels is None:
+        target, panel, levels, by_star = self.target, self.target.panel(), self._levels, self._by_star
+        if panel is None or levels is None or by_star is None:
             return
         if self._exact is None:
-            self._exact = star_quantiser(target.quantisation)(panel, target.resolution_px, target.sigma_px, target.seen)
+            self._exact = by_star(panel, target.resolution_px, target.psf, target.seen)
         if self._exact_pass is not None and (left := self._exact_pass.left) is not None:
             self._exact.left, self._exact_pass.left = left, None
         lights = () if sprites is None else sprites.extended
-        floor = self._floor(lights, mask_turn(frame) if self._quantiser.over_frames else 0.0, panel, levels) if lights else None
+        floor = self._floor(lights, by_star.floor_turn(frame), panel, levels) if lights else None
         self._exact_levels = self._exact.levels(sprites, floor)
         levels.write(self._exact_levels)
 
     def _encode(self, encoder: Encoder, sprites: Sprites | None, covered_px: int) -> None:
         count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
-        encoder.draw(count, per_star, covered_px, 0.0, self._regions, self._levels_black)
+        uniforms = self._by_pixel.uniforms(self._last_frame)
+        encoder.draw(count, per_star, covered_px, uniforms, self._regions, self._levels_black)
         self._levels_black = True  # but for what this frame has
 
     def _floor(self, lights: tuple[ExtendedLight, ...], turn: float, panel: Panel, levels: LevelTexture) -> Levels:
@@ -299,11 +280,11 @@ class Renderer:
         if (lights, turn) == self._floor_key and self._floor_levels is not None:
             return self._floor_levels
         if self._floor_encoder is None:
-            self._floor_encoder = Encoder(self._ctx, self._linear, levels, panel, dithered=True)
+            self._floor_encoder = Encoder(self._ctx, self._linear, levels, panel, DitherQuantiser)
         self._erase()
         self._shine(lights)
         levels.fbo.clear()
-        self._floor_encoder.draw(0, 1, 0, turn, self._regions)
+        self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions)
         self._floor_key, self._floor_levels = (lights, turn), levels.read().copy()
         return self._floor_levels
 
@@ -360,6 +341,7 @@ class Renderer:
         width, height = self.target.resolution_px
         margin = self.footprint_px
         self._linear_fbo.use()
+        self._shares.bind()
         self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
         self._ctx.enable(moderngl.BLEND)
         vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao
@@ -367,10 +349,7 @@ class Renderer:
         self._ctx.disable(moderngl.BLEND)
 
     def levels(self) -> Levels:
-        """The levels of the last draw (height, width), in an array that the next draw or call overwrites.
-
-        uint8 up to 256 levels, uint16 beyond. A target without a response has none: TypeError.
-        """
+        """See `Backend.levels`."""
         if self._by_numpy:
             return self._exact_levels
         if self._levels is None:
@@ -381,16 +360,13 @@ class Renderer:
 
     @property
     def codes_texture(self) -> moderngl.Texture:
-        """The levels of the last draw, R8UI or R16UI, for a window; its `ctx` must be current where it is used.
-
-        A target without a response has none: TypeError.
-        """
+        """The levels of the last draw, R8UI or R16UI, for whom its `ctx` is current; TypeError without a response."""
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no levels")
         return self._levels.texture
 
     def linear(self) -> Float32Array:
-        """The linear image of the last draw, electrons per second, float32 (height, width); overwritten by the next."""
+        """See `Backend.linear`."""
         if self._host is not None and self._on_host:
             return self._host.image
         with self._ctx:
@@ -400,23 +376,40 @@ class Renderer:
             self._linear_fbo.read_into(self._linear_image, components=1, dtype="f4", alignment=1)
         return self._linear_image
 
+    def show_on(self, view: ScreenView) -> None:
+        """See `Backend.show_on`."""
+        self._screen, self._presenter = view, Presenter(self.codes_texture, view)
+        self.tables.append(self._presenter.table)
+
+    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+        """See `Backend.present`."""
+        self._presenter.present(overlay, patch_code, marker)
+
+    def take_back_buffer(self) -> None:
+        """See `Backend.take_back_buffer`."""
+        self._presenter.wait()
+
+    def changed_codes(self) -> str:
+        """See `Backend.changed_codes`."""
+        return changed_codes(self._ctx, self._screen.screen_px, self._screen.bits)
+
     def fault(self) -> str:
-        """What has become of the GPU since the last call: a reset or a GL error; "" where all is well. Some microseconds."""
+        """See `Backend.fault`."""
         with self._ctx:
             return self._driver.fault()
 
     def remember_tables(self) -> None:
-        """Take the checksums of what turns light into codes, for `changed_tables`."""
+        """See `Backend.remember_tables`."""
         with self._ctx:
             self._checksums = [(table, _checksum(table)) for table in self.tables]
 
     def changed_tables(self) -> int:
-        """How many of the tables that were remembered have other bytes now."""
+        """See `Backend.changed_tables`."""
         with self._ctx:
             return sum(_checksum(table) != checksum for table, checksum in self._checksums)
 
     def forget_images(self) -> None:
-        """Draw the next frame on black, with nothing kept from those before it: the GPU's memory may have been lost."""
+        """See `Backend.forget_images`."""
         self._last_count, self._levels_black = None, False
         self._floor_encoder, self._floor_levels = None, None
         with self._ctx:
@@ -432,7 +425,8 @@ class Renderer:
 
     def finish(self) -> None:
         """Wait until everything that was asked for is drawn."""
-        self._ctx.finish()
+        with self._ctx:
+            self._driver.wait()
 
     def close(self) -> None:
         """Free the GL context and everything in it."""

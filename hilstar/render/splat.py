@@ -1,49 +1,46 @@
-"""The program that draws a star's light: by a polynomial for each axis where one is exact enough, else by error functions."""
+"""A PSF for the shaders of one context, and the program that draws stars by it."""
 
 from __future__ import annotations
-
-from functools import reduce
-from itertools import zip_longest
 
 import moderngl
 
 from hilstar.render.encoder import build_program
-from hilstar.scene.psf import SQRT2, share_polynomial
+from hilstar.scene.psf import Psf
+
+TABLE_UNIT = 15  # the last texture unit that every OpenGL has: nothing else takes it
+
+
+class Shares:
+    """What a program needs that comes after shares.glsl; `defines` stand before it. It lives in its renderer's context."""
+
+    def __init__(self, ctx: moderngl.Context, psf: Psf, footprint_px: int | None = None) -> None:
+        self.footprint_px = footprint_px or psf.footprint_px
+        self.defines, self._uniforms, table = psf.shader(self.footprint_px)
+        self._table: moderngl.Texture | None = None
+        if table is not None:
+            self._table = ctx.texture(table.shape[1::-1], table.shape[2], table, dtype="f4")
+            self._table.filter = (moderngl.NEAREST, moderngl.NEAREST)
+
+    def set(self, program: moderngl.Program | moderngl.ComputeShader) -> None:
+        """Set the uniforms of a program; compilers drop what a program does not need."""
+        for name, value in self._uniforms.items():
+            if name in program:
+                program[name] = value
+        if "share_table" in program:
+            program["share_table"] = TABLE_UNIT
+
+    def bind(self) -> None:
+        """Bind the table, if there is one, for the next passes: another renderer of the context may have bound its own."""
+        if self._table is not None:
+            self._table.use(TABLE_UNIT)
 
 
 def splat_program(
-    ctx: moderngl.Context,
-    resolution_px: tuple[int, int],
-    sigma_px: tuple[float, float],
-    footprint_px: int,
-    by_erf: bool = False,
-    in_units: bool = False,
+    ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares, in_units: bool = False
 ) -> moderngl.Program:
-    """The program of star.vert and splat.frag for sprites of one sigma, up to `footprint_px` a side.
-
-    `by_erf` has error functions where polynomials would do, for the study of trade-offs. `in_units` draws light in the whole
-    units of a LightUnits.
-    """
-    define = (() if by_erf else share_define(sigma_px, footprint_px)) + (("UNITS",) if in_units else ())
-    program = build_program(ctx, "star.vert", "splat.frag", define, "shares.glsl")
-    set_sigma(program, sigma_px)
+    """The program of star.vert and splat.frag; `in_units` draws light in the whole units of a LightUnits."""
+    program = build_program(ctx, "star.vert", "splat.frag", (*shares.defines, *["UNITS"] * in_units), "shares.glsl")
+    shares.set(program)
     program["resolution_px"] = resolution_px
-    program["footprint_px"] = footprint_px
+    program["footprint_px"] = shares.footprint_px
     return program
-
-
-def set_sigma(program: moderngl.Program | moderngl.ComputeShader, sigma_px: tuple[float, float]) -> None:
-    """Set the sigma of a program of shares.glsl, where its shares are by error functions."""
-    if "inverse_sigma_sqrt2" in program:
-        program["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in sigma_px)
-
-
-def share_define(sigma_px: tuple[float, float], footprint_px: int) -> tuple[str, ...]:
-    """LOG2_SHARE for a shader, in a footprint; nothing where only error functions are exact enough."""
-    axes = [share_polynomial(sigma, footprint_px / 2 + 0.5) for sigma in sigma_px]
-    if axes[0] is None or axes[1] is None:
-        return ()
-    terms = [f"vec2({x:.9e}, {y:.9e})" for x, y in zip_longest(axes[0], axes[1], fillvalue=0.0)]
-    # Written out: from an array of uniforms llvmpipe takes twice as long.
-    polynomial = reduce(lambda sum, term: f"({sum} * square + {term})", reversed(terms))
-    return (f"LOG2_SHARE(square) {polynomial}",)

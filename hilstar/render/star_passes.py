@@ -16,8 +16,8 @@ from hilstar.monitor.quantise import CodeTable, Panel, code_table
 from hilstar.render.backend import SpriteSides
 from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
 from hilstar.render.encoder import LevelTexture, LookupTable, build_compute
-from hilstar.render.splat import set_sigma, share_define
-from hilstar.scene.psf import footprint_px, outside_share, peak_share, share_bound
+from hilstar.render.splat import Shares
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 LOCAL_SIZE = 32  # as in light.comp
@@ -46,15 +46,15 @@ class LightUnits:
     what light of a star alone they may leave out.
     """
 
-    def __init__(self, panel: Panel, size_px: tuple[int, int], sigma_px: tuple[float, float], sides: SpriteSides = ()) -> None:
-        self._size_px, self._footprint_px = size_px, footprint_px(sigma_px)
+    def __init__(self, panel: Panel, size_px: tuple[int, int], psf: Psf, sides: SpriteSides = ()) -> None:
+        self._size_px, self._footprint_px = size_px, psf.footprint_px
         gain = panel.gain()
         low, high = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
         thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
         self._lit_e_per_s, self.white_e_per_s = float(thresholds[0]) / high, panel.flux_at_white_e_per_s / low
-        self._peak_share = peak_share(sigma_px)
-        self.axes_px2, self._share_bound = share_bound(sigma_px, self._footprint_px)
-        self.wings = WINGS if not sides else _wings_of(sides, self._lit_e_per_s, sigma_px)
+        self._peak_share = psf.peak_share
+        self.axes_px2, self._share_bound = psf.reach
+        self.wings = WINGS if not sides else _wings_of(sides, self._lit_e_per_s, psf)
         self.side_px = max((side.side_px for side in sides), default=self._footprint_px)
 
     @staticmethod
@@ -92,13 +92,11 @@ class StarPasses:
     With `keep` the sums stay for `exact` to look at.
     """
 
-    def __init__(
-        self, levels: LevelTexture, panel: Panel, sigma_px: tuple[float, float], keep: bool, units: LightUnits
-    ) -> None:
+    def __init__(self, levels: LevelTexture, panel: Panel, psf: Psf, shares: Shares, keep: bool, units: LightUnits) -> None:
         ctx = self._ctx = levels.texture.ctx
-        self._levels, self._keep, self._units = levels, keep, units
+        self._levels, self._keep, self._units, self._shares = levels, keep, units, shares
         self._size_px = levels.texture.size
-        self._footprint_px = footprint_px(sigma_px)
+        self._footprint_px = psf.footprint_px
         gain = panel.gain()
         self._gain = None if gain is None else ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
         thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
@@ -106,21 +104,21 @@ class StarPasses:
         self._unit_e_per_s = 0.0  # unit of the sums
         self.sprites = ctx.buffer(reserve=SPRITE_DTYPE.itemsize, dynamic=True)
         self._drawn: int | None = None  # sprites that are in the buffer and on the images; None: it is not known
-        self._build(code_table(thresholds), sigma_px)
+        self._build(code_table(thresholds), psf)
 
     @staticmethod
     def runs_on(ctx: moderngl.Context) -> bool:
         """Whether this GL is a processor's, with compute shaders; a graphics card is left idle by a star a lane."""
         return computes_in_software(ctx)
 
-    def _build(self, table: CodeTable, sigma_px: tuple[float, float]) -> None:
+    def _build(self, table: CodeTable, psf: Psf) -> None:
         steps = table.steps()
         if steps is None:
             raise ValueError("several thresholds in a bin; ask `runs_on` first")
         self._steps = LookupTable(self._ctx, "STEPS", STEPS_BINDING, steps)
         texel = {"u1": "r8ui", "u2": "r16ui"}[self._levels.texture.dtype]
         defines = [f"LEVELS_FORMAT {texel}", f"BIN_SHIFT {table.bin_shift}"]
-        defines += [*share_define(sigma_px, self._footprint_px), *["KEEP"] * self._keep]
+        defines += [*self._shares.defines, *["KEEP"] * self._keep]
         defines += ["UNIFORMITY"] * (self._gain is not None) + self._steps.define
         side, all_px = f"FOOTPRINT {self._units.side_px}", f"FOOTPRINT {self._footprint_px}"
         self._light, self._encode, self._black = (
@@ -130,8 +128,8 @@ class StarPasses:
         for program in (self._light, self._encode, self._black):
             program["resolution_px"], program["reach_px2"] = self._size_px, self._units.axes_px2
         if self._keep:
-            self._black["least_reach"] = 0.5 * PixelOrder(sigma_px).near_sigmas(PHASE_PX) ** 2
-        set_sigma(self._light, sigma_px)
+            self._black["least_reach"] = 0.5 * PixelOrder(psf).near_sigmas(PHASE_PX) ** 2
+        self._shares.set(self._light)
         self._light["most_e_per_s"] = self._units.white_e_per_s
         self._encode["lowest"] = (table.first_bin - 1) << table.bin_shift
         self._encode["highest"] = ((table.first_bin + len(table.first_code)) << table.bin_shift) - 1
@@ -193,6 +191,7 @@ class StarPasses:
         if not self._drawn:
             return
         program["count"] = self._drawn
+        self._shares.bind()
         self.sprites.bind_to_storage_buffer(0)
         self._sums.bind_to_storage_buffer(SUMS_BINDING)
         self._levels.texture.bind_to_image(0, read=False, write=True)
@@ -200,7 +199,7 @@ class StarPasses:
         self._ctx.memory_barrier()
 
 
-def _wings_of(sides: SpriteSides, lit_e_per_s: float, sigma_px: tuple[float, float]) -> float:
+def _wings_of(sides: SpriteSides, lit_e_per_s: float, psf: Psf) -> float:
     """What part of the light that lights a pixel the squares of `sides` leave out beside them at most: one in so many."""
-    found = [lit_e_per_s / (side.below_e_per_s * outside_share(side.side_px, sigma_px)) for side in sides]
+    found = [lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px)) for side in sides]
     return SQUARE_WINGS * max(1.0, min([wings for wings in found if wings > ANY_RATE], default=WINGS / SQUARE_WINGS))

@@ -15,7 +15,7 @@ from hilstar.monitor.response import Levels
 from hilstar.render.backend import Target
 from hilstar.render.encoder import build_program
 from hilstar.render.renderer import FIRST_CAPACITY, Renderer
-from hilstar.render.splat import splat_program
+from hilstar.render.splat import Shares, splat_program
 from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
 from hilstar.units import NS_PER_MS
@@ -57,8 +57,10 @@ class VariantRenderer(Renderer):
             self._linear = self._ctx.texture(self.target.resolution_px, 1, dtype="f2")
             self._linear_fbo = self._ctx.framebuffer([self._linear])
         if variant.profile in ("renderer", "erf"):
-            target, by_erf = self.target, variant.profile == "erf"
-            self._splat = splat_program(self._ctx, target.resolution_px, target.sigma_px, self.footprint_px, by_erf)
+            self._shares = Shares(self._ctx, self.target.psf, self.footprint_px)
+            if variant.profile == "erf":  # where a polynomial would do
+                self._shares.defines = ()
+            self._splat = splat_program(self._ctx, self.target.resolution_px, self._shares)
         else:
             define = variant.profile.upper().replace(" ", "_")
             self._splat = build_program(self._ctx, "star.vert", "study/splat.frag", (define,))
@@ -66,7 +68,7 @@ class VariantRenderer(Renderer):
             if variant.profile == "table":
                 self._load_table(variant.table_size)
             else:
-                self._splat["sigma_px"] = self.target.sigma_px
+                self._splat["sigma_px"] = self.target.psf.width_px
             self._splat["footprint_px"] = self.footprint_px
         self._reserve(FIRST_CAPACITY)
 
@@ -74,7 +76,7 @@ class VariantRenderer(Renderer):
         """Shares along x and y, the two channels of one row, from a star's centre to past its footprint's edge."""
         reach_px = self.footprint_px / 2 + 1
         offset_px = np.linspace(0, reach_px, size)
-        shares = np.stack([pixel_shares(offset_px, sigma) for sigma in self.target.sigma_px], axis=-1).astype(np.float32)
+        shares = np.stack([pixel_shares(offset_px, sigma) for sigma in self.target.psf.width_px], axis=-1).astype(np.float32)
         self._table = self._ctx.texture((size, 1), 2, shares.tobytes(), dtype="f4")
         self._table.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._table.use(0)

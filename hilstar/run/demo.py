@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-import msgspec
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.logs.log_file import write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
 from hilstar.bench.build import load
@@ -26,8 +26,8 @@ from hilstar.monitor.response import Codes
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
 from hilstar.run.loop import Limit
+from hilstar.run.pacer import FrameSink, Shown
 from hilstar.run.serve import Outlet, serve
-from hilstar.run.shown import FrameSink, Shown
 from hilstar.run.summary import RunSummary
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
@@ -84,15 +84,6 @@ def _jitter_rad(count: int, rng: np.random.Generator) -> FloatArray:
     for k in range(1, count):
         noise[k] = keep * noise[k - 1] + np.sqrt(1 - keep**2) * noise[k]
     return np.asarray(noise)
-
-
-def write_log(path: Path, samples: list[AttitudeSample]) -> None:
-    """JSON lines that `hilstar send` and `hilstar replay` read."""
-    with path.open("wb") as file:
-        for sample in samples:
-            rate = None if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s.tolist()
-            line = {"t_ns": sample.t_ns, "q": sample.q_icrs_to_cam.tolist(), "rate": rate, "sequence": sample.sequence}
-            file.write(msgspec.json.encode(line) + b"\n")
 
 
 Watching = Callable[[Bench, str], AbstractContextManager[tuple[FrameSink, Outlet]]]

@@ -23,16 +23,15 @@ from hilstar.bench.config.attitude import FaultSettings
 from hilstar.bench.fault_schedule import FILE, FaultChange, FaultSchedule, share_on
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
-from hilstar.bench.scenario import NO_SCENARIO, Scenario
+from hilstar.bench.scenario import Scenario
 from hilstar.errors import InputError, printable, shortened
 from hilstar.frame.fault_kinds import Fault, Freeze, MeasuredMap, Now, fault_of, table_of
 from hilstar.frame.stray_light import map_sha256
 from hilstar.notices import Notices
 from hilstar.reading import NOT_JSON
-from hilstar.run.faulty_frames import FaultyFrames
+from hilstar.run.loop import FaultyFrames
 from hilstar.run.record.ledger import Allowance, LedgerSwitch
-from hilstar.run.record.ledger_reader import fault_records
-from hilstar.run.record.ledger_records import FaultRecord, FrameRecord
+from hilstar.run.record.ledger_records import FaultRecord, FrameRecord, fault_records
 from hilstar.units import NS_PER_S
 
 STREAM = "stream"
@@ -162,31 +161,6 @@ def read_recording(path: Path) -> Recording:
     return Recording(faults, seed, folder, records)
 
 
-class RecordedFaults:
-    """A source of faults (see `run.faulty_frames.Source`) that is told each frame: its faults of light, and whether it stays.
-
-    A recorded attitude is the one that was shown, so a wrong one is not made wrong again; a dropped frame was never recorded.
-    """
-
-    def __init__(self, recording: Recording, refresh_hz: float) -> None:
-        self._faults = recording.faults
-        self._frame_ns = round(NS_PER_S / refresh_hz)
-        self._now: tuple[Now, ...] = ()
-
-    def recall(self, record: FrameRecord) -> None:
-        """Take the faults of the frame that is drawn next."""
-        found = []
-        for number, since_ns in zip(record.faults, record.fault_since_ns, strict=False):
-            fault = self._faults.get(number)
-            if fault is not None and (fault.OF_LIGHT or isinstance(fault, Freeze)):
-                found.append(Now(number, fault, since_ns, share_on(fault, since_ns, self._frame_ns)))
-        self._now = tuple(found)
-
-    def at(self, t_ns: int) -> tuple[Now, ...]:
-        """The faults of that frame."""
-        return self._now
-
-
 WORDS = {"start": "begins", "end": "ends", "missed": "fell between two frames"}
 MAX_NAMES = 100  # in the summary: a stream may make up names
 
@@ -207,7 +181,7 @@ class RunFaults:
             fault: map_sha256(scenario.folder / fault.file) for fault in scenario.faults if isinstance(fault, MeasuredMap)
         }
         self.schedule = FaultSchedule(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare, self._hear)
-        self.frames = FaultyFrames(self.schedule, view)
+        self.frames = FaultyFrames(self.schedule.at, view)
         if ledger is not None and scenario.faults:
             ledger.fault(self._record("scenario", scenario.text, name=printable(str(scenario.path))))
 
@@ -277,15 +251,6 @@ class RunFaults:
         return told if self._stream is None else told | {"stream": self._stream.summary()}
 
 
-def run_faults(
-    bench: Bench, scenario: Scenario | None, notices: Notices, ledger: LedgerSwitch | None = None
-) -> RunFaults | None:
-    """The faults of a run that has a scenario, or whose bench file has a stream of them; None for one that has neither."""
-    if scenario is None and bench.config.faults.endpoint is None:
-        return None
-    return RunFaults(bench, scenario or NO_SCENARIO, notices, ledger)
-
-
 class ReplayedFaults:
     """The faults of an earlier run for the loop that draws it again, and for the ledger of that.
 
@@ -296,9 +261,11 @@ class ReplayedFaults:
         view = display_view(bench, recording.scenario)
         for fault in recording.faults.values():
             view.prepare(fault)
-        self._source = RecordedFaults(recording, bench.config.monitor.refresh_hz)
+        self._faults = recording.faults
+        self._frame_ns = round(NS_PER_S / bench.config.monitor.refresh_hz)
+        self._now: tuple[Now, ...] = ()
         self._started = Counter(record.name for record in recording.records if record.event == "start")
-        self.frames = FaultyFrames(self._source, view)
+        self.frames = FaultyFrames(lambda t_ns: self._now, view)
         if ledger is not None:
             for record in recording.records:
                 ledger.fault(record)
@@ -307,9 +274,19 @@ class ReplayedFaults:
         """The recording says what is on in each frame."""
 
     def recall(self, record: FrameRecord | None) -> None:
-        """Take the faults of the frame that is drawn next."""
-        if record is not None:
-            self._source.recall(record)
+        """Take the faults of the frame that is drawn next: those of light, and what freezes it.
+
+        A recorded attitude is the one that was shown: a wrong one is not made wrong again. A dropped frame was never recorded.
+        """
+        if record is None:
+            return
+        recorded = zip(record.faults, record.fault_since_ns, strict=False)
+        known = ((number, self._faults[number], since_ns) for number, since_ns in recorded if number in self._faults)
+        self._now = tuple(
+            Now(number, fault, since_ns, share_on(fault, since_ns, self._frame_ns))
+            for number, fault, since_ns in known
+            if fault.OF_LIGHT or isinstance(fault, Freeze)
+        )
 
     def summary(self) -> dict[str, Any]:
         """What was on in the earlier run, by how often it began, and how many frames stayed."""
@@ -317,8 +294,3 @@ class ReplayedFaults:
 
 
 AnyFaults = RunFaults | ReplayedFaults
-
-
-def replayed_faults(bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None) -> ReplayedFaults | None:
-    """The faults of an earlier run; None where it had none."""
-    return ReplayedFaults(bench, recording, ledger) if recording.faults else None

@@ -6,13 +6,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 from hilstar.attitude.wire.serial_link import LOST, RtsLine
 from hilstar.bench.config import SyncSettings
 from hilstar.errors import one_line
 from hilstar.notices import Notices
+from hilstar.process.closing import Closing
 from hilstar.process.scheduling import raise_priority
 from hilstar.run.sync import SyncSummary
 from hilstar.running_statistics import RunningStatistics
@@ -29,7 +29,7 @@ def _nobody_counts(what: str) -> None:
     """The counter of pulses in a run without a ledger."""
 
 
-class FramePulse:
+class FramePulse(Closing):
     """Raises a line at every `every_frames`th frame for `pulse_ms`, and never keeps a frame waiting. End it with `close`.
 
     A frame that comes while the line is still busy, or lost, has no pulse; a lost line is opened again, with back-off.
@@ -149,9 +149,3 @@ class FramePulse:
         self._thread.join(END_S)
         if not self._thread.is_alive():
             self._line.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

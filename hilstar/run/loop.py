@@ -1,7 +1,7 @@
 """The frame loop: an attitude at each frame's moment of light, drawn, counted, handed on.
 
 It knows neither screens nor links: a pacer says when frames are due and shows them, and the caller supplies
-the attitudes.
+the attitudes. `FaultyFrames` says which frames a fault drops, freezes or blanks; a fault of light is a layer of the frame.
 """
 
 from __future__ import annotations
@@ -9,21 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import scipy.special  # noqa: F401 - takes 0.1 s, which the first star that might clip is not to cost its frame
 from msgspec import UNSET, UnsetType
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.config import AttitudeSettings
-from hilstar.bench.frame import Bench
+from hilstar.bench.frame import Bench, Drawn
 from hilstar.errors import GpuError
+from hilstar.frame.fault_kinds import Freeze, Now
+from hilstar.frame.fault_light import FaultView
 from hilstar.frame.faults import FaultLayer
+from hilstar.frame.view import View
 from hilstar.notices import Notices
-from hilstar.render.renderer import Renderer
-from hilstar.run.faulty_frames import FaultyFrames
-from hilstar.run.pacer import AT_ONCE, ClockPacer, Moment, Pacer
-from hilstar.run.shown import FrameSink, OnScreen, Shown, ignore
+from hilstar.run.operator import OnScreen
+from hilstar.run.pacer import AT_ONCE, FrameSink, Moment, Pacer, Shown, ignore
 from hilstar.run.summary import RunTally
 from hilstar.run.watchdog import AttitudeWatch, FrameWatch, GpuWatch
 from hilstar.scene.sprites import Sprites
@@ -42,6 +43,69 @@ class Limit:
     slots: float = math.inf
     frames: float = math.inf
     from_first_attitude: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """The last frame that was drawn: what stays when the next ones are frozen."""
+
+    drawn: Drawn
+    attitude: Attitude | None
+    t_ns: int
+    now: tuple[Now, ...]
+
+
+class FaultyFrames:
+    """The faults of a run, frame by frame; `source` says which are on in the frame whose light begins at a time, ns."""
+
+    def __init__(self, source: Callable[[int], tuple[Now, ...]], view: FaultView) -> None:
+        self.dropped = self.frozen = 0
+        self.now: tuple[Now, ...] = ()  # faults of the last frame that was asked about
+        self._source, self._view = source, view
+        self._held: Held | None = None
+
+    def at(self, t_ns: int, attitude: Attitude | None) -> FaultLayer | None:
+        """What is wrong in a frame; None where nothing is, and before the run's first attitude, from which time counts."""
+        if attitude is None and self._held is None:
+            return None
+        now = self.now = self._source(t_ns)
+        return FaultLayer(self._view, now) if now else None
+
+    def drops(self, effects: FaultLayer | None, number: int) -> bool:
+        """Whether a frame is never shown; it is counted."""
+        if effects is None or self._held is None or not effects.drops(number):
+            return False
+        self.dropped += 1
+        return True
+
+    def attitude(self, effects: FaultLayer | None, t_ns: int, attitude: Attitude | None) -> Attitude | None:
+        """The attitude that is shown in place of a frame's own."""
+        if effects is None or attitude is None:
+            return attitude
+        if effects.frozen and self._held is not None:
+            held = self._held.attitude
+            return None if held is None else replace(held, age_ns=max(0, held.age_ns + t_ns - self._held.t_ns))
+        if effects.blank:
+            return None
+        turned = effects.turned(View(attitude.q_icrs_to_cam, attitude.rate_cam_rad_s))
+        return replace(attitude, q_icrs_to_cam=turned.q_icrs_to_cam, rate_cam_rad_s=turned.rate_cam_rad_s)
+
+    def frozen_frame(self, effects: FaultLayer | None, bench: Bench) -> Drawn | None:
+        """What is on the display already, for a frame that is frozen."""
+        if effects is None or not effects.frozen or self._held is None:
+            return None
+        self.frozen += 1
+        return Drawn(bench.renderer, self._held.drawn.sprites, self._held.drawn.clipped_hip)
+
+    def shown(
+        self, effects: FaultLayer | None, drawn: Drawn, attitude: Attitude | None, t_ns: int, stays: bool
+    ) -> tuple[Now, ...]:
+        """Take note of a frame; its faults, which of one that `stays` are those of its light and what freezes it."""
+        now = () if effects is None else effects.now
+        if stays and self._held is not None:
+            return (*self._held.now, *(one for one in now if isinstance(one.fault, Freeze)))
+        self._held = Held(drawn, attitude, t_ns, tuple(one for one in now if not isinstance(one.fault, Freeze)))
+        return now
 
 
 def nothing_on_frame(number: int, frame_ns: int) -> None:
@@ -70,7 +134,7 @@ class FrameLoop:
         self._sink = sink
         self._period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         self._blank_when_stale = settings.on_stale == "blank"
-        self.pacer = ClockPacer(self._period_ns) if pacer is None else pacer
+        self.pacer = Pacer(self._period_ns) if pacer is None else pacer
         self._moving = (motion == "on" or (motion == "auto" and self.pacer.moves_stars)) if moving is None else moving
         self.on_frame: Callable[[int, int], None] = nothing_on_frame
         self.stop = self.pacer.stop
@@ -80,8 +144,7 @@ class FrameLoop:
         self._presence = AttitudeWatch(self.notices, self.pacer.clock)
         self._faults = faults
         self.watch = FrameWatch(self._period_ns, self.notices, self.pacer.clock)
-        # A stream is opened with a GL context: NumPy never draws one.
-        self._gpu = GpuWatch(cast(Renderer, bench.renderer), self.notices, self.stop, self.pacer.clock)
+        self._gpu = GpuWatch(bench.renderer, self.notices, self.stop, self.pacer.clock)
 
     def draw(self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment = AT_ONCE) -> Shown | None:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank.
@@ -147,7 +210,7 @@ class FrameLoop:
         """The attitude after the operator's keys and the bench file's rule for stale attitudes."""
         operator = self.pacer.operator
         attitude = operator.attitude(t_ns, attitude)
-        return None if stale and self._blank_when_stale and not operator.paused else attitude
+        return None if stale and self._blank_when_stale and not operator.aids.paused else attitude
 
     def _light(self, attitude: Attitude | None, t_ns: int, faults: FaultLayer | None) -> Sprites | None:
         if attitude is None:

@@ -1,6 +1,6 @@
 """The operator of a run: switches over the sky (keys at the display, the page), who asks for them, and what they change.
 
-The frame loop turns switches and counts the frames that they change. Other threads ask through `SwitchRequests`.
+The frame loop turns switches and counts the frames that they change. Other threads ask through a queue of `SwitchRequest`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from hilstar.bench.frame import Bench
 from hilstar.monitor.response import Levels
 from hilstar.notices import Notices
 from hilstar.render.aids import BLANK, CROSSHAIR, GRID, PATCH, AidLevels
-from hilstar.run.pacer import Operator
-from hilstar.run.shown import HEADLESS, OnScreen
 from hilstar.units import NS_PER_S
 
 PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of white
@@ -99,80 +97,74 @@ class SwitchRequest:
         return f"{self.name} {'on' if self.on else 'off'}"
 
 
-class SwitchRequests:
-    """Queue of requests from any thread. The frame loop empties it once a frame and never waits."""
-
-    def __init__(self) -> None:
-        self.waiting: deque[SwitchRequest] = deque()
-
-    def ask(self, request: SwitchRequest) -> None:
-        """Add a request."""
-        self.waiting.append(request)
-
-    def act(self, aids: Aids, acted: Callable[[SwitchRequest], None]) -> None:
-        """Turn the requested switches and report each by `acted`. Called by the frame loop."""
-        while self.waiting:
-            request = self.waiting.popleft()
-            if request.called_off:
-                continue
-            aids.set(request.name, request.on, request.share)
-            acted(request)
-            request.done = True
+SwitchRequests = deque[SwitchRequest]  # from any thread; the frame loop empties it once a frame and never waits
 
 
+@dataclass(frozen=True, slots=True)
+class OnScreen:
+    """What changes a frame on the screen: an operator's keys ("" for none), and why it is hidden ("" if it is not).
+
+    `sky` is false where the keys leave no sky at all.
+    """
+
+    operator: str = ""
+    hidden: str = ""
+    sky: bool = True
+
+
+HEADLESS = OnScreen()
 GAMMA = "gamma"  # the kind of event while another program's gamma ramp lies on the display
 SKY_AGAIN = "the sky of the attitude again"
 
 
-def always_seen() -> str:
-    """Reason for a hidden window, in a run without one: always none."""
-    return ""
+class Operator:
+    """What covers the sky, and why the window is `hidden` ("" where it is visible, and without one).
 
-
-class Overrides(Operator):
-    """What covers the sky, and why the window is hidden ("" where it is visible). `requests` come from other threads."""
+    `requests` come from other threads. Without a screen, the aids are drawn into the `levels`.
+    """
 
     def __init__(
-        self, aids: Aids, notices: Notices, hidden: Callable[[], str] = always_seen, requests: SwitchRequests | None = None
+        self,
+        aids: Aids,
+        notices: Notices,
+        hidden: Callable[[], str] = str,
+        requests: SwitchRequests | None = None,
+        levels: AidLevels | None = None,
     ) -> None:
         self.aids = aids
         self._notices = notices
         self._hidden = hidden
-        self._requests = SwitchRequests() if requests is None else requests
+        self._requests = deque() if requests is None else requests
+        self._levels = levels
         self._told = HEADLESS
         self._held: tuple[Attitude, int] | None = None  # what a paused screen shows, and the time that it was for
         self._last_swap_ns: int | None = None
         self._frames = {"operator": 0, "hidden": 0}
         self._lasted_ns = {"operator": 0, "hidden": 0}
 
-    @property
-    def paused(self) -> bool:
-        """Whether the operator has paused the sky."""
-        return self.aids.paused
-
     def look(self) -> OnScreen:
-        """State of the switches and the window now. Reports what has changed."""
-        if self._requests.waiting:
-            self._requests.act(self.aids, self._acted)
+        """State of the switches and the window now, once what was requested is done. Reports what has changed."""
+        while self._requests:
+            self._act(self._requests.popleft())
         now = OnScreen(self.aids.text, self._hidden(), self.aids.shows_sky)
         if now != self._told:
             before, self._told = self._told, now
             if now.operator != before.operator:
                 self._notices.tell("operator", f"operator's keys: {now.operator or SKY_AGAIN}")
-            if now.hidden != before.hidden:
-                self._tell_hidden(now.hidden)
+            if now.hidden and now.hidden != before.hidden:
+                self._notices.tell("hidden", f"the window is {now.hidden}: its frames are not fully visible")
+            elif before.hidden and not now.hidden:
+                self._notices.tell("visible", "the window is visible again")
         return now
 
-    def _acted(self, request: SwitchRequest) -> None:
+    def _act(self, request: SwitchRequest) -> None:
+        if request.called_off:
+            return
+        self.aids.set(request.name, request.on, request.share)
         shown = self.aids.text
         self._told = replace(self._told, operator=shown)
         self._notices.tell("operator", f"{request.text}, by {request.who}: {shown or SKY_AGAIN}", request.who)
-
-    def _tell_hidden(self, hidden: str) -> None:
-        if hidden:
-            self._notices.tell("hidden", f"the window is {hidden}: its frames are not fully visible")
-        else:
-            self._notices.tell("visible", "the window is visible again")
+        request.done = True
 
     def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
         """Attitude to show: during a pause the one of its start, with a growing age; None where no sky is shown."""
@@ -184,6 +176,10 @@ class Overrides(Operator):
             held, held_t_ns = self._held
             attitude = replace(held, rate_cam_rad_s=None, age_ns=max(0, held.age_ns + t_ns - held_t_ns))
         return attitude if self.aids.shows_sky else None
+
+    def laid_over(self, levels: Levels) -> Levels:
+        """The levels of a frame that no screen changes, with the aids over them."""
+        return levels if self._levels is None else self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)
 
     def count(self, shown: OnScreen, swap_ns: int) -> None:
         """Count a frame by how it was shown."""
@@ -203,15 +199,3 @@ def aid_levels_of(bench: Bench) -> AidLevels:
     """The aids' levels on a bench."""
     x_px, y_px = bench.camera.boresight_px
     return AidLevels(bench.calibration.response, bench.config.monitor.bits, (round(x_px), round(y_px)))
-
-
-class HeadlessOverrides(Overrides):
-    """Operator of a run without a screen: the aids are drawn into the levels."""
-
-    def __init__(self, bench: Bench, notices: Notices, requests: SwitchRequests | None = None) -> None:
-        super().__init__(Aids(), notices, always_seen, requests)
-        self._levels = aid_levels_of(bench)
-
-    def laid_over(self, levels: Levels) -> Levels:
-        """Levels with the operator's aids over them."""
-        return self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)

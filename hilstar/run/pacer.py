@@ -1,7 +1,7 @@
-"""Pacing: when each frame of a run is to be begun, when its light leaves, and what shows it.
+"""Pacing: when each frame of a run is to be begun, when its light leaves, and how it was shown.
 
-A pacer hands the frame loop one moment after another. `ClockPacer` keeps a grid of this host's clock, for a run without a
-screen; `screen.display_pacer` follows a display's refresh.
+A pacer hands the frame loop one moment after another. `Pacer` keeps a grid of this host's clock, for a run without a screen;
+`screen.display_pacer` follows a display's refresh.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.frame import Drawn
-from hilstar.monitor.response import Levels
-from hilstar.run.host_clock import HOST_CLOCK, HostClock
-from hilstar.run.shown import HEADLESS, OnScreen
+from hilstar.frame.fault_kinds import Now
+from hilstar.notices import Notices
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.run.operator import HEADLESS, Aids, OnScreen, Operator
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,78 +59,58 @@ class Presented:
     marker: int | None = None
 
 
-class Operator:
-    """What an operator changes in the frames: nothing without a screen."""
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """One frame of a run: its number, its time on the timeline, its attitude (None: blank) and what was drawn.
 
-    @property
-    def paused(self) -> bool:
-        """Whether the attitude is frozen."""
-        return False
+    Host times, ns: `draw_ns` when drawing began, `predicted_swap_ns` and `swap_ns` when the frame was to be swapped onto the
+    screen and when it was; headless, with nothing predicted, when its levels were ready. `missed_before` counts the refresh
+    periods just before it that had no frame of their own, and `marker` is the photodiode square's light, 0 or 1. `missing`
+    is true where no attitude has come yet; `attitude` is None too where an operator's key hides the sky.
+    """
 
-    def look(self) -> OnScreen:
-        """The state of the keys and the window now."""
-        return HEADLESS
-
-    def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
-        """The attitude to show at `t_ns` of the timeline."""
-        return attitude
-
-    def laid_over(self, levels: Levels) -> Levels:
-        """The levels of a frame that no screen changes, with what lies over them."""
-        return levels
-
-    def count(self, shown: OnScreen, swap_ns: int) -> None:
-        """Count a frame by how it was shown."""
-
-
-class Pacer(Protocol):
-    """Decides when frames are due, and shows them."""
-
-    @property
-    def clock(self) -> HostClock:
-        """The clock of all its moments."""
-
-    @property
-    def stop(self) -> threading.Event:
-        """Set to end the run."""
-
-    @property
-    def operator(self) -> Operator:
-        """The operator at the screen."""
-
-    @property
-    def moves_stars(self) -> bool:
-        """Whether stars move within a frame here: rows of a screen light one after another."""
-
-    def moments(self) -> Iterator[Moment]:
-        """The moments of a run, without end; each is the first that can be reached when it is asked for."""
-
-    def steady(self) -> AbstractContextManager[object]:
-        """While this is open, the process does not interrupt its frames."""
-
-    def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
-        """Show a frame that was begun at `begun_ns`; `enter` is called with the name of each stage."""
-
-    def idle(self) -> None:
-        """Called while no frame is due."""
-
-    def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
-        """What the run's summary says of the screen and its `swaps`; {} without a screen."""
+    number: int
+    t_ns: int
+    attitude: Attitude | None
+    drawn: Drawn
+    draw_ns: int = 0
+    predicted_swap_ns: int | None = None
+    swap_ns: int = 0
+    stale: bool = False
+    timestamp_source: str = "headless"
+    missed_before: int = 0
+    marker: int | None = None
+    missing: bool = False
+    on_screen: OnScreen = HEADLESS
+    faults: tuple[Now, ...] = ()
 
 
-class ClockPacer:
-    """Frames at a steady rate of this host's clock, without a screen: their levels are read back."""
+FrameSink = Callable[[Shown], None]
+
+
+def ignore(shown: Shown) -> None:
+    """The sink of a run whose frames are not used."""
+
+
+class Pacer:
+    """Says when frames are due, and shows them: here at a steady rate of the host's clock, their levels read back.
+
+    `stop` is set to end the run. `moves_stars`: whether stars move within a frame, as where rows of a screen light one by one.
+    """
 
     moves_stars = False
 
     def __init__(self, period_ns: float, clock: HostClock = HOST_CLOCK, operator: Operator | None = None) -> None:
         self.clock = clock
         self.stop = threading.Event()
-        self.operator = Operator() if operator is None else operator
+        self.operator = Operator(Aids(), Notices()) if operator is None else operator
         self._period_ns = period_ns
 
     def moments(self) -> Iterator[Moment]:
-        """One each period from now on; those already past when the next is asked for are skipped."""
+        """The moments of a run, without end, each the first that can be reached when it is asked for.
+
+        One each period from now on; those already past when the next is asked for are skipped.
+        """
         start_ns = self.clock.now_ns()
         slot = 0
         while True:
@@ -139,18 +120,18 @@ class ClockPacer:
             slot = max(slot, passed) + 1
 
     def steady(self) -> AbstractContextManager[object]:
-        """Nothing to do without a screen."""
+        """While this is open, the process does not interrupt its frames; without a screen nothing is done for that."""
         return nullcontext()
 
     def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
-        """Read the levels back, with what the operator lays over them."""
+        """Show a frame that was begun at `begun_ns`; `enter` is called with the name of each stage."""
         drawn.levels = self.operator.laid_over(drawn.levels)
         return Presented(self.clock.now_ns())
 
     def idle(self) -> None:
-        """Take in what the operator wishes."""
+        """Take in what the operator wishes while no frame is due."""
         self.operator.look()
 
     def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
-        """There is no screen."""
+        """What the run's summary says of the screen and its `swaps`; {} without a screen."""
         return {}

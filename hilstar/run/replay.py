@@ -1,19 +1,20 @@
-"""The replay of a log or of a ledger: which part of it, how fast, and the run itself."""
+"""The replay of a log or of a ledger: which part of it, how fast, the run itself, and its frames as files."""
 
 from __future__ import annotations
 
+import csv
 import math
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from types import TracebackType
+from typing import NamedTuple, Self
 
 import numpy as np
-from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
-from hilstar.attitude.clock.timeline import Attitude, Timeline
+from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
@@ -23,23 +24,24 @@ from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
 from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
-from hilstar.errors import InputError, printable
-from hilstar.monitor.quantise import QUANTISERS, Quantisation
+from hilstar.bench.frame_files import write_codes_png
+from hilstar.errors import InputError, cannot_write, printable
+from hilstar.files import make_directory, refuse_ledger
+from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
-from hilstar.run.faults import NO_RECORDING, Recording, read_recording, replayed_faults
-from hilstar.run.loop import FrameLoop, Limit, policy_of
-from hilstar.run.pacer import Moment
-from hilstar.run.record.ledger_reader import drawable_frames, read_head
-from hilstar.run.record.ledger_records import FrameRecord, below_step, frame_record
+from hilstar.run.faults import NO_RECORDING, Recording, ReplayedFaults, read_recording
+from hilstar.run.loop import Limit, policy_of
+from hilstar.run.pacer import FrameSink, Moment, Shown, ignore
+from hilstar.run.record.ledger_records import FrameRecord, drawable_frames, read_head
 from hilstar.run.serve import Outlet, Running
-from hilstar.run.shown import FrameSink, Shown, ignore
 from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
 
 MAX_FRAMES = 100_000_000
 # `exact` in NumPy is another program than its shader: of two choices that are as good it may take the other.
 OTHER_CODES_BY_NUMPY = 0.35
+COLUMNS = ("frame", "t_s", "qw", "qx", "qy", "qz", "stars_drawn", "clipped")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,56 +55,6 @@ class Wanted:
     start_s: float | None = None
     stop_s: float | None = None
     step_s: float | None = None
-
-
-class Play(Protocol):
-    """Recorded frames, in order; paced as on a monitor, or as fast as possible."""
-
-    @property
-    def paced(self) -> bool:
-        """As on a monitor, where late frames are missed."""
-
-    @property
-    def frame_count(self) -> int:
-        """How many frames there are."""
-
-    @property
-    def packet_count(self) -> int:
-        """How many attitudes they come from."""
-
-    @property
-    def moving(self) -> bool | None:
-        """Whether stars are drawn along their paths; None: as the bench file says."""
-
-    @property
-    def first_ns(self) -> int:
-        """The time of the log's or the run's first frame."""
-
-    @property
-    def zero_ns(self) -> int:
-        """The time from which a scenario counts its seconds: the log's first sample, or the run's first frame."""
-
-    @property
-    def recording(self) -> Recording:
-        """The faults of an earlier run."""
-
-    def past(self, slot: int) -> FrameRecord | None:
-        """The frame of an earlier run; None of a log."""
-
-    @property
-    def drawn_by(self) -> DrawnBy | None:
-        """Who drew an earlier run; None of a log, and where its ledger does not say."""
-
-    @property
-    def told(self) -> list[tuple[str, str]]:
-        """Events to report before it begins: kinds and lines."""
-
-    @property
-    def conventions(self) -> Conventions:
-        """What the log's numbers mean."""
-
-    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
-        """Number, time and attitude of a frame; None is blank."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,78 +77,52 @@ class DrawnBy:
         return OTHER_CODES_BY_NUMPY if by_numpy else QUANTISERS[quantisation].other_codes
 
 
-@dataclass(frozen=True, slots=True)
-class LogPlay:
-    """A log: frame k shows its time `first_ns + k step_s`."""
+class PlayedFrame(NamedTuple):
+    """Number, time and attitude of a frame to be replayed; without an attitude it is blank."""
 
-    timeline: Timeline
-    first_ns: int
-    step_s: float
-    frame_count: int
-    paced: bool
-    moving: bool | None = None
-    told: list[tuple[str, str]] = field(default_factory=list)
-    conventions: Conventions = PACKETS
-    zero_ns: int = 0
-    recording: Recording = NO_RECORDING
-    drawn_by: None = None
-
-    @property
-    def packet_count(self) -> int:
-        """The samples of the log."""
-        return len(self.timeline)
-
-    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
-        """Number, time and attitude of a frame."""
-        t_ns = self.first_ns + round(slot * self.step_s * NS_PER_S)
-        return slot, t_ns, self.timeline.at(t_ns)
-
-    def past(self, slot: int) -> FrameRecord | None:
-        """A log has no frames."""
-        return None
+    number: int
+    t_ns: int
+    attitude: Attitude | None
 
 
 @dataclass(frozen=True, slots=True)
-class RunPlay:
-    """An earlier run, from its ledger: the same frames with the same attitudes, so the same light.
+class Play:
+    """Recorded frames, in order; `paced` as on a monitor, where late ones are missed, else as fast as possible.
 
-    The same renderer draws the same codes bit for bit; another draws them within `DrawnBy.other_codes`.
+    `first_ns` is the time of the first frame, and `zero_ns` that from which a scenario counts its seconds: the log's first
+    sample, or the run's first frame. `moving` says whether stars are drawn along their paths; None: as the bench file says.
+    `told` are events to report before it begins. Only an earlier run has `past` frames, faults in its `recording`, and a
+    renderer (`drawn_by`) that its ledger may name. The same renderer draws the same codes from them bit for bit; another draws
+    them within `DrawnBy.other_codes`.
     """
 
-    frames: list[FrameRecord]
+    frame: Callable[[int], PlayedFrame]
+    frame_count: int
     packet_count: int
     paced: bool
-    moving: bool | None = True  # where the run's own were
-    told: list[tuple[str, str]] = field(default_factory=list)
+    first_ns: int
+    zero_ns: int
+    moving: bool | None = None
+    told: Sequence[tuple[str, str]] = ()
     conventions: Conventions = PACKETS
-    zero_ns: int = 0
+    past: Sequence[FrameRecord] = ()
     recording: Recording = NO_RECORDING
     drawn_by: DrawnBy | None = None
 
-    @property
-    def first_ns(self) -> int:
-        """The time of the first frame that is replayed."""
-        return self.frames[0].t_ns
 
-    @property
-    def frame_count(self) -> int:
-        """The frames that the run drew."""
-        return len(self.frames)
+def played_again(frames: Sequence[FrameRecord], packet_count: int, paced: bool, recording: Recording) -> Play:
+    """The play of an earlier run's frames, each with the attitude and the motion that it had."""
 
-    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
-        """Number, time and attitude of a frame."""
-        past = self.frames[slot]
-        rate = None if past.rate is None else np.array(past.rate)
-        velocity = None if past.velocity_km_s is None else np.array(past.velocity_km_s)
+    def frame(slot: int) -> PlayedFrame:
+        past = frames[slot]
         if past.q is None:
-            return past.frame, past.t_ns, None
-        place = None if past.place_km is None else np.array(past.place_km)
+            return PlayedFrame(past.frame, past.t_ns, None)
+        rate, velocity, place = (None if v is None else np.array(v) for v in (past.rate, past.velocity_km_s, past.place_km))
         attitude = Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate, velocity_km_s=velocity, place_km=place)
-        return past.frame, past.t_ns, attitude
+        return PlayedFrame(past.frame, past.t_ns, attitude)
 
-    def past(self, slot: int) -> FrameRecord | None:
-        """The frame as it was recorded."""
-        return self.frames[slot]
+    t_ns = frames[0].t_ns
+    return Play(frame, len(frames), packet_count, paced, t_ns, t_ns, moving=True, past=frames, recording=recording)
 
 
 def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = NOTHING_STATED) -> Play:
@@ -225,9 +151,13 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
     joins = log_joins(samples)
     timeline = log_timeline(samples, policy_of(config.attitude), joins)
-    told = [*read.told, *joins.told]
-    play = LogPlay(timeline, first_ns, step_s, int(count) + 1, not math.isinf(factor), None)
-    return replace(play, told=told, conventions=read.conventions, zero_ns=samples[0].t_ns)
+
+    def frame(slot: int) -> PlayedFrame:
+        t_ns = first_ns + round(slot * step_s * NS_PER_S)
+        return PlayedFrame(slot, t_ns, timeline.at(t_ns))
+
+    play = Play(frame, int(count) + 1, len(timeline), not math.isinf(factor), first_ns, samples[0].t_ns)
+    return replace(play, told=[*read.told, *joins.told], conventions=read.conventions)
 
 
 def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float) -> None:
@@ -238,7 +168,7 @@ def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float
             raise InputError(f"{log}: attitude {number}: {refusal.detail}")
 
 
-def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord]) -> RunPlay:
+def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord]) -> Play:
     if wanted.step_s is not None or factor not in {1.0, math.inf}:
         raise InputError(f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no --step")
     first_ns = frames[0].swap_ns
@@ -246,8 +176,8 @@ def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord
     kept = [frame for frame in frames if start_s <= (frame.swap_ns - first_ns) / NS_PER_S <= stop_s + 1e-9]
     if not kept:
         raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
-    play = RunPlay(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor))
-    return replace(play, zero_ns=frames[0].t_ns, recording=read_recording(log), drawn_by=_drawn_by(log))
+    play = played_again(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor), read_recording(log))
+    return replace(play, zero_ns=frames[0].t_ns, drawn_by=_drawn_by(log))
 
 
 def _drawn_by(log: Path) -> DrawnBy | None:
@@ -285,44 +215,81 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """
     outlet = outlet or Outlet()
-    ledger = outlet.ledger
-    faults = outlet.faults or replayed_faults(bench, play.recording, ledger)
+    if outlet.faults is None and play.recording.faults:
+        outlet = replace(outlet, faults=ReplayedFaults(bench, play.recording, outlet.ledger))
+    faults = outlet.faults
     if faults is not None:
         faults.begin(play.zero_ns)
-    frames = None if faults is None else faults.frames
-    loop = outlet.on(FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices, frames))
+    loop = outlet.loop(bench, sink, play.moving)
+    clock = loop.pacer.clock
     for kind, line in play.told:
         outlet.notices.tell(kind, line)
     _tell_other_renderer(play.drawn_by, bench, outlet.notices)
 
     def draw_slot(moment: Moment) -> Shown | None:
         if faults is not None:
-            faults.recall(play.past(moment.slot))
+            faults.recall(play.past[moment.slot] if play.past else None)
         number, t_ns, attitude = play.frame(moment.slot)
         shown = loop.draw(number, t_ns, attitude, moment)
-        if ledger.on and shown is not None:
-            ledger.frame(frame_record(shown, t_ns, loop.tally.missed_frames, below_step(bench, shown)))
+        if shown is not None:
+            outlet.record(bench, loop, shown, t_ns)
         return shown
 
     counts = PacketCounts(received=play.packet_count)
     outlet.follower(Running(loop, counts))
     bench.warm_up()
-    begin_ns = time.monotonic_ns()
+    begin_ns = clock.now_ns()
     with stop_on_signal(loop.stop), loop.watch:
-        _draw_all(play, loop, draw_slot)
-    duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.tally.summary(duration_s, counts, bench.renderer)
-    summary = replaced(summary, faults=UNSET if faults is None else faults.summary(), sync=outlet.pulses())
-    told = outlet.notices.counts()
-    return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())
+        if play.paced:
+            loop.paced(Limit(slots=play.frame_count), draw_slot)
+        else:
+            for slot in range(play.frame_count):
+                if loop.stop.is_set():
+                    break
+                draw_slot(Moment(slot))
+    summary = loop.tally.summary((clock.now_ns() - begin_ns) / NS_PER_S, counts, bench.renderer)
+    return replaced(outlet.complete(summary, loop), stale_events=loop.gate.events)
 
 
-def _draw_all(play: Play, loop: FrameLoop, draw_slot: Callable[[Moment], Shown | None]) -> None:
-    """All frames of a replay, paced or as fast as possible, until a signal."""
-    if play.paced:
-        loop.paced(Limit(slots=play.frame_count), draw_slot)
-        return
-    for slot in range(play.frame_count):
-        if loop.stop.is_set():
+class FrameImages:
+    """Writes `frame_000000.png` and on, and `frames.csv`; without a directory it writes nothing."""
+
+    def __init__(self, directory: Path | None, bench: Bench) -> None:
+        self._directory = directory
+        self._bench = bench
+        self._table = Path()
+        self._bits = bench.config.monitor.bits
+        self._stack = ExitStack()
+
+    def __call__(self, shown: Shown) -> None:
+        """Write one frame. A blank one has no quaternion."""
+        if self._directory is None:
             return
-        draw_slot(Moment(slot))
+        write_codes_png(
+            self._directory / f"frame_{shown.number:06d}.png", self._bench.code_values(shown.drawn.levels), self._bits
+        )
+        q = ["", "", "", ""] if shown.attitude is None else [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
+        row = [shown.number, f"{shown.t_ns / 1e9:.9f}", *q, shown.drawn.star_count, len(shown.drawn.clipped_hip)]
+        with self._said():
+            self._writer.writerow(row)
+
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise cannot_write(self._table, error) from error
+
+    def __enter__(self) -> Self:
+        if self._directory is not None:
+            self._table = make_directory(self._directory) / "frames.csv"
+            refuse_ledger(self._table)
+            with self._said():
+                file = self._stack.enter_context(self._table.open("w", encoding="ascii", newline=""))
+            self._writer = csv.writer(file, lineterminator="\n")
+            self._writer.writerow(COLUMNS)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        with self._said():
+            self._stack.close()

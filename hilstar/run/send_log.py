@@ -16,8 +16,8 @@ from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.errors import InputError
+from hilstar.process.scheduling import HOST_CLOCK
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s
-from hilstar.run.host_clock import HOST_CLOCK
 from hilstar.units import NS_PER_S
 
 MAX_RESAMPLED = 10_000_000  # some GB of samples

@@ -7,8 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol, Self
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
@@ -30,6 +28,7 @@ from hilstar.attitude.wire.serial_link import SerialLink, serial_target
 from hilstar.attitude.wire.udp import Datagrams
 from hilstar.attitude.wire.zmq_links import ZmqSender
 from hilstar.errors import InputError, shortened
+from hilstar.process.closing import Closing
 from hilstar.process.interrupts import caught
 
 LISTEN_MS = 20
@@ -39,32 +38,6 @@ PROBE_S = 0.02
 UDP = re.compile(r"udp://(?:\[([0-9A-Fa-f:.]+(?:%\w+)?)\]|([^:\[\]/\s]+)):(\d{1,5})")
 Clock = Callable[[], int]
 Numbers = Sequence[float] | FloatArray
-
-
-class SenderEnd(Protocol):
-    """Where a sender puts its packets."""
-
-    endpoint: str
-    link_counts: LinkCounts
-
-    @property
-    def status(self) -> Status | None:
-        """The newest status of hilstar; None before the first, and where nothing comes back."""
-
-    def wait_for_listener(self, timeout_s: float) -> bool:
-        """True once there is a listener, or where the road cannot tell."""
-
-    def put(self, packet: bytes) -> None:
-        """Send one packet."""
-
-    def close(self) -> None:
-        """Close it, once what was put has left."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None: ...
 
 
 def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, clock: Clock = time.monotonic_ns) -> SenderEnd:
@@ -80,56 +53,33 @@ def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, cl
     return UdpSender(to, clock) if line is None else SerialSender(*line, clock)
 
 
-class Listener:
-    """A thread that answers time requests by `clock`, and keeps the newest status, from whatever `receive` brings."""
+class TwoWay(Closing):
+    """An end that also listens: a thread answers time requests by the clock, and keeps the newest status."""
 
-    def __init__(self, receive: Callable[[int], list[Arrival[Event]]], send: Callable[[Packet], None], clock: Clock) -> None:
-        self.status: Status | None = None
-        self.statuses = self.requests = 0
-        self.answered = threading.Event()
-        self._receive, self._send, self._clock = receive, send, clock
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._listen, name="hilstar-sender", daemon=True)
+    status: Status | None = None
+    statuses = requests = 0  # that came; every request is answered
+
+    def _listen_to(self, receive: Callable[[int], list[Arrival[Event]]], send: Callable[[Packet], None], clock: Clock) -> None:
+        self._answered, self._stop = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._listen, args=(receive, send, clock), name="hilstar-sender", daemon=True)
         self._thread.start()
 
-    def _listen(self) -> None:
+    def _listen(self, receive: Callable[[int], list[Arrival[Event]]], send: Callable[[Packet], None], clock: Clock) -> None:
         while not self._stop.is_set():
-            for arrival in self._receive(LISTEN_MS):
+            for arrival in receive(LISTEN_MS):
                 match arrival.event:
                     case TimeRequest(sequence, t1_ns):
                         self.requests += 1
                         waited_ns = time.monotonic_ns() - arrival.host_ns
-                        self._send(TimeReply(sequence, t1_ns, self._clock() - waited_ns, self._clock()))
+                        send(TimeReply(sequence, t1_ns, clock() - waited_ns, clock()))
                     case TimeReply():
-                        self.answered.set()
+                        self._answered.set()
                     case Status() as status:
                         self.status, self.statuses = status, self.statuses + 1
 
-    def stop(self) -> None:
-        """Stop listening."""
+    def _stop_listening(self) -> None:
         self._stop.set()
         self._thread.join()
-
-
-class TwoWay:
-    """An end that also listens: statuses and time requests."""
-
-    _listener: Listener
-
-    @property
-    def status(self) -> Status | None:
-        """The newest status."""
-        return self._listener.status
-
-    @property
-    def statuses(self) -> int:
-        """How many statuses came."""
-        return self._listener.statuses
-
-    @property
-    def requests(self) -> int:
-        """How many time requests came, and were answered."""
-        return self._listener.requests
 
 
 class SerialSender(TwoWay, SerialLink):
@@ -137,9 +87,8 @@ class SerialSender(TwoWay, SerialLink):
 
     def __init__(self, port: str, baud: int, clock: Clock = time.monotonic_ns) -> None:
         super().__init__(port, baud)
-        self.unsent = 0
         self.send_bytes(DELIMITER)
-        self._listener = Listener(self.receive, self.send, clock)
+        self._listen_to(self.receive, self.send, clock)
 
     def wait_for_listener(self, timeout_s: float) -> bool:
         """A serial line cannot tell whether anybody listens."""
@@ -147,11 +96,11 @@ class SerialSender(TwoWay, SerialLink):
 
     def put(self, packet: bytes) -> None:
         """Frame a packet and send it, at the speed of the line."""
-        self.unsent += not self.send_bytes(framed(packet), PATIENCE_S)
+        self.send_bytes(framed(packet), PATIENCE_S)
 
     def close(self) -> None:
         """Stop listening, and close the port once everything has been sent; after a signal at once."""
-        self._listener.stop()
+        self._stop_listening()
         if caught() is None:
             self.drain()
         super().close()
@@ -170,8 +119,7 @@ class UdpSender(TwoWay):
             raise InputError(f"{shortened(to)}: {error.strerror}; write the address of hilstar's machine") from error
         self.endpoint = to
         self.link_counts = LinkCounts()
-        self.unsent = 0
-        self._listener = Listener(self._receive, lambda packet: self.put(encode(packet)), clock)
+        self._listen_to(self._receive, lambda packet: self.put(encode(packet)), clock)
 
     def _receive(self, timeout_ms: int) -> list[Arrival[Event]]:
         self._datagrams.wait(timeout_ms)
@@ -182,28 +130,25 @@ class UdpSender(TwoWay):
         deadline_s = time.monotonic() + timeout_s
         while True:
             self.put(encode(TimeRequest(0, time.monotonic_ns())))
-            if self._listener.answered.wait(PROBE_S):
+            if self._answered.wait(PROBE_S):
                 return True
             if time.monotonic() > deadline_s:
                 return False
 
     def put(self, packet: bytes) -> None:
         """Send one datagram, never waiting."""
-        self.unsent += not self._datagrams.put(packet)
+        self._datagrams.put(packet)
 
     def close(self) -> None:
         """Stop listening, and close the socket."""
-        self._listener.stop()
+        self._stop_listening()
         self._datagrams.close()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
+SenderEnd = ZmqSender | SerialSender | UdpSender  # where a sender puts its packets
 
 
-class Sender:
+class Sender(Closing):
     """The sending end of a road to hilstar; `hilstar serve` is the other.
 
     `to` is `udp://HOST:PORT`, `serial:/dev/ttyX@BAUD`, or a ZeroMQ endpoint: `tcp://HOST:PORT` or `ipc:///PATH`, which this end
@@ -269,9 +214,3 @@ class Sender:
     def close(self) -> None:
         """Close the road; what was sent over ZeroMQ or a serial line leaves first."""
         self._end.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

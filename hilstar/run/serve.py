@@ -1,40 +1,40 @@
-"""A live run over a link: a free-running stream, or a simulation in lockstep."""
+"""A live run over a link: a free-running stream, or a simulation in lockstep, which waits for a frame of each attitude."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
+from hilstar.attitude.clock.rate_check import RateCheck
 from hilstar.attitude.clock.sender_clock import ClockSummary
-from hilstar.attitude.clock.timeline import Timeline
+from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, Traffic
+from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.links import LockstepLink, Pictures, StreamLink, TrackerCamera
+from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, Status, rate_refusal
 from hilstar.attitude.wire.source import Mounting
-from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import AnyFaults
 from hilstar.run.frame_pulse import FramePulse
-from hilstar.run.frame_status import StatusMaker
-from hilstar.run.lockstep import LockstepRun, serve_lockstep
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
-from hilstar.run.operator import HeadlessOverrides, SwitchRequests
-from hilstar.run.pacer import ClockPacer, Moment, Pacer
-from hilstar.run.record.ledger import LedgerSwitch
+from hilstar.run.operator import Aids, Operator, SwitchRequests, aid_levels_of
+from hilstar.run.pacer import FrameSink, Moment, Pacer, Shown, ignore
+from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.record.ledger_records import below_step, frame_record
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
-from hilstar.run.shown import FrameSink, Shown, ignore
-from hilstar.run.summary import RunSummary, RunTally
-from hilstar.run.sync import SyncSummary
-from hilstar.units import NS_PER_S
+from hilstar.run.summary import RunSummary
+from hilstar.running_statistics import RunningStatistics
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+POLL_MS = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +47,6 @@ class Running:
     loop: FrameLoop
     packets: PacketCounts
     clock: Callable[[], ClockSummary] | None = None
-
-    @property
-    def tally(self) -> RunTally:
-        """The figures of its frames."""
-        return self.loop.tally
 
 
 Follower = Callable[[Running], None]  # called once, when a run begins
@@ -78,32 +73,41 @@ class Outlet:
     faults: AnyFaults | None = None
     pulse: FramePulse | None = None
 
-    def on(self, loop: FrameLoop) -> FrameLoop:
-        """The loop, whose frames start the pulse; the ledger counts them."""
+    def loop(self, bench: Bench, sink: FrameSink, moving: bool | None = None) -> FrameLoop:
+        """The frame loop of a run, paced by the screen or else at the bench's own rate; its frames start the pulse."""
+        faults = None if self.faults is None else self.faults.frames
+        loop = FrameLoop(bench, sink, self._pacer(bench), moving, self.notices, faults)
         if self.pulse is not None:
             loop.on_frame = self.pulse.frame
             self.pulse.counted = self.ledger.pulse
         return loop
 
-    def pulses(self) -> SyncSummary | UnsetType:
-        """What the summary says of the pulses; unset without any."""
-        return UNSET if self.pulse is None else self.pulse.summary()
-
-    def pacer(self, bench: Bench) -> Pacer:
-        """The pacer of the screen, or without one that of the bench's own rate."""
+    def _pacer(self, bench: Bench) -> Pacer:
         if self.screen is not None:
             return DisplayPacer(self.screen, self.notices, requests=self.requests)
-        operator = None if self.requests is None else HeadlessOverrides(bench, self.notices, self.requests)
-        return ClockPacer(NS_PER_S / bench.config.monitor.refresh_hz, operator=operator)
+        operator = Operator(Aids(), self.notices, requests=self.requests, levels=aid_levels_of(bench))
+        return Pacer(NS_PER_S / bench.config.monitor.refresh_hz, operator=operator)
+
+    def record(self, bench: Bench, loop: FrameLoop, shown: Shown, light_ns: int) -> None:
+        """Record a frame in the ledger, if there is one; `light_ns` is on the sender's clock."""
+        if self.ledger.on:
+            self.ledger.frame(frame_record(shown, light_ns, loop.tally.missed_frames, below_step(bench, shown)))
+
+    def complete(self, summary: RunSummary, loop: FrameLoop) -> RunSummary:
+        """The summary of a run with its faults, pulses, events and screen."""
+        return replaced(
+            summary,
+            faults=UNSET if self.faults is None else self.faults.summary(),
+            sync=UNSET if self.pulse is None else self.pulse.summary(),
+            events=self.notices.counts(),
+            screen=loop.screen_summary(),
+        )
 
 
 def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
-    faults = outlet.faults
-    loop = outlet.on(
-        FrameLoop(bench, sink, outlet.pacer(bench), None, outlet.notices, None if faults is None else faults.frames)
-    )
+    loop = outlet.loop(bench, sink)
     if link.conventions.of_body:
         for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
             outlet.notices.tell(kind, line)
@@ -114,47 +118,42 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
             summary = _serve_stream(bench, link, limit, loop, outlet)
     outlet.notices.sum_up()
     told: dict[str, str | int] = {"endpoint": link.endpoint}
-    summary = replaced(summary, faults=UNSET if faults is None else faults.summary(), sync=outlet.pulses())
-    return replaced(
-        summary, events=outlet.notices.counts(), link=told | link.link_counts.summary(), screen=loop.screen_summary()
-    )
+    return replaced(outlet.complete(summary, loop), link=told | link.link_counts.summary())
 
 
 def _serve_lockstep(bench: Bench, link: LockstepLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
     bench.warm_up()
-    steps = LockstepRun(bench, limit, loop, outlet.ledger)
+    steps = LockstepRun(bench, limit, loop, outlet)
     outlet.follower(Running(loop, steps.counts))
-    link.show_camera(_tracker_camera(bench), outlet.pictures)
-    return serve_lockstep(link, steps, loop, StatusMaker(outlet.ledger))
-
-
-def _tracker_camera(bench: Bench) -> TrackerCamera:
     tracker = bench.config.tracker
     height_mm = tracker.resolution_px[1] * tracker.pixel_pitch_um * 1e-3
     field_deg = 2 * math.degrees(math.atan(height_mm / (2 * tracker.focal_length_mm)))
-    return TrackerCamera(Mounting(tracker.q_body_to_cam).q_body_to_cam, tracker.resolution_px, field_deg)
+    camera = TrackerCamera(Mounting(tracker.q_body_to_cam).q_body_to_cam, tracker.resolution_px, field_deg)
+    link.show_camera(camera, outlet.pictures)
+    return steps.serve(link)
 
 
 def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
-    ledger = outlet.ledger
-    timeline = Timeline(policy_of(bench.config.attitude))
-    receiver = _receiver(bench.config.attitude, link, timeline, outlet)
+    settings, clock = bench.config.attitude, loop.pacer.clock
+    timeline = Timeline(policy_of(settings))
+    shared = settings.clock == "shared"
+    traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
+    receiver = Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, wrong_rates=settings.check_rates)
     outlet.follower(Running(loop, receiver.counts, receiver.clock_summary))
-    statuses = StatusMaker(ledger)
+    statuses = StatusMaker(outlet.ledger)
 
     def draw_blank(moment: Moment) -> None:
         receiver.tend()
-        loop.draw(moment.slot, receiver.clock.to_sender_ns(time.monotonic_ns()), None, moment)
+        loop.draw(moment.slot, receiver.clock.to_sender_ns(clock.now_ns()), None, moment)
 
     def draw_slot(moment: Moment) -> Shown | None:
         receiver.tend()
-        t_ns = receiver.clock.to_sender_ns(moment.light_if_begun_at(time.monotonic_ns()))
+        t_ns = receiver.clock.to_sender_ns(moment.light_if_begun_at(clock.now_ns()))
         shown = loop.draw(moment.slot, t_ns, timeline.at(t_ns), moment)
         if shown is None:
             return None
         light_ns = receiver.sender_ns(t_ns)
-        if ledger.on:
-            ledger.frame(frame_record(shown, light_ns, loop.tally.missed_frames, below_step(bench, shown)))
+        outlet.record(bench, loop, shown, light_ns)
         if link.two_way:
             receiver.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
         return shown
@@ -165,12 +164,11 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
         receiver.learn()
         if limit.from_first_attitude:
             loop.lead_in(draw_blank, lambda: len(timeline) > 0)
-        begin_ns = time.monotonic_ns()
+        begin_ns = clock.now_ns()
         loop.paced(limit, draw_slot)
     finally:
         receiver.close()
-    duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.tally.summary(duration_s, receiver.counts, bench.renderer)
+    summary = loop.tally.summary((clock.now_ns() - begin_ns) / NS_PER_S, receiver.counts, bench.renderer)
     return replaced(
         summary,
         stale_events=loop.gate.events,
@@ -180,7 +178,118 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
     )
 
 
-def _receiver(settings: AttitudeSettings, link: StreamLink, timeline: Timeline, outlet: Outlet) -> Receiver:
-    shared = settings.clock == "shared"
-    traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
-    return Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, wrong_rates=settings.check_rates)
+class LockstepRun:
+    """The frames of a simulation in lockstep, up to its limit: each attitude that it asks for is drawn at once.
+
+    Its time is its own, and may run at any speed.
+    """
+
+    def __init__(self, bench: Bench, limit: Limit, loop: FrameLoop, outlet: Outlet) -> None:
+        self.counts = PacketCounts()
+        self._last = Shown(0, 0, None, bench.draw(None), missing=True)
+        self._bench, self._limit, self._loop, self._outlet = bench, limit, loop, outlet
+        self._clock = loop.pacer.clock
+        self._max_rate_rad_s = math.radians(bench.config.attitude.max_rate_deg_s)
+        self._rates = RateCheck(bench.config.attitude.check_rates, loop.notices, used=False)
+
+    def serve(self, link: LockstepLink) -> RunSummary:
+        """Answer requests up to the limit, or until a signal; returns the summary. A refused request leaves the last frame."""
+        loop, statuses, turn_ms = self._loop, StatusMaker(self._outlet.ledger), RunningStatistics()
+        begin_ns = self._clock.now_ns()
+        end_ns = begin_ns + self._limit.slots / self._bench.config.monitor.refresh_hz * NS_PER_S
+        while loop.tally.frames < self._limit.frames and self._clock.now_ns() < end_ns and not loop.stop.is_set():
+            arrival = link.receive(POLL_MS)
+            if arrival is None:
+                loop.idle()
+                continue
+            refusal = self._take(arrival.host_ns, arrival.event, arrival.raw)
+            shown_ns = self._clock.now_ns()
+            status = statuses.status(self._last, self._last.t_ns, loop, self.counts, False)
+            link.answer(status, shown_ns, refusal)
+            turn_ms.add((shown_ns - arrival.host_ns) / NS_PER_MS)
+        duration_s = (self._clock.now_ns() - begin_ns) / NS_PER_S
+        return replaced(loop.tally.summary(duration_s, self.counts, self._bench.renderer), turn_ms=turn_ms.percentiles())
+
+    def _take(self, host_ns: int, event: Event, raw: bytes) -> Refusal | None:
+        """Show what a request says, or say why it is refused; the last frame then stays."""
+        self.counts.received += 1
+        refusal = self._refusal(event)
+        sample = event if isinstance(event, AttitudeSample) else None
+        if refusal is not None:
+            self.counts.refused_by[refusal.reason] += 1
+            if self.counts.refused_by[refusal.reason] == 1:
+                line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
+                self._loop.notices.mention("refused", line)
+        shown = None if refusal is not None or sample is None else self._show(sample, host_ns)
+        self._outlet.ledger.packet(host_ns, raw, sample, refusal)
+        if shown is not None:  # where a fault drops a frame, the previous one stays
+            self._last = shown
+            self._outlet.record(self._bench, self._loop, shown, shown.t_ns)
+        return refusal
+
+    def _refusal(self, event: Event) -> Refusal | None:
+        if isinstance(event, Refusal):
+            return event
+        if isinstance(event, AttitudeSample):
+            self._rates.see(event)
+            return rate_refusal(self._rates.believed(event), self._max_rate_rad_s)
+        return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
+
+    def _show(self, sample: AttitudeSample, host_ns: int) -> Shown | None:
+        attitude = Attitude(
+            sample.q_icrs_to_cam,
+            0,
+            False,
+            sample.sequence,
+            host_ns,
+            velocity_km_s=sample.velocity_km_s,
+            place_km=sample.place_km,
+        )
+        return self._loop.draw(self._loop.tally.frames, sample.t_ns, attitude)
+
+
+class StatusMaker:
+    """Makes the status that goes back to the sender: which frame its attitudes caused, and how the display is doing.
+
+    Missed frames, refused packets and momentary events are reported once each.
+    """
+
+    def __init__(self, ledger: Ledger | LedgerSwitch | None = None) -> None:
+        self._ledger = ledger
+        self._missed = 0
+        self._refused = 0
+        self._told: dict[str, int] = {}
+
+    def status(self, shown: Shown, light_t_ns: int, loop: FrameLoop, counts: PacketCounts, synchronised: bool) -> Status:
+        """The status after a frame whose light leaves at `light_t_ns` of the sender's clock."""
+        missed, refused = loop.tally.missed_frames, counts.refused
+        attitude, on_screen = shown.attitude, loop.pacer.operator.look()
+        health = {
+            protocol.HEALTH_NO_ATTITUDE: shown.missing and not loop.gate.stale,
+            protocol.HEALTH_STALE: loop.gate.stale,
+            protocol.HEALTH_BLANK: attitude is None,
+            protocol.HEALTH_CLOCK_SYNCHRONISED: synchronised,
+            protocol.HEALTH_MISSED: missed > self._missed,
+            protocol.HEALTH_REFUSED: refused > self._refused,
+            protocol.HEALTH_CLIPPED: bool(shown.drawn.clipped_hip),
+            protocol.HEALTH_LEDGER_FAILED: self._ledger is not None and self._ledger.failure is not None,
+            protocol.HEALTH_OPERATOR_OVERRIDE: bool(on_screen.operator),
+            protocol.HEALTH_HIDDEN: bool(on_screen.hidden),
+            protocol.HEALTH_SECOND_SENDER: self._happens(loop.notices, "second-sender"),
+            protocol.HEALTH_SOURCE_FROZEN: self._happens(loop.notices, "source-frozen"),
+        }
+        self._missed, self._refused = missed, refused
+        return Status(
+            health=sum(bit for bit, is_set in health.items() if is_set),
+            frame=shown.number,
+            light_t_ns=light_t_ns,
+            attitude_age_ns=-1 if attitude is None else attitude.age_ns,
+            attitude_sequence=0 if attitude is None else attitude.sequence,
+            accepted=counts.received - refused,
+            refused=refused,
+        )
+
+    def _happens(self, notices: Notices, kind: str) -> bool:
+        """True while an event lasts, and once after each momentary one."""
+        before, self._told[kind] = self._told.get(kind, 0), notices.counts().get(kind, 0)
+        return kind in notices.active or self._told[kind] > before

@@ -8,8 +8,8 @@ from typing import Self
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.notices import Notices
-from hilstar.render.renderer import Renderer
-from hilstar.run.host_clock import HOST_CLOCK, HostClock
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.render.backend import Backend
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 NONE_YET_NS = 2 * NS_PER_S
@@ -134,10 +134,10 @@ class GpuWatch:
     a driver may lose what was in the GPU's memory, and says nothing of it.
     """
 
-    def __init__(self, renderer: Renderer, notices: Notices, stop: threading.Event, clock: HostClock = HOST_CLOCK) -> None:
-        self._renderer, self._notices, self._stop, self._clock = renderer, notices, stop, clock
-        renderer.remember_tables()
-        if fault := renderer.fault():  # a fault from before the run
+    def __init__(self, backend: Backend, notices: Notices, stop: threading.Event, clock: HostClock = HOST_CLOCK) -> None:
+        self._backend, self._notices, self._stop, self._clock = backend, notices, stop, clock
+        backend.remember_tables()
+        if fault := backend.fault():  # a fault from before the run
             notices.tell("gpu-error", f"before the first frame {fault}")
         self._asleep_ns = clock.asleep_ns()
         self._next_ns = clock.now_ns() + GPU_LOOK_NS
@@ -148,7 +148,7 @@ class GpuWatch:
         if now_ns < self._next_ns:
             return
         self._next_ns = now_ns + GPU_LOOK_NS
-        fault = self._renderer.fault()
+        fault = self._backend.fault()
         before_ns, self._asleep_ns = self._asleep_ns, self._clock.asleep_ns()
         if not fault and (slept_ns := self._asleep_ns - before_ns) > SLEPT_NS:
             fault = self._after_sleep(slept_ns / NS_PER_S)
@@ -162,6 +162,6 @@ class GpuWatch:
 
     def _after_sleep(self, slept_s: float) -> str:
         self._notices.tell("resumed", f"the machine slept for {slept_s:.1f} s; the GPU's tables are compared")
-        changed = self._renderer.changed_tables()
-        self._renderer.forget_images()
+        changed = self._backend.changed_tables()
+        self._backend.forget_images()
         return f"the GPU's memory was lost in sleep, {changed} of the tables that make codes" if changed else ""

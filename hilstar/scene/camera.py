@@ -299,6 +299,12 @@ class Camera:
         u, v = self.tangents(x_px, y_px)
         return np.asarray(np.stack([u, v, np.ones_like(u)], axis=-1) @ self.cam_to_image)
 
+    def pixel_sr(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """The solid angles (n,), sr, of pixels (n,)."""
+        u, v = self.tangents(x_px, y_px)
+        a, b, c, d = self.slopes(u, v)
+        return np.asarray(1 / ((a * d - b * c) * (1 + u * u + v * v) ** 1.5))
+
     def fastest_px_s(self, rate_image_rad_s: FloatArray) -> float:
         """The fastest that a direction crosses the image at a rate (3,) of the camera in image axes, px/s; within 2 %."""
         u, v = self.tangents(*self.grid_px(SPEED_PLACES))
@@ -322,9 +328,10 @@ class Camera:
         middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
         return float(np.sqrt(np.nanmin(middle - spread))), float(np.sqrt(np.nanmax(middle + spread)))
 
-    def grid_px(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Places (count^2,) over the whole image, its edges among them."""
-        x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, count) for size in self.resolution_px))
+    def grid_px(self, count: int | tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Places over the whole image, its edges among them: `count` to a row and a column, or (columns, rows)."""
+        counts = (count, count) if isinstance(count, int) else count
+        x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, n) for size, n in zip(self.resolution_px, counts, strict=True)))
         return x.ravel(), y.ravel()
 
     def pixels_from(self, other: Camera, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -388,6 +395,12 @@ class Camera:
         reach_x = max(cx, width - 1 - cx) + 0.5 + margin_px
         reach_y = max(cy, height - 1 - cy) + 0.5 + margin_px
         return float(np.arctan(np.hypot(reach_x, reach_y) / self.focal_length_px))
+
+
+def linear_shares(size: int, count: int) -> FloatArray:
+    """The share (size, count) of each place of `grid_px` in each pixel of a row: linear between neighbours."""
+    at = (np.arange(size) + 0.5) * (count - 1) / size
+    return np.asarray(np.maximum(0.0, 1 - np.abs(at[:, None] - np.arange(count))))
 
 
 @lru_cache(maxsize=16)

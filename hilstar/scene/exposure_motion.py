@@ -17,6 +17,7 @@ from hilstar.errors import InputError
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.paths import MAX_NODES, Chords, Paths, node_counts, nodes_of
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.stars import Stars
 
@@ -62,18 +63,18 @@ class Motion:
         return np.asarray(camera.cam_to_image @ turn @ to_matrix(self.q_icrs_to_cam))
 
 
-def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, footprint_px: int, sigma_px: tuple[float, float]) -> Sprites:
+def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf) -> Sprites:
     """Sprites whose sum is each star's mean light over the exposure; a star at rest is one sprite.
 
     `capped` of them are drawn coarser than NODES_PER_SIGMA where all would be more than MAX_SPRITES. Raises InputError for a
     turn too long to be drawn at all.
     """
     if not motion.rate_cam_rad_s.any() or not motion.exposure_s:
-        return make_sprites(stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, footprint_px)
-    pieces = _piece_count(motion, camera, sigma_px)
+        return make_sprites(stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, psf.footprint_px)
+    pieces = _piece_count(motion, camera, psf)
     fineness = 1.0
     while fineness >= MIN_COARSENESS:
-        smear = _Smear(stars, camera, footprint_px, sigma_px, NODES_PER_SIGMA * fineness)
+        smear = _Smear(stars, camera, psf, NODES_PER_SIGMA * fineness)
         sprites = _joined(smear, motion, pieces)
         if sprites is not None:
             return sprites if fineness == 1.0 else replace(sprites, capped=len(np.unique(sprites.star)))
@@ -83,10 +84,10 @@ def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, footprint_px: 
     )
 
 
-def _piece_count(motion: Motion, camera: Camera, sigma_px: tuple[float, float]) -> int:
+def _piece_count(motion: Motion, camera: Camera, psf: Psf) -> int:
     """The number of pieces of a turn, each short compared with the field and, anywhere on the image, with its nodes."""
     angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
-    path_sigma = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s) * motion.exposure_s / min(sigma_px)
+    path_sigma = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s) * motion.exposure_s / min(psf.width_px)
     pieces = max(angle_rad / MAX_PIECE_RAD, path_sigma / MAX_PIECE_SIGMA)
     if pieces > MAX_PIECES:
         max_deg = np.degrees(angle_rad / pieces * MAX_PIECES)
@@ -110,7 +111,7 @@ def _joined(smear: _Smear, motion: Motion, pieces: int) -> Sprites | None:
         total += len(chain[-1])
         if total > MAX_SPRITES:
             return None
-    return join_sprites(chain, smear.footprint_px)
+    return join_sprites(chain, smear.psf.footprint_px)
 
 
 class PathNodes(NamedTuple):
@@ -127,8 +128,7 @@ class _Smear:
 
     stars: Stars
     camera: Camera
-    footprint_px: int
-    sigma_px: tuple[float, float]
+    psf: Psf
     nodes_per_sigma: float
 
     def piece(self, motion: Motion, begin_s: float, end_s: float, part: float) -> Sprites:
@@ -136,7 +136,7 @@ class _Smear:
         camera, stars = self.camera, self.stars
         angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (end_s - begin_s)
         middle = motion.icrs_to_image(np.array([(begin_s + end_s) / 2]), camera)[0]
-        radius_rad, edges = camera.field(self.footprint_px / 2 + 1)
+        radius_rad, edges = camera.field(self.psf.footprint_px / 2 + 1)
         near = stars.near(middle[2], radius_rad, edges @ middle, angle_rad)
         paths = Paths(stars.directions(near) @ middle.T, camera.cam_to_image @ motion.rate_cam_rad_s, camera)
         half_s = (end_s - begin_s) / 2
@@ -146,17 +146,17 @@ class _Smear:
         x_px, y_px = paths.places_px(nodes.path, (2 * share - 1) * half_s)
         star = near[nodes.path]
         light = nodes.share * (end - begin)[nodes.path] * part * stars.electrons_per_s[star]
-        return pack_sprites(x_px, y_px, light, star, camera.resolution_px, self.footprint_px)
+        return pack_sprites(x_px, y_px, light, star, camera.resolution_px, self.psf.footprint_px)
 
     def _nodes(self, paths: Paths, half_s: float) -> PathNodes:
         """The nodes of paths in a piece of the exposure from -half_s to half_s of the paths' seconds."""
         x_px, y_px = paths.all_places_px(np.array([[-half_s], [0.0], [half_s]]))
         halves = [Chords(x_px[k : k + 2], y_px[k : k + 2]) for k in (0, 1)]
         # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
-        length = sum(half.length_sigma(self.sigma_px) for half in halves)
+        length = sum(half.length_sigma(self.psf.width_px) for half in halves)
         whole = Chords(x_px[::2], y_px[::2])
         bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
-        begin, end = whole.on_image(self.camera.resolution_px, self.footprint_px / 2 + 1 + bulge_px)
+        begin, end = whole.on_image(self.camera.resolution_px, self.psf.footprint_px / 2 + 1 + bulge_px)
         counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA)
         counts[end <= begin] = 0
         return PathNodes(np.minimum(counts, MAX_NODES), begin, end)

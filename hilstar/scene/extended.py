@@ -14,11 +14,10 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.scene.camera import Camera
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import Psf
 from hilstar.sky.bodies.disc import AIR_TOP, Disc
 
 REACH_SIGMAS = 4.0  # as in disc.frag
-PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
 LIMB_PLACES = 128
 BEHIND = 0.05  # minimum z of a unit direction: a limb nearer to the camera's plane has no useful outline
 BOW = 1.01  # margin for the outline's curvature between its places
@@ -93,7 +92,7 @@ class Shear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscLight:
-    """A body's disc through a camera, spread by a Gaussian of `sigma_px`; `icrs_to_image` (3, 3) as for sprites.
+    """A body's disc through a camera, spread by a PSF; `icrs_to_image` (3, 3) as for sprites.
 
     Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it. `scene.discs.disc_lights`
     chooses between it and, for a small disc, a map.
@@ -102,7 +101,7 @@ class DiscLight:
     disc: Disc
     icrs_to_image: FloatArray
     camera: Camera
-    sigma_px: tuple[float, float]
+    psf: Psf
     times: float = 1.0
     covers: bool = True
     shear: Shear | None = None
@@ -111,11 +110,6 @@ class DiscLight:
     def name(self) -> str:
         """The body's name."""
         return self.disc.name
-
-    @property
-    def variance_px(self) -> tuple[float, float]:
-        """Variance of the Gaussian and of a square pixel together, along x and y, px squared."""
-        return self.sigma_px[0] ** 2 + PIXEL_VARIANCE, self.sigma_px[1] ** 2 + PIXEL_VARIANCE
 
     def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
         """The pixels within the outline of its limb, its air and the Gaussian's reach; all where that is partly behind."""
@@ -129,7 +123,7 @@ class DiscLight:
         edges = []
         for k, place in enumerate((x_px, y_px)):
             low, high = float(place.min()), float(place.max())
-            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.variance_px[k])) + 1 + self._sheared_px
+            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.psf.variance_px2[k])) + 1 + self._sheared_px
             edges.append(((low + high) / 2 - half, (low + high) / 2 + half))
         return clipped((edges[0][0], edges[1][0], edges[0][1], edges[1][1]), resolution_px)
 
@@ -144,6 +138,13 @@ class DiscLight:
 
 
 ExtendedLight = LightMap | GlowLight | DiscLight
+
+
+def times(light: ExtendedLight, factor: float) -> ExtendedLight:
+    """Light with all of its electrons times a factor; what it hides stays hidden."""
+    if isinstance(light, GlowLight):
+        return replace(light, peak_e_per_s=light.peak_e_per_s * factor)
+    return replace(light, times=light.times * factor)
 
 
 def clipped(edges_px: tuple[float, float, float, float], resolution_px: tuple[int, int]) -> Rectangle | None:
@@ -164,10 +165,10 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class DiscView:
-    """A camera whose image is spread by a Gaussian of `sigma_px`, at the poses of a frame, and how it turns meanwhile."""
+    """A camera and the PSF that spreads its image, at the poses of a frame, and how it turns meanwhile."""
 
     camera: Camera
-    sigma_px: tuple[float, float]
+    psf: Psf
     poses: tuple[Pose, ...]
     shear: Shear | None = None
 
@@ -176,22 +177,22 @@ def disc_lights(disc: Disc, view: DiscView, covers: bool) -> list[ExtendedLight]
     """A body's disc at all poses, none of it where it does not touch the image; where it `covers`, it hides what is behind."""
     if len(view.poses) == 1:
         pose = view.poses[0]
-        return _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.sigma_px, pose.share, covers, view.shear))
+        return _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.psf, pose.share, covers, view.shear))
     lights: list[ExtendedLight] = []
     if covers:
         # Poses hide together what one in the middle hides: each after the other would hide the light of those before.
         middle = view.poses[len(view.poses) // 2].icrs_to_image
-        lights += _at_pose(DiscLight(disc, middle, view.camera, view.sigma_px, 0.0, True, view.shear))
+        lights += _at_pose(DiscLight(disc, middle, view.camera, view.psf, 0.0, True, view.shear))
     for pose in view.poses:
-        lights += _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.sigma_px, pose.share, False, view.shear))
+        lights += _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.psf, pose.share, False, view.shear))
     return lights
 
 
 def _at_pose(light: DiscLight) -> list[ExtendedLight]:
     camera = light.camera
     radius_px = float(np.tan(min(light.disc.radius_rad, 1.0)) * camera.focal_length_px)
-    if radius_px < SMALL_SIGMAS * max(light.variance_px) ** 0.5:
-        nodes = int(np.ceil(NODES_A_SIGMA * radius_px / min(light.variance_px) ** 0.5))
+    if radius_px < SMALL_SIGMAS * max(light.psf.variance_px2) ** 0.5:
+        nodes = int(np.ceil(NODES_A_SIGMA * radius_px / min(light.psf.variance_px2) ** 0.5))
         drawn = _disc_map(light, min(max(MIN_NODES, nodes), MAX_NODES))
         return [] if drawn is None else [drawn]
     return [] if light.region(camera.resolution_px) is None else [light]
@@ -209,7 +210,7 @@ def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
 
 def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be seen."""
-    disc, camera, reach_px = light.disc, light.camera, footprint_px(light.sigma_px) / 2
+    disc, camera, reach_px = light.disc, light.camera, light.psf.footprint_px / 2
     lit = _places(light, disc, nodes)
     whole = _places(light, replace(disc, law="uniform"), nodes) if light.covers else lit
     if not len(whole.x_px):
@@ -221,9 +222,9 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
         return None
     cover = None
     if light.covers:
-        share = _spread(whole.x_px, whole.y_px, whole.law_sr * _px_per_sr(light), region, light.sigma_px)
+        share = light.psf.spread(whole.x_px, whole.y_px, whole.law_sr * _px_per_sr(light), region)
         cover = np.where(share > WHOLE, np.float32(1), share)
-    image = _spread(lit.x_px, lit.y_px, light.times * disc.normal_e_per_s_sr * lit.law_sr, region, light.sigma_px)
+    image = light.psf.spread(lit.x_px, lit.y_px, light.times * disc.normal_e_per_s_sr * lit.law_sr, region)
     return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name, lasting=False)
 
 
@@ -248,15 +249,3 @@ def _px_per_sr(light: DiscLight) -> float:
     u, v, w = light.icrs_to_image @ light.disc.direction
     a, b, c, d = light.camera.slopes(np.array([u / w]), np.array([v / w]))
     return float(np.nan_to_num(a * d - b * c)[0] / abs(w) ** 3)
-
-
-def _spread(
-    x_px: FloatArray, y_px: FloatArray, rates: FloatArray, region: tuple[int, int, int, int], sigma_px: tuple[float, float]
-) -> Float32Array:
-    """Points' light in the pixels of a region, each point a Gaussian integrated over the pixels."""
-    from scipy.special import ndtr  # 0.1 s of every command that draws no disc
-
-    left, top, width, height = region
-    across = np.diff(ndtr((left - 0.5 + np.arange(width + 1) - x_px[:, None]) / sigma_px[0]), axis=1)
-    down = np.diff(ndtr((top - 0.5 + np.arange(height + 1) - y_px[:, None]) / sigma_px[1]), axis=1)
-    return np.asarray((down * rates[:, None]).T @ across, dtype=np.float32)

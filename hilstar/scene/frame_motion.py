@@ -17,6 +17,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.paths import Chords, Paths, ShortPaths, bend_px, node_counts, nodes_of, points_within, within_budget
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites, brightest, max_stars, pack_sprites
 from hilstar.sky.stars import Stars
 
@@ -96,9 +97,7 @@ class CameraTurn:
         return float(np.linalg.norm(self.rate_cam_rad_s))
 
 
-def swept_sprites(
-    stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, footprint_px: int, sigma_px: tuple[float, float]
-) -> Sprites:
+def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, psf: Psf) -> Sprites:
     """Sprites of each star on its path while its row is lit; the sprites of a star follow each other.
 
     `capped` counts the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
@@ -106,6 +105,7 @@ def swept_sprites(
     turn, is_slower = slowed(turn, scan, camera)
     middle = CameraTurn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
     icrs_to_middle = camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam)
+    footprint_px = psf.footprint_px
     margin_px = footprint_px / 2 + 1
     radius_rad, edges = camera.field(margin_px)
     reach_rad = turn.speed_rad_s * scan.whole_s / 2
@@ -115,7 +115,7 @@ def swept_sprites(
     near = near[close]
     paths = _paths(seen[close], turn, scan, camera)
     late_s = _row_delays_s(paths, scan, camera)
-    wanted, first, last, span_s = _wanted_nodes(paths, late_s, scan, footprint_px, sigma_px)
+    wanted, first, last, span_s = _wanted_nodes(paths, late_s, scan, psf)
     counts = within_budget(_of_the_brightest(wanted, stars.electrons_per_s[near], footprint_px), _extra(footprint_px))
     nodes = nodes_of(counts)
     begin, length = first[nodes.path], (last - first)[nodes.path]
@@ -186,9 +186,7 @@ class FramePaths(NamedTuple):
     span_s: FloatArray
 
 
-def _wanted_nodes(
-    paths: Paths | ShortPaths, late_s: FloatArray, scan: Scan, footprint_px: int, sigma_px: tuple[float, float]
-) -> FramePaths:
+def _wanted_nodes(paths: Paths | ShortPaths, late_s: FloatArray, scan: Scan, psf: Psf) -> FramePaths:
     """The nodes that each star's path needs."""
     ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
     span_s = _spans_s(ends[1], late_s, scan, paths.camera)
@@ -197,8 +195,8 @@ def _wanted_nodes(
     # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
     bulge_px = angle_rad * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
     chords = chords.to(span_s / scan.hold_s) if scan.hold_s else chords
-    begin, end = chords.on_image(paths.camera.resolution_px, footprint_px / 2 + 1 + bulge_px)
-    counts = node_counts(chords.length_sigma(sigma_px) * (end - begin), NODES_PER_SIGMA, 1, POINT_SIGMA)
+    begin, end = chords.on_image(paths.camera.resolution_px, psf.footprint_px / 2 + 1 + bulge_px)
+    counts = node_counts(chords.length_sigma(psf.width_px) * (end - begin), NODES_PER_SIGMA, 1, POINT_SIGMA)
     counts[end <= begin] = 0
     return FramePaths(counts, begin, end, span_s)
 

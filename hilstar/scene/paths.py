@@ -139,10 +139,10 @@ class Chords:
         x_px, y_px = (np.stack([ends[0], ends[0] + (ends[1] - ends[0]) * longer]) for ends in (self.x_px, self.y_px))
         return Chords(x_px, y_px)
 
-    def length_sigma(self, sigma_px: tuple[float, float]) -> FloatArray:
-        """How long each is in sigmas; NaN where an end is behind the camera."""
+    def length_sigma(self, width_px: tuple[float, float]) -> FloatArray:
+        """How long each is in widths of a PSF (see `Psf.width_px`); NaN where an end is behind the camera."""
         return np.asarray(
-            np.hypot(*(np.diff(ends, axis=0)[0] / s for ends, s in zip((self.x_px, self.y_px), sigma_px, strict=True)))
+            np.hypot(*(np.diff(ends, axis=0)[0] / s for ends, s in zip((self.x_px, self.y_px), width_px, strict=True)))
         )
 
     def on_image(self, resolution_px: tuple[int, int], margin_px: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.scene.camera import Camera
-from hilstar.scene.extended import ExtendedLight
-from hilstar.scene.psf import peak_share, pixel_shares
+from hilstar.scene.extended import ExtendedLight, GlowLight, times
+from hilstar.scene.psf import Psf
 from hilstar.sky.stars import Stars
 
 # How far the field may turn before its stars are looked for again. A frame's work grows with it by the stars around the image.
@@ -234,9 +234,31 @@ def with_sprites(sprites: Sprites, parts: Sequence[Sprites]) -> Sprites:
     return replace(sprites, data=joined.data, star=joined.star, x_px=joined.x_px, y_px=joined.y_px)
 
 
+def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
+    """The sprites of each channel of the tracker: every light times its share there; the sprites themselves where it has one.
+
+    `stars` are those among which `sprites.star` has its places. Light that is neither a star's nor a body's, as a fault's, has
+    the mean colour of the stars.
+    """
+    if stars.colours is None:
+        return [sprites]
+    alone = len(stars.rates_e_per_s)
+    shares = np.vstack([stars.colours, stars.rates_e_per_s @ stars.colours[:alone] / (stars.rates_e_per_s.sum() or 1.0)])
+    bodies = {name: alone + k for k, name in enumerate(stars.bodies)}
+    of_sprites = np.where(sprites.star < 0, -1, sprites.star)
+    of_extended = [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended]
+    channels = []
+    for share in shares.T:
+        data = sprites.data.copy()
+        data["electrons_per_s"] *= share[of_sprites].astype(np.float32)
+        extended = tuple(times(light, float(share[k])) for light, k in zip(sprites.extended, of_extended, strict=True))
+        channels.append(replace(sprites, data=data, extended=extended))
+    return channels
+
+
 def clipped_sprites(
     sprites: Sprites,
-    sigma_px: tuple[float, float],
+    psf: Psf,
     flux_at_white_e_per_s: float,
     resolution_px: tuple[int, int],
     uniformity: Float32Array | None = None,
@@ -248,7 +270,7 @@ def clipped_sprites(
 
     Only stars that alone reach half of white in a pixel are tested: two fainter ones on one pixel are not reported.
     """
-    bright_e_per_s = 0.5 * flux_at_white_e_per_s * darkest / peak_share(sigma_px)
+    bright_e_per_s = 0.5 * flux_at_white_e_per_s * darkest / psf.peak_share
     if sprites.per_star * sprites.data["electrons_per_s"].max(initial=0.0) <= bright_e_per_s:
         return np.empty(0, dtype=np.intp)  # most frames: no star is that bright, however its light is divided
     bright = (_star_rates(sprites) > bright_e_per_s).nonzero()[0]
@@ -258,13 +280,13 @@ def clipped_sprites(
     limit = np.full(len(bright), flux_at_white_e_per_s * (1 + CLIP_TOLERANCE))
     if uniformity is not None:
         limit *= uniformity[y, x]
-    own = sprites.data["electrons_per_s"][bright] * _share(x - sprites.x_px[bright], y - sprites.y_px[bright], sigma_px)
+    own = sprites.data["electrons_per_s"][bright] * psf.shares(x - sprites.x_px[bright], y - sprites.y_px[bright])
     over = own > limit
     doubtful = (~over).nonzero()[0]
     if len(doubtful) > MAX_DOUBTFUL:
         doubtful = doubtful[np.argpartition(-own[doubtful], MAX_DOUBTFUL)[:MAX_DOUBTFUL]]
     if len(doubtful):
-        over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], sigma_px) > limit[doubtful]
+        over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], psf) > limit[doubtful]
     return np.asarray(bright[over], dtype=np.intp)
 
 
@@ -277,20 +299,13 @@ def _star_rates(sprites: Sprites) -> Float32Array | FloatArray:
     return np.asarray(np.bincount(star, rates)[star], dtype=np.float64)
 
 
-def _share(offset_x: FloatArray, offset_y: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
-    if sigma_px[0] == sigma_px[1]:
-        both = pixel_shares(np.stack([offset_x, offset_y]), sigma_px[0])
-        return np.asarray(both[0] * both[1])
-    return pixel_shares(offset_x, sigma_px[0]) * pixel_shares(offset_y, sigma_px[1])
-
-
-def _light_at(sprites: Sprites, x: IntArray, y: IntArray, sigma_px: tuple[float, float]) -> FloatArray:
+def _light_at(sprites: Sprites, x: IntArray, y: IntArray, psf: Psf) -> FloatArray:
     """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
     close = _close_to(sprites, x, y)
     reach = sprites.footprint_px / 2
     if len(x) * len(close) <= FEW_PAIRS:
-        offset_x, offset_y = (places[close] - wanted[:, None] for places, wanted in ((sprites.x_px, x), (sprites.y_px, y)))
-        share = _share(offset_x, offset_y, sigma_px)
+        offset_x, offset_y = (wanted[:, None] - places[close] for places, wanted in ((sprites.x_px, x), (sprites.y_px, y)))
+        share = psf.shares(offset_x, offset_y)
         share[np.maximum(np.abs(offset_x), np.abs(offset_y)) > reach] = 0.0
         return np.asarray(share @ sprites.data["electrons_per_s"][close].astype(np.float64))
     order = close[np.argsort(sprites.x_px[close])]
@@ -299,10 +314,10 @@ def _light_at(sprites: Sprites, x: IntArray, y: IntArray, sigma_px: tuple[float,
     count = np.searchsorted(rising_px, x + reach, side="right") - first
     pixel = np.repeat(np.arange(len(x)), count)
     other = order[np.arange(len(pixel)) + np.repeat(first - (np.cumsum(count) - count), count)]
-    offset_y = sprites.y_px[other] - y[pixel]
+    offset_y = y[pixel] - sprites.y_px[other]
     near = np.abs(offset_y) <= reach
     pixel, other, offset_y = pixel[near], other[near], offset_y[near]
-    share = _share(sprites.x_px[other] - x[pixel], offset_y, sigma_px)
+    share = psf.shares(x[pixel] - sprites.x_px[other], offset_y)
     return np.asarray(np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)), dtype=np.float64)
 
 

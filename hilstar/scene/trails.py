@@ -19,6 +19,7 @@ from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, disc_lights
 from hilstar.scene.paths import Chords, Paths
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites, pack_sprites, with_sprites
 from hilstar.sky.bodies.disc import Disc
 
@@ -67,13 +68,12 @@ class TrailView:
 
 @dataclass(frozen=True, slots=True)
 class Brush:
-    """A sprite's side and sigma, and the maximum number for all satellites together; above it sprites are spaced more widely.
+    """A sprite's PSF, and the maximum number for all satellites together; above it sprites are spaced more widely.
 
     A satellite that is a disc is drawn at up to `poses` places.
     """
 
-    footprint_px: int
-    sigma_px: tuple[float, float]
+    psf: Psf
     most: int
     poses: int = 33
 
@@ -116,7 +116,7 @@ def trails(seen: Pass, view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s
     shown = (total > 0) & (total >= faintest_e_per_s)
     kept = shown[path] & (light > 0)
     star, size_px = seen.index[path[kept]], view.camera.resolution_px
-    sprites = pack_sprites(x_px[kept], y_px[kept], light[kept], star, size_px, brush.footprint_px)
+    sprites = pack_sprites(x_px[kept], y_px[kept], light[kept], star, size_px, brush.psf.footprint_px)
     found = np.flatnonzero(np.isin(seen.index, sprites.star))
     most = int(np.bincount(path[kept], minlength=1).max(initial=1))
     sprites = replace(sprites, per_star=max(1, most), capped=int((counts < wanted)[found].sum()))
@@ -138,8 +138,8 @@ def sprite_counts(seen: Pass, view: TrailView, lit: Lit, brush: Brush) -> tuple[
     ends = Chords(x_px[[0, -1]], y_px[[0, -1]])
     off_x, off_y = ((1 - at) * place[0] + at * place[-1] - place for place in (x_px, y_px))
     bulge_px = BULGE * np.sqrt((off_x * off_x + off_y * off_y).max(axis=0))
-    begin, end = ends.on_image(view.camera.resolution_px, brush.footprint_px / 2 + 1 + np.nan_to_num(bulge_px))
-    step_x, step_y = (np.diff(place, axis=0) / s for place, s in zip((x_px, y_px), brush.sigma_px, strict=True))
+    begin, end = ends.on_image(view.camera.resolution_px, brush.psf.footprint_px / 2 + 1 + np.nan_to_num(bulge_px))
+    step_x, step_y = (np.diff(place, axis=0) / s for place, s in zip((x_px, y_px), brush.psf.width_px, strict=True))
     length = np.sqrt(step_x * step_x + step_y * step_y).sum(axis=0) * (end - begin)
     length = np.nan_to_num(length, nan=brush.most * SPACING_SIGMA)
     wanted = 1 + np.floor(np.minimum(length / SPACING_SIGMA, brush.most)).astype(np.intp)
@@ -197,7 +197,7 @@ def disc_of(seen: Pass, name: str, second: float, velocity_km_s: FloatArray | No
 def disc_trail(seen: Pass, name: str, view: TrailView, lit: Lit, brush: Brush) -> DiscTrail | None:
     """The only satellite of a pass along its path; None where it misses the image or has no light."""
     counts, (begin, end) = sprite_counts(seen, view, lit, brush)
-    radius_sigma = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px / min(brush.sigma_px)
+    radius_sigma = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px / min(brush.psf.width_px)
     coarser = max(1.0, radius_sigma / (STEPS_A_RADIUS * SPACING_SIGMA))
     count = min(math.ceil(int(counts[0]) / coarser), brush.poses)
     if not count:
@@ -226,7 +226,7 @@ def disc_trail(seen: Pass, name: str, view: TrailView, lit: Lit, brush: Brush) -
 
 def _lights(disc: Disc, view: TrailView, second: float, brush: Brush, share: float, covers: bool) -> list[ExtendedLight]:
     turned = to_matrix(propagate(AT_REST, view.rate_image_rad_s, second)) @ view.icrs_to_image
-    return disc_lights(disc, DiscView(view.camera, brush.sigma_px, (Pose(turned, share),)), covers)
+    return disc_lights(disc, DiscView(view.camera, brush.psf, (Pose(turned, share),)), covers)
 
 
 def _brightest_e_per_s(lights: list[ExtendedLight], view: TrailView) -> float:

@@ -63,8 +63,9 @@ class Catalog:
     `pm_ra_cosdec_mas_yr` carries the cos(dec), as Hipparcos publishes it. `vi_mag` and `parallax_mas` are NaN where the
     catalogue gives none. `hip` is 0 for stars of another catalogue, which `designation` and `identifier` name instead.
     `variable` is Hipparcos' type of a variable star (P periodic, U unsolved, M within 0.03 mag; blank for others), which varies
-    by `range_mag` in Hp with `period_d`, NaN where none is given. `multiple` is its flag H59 of doubles (C resolved, G
-    accelerated, O orbit, V variability-induced, X unexplained scatter), with `separation_arcsec` where it resolved the pair:
+    by `range_mag` in Hp with `period_d`, NaN where none is given; `maximum_jd` is a time of its largest light, which a
+    user's table may have. `multiple` is its flag H59 of doubles (C resolved, G accelerated, O orbit, V variability-induced, X
+    unexplained scatter), with `separation_arcsec` where it resolved the pair:
     V and the colours are then those of both, except for 472 of 11 101 entries. `rows_read` counts all rows of the source, and
     `notes` say what became of them.
     """
@@ -83,6 +84,7 @@ class Catalog:
     variable: Letters
     range_mag: Float32Array
     period_d: Float32Array
+    maximum_jd: FloatArray
     multiple: Letters
     separation_arcsec: Float32Array
     designation: str = "HIP"
@@ -95,6 +97,16 @@ class Catalog:
     def taken(self, rows: IntArray | npt.NDArray[np.bool_]) -> Catalog:
         """The stars at `rows`: places, or a mask (n,)."""
         return replace(self, **{name: getattr(self, name)[rows] for name in column_names()})
+
+    def at_phase(self, jd: float) -> Catalog:
+        """The stars with their V at a Julian date: a sinusoid of magnitudes about V, of those that have a `maximum_jd`."""
+        known = np.flatnonzero(np.isfinite(self.maximum_jd))
+        turns = (jd - self.maximum_jd[known]) / self.period_d[known]
+        v_mag = self.v_mag.copy()
+        v_mag[known] -= self.range_mag[known] / 2 * np.cos(2 * np.pi * turns)
+        count = int(np.isin(self.variable, [bytes([letter]) for letter in VARIABLE_TYPES]).sum()) - len(known)
+        note = f"{len(known)} variable stars have their light of JD {jd:.4f}; {count} without an epoch of phase have their mean"
+        return replace(self, v_mag=v_mag, notes=(*self.notes, note))
 
     def brighter_than(self, faintest_v_mag: float) -> Catalog:
         """The stars with v_mag <= `faintest_v_mag` (inclusive)."""
@@ -147,6 +159,7 @@ def plain_catalog(designation: str, rows_read: int, columns: dict[str, npt.NDArr
         "variable": np.zeros(n, dtype="S1"),
         "range_mag": unknown.astype(np.float32),
         "period_d": unknown.astype(np.float32),
+        "maximum_jd": unknown,
         "multiple": np.zeros(n, dtype="S1"),
         "separation_arcsec": unknown.astype(np.float32),
     }

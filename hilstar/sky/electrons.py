@@ -12,7 +12,8 @@ fitted to the library once per bench. tests/authority/test_pickles.py holds the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -91,6 +92,24 @@ class Optics:
         return max(w[0] for w in ranged), min(w[-1] for w in ranged)
 
 
+def all_channels(channels: Sequence[Optics]) -> Optics:
+    """The optics of a tracker that adds up its channels, which differ in quantum efficiency alone.
+
+    A curve may end above zero: the sum has a knot on either side of that step.
+    """
+    if len(channels) == 1:
+        return channels[0]
+    curves = [one.quantum_efficiency for one in channels]
+    ranges = [one.range_nm for one in channels]
+    curves = [
+        curve if len(curve.wavelength_nm) else Curve(np.array(range_nm), np.full(2, curve.value[0]))
+        for curve, range_nm in zip(curves, ranges, strict=True)
+    ]
+    ends = [np.nextafter(curve.wavelength_nm[[0, -1]], [0.0, np.inf]) for curve in curves]
+    knots = np.unique(np.concatenate([*ends, *(curve.wavelength_nm for curve in curves)]))
+    return replace(channels[0], quantum_efficiency=Curve(knots, np.sum([curve(knots) for curve in curves], axis=0)))
+
+
 @dataclass(frozen=True, slots=True)
 class Photometry:
     """How a V magnitude becomes a spectral irradiance."""
@@ -125,11 +144,18 @@ def reference_mean_w_m2_m(photometry: Photometry) -> float:
     return float(dilution * v_band_mean_w_m2_m(REFERENCE_TEMPERATURE_K, photometry.weighting))
 
 
-def dgs_electrons_per_s(temperature_k: float | FloatArray, optics: Optics, photometry: Photometry) -> FloatArray:
-    """Electron rate of a V = 0 black body by direct integration (thesis eq. 3.1); shape of `temperature_k`."""
+def electron_response(optics: Optics) -> tuple[FloatArray, FloatArray]:
+    """Wavelengths (n,), nm, and weights (n,): a spectrum in W/m2/m there, times the weights, sums to electrons/s/m2."""
     wavelength_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
     electrons_per_j = wavelength_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    response = optics.quantum_efficiency(wavelength_nm) * optics.transmission(wavelength_nm) * electrons_per_j * weight_m
+    return wavelength_nm, optics.quantum_efficiency(wavelength_nm) * optics.transmission(
+        wavelength_nm
+    ) * electrons_per_j * weight_m
+
+
+def dgs_electrons_per_s(temperature_k: float | FloatArray, optics: Optics, photometry: Photometry) -> FloatArray:
+    """Electron rate of a V = 0 black body by direct integration (thesis eq. 3.1); shape of `temperature_k`."""
+    wavelength_nm, response = electron_response(optics)
     temperature_k = np.asarray(temperature_k, dtype=np.float64)
     exitance = blackbody_exitance_w_m2_m(wavelength_nm, temperature_k[..., None])
     dilution = reference_mean_w_m2_m(photometry) / v_band_mean_w_m2_m(temperature_k, photometry.weighting)

@@ -32,6 +32,26 @@ GAUSS_ORDER = 8
 MAX_INTERVAL_NM = 25.0
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(GAUSS_ORDER)
 
+# log10 T over B-V: Torres 2010 (AJ 140, 1158, table 2), Flower 1996 corrected.
+TORRES_DWARFS_AND_GIANTS = (
+    3.979145106714099,
+    -0.654992268598245,
+    1.740690042385095,
+    -4.608815154057166,
+    6.792599779944473,
+    -5.396909891322525,
+    2.192970376522490,
+    -0.359495739295671,
+)
+TORRES_SUPERGIANTS = (
+    4.012559732366214,
+    -1.055043117465989,
+    2.133394538571825,
+    -2.459769794654992,
+    1.349423943497744,
+    -0.283942579112032,
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Curve:
@@ -140,6 +160,12 @@ def temperature_wang2021_k(bv_mag: FloatArray) -> FloatArray:
     hot = 1079.20644 * np.exp(-np.minimum(bv_mag, 0.0) / 0.09824) + 8180.59419
     cool = 8906.09411 * np.exp(-np.maximum(bv_mag, 0.0) / 1.59761) + 3.633
     return np.where(bv_mag < 0, hot, cool)
+
+
+def torres2010_k(bv_mag: FloatArray, supergiant: bool = False) -> FloatArray:
+    """Effective temperature from B-V (Torres 2010, table 2); shape of `bv_mag`."""
+    coefficients = TORRES_SUPERGIANTS if supergiant else TORRES_DWARFS_AND_GIANTS
+    return np.asarray(10 ** np.polynomial.polynomial.polyval(bv_mag, coefficients))
 
 
 TEMPERATURE_SCALES: dict[str, Callable[[FloatArray], FloatArray]] = {

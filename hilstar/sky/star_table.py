@@ -43,6 +43,7 @@ EPOCHS_JYEAR = (1800.0, 2200.0)
 HOURS_SPAN_DEG, HOURS_STARS = 60.0, 100
 # The fastest of a thousand stars moves by some 100 mas a year; no star in the sky moves by 12 arcsec a year.
 SLOWEST_MAS_YR, MOTION_STARS = 12.0, 1000
+MAX_AMPLITUDE_MAG = 10.0  # half of the range: chi Cygni has 5
 MAX_STEM = 16  # characters of a file's name in the name of its stars, which has 32 in a truth table
 ADVICE = "give the column its unit in a FITS, ECSV or VOTable, or convert it"
 # Two catalogues' places of one star at a common epoch differ by far less, but for orbits. Hipparcos' photometry has the light
@@ -57,7 +58,7 @@ ODD_MAG = 1.0
 OVERLAP_LIMIT_MAG = 0.03  # limit for the median
 FEW_MATCHES, BRIGHT_STARS, BRIGHT_V_MAG = 0.5, 20, 7.0
 RAD_PER_ARCSEC = np.pi / (180 * 3600)
-VERSION = 1  # version of the cached result: count up whenever it changes
+VERSION = 2  # version of the cached result: count up whenever it changes
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
 HASH_BYTES = 1 << 22
 MAX_STORED_BYTES = 3_000_000_000
@@ -96,6 +97,7 @@ def assemble(path: Path, table: RawTable, stated_epoch_jyear: float | None, comp
         "vi_mag": vi_mag,
         **pm,
         "parallax_mas": columns.role("parallax_mas", np.nan),
+        **columns.variables(),
     }
     designation, identifier = columns.identifiers()
     _check_hours(path, ra_deg, dec_deg, columns.has_unit(columns.pair[0]))
@@ -171,6 +173,20 @@ class _Columns:
             given = self.role("vi_mag", np.nan)
             vi = np.where(np.isfinite(given), given, vi)
         return TableMagnitudes(v, bv, vi, ", ".join(words))
+
+    def variables(self) -> dict[str, npt.NDArray[Any]]:
+        """Type, range, period and a time of largest light, where a row has all of its three figures; nothing without them."""
+        roles = ("maximum_jd", "period_d", "amplitude_mag")
+        if not all(role in self.layout.role for role in roles):
+            return {}
+        maximum, period, amplitude = (self.role(role, np.nan) for role in roles)
+        known = np.isfinite(maximum) & (period > 0) & (amplitude > 0) & (amplitude < MAX_AMPLITUDE_MAG)
+        return {
+            "variable": np.where(known, b"P", b"").astype("S1"),
+            "range_mag": np.where(known, 2 * amplitude, np.nan).astype(np.float32),
+            "period_d": np.where(known, period, np.nan),
+            "maximum_jd": np.where(known, maximum, np.nan),
+        }
 
     def identifiers(self) -> tuple[str, npt.NDArray[np.int64]]:
         """What the stars are called, and the number of each: Gaia's, Tycho's, or that of the row, from 1."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +43,9 @@ class Stars:
     `velocity_km_s` (3,), ICRS, they are seen by an observer who moves so against the one who sees `vectors`: `near` and
     `directions` then say what that observer sees. The last stars may be `bodies`, by name: whoever moves them rewrites their
     part of the arrays. Those that `near` does not find (satellites) come first.
+
+    `colours` (n, channels) are the shares of `electrons_per_s` that each channel of the tracker has, which sum to 1; None where
+    it has one channel.
     """
 
     hip: npt.NDArray[np.int32]
@@ -55,6 +59,7 @@ class Stars:
     row: IntArray
     velocity_km_s: FloatArray | None = None
     bodies: tuple[str, ...] = ()
+    colours: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.hip)
@@ -120,11 +125,13 @@ def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
         grid=grid,
         catalog=stars.catalog,
         row=stars.row[order],
+        colours=None if stars.colours is None else stars.colours[order],
     )
 
 
 def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray, electrons_per_s: FloatArray) -> Stars:
-    """Sort a catalogue's stars by cell."""
+    """Sort a catalogue's stars by cell; their electrons (n,), or by channel (n, channels)."""
+    electrons_per_s, colours = total_and_colours(electrons_per_s)
     grid = cell_grid(vectors)
     order = grid.order
     return Stars(
@@ -137,13 +144,32 @@ def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray,
         grid=grid,
         catalog=catalog,
         row=order,
+        colours=None if colours is None else colours[order],
     )
 
 
-def with_bodies(stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray, found: bool = True) -> Stars:
+class Flux(NamedTuple):
+    """Electrons per second of all channels (n,), and each channel's share of them (n, channels), None for one channel."""
+
+    electrons_per_s: FloatArray
+    colours: FloatArray | None
+
+
+def total_and_colours(electrons_per_s: FloatArray) -> Flux:
+    """The flux of electrons (n,), or by channel (n, channels)."""
+    if electrons_per_s.ndim == 1 or electrons_per_s.shape[1] == 1:
+        return Flux(electrons_per_s.reshape(len(electrons_per_s)), None)
+    total = electrons_per_s.sum(axis=1)
+    return Flux(total, electrons_per_s / total[:, None])
+
+
+def with_bodies(
+    stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray, found: bool = True, colours: FloatArray | None = None
+) -> Stars:
     """The stars, in arrays of their own, and after them bodies of colours `bv_mag` (k,), which have no place or light yet.
 
-    Bodies not to be `found` are in no cell: `near` passes over them, whoever moves them adds them to an image.
+    Bodies not to be `found` are in no cell: `near` passes over them, whoever moves them adds them to an image. Their `colours`
+    (k, channels) or (channels,) are wanted where stars have theirs.
     """
     count, order = len(bodies), len(stars) + np.arange(len(bodies))
     cells = order[: count if found else 0]
@@ -168,6 +194,9 @@ def with_bodies(stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray, found
         catalog=stars.catalog,
         row=np.concatenate([stars.row, np.full(count, -1)]),
         bodies=(*stars.bodies, *bodies),
+        colours=None
+        if stars.colours is None or colours is None
+        else np.vstack([stars.colours, np.broadcast_to(colours, (count, colours.shape[-1]))]),
     )
 
 

@@ -24,6 +24,7 @@ from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscView, ExtendedLight, Pose, disc_lights
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.sky.bodies.disc import Disc, lunar_share
 from hilstar.study.settings import Table, bench_text
@@ -231,9 +232,9 @@ def exactness(radius_px: float, phase_deg: float) -> Exactness:
     half = int(np.ceil(radius_px)) + MARGIN_PX
     size = (2 * half + 1, 2 * half + 1)
     camera = Camera(size, FOCAL_PX, (half, half), np.eye(3))
-    with Renderer(Target(size, SIGMA_PX)) as renderer:
+    with Renderer(Target(size, GaussianPsf(SIGMA_PX))) as renderer:
         point = _point(disc, camera, renderer.footprint_px)
-        lights = disc_lights(disc, DiscView(camera, SIGMA_PX, (Pose(np.eye(3)),)), covers=True)
+        lights = disc_lights(disc, DiscView(camera, GaussianPsf(SIGMA_PX), (Pose(np.eye(3)),)), covers=True)
         renderer.draw(_dark(point, tuple(lights)))
         drawn = renderer.linear().astype(np.float64)
         renderer.draw(point)

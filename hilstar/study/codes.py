@@ -11,11 +11,11 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, TEAL, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.balance import AS_USUAL, Balance
-from hilstar.monitor.phases import SIGMA_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
-from hilstar.monitor.quantise import EXPOSURE_FRAMES, Panel, Quantisation, dither_levels, mask_turn, shown_light
+from hilstar.monitor.phases import USUAL_PSF, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.monitor.quantise import EXPOSURE_FRAMES, Panel, dither_levels, mask_turn, shown_light
+from hilstar.monitor.quantisers import Quantisation
 from hilstar.monitor.response import Response, Weights, bit_stealing_response, gamma_response, srgb_response, table_response
 from hilstar.monitor.temporal import TemporalQuantiser
-from hilstar.scene.psf import peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
@@ -76,17 +76,17 @@ def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:
     """STARS sprites anywhere on the frame, over eight magnitudes, three times as many in each as in the one before."""
     rng = np.random.default_rng(SEED)
     mag = 2 * np.log10(1 + rng.uniform(size=STARS) * (10 ** (8 / 2) - 1))
-    flux = WHITE / peak_share(SIGMA_PX) * flux_ratio(mag)
+    flux = WHITE / USUAL_PSF.peak_share * flux_ratio(mag)
     x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(frame_px)[:, None]
     return pack_sprites(x_px, y_px, flux, np.arange(STARS), frame_px, footprint_px)
 
 
 def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list[StarErrors]:
     """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the tracker is as usual."""
-    panel, balance = Panel(response_of(bits, way), WHITE), Balance(SIGMA_PX, AS_USUAL)
-    sprites, _ = phase_grid(phases, SIGMA_PX)
-    bright = phase_image(sprites, SIGMA_PX)
-    judge = Judge(bright, line_places(sprites), SIGMA_PX, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    panel, balance = Panel(response_of(bits, way), WHITE), Balance(USUAL_PSF, AS_USUAL)
+    sprites, _ = phase_grid(phases, USUAL_PSF)
+    bright = phase_image(sprites, USUAL_PSF)
+    judge = Judge(bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px)
     errors = []
     for mag in mags:
         wanted = (bright * flux_ratio(mag)).astype(np.float32)
@@ -160,10 +160,10 @@ def study_frames(directory: Path, quick: bool) -> str:
 def _left_by(shown: ShownStars, phases: int, counts: tuple[int, ...]) -> list[OverFrames]:
     panel, share = Panel(shown.response, WHITE), flux_ratio(shown.mag)
     sprites, tile = phase_grid(phases)
-    bright = phase_image(sprites, SIGMA_PX)
-    judge = Judge(bright, line_places(sprites), SIGMA_PX, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    bright = phase_image(sprites, USUAL_PSF)
+    judge = Judge(bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px)
     stars, linear = fainter(sprites, shown.mag), (share * bright).astype(np.float32)
-    quantiser = TemporalQuantiser(panel, (phases * tile, phases * tile), SIGMA_PX)
+    quantiser = TemporalQuantiser(panel, (phases * tile, phases * tile), USUAL_PSF)
     steps = float(stars.data["electrons_per_s"][0]) / (float(shown.response.light[1]) * WHITE)
     rows = []
     for method in ("temporal", "dither"):

@@ -145,10 +145,9 @@ def _outcome(scene: EffortScene, name: str, bench: Bench, frame_ms: float) -> Ef
     turn, size = _turn(scene), bench.camera.resolution_px
     drawn = bench.draw(turn.q_icrs_to_cam, 0, turn.rate_cam_rad_s)
     shown = shown_light(drawn.levels, bench.panel)
-    sigma_px, footprint = bench.config.render.sprite_sigma_px, bench.renderer.footprint_px
     scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
-    sprites = swept_sprites(bench.stars, turn, scan, bench.camera, footprint, sigma_px)
-    true = linear_image(sprites, size, sigma_px)
+    sprites = swept_sprites(bench.stars, turn, scan, bench.camera, bench.psf)
+    true = linear_image(sprites, size, bench.psf)
     errors, windows = [], []
     rates = sprites.data["electrons_per_s"]
     for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, size, ISOLATION):
@@ -158,7 +157,7 @@ def _outcome(scene: EffortScene, name: str, bench: Bench, frame_ms: float) -> Ef
         windows.append(window)
     seen = bench.renderer.target.seen
     lit, wanted = (squares(image, windows) for image in (shown, true))
-    off_px = stamp_errors(lit, wanted, sigma_px, seen.blur_px, seen.pixel_px)
+    off_px = stamp_errors(lit, wanted, bench.psf.width_px, seen.blur_px, seen.pixel_px)
     return EffortOutcome(
         scene=scene.name,
         effort=name,

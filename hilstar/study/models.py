@@ -29,40 +29,32 @@ from hilstar.sky.electrons import (
     tabulate_pickles,
     v_band_mean_w_m2_m,
 )
-from hilstar.sky.spectrum import PLANCK_J_S, TEMPERATURE_SCALES, blackbody_exitance_w_m2_m, integration_nodes
-from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
+from hilstar.sky.spectral_types import bare_and_dusty
+from hilstar.sky.spectrum import (
+    PLANCK_J_S,
+    TEMPERATURE_SCALES,
+    blackbody_exitance_w_m2_m,
+    integration_nodes,
+    torres2010_k,
+)
+from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_by_type, held_out_errors, study_optics
 from hilstar.units import LIGHT_M_S, magnitude
 
 SENSORS = {"ccd47-20": "CCD47-20", "kai-4021": "KAI-4021 (approximate QE)"}
 WEIGHTINGS: tuple[Weighting, ...] = ("energy", "photon")
 BRIGHT_V_MAG = 7.5
 HELD_OUT = "pickles, leave-one-out"
+BY_TYPE = "mk, leave-one-out"
 
 # Relative errors (m,) of the library's stars, by sensor and method.
 Errors = dict[tuple[str, str], FloatArray]
 SETTINGS = [Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS]
-# log10 T over B-V: Torres 2010 (AJ 140, 1158, table 2), Flower 1996 corrected.
-TORRES_DWARFS_AND_GIANTS = (
-    3.979145106714099,
-    -0.654992268598245,
-    1.740690042385095,
-    -4.608815154057166,
-    6.792599779944473,
-    -5.396909891322525,
-    2.192970376522490,
-    -0.359495739295671,
-)
-TORRES_SUPERGIANTS = (
-    4.012559732366214,
-    -1.055043117465989,
-    2.133394538571825,
-    -2.459769794654992,
-    1.349423943497744,
-    -0.283942579112032,
-)
 SCALE_BV_MAG = np.arange(-35, 181) / 100  # where Torres 2010 holds; exact at 0, where wang2021 steps
 QUOTED_K = (3000.0, 5000.0, 9000.0, 50_000.0)
-THESIS_HOT_STARS = {"ccd47-20": " (thesis: 15 % to 5 %)"}  # section 5.4, of figure 5.19
+SAID_OF_THESIS = {  # section 5.4, of figures 5.19 and 5.22
+    "ccd47-20": " (thesis: 15 % to 5 %)",
+    "kai-4021": " (thesis: RAPP1 and RAPP2 as the CCD47-20's, which a curve of 300 to 1050 nm has; this has 400 to 1000)",
+}
 
 Ratios = dict[Weighting, FloatArray]
 BV_MAG = np.arange(-30, 201) / 100
@@ -91,6 +83,13 @@ def spectra(directory: Path) -> ChartFinding:
         for real, body in [(figures[sensor, HELD_OUT], figures[sensor, "black body, ballesteros2012"])]
     )
     real, body = (max(figures[s, name][1] for s in SENSORS) for name in (HELD_OUT, "black body, ballesteros2012"))
+    late = ~sure & np.array([name.endswith("III") for name in library.spectral_type])
+    of_late = {key: np.percentile(100 * np.abs(error[late]), 95) for key, error in errors.items()}
+    text += "; late M giants (95 %), " + "; ".join(
+        f"{SENSORS[sensor].split()[0]} {of_late[sensor, HELD_OUT]:.0f} % by V-I, {of_late[sensor, BY_TYPE]:.1f} % by MK type"
+        f" (others {figures[sensor, BY_TYPE][1]:.1f} %)"
+        for sensor in SENSORS
+    )
     finding = (
         f"Real spectra by V-I give the electron rate within {real:.1f} % for 95 % of stars to V-I = {MAX_RELIABLE_VI_MAG:g},"
         f" black bodies by B-V within {body:.0f} %"
@@ -108,6 +107,8 @@ def method_errors(library: Library) -> Errors:
     for sensor in SENSORS:
         rates = library_electrons_per_s(library, study_optics(sensor), Photometry())
         errors[sensor, HELD_OUT] = held_out_errors(rates)
+        with_dust = library_electrons_per_s(bare_and_dusty(), study_optics(sensor), Photometry())
+        errors[sensor, BY_TYPE] = held_out_by_type(with_dust)[: len(rates)]
         for scale in TEMPERATURE_SCALES:
             body = dgs_electrons_per_s(star_temperatures_k(library.bv_mag, scale), study_optics(sensor), Photometry())
             errors[sensor, f"black body, {scale}"] = body / rates - 1
@@ -120,13 +121,15 @@ def _draw_spectra(path: Path, finding: str, library: Library, errors: Errors) ->
     with chart(path, finding, panels=2, note=note) as panels:
         for axes, sensor in zip(panels, SENSORS, strict=True):
             named = [(name, error) for (owner, name), error in errors.items() if owner == sensor]
-            for (name, error), mark, colour in zip(reversed(named), ("+", "x", "o"), (GREEN, ORANGE, BLUE), strict=True):
+            for (name, error), mark, colour in zip(
+                reversed(named), ("+", "x", "^", "o"), (GREEN, ORANGE, INK, BLUE), strict=True
+            ):
                 axes.plot(library.vi_mag, 100 * error, mark, color=colour, ms=4, label=name)
             axes.axvline(MAX_RELIABLE_VI_MAG, color=MUTED, lw=1, ls="--")
             axes.axhline(0, color=INK, lw=1)
             axes.set_yscale("symlog", linthresh=5)
             axes.set(ylabel="error of the electron rate [%]", title=SENSORS[sensor])
-            axes.set_ylim(-130, 5000)
+            axes.set_ylim(-130, 50_000)
             plain_ticks(axes.yaxis, (-50, -10, 0, 10, 50, 200))
         panels[-1].set(xlabel="V-I [mag]")
         panels[0].legend(loc="upper right")
@@ -223,12 +226,6 @@ def compared_scales() -> Scales:
     return Scales(bv, torres, kelvin, percent, mag)
 
 
-def torres2010_k(bv_mag: FloatArray, supergiant: bool = False) -> FloatArray:
-    """Effective temperature from B-V (Torres 2010, table 2); shape of `bv_mag`."""
-    coefficients = TORRES_SUPERGIANTS if supergiant else TORRES_DWARFS_AND_GIANTS
-    return np.asarray(10 ** np.polynomial.polynomial.polyval(bv_mag, coefficients))
-
-
 def _draw_temperatures(path: Path, finding: str, scales: Scales) -> None:
     note = "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, + is fainter."
     with chart(path, finding, panels=3, note=note) as panels:
@@ -255,7 +252,7 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
     text = (
         f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the average one at 3000 K,"
         f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by {100 * (hottest - 1):+.1f} %"
-        + THESIS_HOT_STARS.get(sensor, "")
+        + SAID_OF_THESIS.get(sensor, "")
     )
     finding = ChartFinding(f"rapp_{sensor}", text)
     title = (

@@ -30,6 +30,7 @@ from hilstar.study.predictors import (
     SLEW_DEG,
     SLEW_S,
     Predictor,
+    attitude_at,
     predictors,
     slew_attitude,
     slew_sample,
@@ -144,9 +145,7 @@ def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rate
             rate = Z * (turn + amplitude * turning * math.cos(turning * at_s + 0.3)) if rates else None
             timeline.add(AttitudeSample(round(at_s * NS_PER_S), propagate(ORION, Z, angle(at_s)), rate))
             taken += 1
-        shown = timeline.at(round(t_s * NS_PER_S))
-        if shown is None:
-            raise AssertionError("a timeline with samples has an attitude")
+        shown = attitude_at(timeline, round(t_s * NS_PER_S))
         errors.append(-to_rotation_vector(multiply(shown.q_icrs_to_cam, conjugate(propagate(ORION, Z, angle(t_s)))))[2])
     late = times_s >= SETTLED_S
     phase, error = turning * times_s[late] + 0.3, np.array(errors)[late]
@@ -193,12 +192,12 @@ def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, 
 
 def _attitude_us(predictor: Predictor, samples: list[AttitudeSample], latency_ms: int) -> float:
     """The median time of one attitude after the last sample, us."""
-    attitude_at = predictor.load(samples[-NEAR:])
+    predict = predictor.load(samples[-NEAR:])
     t_ns = samples[-1].t_ns + latency_ms * NS_PER_MS
     times = []
     for _ in range(TIMED):
         begin_ns = time.perf_counter_ns()
-        attitude_at(t_ns)
+        predict(t_ns)
         times.append((time.perf_counter_ns() - begin_ns) / 1e3)
     return float(np.median(times))
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.config import AttitudeSettings
 from hilstar.rotation import from_radec_roll_deg, multiply, propagate, rate_between_rad_s
@@ -55,9 +55,14 @@ def predictors() -> tuple[Predictor, ...]:
 
 def slew_attitude(t_ns: int) -> FloatArray:
     """The true q_icrs_to_cam: three turns about the camera's axes on ORION, each a slow swing and a fast jitter."""
-    t_s, q = t_ns / NS_PER_S, ORION
-    for axis in range(3):
-        angle = math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis)
+    t_s = t_ns / NS_PER_S
+    return shaken(ORION, t_s, [math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis) for axis in range(3)])
+
+
+def shaken(q_icrs_to_cam: FloatArray, t_s: float, angles_rad: Sequence[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+    """An attitude turned about the camera's x, y and z by these angles and JITTER."""
+    q = q_icrs_to_cam
+    for axis, angle in enumerate(angles_rad):
         for size_arcsec, hz in JITTER:
             angle += math.radians(size_arcsec / 3600) * math.sin(2 * math.pi * hz * t_s + 2 * axis * hz)
         turn = np.zeros(4)
@@ -66,24 +71,30 @@ def slew_attitude(t_ns: int) -> FloatArray:
     return q
 
 
+def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
+    """The rate (3,) of a movement, from RATE_STEP_NS on both sides: 0.006 arcsec/s off at 37 Hz, 0.0003 arcsec predicted."""
+    before, after = attitude(t_ns - RATE_STEP_NS), attitude(t_ns + RATE_STEP_NS)
+    return rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S)
+
+
+def attitude_at(timeline: Timeline, t_ns: int) -> Attitude:
+    """The attitude at a moment, of a timeline that has samples."""
+    attitude = timeline.at(t_ns)
+    if attitude is None:
+        raise AssertionError("a timeline with samples has an attitude")
+    return attitude
+
+
 def slew_sample(t_ns: int) -> AttitudeSample:
-    """The attitude with its rate, from 0.1 ms on both sides: 0.006 arcsec/s off at 37 Hz, 0.0003 arcsec in a prediction."""
-    before, after = slew_attitude(t_ns - RATE_STEP_NS), slew_attitude(t_ns + RATE_STEP_NS)
-    return AttitudeSample(t_ns, slew_attitude(t_ns), rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S))
+    """The attitude with its rate."""
+    return AttitudeSample(t_ns, slew_attitude(t_ns), rate_of(slew_attitude, t_ns))
 
 
 def _timeline(policy: Policy, near: Sequence[AttitudeSample]) -> AttitudeAt:
     timeline = Timeline(policy)
     for sample in near:
         timeline.add(sample)
-
-    def attitude_at(t_ns: int) -> FloatArray:
-        attitude = timeline.at(t_ns)
-        if attitude is None:
-            raise AssertionError("a timeline with samples has an attitude")
-        return attitude.q_icrs_to_cam
-
-    return attitude_at
+    return lambda t_ns: attitude_at(timeline, t_ns).q_icrs_to_cam
 
 
 def _timeline_without_rates(policy: Policy, near: Sequence[AttitudeSample]) -> AttitudeAt:
@@ -94,12 +105,12 @@ def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
     """The newest sample's rate, and the change since the one before it carried on."""
     before, newest = near[-2:]
 
-    def attitude_at(t_ns: int) -> FloatArray:
+    def predicted(t_ns: int) -> FloatArray:
         ahead_s, gap_s = (t_ns - newest.t_ns) / NS_PER_S, (newest.t_ns - before.t_ns) / NS_PER_S
         bend = (_rate(newest) - _rate(before)) / gap_s
         return propagate(newest.q_icrs_to_cam, _rate(newest) + 0.5 * ahead_s * bend, ahead_s)
 
-    return attitude_at
+    return predicted
 
 
 def _rate(sample: AttitudeSample) -> FloatArray:
@@ -112,10 +123,10 @@ def _spline(near: Sequence[AttitudeSample]) -> AttitudeAt:
     """The samples' turns from the newest one, as a cubic carried on past it."""
     newest = near[-1]
 
-    def attitude_at(t_ns: int) -> FloatArray:
+    def predicted(t_ns: int) -> FloatArray:
         seconds = [(s.t_ns - newest.t_ns) / NS_PER_S for s in near]
         turns = [rate_between_rad_s(newest.q_icrs_to_cam, s.q_icrs_to_cam, 1.0) for s in near]
         turn = CubicSpline(seconds, turns)((t_ns - newest.t_ns) / NS_PER_S)
         return propagate(newest.q_icrs_to_cam, np.asarray(turn), 1.0)
 
-    return attitude_at
+    return predicted

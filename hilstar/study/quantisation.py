@@ -5,18 +5,16 @@ from __future__ import annotations
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.charts import BLUE, INK, MUTED, ORANGE, SMALL_PT, chart, label_ends, name_at_side, write_csv
-from hilstar.monitor.phases import SIGMA_PX, WHITE
+from hilstar.monitor.phases import USUAL_PSF, WHITE
 from hilstar.monitor.quantise import EXPOSURE_FRAMES
 from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.study.codes import (
     AIM_PX,
     AIMS,
@@ -36,10 +34,6 @@ from hilstar.study.sweep import medians_ms
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import StarErrors
 from hilstar.units import flux_ratio
-
-if TYPE_CHECKING:
-    pass
-
 
 Found = dict[tuple[int, str], list[StarErrors]]
 MIN_ERROR = 1e-5  # as drawn
@@ -72,14 +66,14 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 
 def _frames_ms(bits: int, rounds: int) -> dict[str, float]:
     """The median time of drawing STARS stars and reading their levels back, ms, of each way, timed in turn."""
-    sprites = star_field(FRAME_PX, footprint_px(SIGMA_PX))
+    sprites = star_field(FRAME_PX, USUAL_PSF.footprint_px)
 
     def draw(renderer: Renderer, frame: int) -> object:
         renderer.draw(sprites, frame)
         return renderer.levels()
 
     with ExitStack() as stack:
-        targets = {way.name: Target(FRAME_PX, SIGMA_PX, response_of(bits, way), WHITE, way.method) for way in WAYS}
+        targets = {way.name: Target(FRAME_PX, USUAL_PSF, response_of(bits, way), WHITE, way.method) for way in WAYS}
         return medians_ms({name: partial(draw, stack.enter_context(Renderer(on))) for name, on in targets.items()}, rounds)
 
 
@@ -87,7 +81,7 @@ def _summary(bits: int, found: Found, mags: FloatArray) -> str:
     aim_mag, limit = AIMS[bits]
     worst = {way: _worst(found[bits, way.name], mags, limit) for way in WAYS}
     others = ", ".join(f"{way.method} {worst[way]}" for way in WAYS[:3])
-    half_step_px = srgb_response(bits).half_step * peak_share(SIGMA_PX) / flux_ratio(limit)
+    half_step_px = srgb_response(bits).half_step * USUAL_PSF.peak_share / flux_ratio(limit)
     return (
         f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {AIM_PX:g} px): largest errors, places by a PSF fit, of"
         f" exact {worst[WAYS[3]]}, with bit stealing {worst[WAYS[5]]}; {others} (over {EXPOSURE_FRAMES} frames)."

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.scene.sprites import Sprites
 from hilstar.sky.electrons import Optics, fit_table, load_library
+from hilstar.sky.spectral_types import bare_and_dusty, fit_spectra, read_types
 from hilstar.sky.spectrum import load_curve
 from hilstar.units import magnitude
 
@@ -49,6 +50,21 @@ def held_out_errors(rates: FloatArray) -> FloatArray:
         table = fit_table(library.bv_mag[rest], library.vi_mag[rest], rates[rest])
         one = table.electrons_per_s(np.zeros(1), library.bv_mag[k : k + 1], library.vi_mag[k : k + 1])
         errors[k] = one[0] / rates[k] - 1
+    return errors
+
+
+def held_out_by_type(rates: FloatArray) -> FloatArray:
+    """Relative error (2m,) of the rate of each spectrum of `bare_and_dusty` by type, each star held out with its dusty one."""
+    library = bare_and_dusty()
+    kind = read_types(np.array(library.spectral_type, dtype=np.bytes_))
+    count, errors = len(rates) // 2, np.empty(len(rates))
+    for k in range(count):
+        own = np.array([k, k + count])
+        rest = np.delete(np.arange(len(rates)), own)
+        part = replace(library, bv_mag=library.bv_mag[rest], vi_mag=library.vi_mag[rest])
+        table = fit_spectra(kind[rest], part, rates[rest])
+        found = table.electrons_per_s(np.zeros(2), library.bv_mag[own], library.vi_mag[own], kind[own])
+        errors[own] = found / rates[own] - 1
     return errors
 
 

@@ -6,10 +6,12 @@ which method is faster, so a study also notes what else ran.
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +20,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray
 
-MIN_ROUNDS = 3  # every work runs this often, whatever the budget
+MIN_ROUNDS = 3  # every work runs this often, whatever its share of a budget
 MAX_ROUNDS = 500  # more do not move a median
 SEED = 1
 BUSY_SHARE = 0.15  # share of the cores taken by others above which times are 5 % and more off: a third of one of two cores
@@ -40,40 +42,25 @@ def spent(work: Callable[[], object]) -> Spent:
     return Spent(1e3 * wall_s, 1e3 * (time.process_time() - begin_cpu))
 
 
-def in_turn(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, list[Spent]]:
-    """The times of `rounds` calls of each work, which is given the number of its round.
+def in_turn(works: Mapping[str, Callable[[int], object]], rounds: int, share_s: float = math.inf) -> dict[str, list[Spent]]:
+    """The times of at most `rounds` calls of each work, which is given the number of its round.
 
-    Round 0 comes first and is not counted: it compiles shaders and fills caches.
+    Each round has an order of its own, so that no work always follows the same one. A work that has had `share_s` skips what
+    follows MIN_ROUNDS. Round 0 comes first and is not counted: it compiles shaders and fills caches.
     """
     times: dict[str, list[Spent]] = {name: [] for name in works}
+    names, rng = list(works), np.random.default_rng(SEED)
     for number in range(rounds + 1):
-        for name, work in works.items():
-            took = spent(lambda work=work, number=number: work(number))  # type: ignore[misc]
-            if number:
-                times[name].append(took)
+        for name in (names[k] for k in rng.permutation(len(names))):
+            if number <= MIN_ROUNDS or sum(one.wall_ms for one in times[name]) <= 1e3 * share_s:
+                took = spent(partial(works[name], number))
+                times[name] += [took] if number else []
     return times
 
 
 def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dict[str, float]:
     """The median wall time of each work over `rounds` rounds, ms; see `in_turn`."""
     return {name: float(np.median([one.wall_ms for one in took])) for name, took in in_turn(works, rounds).items()}
-
-
-def interleaved(works: Sequence[Callable[[], object]], budget_s: float) -> list[list[float]]:
-    """The wall times of each work, ms, within a budget in seconds; a work that has had its share skips later rounds.
-
-    Each round has its own order, so that no work always follows the same one.
-    """
-    for work in works:
-        work()  # a first call compiles shaders and fills caches
-    times: list[list[float]] = [[] for _ in works]
-    share_ms = 1e3 * budget_s / len(works)
-    rng = np.random.default_rng(SEED)
-    for count in range(MAX_ROUNDS):
-        for k in rng.permutation(len(works)):
-            if count < MIN_ROUNDS or sum(times[k]) <= share_ms:
-                times[k].append(spent(works[k]).wall_ms)
-    return times
 
 
 def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:

@@ -31,6 +31,7 @@ from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
+from hilstar.study.predictors import attitude_at
 from hilstar.study.settings import Isolation, Table, bench_text, centroid_px, lone_windows, star_error
 from hilstar.study.sweep import medians_ms
 from hilstar.twin.optics import BenchGeometry, TwinOptics
@@ -138,7 +139,7 @@ class ScanningPanel:
         tracker = config.tracker
         self.exposure_s = tracker.exposure_s
         self.camera = tracker_camera(tracker, self.bench.file.folder)
-        self.optics = TwinOptics(BenchGeometry(self.bench.camera, self.camera), tracker.psf_sigma_px)
+        self.optics = TwinOptics(BenchGeometry(self.bench.camera, self.camera), self.bench.tracker_psf)
         self.panel = self.bench.panel
 
     def attitude(self, slew: Slew, swap_s: float) -> Attitude:
@@ -147,10 +148,7 @@ class ScanningPanel:
         light_s = swap_s + self.period_s / 2
         if self.way == "no prediction":
             light_s = math.floor((swap_s - DRAW_TO_SWAP_S) * PACKET_HZ) / PACKET_HZ
-        attitude = timeline.at(round(light_s * NS_PER_S))
-        if attitude is None:
-            raise AssertionError("the timeline has packets")
-        return attitude
+        return attitude_at(timeline, round(light_s * NS_PER_S))
 
     def draw(self, attitude: Attitude, number: int) -> FloatArray:
         """The light of one frame, (H, W)."""
@@ -189,16 +187,14 @@ class TimingSky:
 
     def __init__(self, shown: ScanningPanel) -> None:
         self._shown = shown
-        render = shown.bench.config.render
-        self._sigma_px = render.sprite_sigma_px
-        self._renderer = Renderer(Target(shown.bench.config.monitor.resolution_px, self._sigma_px))
+        self._renderer = Renderer(Target(shown.bench.config.monitor.resolution_px, shown.bench.psf))
 
     def paths(self, slew: Slew) -> Sprites:
         """Each star's path over the exposure, in monitor pixels."""
         middle_s = self._shown.start_s + self._shown.exposure_s / 2
         motion = Motion(slew.at(middle_s), slew.rate_cam_rad_s, self._shown.exposure_s)
         bench = self._shown.bench
-        return smeared_sprites(bench.stars, motion, bench.camera, self._renderer.footprint_px, self._sigma_px)
+        return smeared_sprites(bench.stars, motion, bench.camera, bench.psf)
 
     def exposed_e_per_s(self, slew: Slew) -> FloatArray:
         """The tracker's image (h, w), mean over the exposure."""

@@ -20,6 +20,7 @@ from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, cannot_read
 from hilstar.frame.truth import TRUTH_DTYPE
 from hilstar.reading import read_bytes, read_text, size_text
+from hilstar.scene.psf import Psf
 from hilstar.testing.sky_comparison import Limits, SkyComparison, StarDifference, common_change
 from hilstar.testing.star_fit import (
     RIPPLE_SHARE,
@@ -34,7 +35,7 @@ from hilstar.testing.star_fit import (
     names_at,
     refined,
     shifts_px,
-    star_sigma_px,
+    star_psf,
 )
 from hilstar.units import MAG_PER_RELATIVE, magnitude
 
@@ -65,11 +66,11 @@ def compare_skies(
     `truth` of another sky.
     """
     check_skies(frame, golden)
-    sigma_px = star_sigma_px(golden)
-    seeds, unmeasured = _measurable(golden, find_seeds(golden, truth, sigma_px), sigma_px)
+    psf = star_psf(golden)
+    seeds, unmeasured = _measurable(golden, find_seeds(golden, truth, psf), psf)
     if not seeds.hip:
         raise InputError("compare: no star of the golden image has enough light in view; give one that has")
-    fit = _SkyFit(golden, seeds.places_px, sigma_px)
+    fit = _SkyFit(golden, seeds.places_px, psf)
     moved = fit.follow(frame)
     stars = _differences(seeds, fit, moved, limits)
     more, less = moved.residual - fit.residual, fit.residual - moved.residual
@@ -77,7 +78,7 @@ def compare_skies(
         places, flux = _unexplained(light, fit, moved)
         stars += [
             StarDifference(hip, float(x), float(y), float(f), error, 0.0, 0.0, limits)
-            for hip, (x, y), f in zip(names_at(places, table, blend_distance_px(sigma_px)), places, flux, strict=True)
+            for hip, (x, y), f in zip(names_at(places, table, blend_distance_px(psf)), places, flux, strict=True)
         ]
     return SkyComparison(stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0])))
 
@@ -98,28 +99,28 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
         raise InputError("compare: the golden image has no star; give one that has")
 
 
-def _measurable(golden: FloatArray, seeds: Seeds, sigma_px: tuple[float, float]) -> tuple[Seeds, int]:
+def _measurable(golden: FloatArray, seeds: Seeds, psf: Psf) -> tuple[Seeds, int]:
     """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many stars do not."""
     count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
-    seeds = _in_view(seeds, sigma_px, shape)
-    seeds = _in_view(Seeds(refined(golden, seeds.places_px, sigma_px), seeds.hip), sigma_px, shape)
-    templates = StarTemplates(seeds.places_px, sigma_px, shape)
+    seeds = _in_view(seeds, psf, shape)
+    seeds = _in_view(Seeds(refined(golden, seeds.places_px, psf), seeds.hip), psf, shape)
+    templates = StarTemplates(seeds.places_px, psf, shape)
     flux = templates.fit(golden)[:, 0]
     seeds = seeds.only(flux > templates.errors(flux, PIXEL_ERROR)[0] / MAX_ERROR)
     return seeds, count - seeds.stars
 
 
-def _in_view(seeds: Seeds, sigma_px: tuple[float, float], shape: tuple[int, int]) -> Seeds:
-    return seeds.only(StarTemplates(seeds.places_px, sigma_px, shape).in_view >= MIN_IN_VIEW)
+def _in_view(seeds: Seeds, psf: Psf, shape: tuple[int, int]) -> Seeds:
+    return seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
 
 
 class _SkyFit:
     """All stars of one image, fitted at `places_px`: what they are, and the light (height, width) that they leave."""
 
-    def __init__(self, image: FloatArray, places_px: FloatArray, sigma_px: tuple[float, float]) -> None:
+    def __init__(self, image: FloatArray, places_px: FloatArray, psf: Psf) -> None:
         self.light = image
-        self.sigma_px = sigma_px
-        self.templates = StarTemplates(places_px, sigma_px, (image.shape[0], image.shape[1]))
+        self.psf = psf
+        self.templates = StarTemplates(places_px, psf, (image.shape[0], image.shape[1]))
         fitted = self.templates.fit(image)
         self.flux = fitted[:, 0]
         self.places_px = places_px + shifts_px(fitted)
@@ -129,14 +130,14 @@ class _SkyFit:
     def follow(self, frame: FloatArray) -> _SkyFit:
         """The same stars in another image: the same templates, except for those that moved."""
         start = self.templates.places_px
-        fit = _SkyFit(frame, start, self.sigma_px)
+        fit = _SkyFit(frame, start, self.psf)
         for _ in range(MOVE_STEPS):
             shift = np.hypot(*(fit.places_px - self.places_px).T)
             there = fit.flux > MISSING_SHARE * self.flux
-            moved = there & (shift > SMALL_MOVE_PX) & (shift <= MAX_MOVE_SIGMAS * max(self.sigma_px))
+            moved = there & (shift > SMALL_MOVE_PX) & (shift <= MAX_MOVE_SIGMAS * max(self.psf.width_px))
             if not moved.any():
                 break
-            fit = _SkyFit(frame, start + np.where(moved[:, None], fit.places_px - self.places_px, 0.0), self.sigma_px)
+            fit = _SkyFit(frame, start + np.where(moved[:, None], fit.places_px - self.places_px, 0.0), self.psf)
         return fit
 
 
@@ -145,7 +146,7 @@ def _differences(seeds: Seeds, fit: _SkyFit, moved: _SkyFit, limits: Limits) -> 
     limit_mag = np.maximum(MAG_PER_RELATIVE * flux_error / fit.flux, limits.flux_mag)
     limit_px = np.maximum(place_error_px, limits.centroid_px)
     shift = moved.places_px - fit.places_px
-    gone = (moved.flux <= MISSING_SHARE * fit.flux) | (np.hypot(*shift.T) > MAX_MOVE_SIGMAS * max(fit.sigma_px))
+    gone = (moved.flux <= MISSING_SHARE * fit.flux) | (np.hypot(*shift.T) > MAX_MOVE_SIGMAS * max(fit.psf.width_px))
     error_mag = np.where(gone, np.inf, magnitude(np.where(gone, 1.0, moved.flux / fit.flux)))
     columns = (*fit.places_px.T, fit.flux, error_mag, *np.where(gone, 0.0, shift.T), limit_mag, limit_px)
     return [
@@ -165,9 +166,9 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
     change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))
     floor = RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
     rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
-    seeds = nameless_seeds(bright_pixels(light, around(floor, fit.sigma_px) + rounding), fit.sigma_px).places_px
-    places = refined(light, seeds, fit.sigma_px)
-    flux = StarTemplates(places, fit.sigma_px, (light.shape[0], light.shape[1])).fit(light)[:, 0]
+    seeds = nameless_seeds(bright_pixels(light, around(floor, fit.psf) + rounding), fit.psf).places_px
+    places = refined(light, seeds, fit.psf)
+    flux = StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[:, 0]
     column, row = seeds.astype(np.intp).T
     return places, np.maximum(
         flux, light[row, column]

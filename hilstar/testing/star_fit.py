@@ -23,7 +23,7 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf, Psf
 
 # Around a bright star float32 leaves ripples of 2e-6 of its peak (4.4e-7 of its flux, see tests/gpu), which are no stars.
 RIPPLE_SHARE = 1e-5
@@ -49,11 +49,11 @@ class StarTemplates:
     A star's share of light that falls on the image is in `in_view` (n,).
     """
 
-    def __init__(self, places_px: FloatArray, sigma_px: tuple[float, float], shape: tuple[int, int]) -> None:
+    def __init__(self, places_px: FloatArray, psf: Psf, shape: tuple[int, int]) -> None:
         self.places_px = places_px
         self.shape = shape
-        reach_px = footprint_px(sigma_px) // 2 + 1
-        self._x, self._y = (_Profiles(places_px[:, k], sigma_px[k], reach_px, shape[1 - k]) for k in (0, 1))
+        reach_px = psf.footprint_px // 2 + 1
+        self._x, self._y = (_Profiles(places_px[:, k], psf.width_px[k], reach_px, shape[1 - k]) for k in (0, 1))
         self.in_view = self._x.share.sum(axis=1) * self._y.share.sum(axis=1)
 
     @cached_property
@@ -154,18 +154,18 @@ def bright_pixels(image: FloatArray, floor: FloatArray) -> FloatArray:
     return np.column_stack([column, row])[order].astype(np.float64)
 
 
-def around(image: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
+def around(image: FloatArray, psf: Psf) -> FloatArray:
     """The brightest pixel within a star's footprint around each pixel, the same shape."""
-    return np.asarray(ndimage.maximum_filter(image, footprint_px(sigma_px), mode="constant"))
+    return np.asarray(ndimage.maximum_filter(image, psf.footprint_px, mode="constant"))
 
 
-def star_sigma_px(image: FloatArray) -> tuple[float, float]:
-    """The sigma of the stars along x and y: Newton's steps on the brightest, from the image's correlation of neighbours."""
+def star_psf(image: FloatArray) -> GaussianPsf:
+    """The Gaussian of an image's stars: Newton's steps on the brightest, from the image's correlation of neighbours."""
     x, y = (_first_sigma_px(image, axis) for axis in (1, 0))
-    sigma = np.array([x, y])
-    found = bright_pixels(image, RIPPLE_SHARE * around(image, (x, y)))
-    places = _apart(found, footprint_px((x, y)), (image.shape[1], image.shape[0]))
-    reach = footprint_px((x, y)) // 2 + 1
+    sigma, first = np.array([x, y]), GaussianPsf((x, y))
+    found = bright_pixels(image, RIPPLE_SHARE * around(image, first))
+    places = _apart(found, first.footprint_px, (image.shape[1], image.shape[0]))
+    reach = first.footprint_px // 2 + 1
     padded = np.pad(image, 2 * reach)
     for _ in range(SIGMA_STEPS):
         steps = _sigma_steps(padded, places, sigma, reach)
@@ -174,7 +174,7 @@ def star_sigma_px(image: FloatArray) -> tuple[float, float]:
             break
         places[good] += np.clip(steps[good, :2], -0.5, 0.5)
         sigma = sigma + np.clip(np.median(steps[good, 2:], axis=0), -MAX_SIGMA_STEP * sigma, MAX_SIGMA_STEP * sigma)
-    return float(sigma[0]), float(sigma[1])
+    return GaussianPsf((float(sigma[0]), float(sigma[1])))
 
 
 def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) -> FloatArray:
@@ -211,15 +211,15 @@ def _sigma_steps(padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray
         return np.asarray(fitted[:, 1:, 0] / fitted[:, :1, 0])
 
 
-def refined(image: FloatArray, places_px: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
+def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
     """Places (n, 2) of stars, px, refined from their brightest pixels, or from places known well: all stars at once."""
     start, shape = places_px, (image.shape[0], image.shape[1])
     last = np.array([shape[1] - 1, shape[0] - 1])
-    outwards = BEYOND_SIGMAS * np.array(sigma_px)
+    outwards = BEYOND_SIGMAS * np.array(psf.width_px)
     low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - MAX_OFFSET_PX)
     high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + MAX_OFFSET_PX)
     for _ in range(MAX_PLACE_STEPS):
-        step = np.clip(shifts_px(StarTemplates(places_px, sigma_px, shape).fit(image)), -MAX_STEP_PX, MAX_STEP_PX)
+        step = np.clip(shifts_px(StarTemplates(places_px, psf, shape).fit(image)), -MAX_STEP_PX, MAX_STEP_PX)
         before, places_px = places_px, np.clip(places_px + step, low, high)
         if np.abs(places_px - before).max(initial=0.0) < MIN_STEP_PX:
             break
@@ -249,12 +249,12 @@ class Seeds:
         return Seeds(self.places_px[kept], [hip for hip, keep in zip(self.hip, kept, strict=True) if keep])
 
 
-def find_seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, float]) -> Seeds:
+def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
     """The table's stars, and the image's where the table has none. Raises InputError for a table of another sky."""
-    found = bright_pixels(golden, RIPPLE_SHARE * around(golden, sigma_px))
+    found = bright_pixels(golden, RIPPLE_SHARE * around(golden, psf))
     if truth is None:
-        return nameless_seeds(found, sigma_px)
-    blend_px = blend_distance_px(sigma_px)
+        return nameless_seeds(found, psf)
+    blend_px = blend_distance_px(psf)
     if not _has(truth, found, blend_px):
         raise InputError(
             "compare: the truth table's stars are not where the golden image has them; give the table of that frame"
@@ -265,24 +265,24 @@ def find_seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, f
     # The light of a star off the image is brightest at the image's edge.
     shown = np.clip(places, 0, np.array([golden.shape[1], golden.shape[0]]) - 1)
     away = _nearest(shown, found)[0] > blend_px
-    unlisted = nameless_seeds(found[away], sigma_px)
+    unlisted = nameless_seeds(found[away], psf)
     return Seeds(np.concatenate([listed.places_px, unlisted.places_px]), listed.hip + unlisted.hip)
 
 
-def nameless_seeds(places_px: FloatArray, sigma_px: tuple[float, float]) -> Seeds:
+def nameless_seeds(places_px: FloatArray, psf: Psf) -> Seeds:
     """Seeds at places (n, 2), px, brightest first; those closer than a blend are one."""
-    return _blended(Seeds(places_px, [()] * len(places_px)), blend_distance_px(sigma_px))
+    return _blended(Seeds(places_px, [()] * len(places_px)), blend_distance_px(psf))
 
 
-def blend_distance_px(sigma_px: tuple[float, float]) -> float:
+def blend_distance_px(psf: Psf) -> float:
     """The distance within which two stars are one blend."""
-    return max(BLEND_SIGMAS * max(sigma_px), BLEND_PX)
+    return max(BLEND_SIGMAS * max(psf.width_px), BLEND_PX)
 
 
 def describes(truth: Truth, image: FloatArray) -> bool:
     """Whether a table (TRUTH_DTYPE) has at least half of the brightest stars of a linear image (height, width)."""
-    sigma_px = star_sigma_px(image)
-    return _has(truth, bright_pixels(image, RIPPLE_SHARE * around(image, sigma_px)), blend_distance_px(sigma_px))
+    psf = star_psf(image)
+    return _has(truth, bright_pixels(image, RIPPLE_SHARE * around(image, psf)), blend_distance_px(psf))
 
 
 def names_at(places_px: FloatArray, truth: Truth | None, blend_px: float) -> list[tuple[int | str, ...]]:

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
+from hilstar.tracker.frame_noise import Word64Array, draw_blocks, normal_pairs, poisson
 from hilstar.tracker.settings import MAX_E, DetectorSettings, PixelPitch, check_value
 
 DEFAULT_PITCH_UM = 13.0
@@ -39,6 +40,7 @@ RAY_STEP_PX = 0.25
 
 FALSE_STAR_REACH_SIGMAS = 5.0
 CodeArray = npt.NDArray[np.uint16]
+ChargeArray = npt.NDArray[Any]  # float64 in `noise_version = 1`, else float32
 
 
 def cosmic_rays_e(
@@ -114,14 +116,21 @@ class Detector:
         self.settings = settings
         self.pixel_pitch_um = pixel_pitch_um
         self.shape = (height, width)
-        prnu, dsnu, hot, dead, column = map(np.random.default_rng, np.random.SeedSequence(settings.device_seed).spawn(5))
-        self.gain_map = _gain_map(settings, self.shape, prnu)
-        self.dark_map_e_per_s = _dark_map_e_per_s(settings, self.shape, dsnu, hot)
-        self.column_e = settings.column_noise_e * column.standard_normal(width)
+        streams = map(np.random.default_rng, np.random.SeedSequence(settings.device_seed).spawn(7))
+        prnu, dsnu, hot, dead, column, column_dark, offset = streams
+        gain_map: ChargeArray = _gain_map(settings, self.shape, prnu)
+        dark_map_e_per_s = _dark_map_e_per_s(settings, self.shape, dsnu, hot, column_dark)
         if settings.dead_pixel_fraction:
             alive = dead.random(self.shape) >= settings.dead_pixel_fraction
-            self.gain_map *= alive
-            self.dark_map_e_per_s *= alive
+            gain_map *= alive
+            dark_map_e_per_s *= alive
+        kind = np.float64 if settings.noise_version == 1 else np.float32
+        self.gain_map: ChargeArray = gain_map.astype(kind, copy=False)
+        self.dark_map_e_per_s: ChargeArray = dark_map_e_per_s.astype(kind, copy=False)
+        self.column_e: ChargeArray = (settings.column_noise_e * column.standard_normal(width)).astype(kind)
+        self.offset_map_e: ChargeArray = (
+            settings.dsnu_e * offset.standard_normal(self.shape if settings.dsnu_e else 0)
+        ).astype(kind)
 
     def expose(self, mean_e: npt.ArrayLike, exposure_s: float, rng: np.random.Generator) -> CodeArray:
         """One frame, DN, of `mean_e` (height, width): the electrons that the light makes on average in the exposure.
@@ -130,22 +139,56 @@ class Detector:
         MAX_E.
         """
         settings = self.settings
-        expected_e = self._light_e(mean_e, exposure_s)
+        light_e = self._light_e(mean_e, exposure_s)
         if settings.false_stars and exposure_s > 0:
-            expected_e = expected_e + false_stars_e(settings, self.shape, exposure_s, rng)
-        expected_e = expected_e * self.gain_map
+            light_e = light_e + false_stars_e(settings, self.shape, exposure_s, rng)
+        if settings.noise_version == 1:
+            return self._expose_by_generator(light_e, exposure_s, rng)
+        rays_e = None
+        if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
+            rays_e = cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
+        codes = np.empty(self.shape, dtype=np.uint16)
+        spilt_e, normal = (np.empty(self.shape if settings.blooming else 0, dtype=np.float32) for _ in range(2))
+
+        def draw(part: slice, words: Word64Array) -> None:
+            self._check_light(light_e[part])
+            expected_e: Float32Array = np.multiply(self.dark_map_e_per_s[part], exposure_s, dtype=np.float32)
+            expected_e += light_e[part].astype(np.float32) * self.gain_map[part]
+            self._check_largest(expected_e)
+            shot, read = normal_pairs(words)
+            charge_e = poisson(expected_e, shot)
+            if rays_e is not None:
+                charge_e += rays_e[part]
+            if settings.blooming:
+                spilt_e[part], normal[part] = charge_e, read
+            else:
+                codes[part] = self._read_out(np.minimum(charge_e, np.float32(settings.full_well_e)), read, part)
+
+        draw_blocks(self.shape, rng, draw)
+        return self._read_out(bloom(spilt_e, settings.full_well_e), normal) if settings.blooming else codes
+
+    def _expose_by_generator(self, light_e: FloatArray, exposure_s: float, rng: np.random.Generator) -> CodeArray:
+        """`noise_version = 1`: NumPy's own draws of the whole frame."""
+        settings = self.settings
+        self._check_light(light_e)
+        expected_e = light_e * self.gain_map
         expected_e += self.dark_map_e_per_s * exposure_s
         self._check_largest(expected_e)
         collected_e = rng.poisson(expected_e).astype(np.float64)
         if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
             collected_e += cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
         kept_e = self._fill_wells(collected_e)
-        if settings.column_noise_e:
-            kept_e += self.column_e
-        noise_e = math.hypot(settings.read_noise_e, settings.adc_noise_e if settings.quantisation_noise else 0.0)
-        if noise_e:
-            kept_e += noise_e * rng.standard_normal(self.shape, dtype=np.float32)
-        return self._convert(kept_e)
+        return self._read_out(kept_e, rng.standard_normal(self.shape, dtype=np.float32) if settings.electronics_e else None)
+
+    def _read_out(self, charge_e: ChargeArray, normal: Float32Array | None, part: slice = slice(None)) -> CodeArray:
+        """DN of the charge in the wells, the rows `part`, with the noise of the electronics; `charge_e` is changed."""
+        if self.settings.column_noise_e:
+            charge_e += self.column_e
+        if self.settings.dsnu_e:
+            charge_e += self.offset_map_e[part]
+        if self.settings.electronics_e and normal is not None:
+            charge_e += self.settings.electronics_e * normal
+        return self._convert(charge_e)
 
     def expose_noiseless(self, mean_e: npt.ArrayLike, exposure_s: float) -> CodeArray:
         """The DN of the mean signal, light and mean dark, through full well and ADC; refuses what `expose` refuses.
@@ -153,7 +196,9 @@ class Detector:
         No fixed pattern, no strays. The mean of noisy frames differs where a well or the ADC clips the noise.
         """
         settings = self.settings
-        expected_e = self._light_e(mean_e, exposure_s) + settings.dark_e_per_s * settings.dark_factor * exposure_s
+        light_e = self._light_e(mean_e, exposure_s)
+        self._check_light(light_e)
+        expected_e = light_e.astype(np.float64) + settings.dark_e_per_s * settings.dark_factor * exposure_s
         self._check_largest(expected_e)
         return self._convert(self._fill_wells(expected_e))
 
@@ -163,10 +208,12 @@ class Detector:
             raise InputError(f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}")
         if not 0 <= exposure_s <= MAX_E:
             raise InputError(f"exposure {exposure_s} s; write 0 or more seconds")
+        return light_e
+
+    def _check_light(self, light_e: npt.NDArray[Any]) -> None:
         if not light_e.min() >= 0:  # NaN propagates through min
             raise InputError("a pixel's electrons are negative or NaN; give expected electrons, 0 or more")
         self._check_largest(light_e)
-        return light_e.astype(np.float64, copy=False)
 
     def _check_largest(self, expected_e: npt.NDArray[Any]) -> None:
         largest_e = expected_e.max()
@@ -175,11 +222,11 @@ class Detector:
                 f"{largest_e:.3g} electrons in one pixel, at most {MAX_E:g} can be simulated; shorten the exposure"
             )
 
-    def _fill_wells(self, collected_e: FloatArray) -> FloatArray:
+    def _fill_wells(self, collected_e: FloatArray) -> ChargeArray:
         full_e = self.settings.full_well_e
         return bloom(collected_e, full_e) if self.settings.blooming else np.minimum(collected_e, full_e)
 
-    def _convert(self, charge_e: FloatArray) -> CodeArray:
+    def _convert(self, charge_e: ChargeArray) -> CodeArray:
         """The ADC: electrons to the nearest code (a half goes to the even one), clipped to the bits; same shape."""
         codes = charge_e
         codes /= self.settings.gain_e_per_dn
@@ -197,22 +244,36 @@ def _gain_map(settings: DetectorSettings, shape: tuple[int, int], rng: np.random
 
 
 def _dark_map_e_per_s(
-    settings: DetectorSettings, shape: tuple[int, int], dsnu: np.random.Generator, hot: np.random.Generator
+    settings: DetectorSettings,
+    shape: tuple[int, int],
+    dsnu: np.random.Generator,
+    hot: np.random.Generator,
+    column: np.random.Generator,
 ) -> FloatArray:
-    """Dark rates at the sensor's temperature: dark + N(0, DSNU), never negative, plus the hot pixels.
+    """Dark rates at the sensor's temperature: the pixels' and the columns', never negative, plus the hot pixels' extra.
 
-    Where DSNU is not small beside dark, the cut at 0 lifts the mean: 1e-4 of it for table 4.2 (203 and 60 e-/s).
+    Where DSNU is not small beside dark, the normal law's cut at 0 lifts the mean: 1e-4 of it for table 4.2 (203 and 60 e-/s).
     """
-    rate_e_per_s = np.full(shape, settings.dark_e_per_s)
-    if settings.dsnu_e_per_s:
-        rate_e_per_s = np.maximum(rate_e_per_s + settings.dsnu_e_per_s * dsnu.standard_normal(shape), 0.0)
+    mean, sigma = settings.dark_e_per_s, settings.dsnu_e_per_s
+    rate_e_per_s = np.full(shape, mean)
+    if sigma and settings.dark_distribution == "gamma":
+        rate_e_per_s = dsnu.gamma((mean / sigma) ** 2, sigma**2 / mean, shape)
+    elif sigma and settings.dark_distribution == "log-normal":
+        spread2 = math.log1p((sigma / mean) ** 2)
+        rate_e_per_s = dsnu.lognormal(math.log(mean) - spread2 / 2, math.sqrt(spread2), shape)
+    elif sigma:
+        rate_e_per_s = np.maximum(rate_e_per_s + sigma * dsnu.standard_normal(shape), 0.0)
+    if settings.column_dark_e_per_s:
+        columns_e_per_s = settings.column_dark_e_per_s * column.standard_normal(shape[1])
+        rate_e_per_s = np.maximum(rate_e_per_s + columns_e_per_s, 0.0)
     if settings.hot_pixel_fraction:
         is_hot = hot.random(shape) < settings.hot_pixel_fraction
-        rate_e_per_s += is_hot * hot.exponential(settings.hot_pixel_e_per_s, shape)
+        hot_factor = settings.hot_factor / settings.dark_factor
+        rate_e_per_s += is_hot * hot.exponential(settings.hot_pixel_e_per_s, shape) * hot_factor
     return np.asarray(rate_e_per_s * settings.dark_factor)
 
 
-def bloom(charge_e: FloatArray, full_well_e: float) -> FloatArray:
+def bloom(charge_e: ChargeArray, full_well_e: float) -> ChargeArray:
     """`charge_e` with what exceeds the full well spilt along its columns, half up and half down; same shape.
 
     Only the charge that leaves a column at its ends is lost.

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 from msgspec import Meta
 
+from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 
 BOLTZMANN_EV_PER_K = 8.617333262e-5  # CODATA 2018
+ELECTRON_C = 1.602176634e-19
 TABLE_4_2_TEMPERATURE_K = 293.0
-DATASHEET_RANGE_K = (230.0, 300.0)  # where the CCD47-20's datasheet gives its law of dark current
+# e2v's dark signal relative to 293 K, a T^3 exp(-b / T), from 230 to 300 K: a in 1/K^3 and b in K. Seen in public code, not
+# on a data sheet: the first (AIMO) in the response model of Solar-C's EUVST, the second (NIMO) there, in a simulator that
+# quotes the CCD230-42's sheet, and in a background analysis of New Horizons' LORRI. They give 0.997 and 1.001 at 293 K.
+E2V_DARK = {"ccd47-20": (1.14e6, 9080.0), "e2v-nimo": (122.0, 6400.0)}
+DATASHEET_RANGE_K = (230.0, 300.0)
 
 # More is refused. numpy's Poisson sampler compares logarithms of the size of mean * ln(mean): their rounding is 0.004
 # at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails (9.2e18).
@@ -23,6 +32,29 @@ Charge = Annotated[float, Meta(ge=1e-6, le=MAX_E)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Temperature = Annotated[float, Meta(ge=50, le=500)]
 PixelPitch = Annotated[float, Meta(ge=0.1, le=1000)]
+
+
+@dataclass(frozen=True, slots=True)
+class PixelNoise:
+    """Variances of a pixel's signal by source, e-^2, each of the shape of the light or a number.
+
+    Shot is the light's, dark the dark current's own shot noise. PRNU and DSNU, which holds CMOS columns too, are fixed in a
+    device: variances over its pixels.
+    """
+
+    shot_e2: FloatArray
+    dark_e2: float
+    read_e2: float
+    reset_e2: float
+    quantisation_e2: float
+    prnu_e2: FloatArray
+    dsnu_e2: float
+
+    @property
+    def total_e2(self) -> FloatArray:
+        """The sum: the square of n_TOT (thesis table 4.1, eq. 4.14)."""
+        thermal_e2 = self.dark_e2 + self.read_e2 + self.reset_e2 + self.quantisation_e2 + self.dsnu_e2
+        return np.asarray(self.shot_e2 + self.prnu_e2 + thermal_e2)
 
 
 class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -36,9 +68,39 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     full_well_e: Annotated[Charge, Meta(description="Charge above this is lost, or spills with `blooming`.")] = 70_000.0
     bits: Annotated[int, Meta(ge=1, le=16, description="Bits of a DN.")] = 12
     offset_dn: Annotated[Amount, Meta(description="Added by the ADC.")] = 0.0
-    read_noise_e: Annotated[Amount, Meta(description="Sigma of the read noise.")] = 0.0
+    fill_factor: Annotated[
+        float,
+        Meta(ge=1e-3, le=1, description="Share of a pixel that takes light: `quantum_efficiency` is that of its open part."),
+    ] = 1.0
+    read_noise_e: Annotated[Amount, Meta(description="Sigma of the read noise, at `read_noise_reference_hz`.")] = 0.0
+    readout_hz: Annotated[
+        Amount, Meta(description="Pixels that an output reads in a second; 0: `read_noise_e` holds as it is.")
+    ] = 0.0
+    read_noise_reference_hz: Annotated[Charge, Meta(description="Readout frequency of `read_noise_e`.")] = 1e6
+    read_noise_corner_hz: Annotated[
+        Amount,
+        Meta(description="Where 1/f noise equals white noise: read noise goes as the root of readout frequency plus this."),
+    ] = 0.0
+    read_noise_table: Annotated[
+        tuple[tuple[Charge, Amount], ...],
+        Meta(
+            description="Read noise by readout frequency, instead: points `[hz, e-]`, between which its logarithm is straight.",
+            extra={"form": "[[hz, e], ...]", "default": "none"},
+        ),
+    ] = ()
+    sense_capacitance_ff: Annotated[
+        Amount,
+        Meta(description="Capacitance whose reset adds kTC noise; 0: none, as with correlated double sampling."),
+    ] = 0.0
     dark_e_per_s: Annotated[Amount, Meta(description="Dark current of a pixel at the reference temperature.")] = 0.0
     dsnu_e_per_s: Annotated[Amount, Meta(description="Sigma of the dark current over the device (DSNU).")] = 0.0
+    dsnu_e: Annotated[
+        Amount, Meta(description="Sigma of a fixed offset of each pixel, whatever the exposure (EMVA 1288's DSNU).")
+    ] = 0.0
+    dark_distribution: Annotated[
+        Literal["normal", "gamma", "log-normal"],
+        Meta(description="How pixels' dark currents lie about their mean, with that sigma; `normal` is cut at 0."),
+    ] = "normal"
     prnu: Annotated[Share, Meta(description="Relative sigma of the gain map (PRNU), which is fixed for a device.")] = 0.0
     device_seed: Annotated[
         int,
@@ -57,12 +119,20 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         Temperature, Meta(description="Temperature at which the dark currents above hold.")
     ] = TABLE_4_2_TEMPERATURE_K
     dark_law: Annotated[
-        Literal["arrhenius", "ccd47-20"],
+        Literal["arrhenius", "diffusion-depletion", "ccd47-20", "e2v-nimo"],
         Meta(
-            description='Dark current against temperature. `"arrhenius"`: with `dark_activation_ev`. `"ccd47-20"`: the '
-            "datasheet's law, 230 to 300 K."
+            description='Dark current against temperature. `"arrhenius"`: with `dark_activation_ev`. `"diffusion-depletion"`: '
+            "T^3 exp(-E/kT) and T^1.5 exp(-E/2kT). "
+            '`"ccd47-20"` (AIMO) and `"e2v-nimo"`: e2v\'s laws, 230 to 300 K.'
         ),
     ] = "arrhenius"
+    dark_depletion_share: Annotated[
+        Share, Meta(description="Share of depletion in the dark current at the reference temperature; the rest is diffusion.")
+    ] = 1.0
+    dark_gap_ev: Annotated[
+        float,
+        Meta(ge=0, le=2, description="E of `diffusion-depletion`; 0 is silicon's gap, 1.125 eV at 300 K, wider if colder."),
+    ] = 0.0
     # Half of silicon's band gap: the depletion term of eq. 4.12.
     dark_activation_ev: Annotated[
         float, Meta(ge=0, le=1.2, description="Activation energy of `arrhenius`; the default is half of silicon's band gap.")
@@ -71,8 +141,14 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     hot_pixel_e_per_s: Annotated[
         Amount, Meta(description="Mean of the exponential law from which the extra dark current of a hot pixel is drawn.")
     ] = 10_000.0
+    hot_pixel_activation_ev: Annotated[
+        float, Meta(ge=0, le=2, description="Activation energy of that extra current; 0: it goes as the dark current does.")
+    ] = 0.0
     dead_pixel_fraction: Annotated[Share, Meta(description="Share of the pixels that give no electrons.")] = 0.0
     column_noise_e: Annotated[Amount, Meta(description="Sigma of a fixed offset of each column, for `cmos`.")] = 0.0
+    column_dark_e_per_s: Annotated[
+        Amount, Meta(description="Sigma of a dark current that a column's pixels share, for `cmos`.")
+    ] = 0.0
     cosmic_rays_per_cm2_s: Annotated[
         Amount, Meta(description="Hits by isotropic minimum-ionising particles; each leaves a straight track.")
     ] = 0.0
@@ -80,6 +156,13 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     false_star_e_per_s: Annotated[Amount, Meta(description="Rate of a false star.")] = 10_000.0
     false_star_sigma_px: Annotated[float, Meta(ge=0.05, le=20, description="Gaussian sigma of a false star.")] = 0.55
     blooming: Annotated[bool, Meta(description="Charge above the full well spills along the column.")] = False
+    noise_version: Annotated[
+        Literal[1, 2],
+        Meta(
+            description="How a frame's noise is drawn from its seed. `2`: in blocks, on every core, the same on any number "
+            "of them; `1`: as up to version 0.2, slower."
+        ),
+    ] = 2
     quantisation_noise: Annotated[
         bool, Meta(description="Adds the Gaussian quantisation noise of the thesis to what rounding does.")
     ] = False
@@ -90,24 +173,83 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             check_value(name, getattr(self, name), kind)
         low_k, high_k = DATASHEET_RANGE_K
         for name in ("temperature_k", "dark_reference_temperature_k"):
-            if self.dark_law == "ccd47-20" and not low_k <= getattr(self, name) <= high_k:
+            if self.dark_law in E2V_DARK and not low_k <= getattr(self, name) <= high_k:
                 raise InputError(
-                    f'{name} = {getattr(self, name):g}; dark_law "ccd47-20" holds from {low_k:g} to {high_k:g} K: '
+                    f'{name} = {getattr(self, name):g}; dark_law "{self.dark_law}" holds from {low_k:g} to {high_k:g} K: '
                     'write such a temperature, or dark_law = "arrhenius"'
                 )
-        if self.fixed_pattern == "ccd" and self.column_noise_e > 0:
+        for name in ("column_noise_e", "column_dark_e_per_s"):
+            if self.fixed_pattern == "ccd" and getattr(self, name) > 0:
+                raise InputError(
+                    f'{name} is for CMOS, whose columns have an amplifier each; write fixed_pattern = "cmos", or {name} = 0'
+                )
+        if self.dark_distribution != "normal" and self.dsnu_e_per_s and not self.dark_e_per_s:
+            raise InputError(f'dark_distribution = "{self.dark_distribution}" has no mean of 0; write dark_e_per_s above 0')
+        hz = [point[0] for point in self.read_noise_table]
+        if hz and self.readout_hz and not (sorted(set(hz)) == hz and hz[0] <= self.readout_hz <= hz[-1]):
             raise InputError(
-                'column_noise_e is for CMOS, whose columns have an amplifier each; write fixed_pattern = "cmos", '
-                "or column_noise_e = 0"
+                f"readout_hz = {self.readout_hz:g}; write a frequency within read_noise_table, whose frequencies rise: "
+                f"{hz[0]:g} to {hz[-1]:g}"
             )
 
     @property
     def dark_factor(self) -> float:
-        """What the temperature does to every dark rate: 1 at the reference temperature."""
+        """What the temperature does to dark rates: 1 at the reference temperature (thesis eq. 4.12)."""
         cold_k, warm_k = self.dark_reference_temperature_k, self.temperature_k
-        if self.dark_law == "ccd47-20":
-            return ccd47_20_dark(warm_k) / ccd47_20_dark(cold_k)
-        return math.exp(self.dark_activation_ev / BOLTZMANN_EV_PER_K * (1 / cold_k - 1 / warm_k))
+        if self.dark_law == "arrhenius":
+            return _arrhenius(self.dark_activation_ev, cold_k, warm_k)
+        if self.dark_law in E2V_DARK:
+            return e2v_dark(self.dark_law, warm_k) / e2v_dark(self.dark_law, cold_k)
+        cold_ev, warm_ev = (self.dark_gap_ev or silicon_gap_ev(kelvin) for kelvin in (cold_k, warm_k))
+        depletion = math.pow(warm_k / cold_k, 1.5) * math.exp((cold_ev / cold_k - warm_ev / warm_k) / (2 * BOLTZMANN_EV_PER_K))
+        return (1 - self.dark_depletion_share) * depletion**2 + self.dark_depletion_share * depletion
+
+    @property
+    def hot_factor(self) -> float:
+        """What the temperature does to the extra dark current of hot pixels."""
+        if not self.hot_pixel_activation_ev:
+            return self.dark_factor
+        return _arrhenius(self.hot_pixel_activation_ev, self.dark_reference_temperature_k, self.temperature_k)
+
+    @property
+    def read_noise_now_e(self) -> float:
+        """Sigma of the read noise at `readout_hz`: white noise of the band, and 1/f noise, which has as much in each octave."""
+        if not self.readout_hz:
+            return self.read_noise_e
+        if self.read_noise_table:
+            hz, table_e = np.log(np.maximum(self.read_noise_table, 1e-12)).T
+            return math.exp(float(np.interp(math.log(self.readout_hz), hz, table_e)))
+        corner_hz = self.read_noise_corner_hz
+        return self.read_noise_e * math.sqrt((self.readout_hz + corner_hz) / (self.read_noise_reference_hz + corner_hz))
+
+    @property
+    def reset_noise_e(self) -> float:
+        """kTC noise: sqrt(k T C) / q, e-."""
+        return math.sqrt(BOLTZMANN_EV_PER_K * self.temperature_k * self.sense_capacitance_ff * 1e-15 / ELECTRON_C)
+
+    def noise(self, light_e: npt.ArrayLike, exposure_s: float) -> PixelNoise:
+        """The noise of pixels that light gives `light_e` electrons on average, background among them (thesis table 4.1).
+
+        Of pixels that are neither hot nor dead nor hit by a cosmic ray, below full well and above code 0.
+        """
+        light = np.asarray(light_e, dtype=np.float64)
+        seconds = self.dark_factor * exposure_s
+        return PixelNoise(
+            shot_e2=light,
+            dark_e2=self.dark_e_per_s * seconds,
+            read_e2=self.read_noise_now_e**2,
+            reset_e2=self.reset_noise_e**2,
+            quantisation_e2=self.gain_e_per_dn**2 / 12 + (self.adc_noise_e**2 if self.quantisation_noise else 0.0),
+            prnu_e2=(self.prnu * light) ** 2,
+            dsnu_e2=math.hypot(self.dsnu_e_per_s, self.column_dark_e_per_s) ** 2 * seconds**2
+            + self.column_noise_e**2
+            + self.dsnu_e**2,
+        )
+
+    @property
+    def electronics_e(self) -> float:
+        """Sigma of what the electronics add to the charge: read and reset noise, and the ADC's for `quantisation_noise`."""
+        return math.hypot(self.read_noise_now_e, self.reset_noise_e, self.adc_noise_e if self.quantisation_noise else 0.0)
 
     @property
     def adc_noise_e(self) -> float:
@@ -118,12 +260,19 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 _KINDS = get_type_hints(DetectorSettings, include_extras=True)
 
 
-def ccd47_20_dark(temperature_k: float) -> float:
-    """Dark signal of an AIMO CCD47-20 relative to 293 K, 230 to 300 K: 1.14e6 T^3 exp(-9080/T) (e2v's datasheet).
+def e2v_dark(law: str, temperature_k: float) -> float:
+    """Dark signal by e2v's law (a name of E2V_DARK) relative to 293 K."""
+    per_k3, kelvin = E2V_DARK[law]
+    return float(per_k3 * temperature_k**3 * math.exp(-kelvin / temperature_k))
 
-    The coefficients are recalled, not read off the sheet; they give 0.997 at 293 K, as they must.
-    """
-    return float(1.14e6 * temperature_k**3 * math.exp(-9080.0 / temperature_k))
+
+def silicon_gap_ev(temperature_k: float) -> float:
+    """Silicon's band gap, eV (Thurmond, J. Electrochem. Soc. 122 (1975) 1133; Sze, Physics of Semiconductor Devices)."""
+    return 1.17 - 4.73e-4 * temperature_k**2 / (temperature_k + 636.0)
+
+
+def _arrhenius(activation_ev: float, cold_k: float, warm_k: float) -> float:
+    return math.exp(activation_ev / BOLTZMANN_EV_PER_K * (1 / cold_k - 1 / warm_k))
 
 
 def check_value(name: str, value: Any, kind: Any) -> None:

@@ -13,12 +13,14 @@ from typing import Literal
 
 import numpy as np
 
+from hilstar.bench.build import bench_channels
 from hilstar.bench.frame import Bench, clipping_hip, named
 from hilstar.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, read_primaries
 from hilstar.monitor.quantise import Panel
-from hilstar.scene.psf import peak_share
+from hilstar.scene.psf import Psf
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
@@ -86,6 +88,7 @@ class LightBudget:
     rows: list[MagnitudeRow]
     centroider: By
     centroid_rms_px: dict[str, float | None]
+    primaries: ChannelMatrix | None
 
 
 def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
@@ -98,14 +101,14 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     render, white = bench.config.render, bench.flux_at_white_e_per_s
     # A star of rate r has V = zero_mag + magnitude(r).
     zero_mag = zero_point_mag(bench)
-    clips = zero_mag + magnitude(white * bench.darkest / peak_share(render.sprite_sigma_px))
+    clips = zero_mag + magnitude(white * bench.darkest / bench.psf.peak_share)
     nothing = zero_mag + magnitude(nothing_below_e_per_s(bench))
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return LightBudget(
         method=render.quantisation + (" with bit stealing" if render.bit_stealing else ""),
         bits=bench.config.monitor.bits,
         clips_v_mag=clips,
-        clips_v_mag_at_best=zero_mag + magnitude(white / corner_share(render.sprite_sigma_px)),
+        clips_v_mag_at_best=zero_mag + magnitude(white / corner_share(bench.psf)),
         nothing_v_mag=nothing,
         range_mag=nothing - clips,
         within=_within(rows),
@@ -115,7 +118,17 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         rows=rows,
         centroider=by,
         centroid_rms_px=next((row.axis_rms_px for row in rows if row.below_white_mag == COMPARED_MAG), dict.fromkeys(FAMILY)),
+        primaries=primaries_matrix(bench),
     )
+
+
+def primaries_matrix(bench: Bench) -> ChannelMatrix | None:
+    """What the tracker's channels have of the monitor's primaries; None where their spectra are not known."""
+    tracker, file = bench.config.tracker, bench.config.monitor.primaries.file
+    if file is None:
+        return None
+    channels = dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, bench.file.folder), strict=True))
+    return channel_matrix(read_primaries(bench.file.folder / file), channels, bench.flux_at_white_e_per_s)
 
 
 def zero_point_mag(bench: Bench) -> float:
@@ -131,9 +144,10 @@ def zero_point_mag(bench: Bench) -> float:
     return float(np.median(v_mag[alike] - magnitude(rates_e_per_s[alike])))
 
 
-def corner_share(sigma_px: tuple[float, float]) -> float:
+def corner_share(psf: Psf) -> float:
     """The share of a star's brightest pixel when it is on a corner of four: the minimum that a peak can be."""
-    return math.prod(0.5 * math.erf(1.0 / (sigma * math.sqrt(2.0))) for sigma in sigma_px)
+    half = np.array([-0.5, 0.5])
+    return float(psf.shares(half, half[:, None]).max())
 
 
 def nothing_below_e_per_s(bench: Bench) -> float:
@@ -151,11 +165,12 @@ def not_drawn(bench: Bench) -> NotDrawn:
 
 def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
     """The errors at each magnitude below full scale, down to the first at which a star shows nothing."""
-    render, target, frames = bench.config.render, bench.renderer.target, bench.config.exposure_frames
-    sprites, _ = phase_grid(PHASES, render.sprite_sigma_px)
-    bright = phase_image(sprites, render.sprite_sigma_px)
-    judge = Judge(bright, line_places(sprites), render.sprite_sigma_px, target.seen.blur_px, target.seen.pixel_px)
-    panel, balance = Panel(bench.calibration.response, WHITE), Balance(render.sprite_sigma_px, target.seen)
+    target, frames = bench.renderer.target, bench.config.exposure_frames
+    psf = bench.psf
+    sprites, _ = phase_grid(PHASES, psf)
+    bright = phase_image(sprites, psf)
+    judge = Judge(bright, line_places(sprites), psf.width_px, target.seen.blur_px, target.seen.pixel_px)
+    panel, balance = Panel(bench.calibration.response, WHITE), Balance(psf, target.seen)
     found = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():
         wanted, stars = (bright * flux_ratio(mag)).astype(np.float32), fainter(sprites, mag)
@@ -255,9 +270,16 @@ def budget_lines(found: LightBudget) -> list[str]:
         f"{'clipped stars':22}{named(found.clipped_hip, MAX_NAMED)}",
         f"{'not drawn':22}{found.left_out.stars} stars, too faint: {found.left_out.flux_share:.2e} of all light",
         f"{'black':22}{found.black_e_per_s_px:.4g} e-/s in a monitor pixel",
+        *([] if found.primaries is None else _primaries_lines(found.primaries)),
         "",
         *(_by_each(found) if found.centroider == "all" else _by_one(found)),
     ]
+
+
+def _primaries_lines(found: ChannelMatrix) -> Iterator[str]:
+    yield f"{'condition number':22}{_number(found.condition, '.2f')}, electrons of each channel by each primary at full light:"
+    for channel, rates in zip(found.channels, found.e_per_s.tolist(), strict=True):
+        yield f"{channel:22}" + ", ".join(f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True))
 
 
 def _by_one(found: LightBudget) -> Iterator[str]:

@@ -85,11 +85,11 @@ class _Head:
             (seen.x_px > margin) & (seen.x_px < width - 1 - margin) & (seen.y_px > margin) & (seen.y_px < height - 1 - margin)
         )
         bench = self.twin.bench
-        reach = bench.renderer.footprint_px / 2 + margin * self.twin.monitor_px_per_px
+        reach = bench.psf.footprint_px / 2 + margin * self.twin.monitor_px_per_px
         screen_w, screen_h = bench.camera.resolution_px
         x, y = truth["x_px"], truth["y_px"]
         inside &= (x > reach) & (x < screen_w - 1 - reach) & (y > reach) & (y < screen_h - 1 - reach)
-        near = crowded(seen.x_px, seen.y_px, truth["electrons_per_s"], radius_px, self.finder.sigma_px)
+        near = crowded(seen.x_px, seen.y_px, truth["electrons_per_s"], radius_px, self.finder.psf)
         found = (sky.index >= 0) & (shown.index >= 0) & ~shared(sky.index)
         return np.asarray(inside & found & truth["drawn"] & ~truth["clipped"] & ~near)
 

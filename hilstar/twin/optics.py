@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.monitor.quantise import Panel
+from hilstar.process.closing import Closing
 from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import pack_sprites
 
 Mirror = Literal["none", "x", "y", "swap"]
@@ -62,14 +63,14 @@ class BenchGeometry:
                 return x_px, y_px
 
 
-class TwinOptics:
+class TwinOptics(Closing):
     """Images of a monitor on the tracker's detector. Free it with `close`, or use it as a context manager."""
 
-    def __init__(self, geometry: BenchGeometry, psf_sigma_px: tuple[float, float]) -> None:
+    def __init__(self, geometry: BenchGeometry, psf: Psf) -> None:
         self.geometry = geometry
         side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px / SUB
-        sigma_x, sigma_y = (math.hypot(sigma, side_px / math.sqrt(12)) for sigma in psf_sigma_px)
-        self._renderer = open_backend(Target(geometry.tracker.resolution_px, (sigma_x, sigma_y)), headless_context())
+        self._psf = psf.blurred(side_px / math.sqrt(12))
+        self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 
     def image_e_per_s(self, light_e_per_s: FloatArray) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of each monitor pixel (H, W), float64."""
@@ -88,7 +89,7 @@ class TwinOptics:
         x_px, y_px = self.geometry.to_tracker((columns[:, None] + dx).ravel(), (rows[:, None] + dy).ravel())
         light = np.repeat(light_e_per_s / SUB**2, SUB**2)
         star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
-        self._renderer.draw(pack_sprites(x_px, y_px, light, star, size_px, self._renderer.footprint_px))
+        self._renderer.draw(pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px))
         return self._renderer.linear().astype(np.float64)
 
     def glow_e_per_s(self, panel: Panel) -> FloatArray:
@@ -115,9 +116,3 @@ class TwinOptics:
     def close(self) -> None:
         """Free the GL context."""
         self._renderer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

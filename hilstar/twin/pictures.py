@@ -22,8 +22,10 @@ from hilstar.bench.frame_files import sky_header, write_fits
 from hilstar.bench.scenario import NO_SCENARIO, Scenario
 from hilstar.files import written
 from hilstar.frame.fault_kinds import Drop, Freeze, Now
+from hilstar.frame.truth import with_errors
 from hilstar.frame.view import STILL, View
 from hilstar.scene.camera import Camera
+from hilstar.sky.stars import Stars
 from hilstar.twin.simulator import Exposure, ExposurePiece, FaultyExposure, FrameNoise, Simulator, simulator_view
 
 BOX_PX = 5  # side of the square over which a star's light is summed: where the middle is full, the wings still grow
@@ -77,6 +79,7 @@ class Imager(Protocol):
     file: BenchFile
     config: BenchConfig
     camera: Camera
+    stars: Stars
 
 
 def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise: FrameNoise) -> None:
@@ -100,7 +103,8 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
     if exposure.faults:
         header["FAULTS"] = ", ".join(exposure.faults)[:MAX_CARD]
     header["NSTARS"] = (len(exposure.truth), "stars in view")
-    hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
+    truth = with_errors(exposure.truth, simulator.stars.catalog, epoch_jyear)
+    hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(truth, name="TRUTH")])
     write_fits(path, hdus)
 
 
@@ -127,7 +131,7 @@ class TrackerPictures:
     """
 
     def __init__(self, bench: Bench, scenario: Scenario = NO_SCENARIO, now: Callable[[], tuple[Now, ...]] = tuple) -> None:
-        self._simulator = Simulator(bench.file, bench.renderer.context)
+        self._simulator = Simulator(bench.file, bench.renderer.context, refuse=False)
         self._noise, self._count = FrameNoise("full"), 0
         self._now = now
         self._stood: View | None = None

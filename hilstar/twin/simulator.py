@@ -6,11 +6,11 @@ An exposure with faults is cut where a fault begins or ends; each piece has its 
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,9 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_optics, bench_sources, bench_stars, moved
-from hilstar.bench.cameras import tracker_camera
-from hilstar.bench.config import BenchConfig, Tracker
+from hilstar.bench.cameras import tracker_camera, tracker_psf
+from hilstar.bench.config import BenchConfig
+from hilstar.bench.config.bench_config import sky_jd
 from hilstar.bench.fault_views import tracker_view
 from hilstar.bench.scenario import Scenario, Timetable
 from hilstar.errors import InputError
@@ -30,16 +31,17 @@ from hilstar.frame.faults import FaultLayer
 from hilstar.frame.layers import light_of, seen_in, sky_layers
 from hilstar.frame.truth import TRUTH_DTYPE, added_truth, truth_table
 from hilstar.frame.view import STILL, Canvas, View
+from hilstar.process.closing import Closing
 from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
-from hilstar.rotation import propagate
-from hilstar.scene.camera import Camera
+from hilstar.rotation import propagate, to_matrix
+from hilstar.scene.camera import Camera, linear_shares
 from hilstar.scene.exposure_motion import MIDDLE_S
 from hilstar.scene.frame_motion import Scan
-from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import Sprites, join_sprites
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
+from hilstar.sky.zodiacal import ZodiacalLight, sunward, tabled_light
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import MAX_E, DetectorSettings
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
@@ -48,8 +50,11 @@ if TYPE_CHECKING:
     from hilstar.render.context import Context
     from hilstar.sky.bodies.moving import MovingSky
 
+log = logging.getLogger(__name__)
+
 # The attitude at a time of the run, ns.
 AttitudeAt = Callable[[int], FloatArray]
+LATTICE = 17  # places along each side of a detector at which zodiacal light is computed; it is linear between them
 BODY_MAX_E = 0.5 * MAX_E  # room for dark current and cosmic rays
 Noise = Literal["full", "none"]
 
@@ -82,18 +87,20 @@ class Exposure:
     faults: tuple[str, ...] = ()
 
 
-class Simulator:
+class Simulator(Closing):
     """A bench's tracker looking at the sky itself, drawn in a GL context of its own or in another renderer's.
 
-    Free it with `close`, or use it as a context manager; one in another's context ends with that.
+    Free it with `close`, or use it as a context manager; one in another's context ends with that. One that
+    does not `refuse` views goes on near the Sun (see `TrackerBackground`).
     """
 
-    def __init__(self, file: BenchFile, context: Context | None = None) -> None:
-        self.file = file
+    def __init__(self, file: BenchFile, context: Context | None = None, *, refuse: bool = True) -> None:
+        self.file, self._refuse = file, refuse
         self.config = file.config
         self._load_sky()
         self._load_tracker()
-        target = Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px)
+        self._layers = sky_layers(self.canvas, self.sources)
+        target = Target(self.config.tracker.resolution_px, self.canvas.psf)
         self.renderer = open_backend(target, context or headless_context(self.config.render.gpu))
 
     def _load_sky(self) -> None:
@@ -103,8 +110,9 @@ class Simulator:
     def _load_tracker(self) -> None:
         tracker = self.config.tracker
         self.camera = tracker_camera(tracker, self.file.folder)
-        self.canvas = detector_canvas(tracker, self.camera)
-        self.background_e = background_e(self.config, self.file.folder)
+        self.canvas = detector_canvas(self.file, self.camera)
+        self._background = TrackerBackground(self.config, self.file.folder, self.camera, refuse=self._refuse)
+        self.background_e = self._background.steady_e
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
     def change(self, file: BenchFile) -> None:
@@ -119,7 +127,8 @@ class Simulator:
             self._load_sky()
         if (before.tracker, before.background, before.sky) != (self.config.tracker, self.config.background, self.config.sky):
             self._load_tracker()
-        target = Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px)
+        self._layers = sky_layers(self.canvas, self.sources)
+        target = Target(self.config.tracker.resolution_px, self.canvas.psf)
         if target != self.renderer.target:
             self.renderer.close()
             self.renderer = open_backend(target, headless_context(self.config.render.gpu))
@@ -149,13 +158,13 @@ class Simulator:
         """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
         exposure_s, canvas = self.config.tracker.exposure_s, self.canvas
         stars = seen_in(view, self.stars, self.moving)
-        layers = sky_layers(canvas, self.sources)
+        layers = self._layers
         if faults is None:
             light = light_of(canvas, layers, stars, view)
-            mean_e = self._linear(light) * exposure_s + self.background_e
+            mean_e = self._linear(light) * exposure_s + self._background.of_view_e(view)
         else:
             mean_e, open_s = faults.light_e(lambda part, layer: light_of(canvas, (*layers, layer), stars, part), self._linear)
-            mean_e += self.background_e * (open_s / exposure_s)
+            mean_e += self._background.of_view_e(faults.pieces[len(faults.pieces) // 2].view) * (open_s / exposure_s)
             light = faults.sprites()
         if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
             mean_e = np.minimum(mean_e, BODY_MAX_E)
@@ -179,12 +188,6 @@ class Simulator:
     def close(self) -> None:
         """Free the GL context."""
         self.renderer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,10 +319,10 @@ def simulator_view(simulator: Simulator, scenario: Scenario) -> FaultView:
     return tracker_view(simulator.file, simulator.canvas, simulator.stars, simulator.moving, scenario)
 
 
-def detector_canvas(tracker: Tracker, camera: Camera) -> Canvas:
-    """The detector of a tracker as layers draw on it."""
-    sigma_px = tracker.psf_sigma_px
-    return Canvas(camera, footprint_px(sigma_px), sigma_px, full_e=full_e(tracker.detector))
+def detector_canvas(file: BenchFile, camera: Camera) -> Canvas:
+    """The detector of a bench's tracker as layers draw on it. Raises InputError (see `tracker_psf`)."""
+    tracker = file.config.tracker
+    return Canvas(camera, tracker_psf(tracker, file.folder), full_e=full_e(tracker.detector))
 
 
 def exposure_truth(canvas: Canvas, view: View, stars: Stars, light: Sprites, mean_e: FloatArray) -> npt.NDArray[np.void]:
@@ -346,11 +349,54 @@ def full_e(detector: DetectorSettings) -> float:
 def _sky_keys(config: BenchConfig) -> tuple[object, ...]:
     """All by which the rates and directions of stars are made, where no body moves among them."""
     tracker = config.tracker
-    return config.sky, config.spacecraft, tracker.aperture_mm, tracker.quantum_efficiency, tracker.transmission
+    gathers = tracker.aperture_mm, tracker.quantum_efficiencies, tracker.transmission, tracker.detector.fill_factor
+    return config.sky, config.spacecraft, gathers
+
+
+class TrackerBackground:
+    """Light between the stars on a bench's detector: what is the same in every view, and zodiacal light by direction.
+
+    Zodiacal light is computed at LATTICE places along each side of the detector, each with its pixel's solid angle. Where its
+    table is blank, near the Sun, a field is refused (InputError); without `refuse` the nearest tabled light is drawn, and
+    a warning says so once until the field has left that part of the sky.
+    """
+
+    def __init__(self, config: BenchConfig, folder: Path, camera: Camera, *, refuse: bool = True) -> None:
+        self.steady_e = background_e(config, folder)
+        self._config, self._refuse, self._beyond = config, refuse, False
+        self._light: ZodiacalLight | None = None
+        if config.background.zodiacal is None:
+            return
+        self._light = ZodiacalLight.through(bench_optics(config.tracker, folder))
+        places = camera.grid_px(LATTICE)
+        rays = camera.rays(*places)
+        self._rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        self._sr = camera.pixel_sr(*places)
+        self._across, self._down = (linear_shares(size, LATTICE) for size in camera.resolution_px)
+
+    def of_view_e(self, view: View) -> FloatArray:
+        """Electrons per exposure (height, width) in a view. Raises InputError near the Sun."""
+        if self._light is None:
+            return self.steady_e
+        seen = sunward(self._rays @ to_matrix(view.q_icrs_to_cam), sky_jd(self._config, view.t_ns))
+        found = tabled_light(seen)
+        self._say(float(seen.elongation_deg.min()), beyond=not found.tabled.all())
+        e = self._light.electrons_per_s_sr(seen, found) * self._sr * self._config.tracker.exposure_s
+        zodiacal_e = self._down @ e.reshape(LATTICE, LATTICE) @ self._across.T
+        return np.asarray(self.steady_e + zodiacal_e)
+
+    def _say(self, nearest_deg: float, *, beyond: bool) -> None:
+        """Refuse a field beyond the table, or warn of it where it follows one that was not."""
+        what = f"[background] zodiacal: the field comes within {nearest_deg:.1f} deg of the Sun, where Leinert's table is blank"
+        if beyond and self._refuse:
+            raise InputError(f"{what}; look farther from it, or write zodiacal_v_mag_arcsec2")
+        if beyond and not self._beyond:
+            log.warning("%s; the nearest tabled light is drawn", what)
+        self._beyond = beyond
 
 
 def background_e(config: BenchConfig, folder: Path) -> FloatArray:
-    """Electrons per exposure between the stars, (height, width): level, plus a gradient that is 0 in the middle.
+    """Electrons per exposure in every view, (height, width): level, plus a gradient that is 0 in the middle.
 
     Zodiacal light is V mag/arcsec^2 through the tracker's optics, times a pixel's solid angle (thesis eq. 4.10, 4.11).
     """

@@ -94,9 +94,8 @@ def test_the_gpu_and_the_oracle_agree_to_float32(rate_deg_s):
     with Simulator(read_bench_file(ROOT / "configs" / "thesis-orion.toml")) as simulator:
         view = simulator.view(from_radec_roll_deg(84.057, -1.2, 0.0), np.radians(rate_deg_s))
         tracker = simulator.config.tracker
-        size = simulator.renderer.footprint_px
-        sprites = smeared_sprites(simulator.stars, view.motion, simulator.camera, size, tracker.psf_sigma_px)
-        oracle_e = linear_image(sprites, tracker.resolution_px, tracker.psf_sigma_px) * tracker.exposure_s
+        sprites = smeared_sprites(simulator.stars, view.motion, simulator.camera, simulator.canvas.psf)
+        oracle_e = linear_image(sprites, tracker.resolution_px, simulator.canvas.psf) * tracker.exposure_s
         gpu_e = simulator.expose(view, None).mean_e - simulator.background_e
         assert np.abs(gpu_e - oracle_e).max() / (simulator.stars.electrons_per_s.max() * tracker.exposure_s) < FLOAT32
         assert gpu_e.sum() == pytest.approx(oracle_e.sum(), rel=1e-6)

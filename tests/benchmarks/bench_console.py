@@ -23,8 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.run.record.ledger_reader import frame_records
-from hilstar.run.record.ledger_records import FrameRecord
+from hilstar.run.record.ledger_records import FrameRecord, frame_records
 from tests.support.benches import attitude_table, bench_text
 from tests.support.pages import PageAddress, children, live, page_of
 from tests.support.senders import connected, free_port, talking

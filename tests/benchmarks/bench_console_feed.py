@@ -13,7 +13,7 @@ from hilstar.attitude.receiver import PacketCounts
 from hilstar.console.publisher import FramePublisher
 from hilstar.console.shared_memory import PictureRequest, SharedMemory
 from hilstar.resources import resource_path
-from hilstar.run.shown import Shown
+from hilstar.run.pacer import Shown
 from hilstar.run.summary import RunTally
 from tests.support.benches import ORION_Q
 

@@ -27,6 +27,7 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights
 from hilstar.scene.frame_motion import Scan
+from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.bodies.disc import Disc
 from hilstar.twin.verify.measure import Comparison
 from hilstar.twin.verify.twin import Twin
@@ -92,7 +93,7 @@ def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
     assert shot.truth["name"][0] == "Moon"
     assert shot.linear.sum() == pytest.approx(shot.truth["electrons_per_s"].sum(), rel=FLUX_LIMIT)
     assert bench.losses_mag(shot)["Moon"] > 3
-    view, canvas = View(q), Canvas(bench.camera, 1, SIGMA)
+    view, canvas = View(q), Canvas(bench.camera, GaussianPsf(SIGMA))
     stars, layers = bench.seen(bench.stars, view), sky_layers(canvas, bench.sources)
     for seen, behind in ((layers, set()), (layers[:1], set(BEEHIVE))):
         found = brightest_in_view(light_of(canvas, seen, stars, view), stars, bench.camera, q, 500)
@@ -126,12 +127,12 @@ def test_the_sun_in_the_field_is_white_finite_and_told_and_stars_keep_their_ligh
 
 def test_a_nearer_disc_hides_a_farther_one_and_covers_all_of_it():
     near, far = disc(9.0, 20.0, name="near"), disc(20.0, 30.0, (47.0, 40.0), "far")
-    view = DiscView(CAMERA, SIGMA, (Pose(np.eye(3)),))
-    with Renderer(Target(SIZE, SIGMA)) as gl:
+    view = DiscView(CAMERA, GaussianPsf(SIGMA), (Pose(np.eye(3)),))
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
         both = replace(none, extended=(*disc_lights(far, view, False), *disc_lights(near, view, True)))
         gl.draw(both)
-        got, wanted = gl.linear().astype(float), linear_image(both, SIZE, SIGMA)
+        got, wanted = gl.linear().astype(float), linear_image(both, SIZE, GaussianPsf(SIGMA))
         gl.draw(replace(none, extended=tuple(disc_lights(near, view, False))))
         alone = gl.linear().astype(float)
     assert np.abs(got - wanted).max() < PIXEL_LIMIT * wanted.max()
@@ -142,13 +143,13 @@ def test_a_disc_that_others_hide_as_a_whole_is_none():
     """The Sun in a total eclipse is neither drawn nor listed, and comes back at its last contact."""
     moon = disc(20.0, 170.0, (45.0, 41.0))
     for sun, seen in ((disc(19.0, 0.0, (45.5, 41.0), "Sun"), 1), (disc(19.0, 0.0, (47.0, 41.0), "Sun"), 2)):
-        layer = BodyLayer(SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]), Canvas(CAMERA, 10, SIGMA))
+        layer = BodyLayer(SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]), Canvas(CAMERA, GaussianPsf(SIGMA)))
         assert len(layer.on_image(AT_START)) == seen
 
 
 def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):
     q = aim(bench, "Moon")
-    layer = BodyLayer(bench.moving, Canvas(bench.camera, bench.renderer.footprint_px, SIGMA))
+    layer = BodyLayer(bench.moving, Canvas(bench.camera, GaussianPsf(SIGMA)))
     stars = bench.seen(bench.shown_stars, View(q))
     points = bench.sprites(q, stars)
     first = len(stars) - len(bench.moving.names)
@@ -169,8 +170,8 @@ def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):
 def test_the_reference_has_the_same_disc(radius_px, lens, late_s):
     one = disc(radius_px, 60.0)
     shear = Shear(np.array([0.02, 0.05, 0.01]), (0.0, late_s / SIZE[1]), (47.5, 39.5)) if late_s else None
-    view = DiscView(replace(CAMERA, lens=lens), SIGMA, (Pose(np.eye(3)),), shear)
-    with Renderer(Target(SIZE, SIGMA)) as gl:
+    view = DiscView(replace(CAMERA, lens=lens), GaussianPsf(SIGMA), (Pose(np.eye(3)),), shear)
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         sprites = replace(
             sprites_at(np.array([[60.2, 30.7]]), np.array([2e5]), gl.footprint_px),
             extended=tuple(disc_lights(one, view, covers=True)),
@@ -178,7 +179,7 @@ def test_the_reference_has_the_same_disc(radius_px, lens, late_s):
         gl.draw(sprites)
         got = gl.linear()
         assert gl.gl_error() == "GL_NO_ERROR"
-    wanted = linear_image(sprites, SIZE, SIGMA)
+    wanted = linear_image(sprites, SIZE, GaussianPsf(SIGMA))
     assert got.sum(dtype=float) == pytest.approx(wanted.sum(), rel=FLUX_LIMIT)
     assert np.abs(got - wanted).max() < PIXEL_LIMIT * wanted.max()
 
@@ -195,14 +196,14 @@ def test_a_large_disc_in_tiles_is_that_of_the_reference(face, law):
     size = (226, 222)
     cam = Camera(size, 900.0, (112.5, 110.5), np.eye(3), LENS)
     one = replace(disc(face[0], 50.0, face[1]), law=law, polar_km=0.93, pole=np.array([0.6, 0.8, 0.0]), lunar_share=0.4)
-    light = DiscLight(one, np.eye(3), cam, (0.85, 1.1))
+    light = DiscLight(one, np.eye(3), cam, GaussianPsf((0.85, 1.1)))
     tiles = disc_tiles(light, light.region(size))
     assert tiles is not None and len(tiles.linear) + len(tiles.edges) > 2
-    with Renderer(Target(size, (0.85, 1.1))) as gl:
+    with Renderer(Target(size, GaussianPsf((0.85, 1.1)))) as gl:
         sprites = replace(sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px), extended=(light,))
         gl.draw(sprites)
         got = gl.linear()
-    wanted = linear_image(sprites, size, (0.85, 1.1))
+    wanted = linear_image(sprites, size, GaussianPsf((0.85, 1.1)))
     assert got.sum(dtype=float) == pytest.approx(wanted.sum(), rel=FLUX_LIMIT / 3)
     assert np.abs(got - wanted).max() < PIXEL_LIMIT * wanted.max()  # at the horns; 0.8 % elsewhere
 
@@ -210,11 +211,11 @@ def test_a_large_disc_in_tiles_is_that_of_the_reference(face, law):
 @pytest.mark.parametrize("radius_px", [3.0, 20.0])
 @pytest.mark.parametrize("method", ["round", "dither", "temporal", "exact"])
 def test_every_quantisation_encodes_discs_and_erases_them(method, radius_px):
-    target = Target(SIZE, SIGMA, srgb_response(10), WHITE, method)
+    target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(10), WHITE, method)
     panel = target.panel()
     turned = lambda image, panel: dither_levels(image, panel, mask_turn(3))  # noqa: E731
     oracle = {"round": round_levels, "temporal": turned}.get(method, dither_levels)
-    view = DiscView(CAMERA, SIGMA, (Pose(np.eye(3)),))
+    view = DiscView(CAMERA, GaussianPsf(SIGMA), (Pose(np.eye(3)),))
     with Renderer(target) as gl:
         star = sprites_at(np.array([[20.2, 20.7]]), np.array([2e5]), gl.footprint_px)
         gl.draw(star, 3)
@@ -233,9 +234,9 @@ def test_maps_of_discs_do_not_push_out_those_that_last(monkeypatch):
     uploaded = []
     upload = ExtendedLayer._upload
     monkeypatch.setattr(ExtendedLayer, "_upload", lambda self, image, n: uploaded.append(image.shape) or upload(self, image, n))
-    view = DiscView(CAMERA, SIGMA, (Pose(np.eye(3)),))
+    view = DiscView(CAMERA, GaussianPsf(SIGMA), (Pose(np.eye(3)),))
     lasting = LightMap(np.ones(SIZE[::-1], dtype=np.float32))
-    with Renderer(Target(SIZE, SIGMA)) as gl:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
         for _ in range(3):
             discs = [
@@ -253,7 +254,7 @@ def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(
     scan = Scan(scanout_s=1 / 60, hold_s=1 / 60)
     layer = BodyLayer(bench.moving, bench.canvas)
     stars = bench.seen(bench.shown_stars, View(q))
-    none = sprites_at(np.empty((0, 2)), np.empty(0), bench.renderer.footprint_px)
+    none = sprites_at(np.empty((0, 2)), np.empty(0), bench.psf.footprint_px)
     middles = []
     for turn in (None, rate, 4 * rate):
         bench.renderer.draw(layer.add(none, stars, View(q, turn, scan=scan)))

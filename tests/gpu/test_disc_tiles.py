@@ -13,6 +13,7 @@ from hilstar.render.extended import AIR_SMOOTH, MIN_TILED_PX, SMOOTH, disc_tiles
 from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, Shear
+from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.bodies.disc import EQUATOR_KM, Disc, earth_disc
 from hilstar.sky.bodies.light import KM_PER_AU
 from tests.support.stars import sprites_at
@@ -27,7 +28,7 @@ assert SIZE[0] * SIZE[1] > MIN_TILED_PX
 
 @pytest.fixture(scope="module")
 def gl():
-    with Renderer(Target(SIZE, SIGMA)) as renderer:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as renderer:
         yield renderer
         assert renderer.gl_error() == "GL_NO_ERROR"
 
@@ -40,7 +41,7 @@ def looking(distance_km: float, focal_px: float, from_limb_deg: float, phase_deg
     side /= np.linalg.norm(side)
     sun = -np.cos(np.radians(phase_deg)) * towards + np.sin(np.radians(phase_deg)) * side
     disc = earth_disc(distance_km * towards, -KM_PER_AU * sun, np.zeros(3), 1e5)
-    return DiscLight(disc, np.eye(3), Camera(SIZE, focal_px, MIDDLE_PX, np.eye(3), lens), SIGMA)
+    return DiscLight(disc, np.eye(3), Camera(SIZE, focal_px, MIDDLE_PX, np.eye(3), lens), GaussianPsf(SIGMA))
 
 
 def moon(light: DiscLight, radius_px: float) -> DiscLight:

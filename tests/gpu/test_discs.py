@@ -12,6 +12,7 @@ from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscView, LightMap, Pose, disc_lights
+from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.bodies.disc import Air, Disc
 from tests.support.ray_traced.bodies import Body, lambert, limb, lunar_lambert
 from tests.support.ray_traced.image import edge_px, spread_image
@@ -29,7 +30,7 @@ EARTH_KM, AIR = 6378.137, (8.0, 0.097)
 
 @pytest.fixture(scope="module")
 def gl():
-    with Renderer(Target(SIZE, SIGMA)) as renderer:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as renderer:
         yield renderer
         assert renderer.gl_error() == "GL_NO_ERROR"
 
@@ -41,7 +42,7 @@ def drawn(gl, *lights) -> np.ndarray:
 
 
 def lights(disc: Disc, cam: Camera, covers: bool = False):
-    return disc_lights(disc, DiscView(cam, SIGMA, (Pose(np.eye(3)),)), covers)
+    return disc_lights(disc, DiscView(cam, GaussianPsf(SIGMA), (Pose(np.eye(3)),)), covers)
 
 
 def camera(focal_px: float = FOCAL_PX, lens: Lens | None = None) -> Camera:
@@ -153,8 +154,8 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
 def test_any_gaussian_keeps_a_disc_s_light_and_its_place(sigma_px):
     cam = camera()
     disc = moon(4.8, 40.0, cam)
-    view = DiscView(cam, sigma_px, (Pose(np.eye(3)),))
-    with Renderer(Target(SIZE, sigma_px)) as gl:
+    view = DiscView(cam, GaussianPsf(sigma_px), (Pose(np.eye(3)),))
+    with Renderer(Target(SIZE, GaussianPsf(sigma_px))) as gl:
         got = drawn(gl, *disc_lights(disc, view, covers=True))
     truth = spread_image(body_of(disc), cam.rays, SIZE, (1.0, 1.0), np.random.default_rng(1), finer=5)  # of the same middle
     assert got.sum() == pytest.approx(disc.law_integral_sr() * 1e9, rel=SUM_LIMIT)

@@ -11,6 +11,7 @@ from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscView, Pose, disc_lights
+from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, Disc, earth_disc
 from hilstar.sky.bodies.light import KM_PER_AU
 from tests.support.ray_traced.bodies import Body, lambert, limb
@@ -25,14 +26,14 @@ PIXEL_LIMIT = 0.01  # of the brightest
 
 @pytest.fixture(scope="module")
 def gl():
-    with Renderer(Target(SIZE, SIGMA)) as renderer:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as renderer:
         yield renderer
         assert renderer.gl_error() == "GL_NO_ERROR"
 
 
 def drawn(gl, disc: Disc, cam: Camera) -> np.ndarray:
     none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
-    gl.draw(replace(none, extended=tuple(disc_lights(disc, DiscView(cam, SIGMA, (Pose(np.eye(3)),)), True))))
+    gl.draw(replace(none, extended=tuple(disc_lights(disc, DiscView(cam, GaussianPsf(SIGMA), (Pose(np.eye(3)),)), True))))
     return gl.linear().astype(float)
 
 

@@ -12,7 +12,7 @@ from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import pack_sprites
 from tests.support.exact_scenes import (
     FRAMES,
@@ -39,7 +39,7 @@ OTHER, OTHER_AMONG_NEIGHBOURS = 0.08, 0.35
 
 
 def target_of(scene, quantisation="exact"):
-    return Target((SIDE, SIDE), scene.sigma_px, scene.response, WHITE, quantisation, scene.uniformity)
+    return Target((SIDE, SIDE), GaussianPsf(scene.sigma_px), scene.response, WHITE, quantisation, scene.uniformity)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -51,7 +51,7 @@ def test_no_scene_is_worse_than_rounded_nor_other_than_the_oracle_s(name):
         assert gl.gl_error() == "GL_NO_ERROR"
     assert levels.max() <= scene.response.white
     assert_no_worse(levels, name, scene)
-    oracle = ExactQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px).levels(scene.sprites)
+    oracle = ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(scene.sprites)
     beside = "neighbour" in name or "apart" in name
     assert (levels != oracle).sum() <= (OTHER_AMONG_NEIGHBOURS if beside else OTHER) * (oracle > 0).sum()
     assert np.abs(levels.astype(int) - oracle).max() <= 1
@@ -65,7 +65,9 @@ def test_streaks_are_as_right_where_they_might_fail(name):
         levels = gl.levels().copy()
         assert gl.gl_error() == "GL_NO_ERROR"
     assert_streaks_are_right(levels, scene)
-    assert_streaks_are_right(ExactQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px).levels(scene.sprites), scene)
+    assert_streaks_are_right(
+        ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(scene.sprites), scene
+    )
 
 
 HARDEST = (
@@ -115,11 +117,11 @@ def test_codes_of_moving_neighbours_do_not_depend_on_the_order_of_stars(sigma_px
     def paths(order):
         star = np.repeat(np.arange(len(order)), len(along))
         places = ((at[order][:, None] + along).ravel() for at in (x, y))
-        sprites = pack_sprites(*places, np.repeat(rates[order] / 2, 2), star, (size, size), footprint_px(sigma_px))
+        sprites = pack_sprites(*places, np.repeat(rates[order] / 2, 2), star, (size, size), GaussianPsf(sigma_px).footprint_px)
         return replace(sprites, per_star=len(along))
 
     found = []
-    with Renderer(Target((size, size), sigma_px, srgb_response(8), WHITE, "exact")) as gl:
+    with Renderer(Target((size, size), GaussianPsf(sigma_px), srgb_response(8), WHITE, "exact")) as gl:
         for order in (np.arange(2 * PAIRS), np.arange(2 * PAIRS)[::-1], rng.permutation(2 * PAIRS)):
             gl.draw(paths(order))
             found.append(gl.levels().copy())

@@ -13,6 +13,7 @@ from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import GlowLight, LightMap
+from hilstar.scene.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
@@ -31,7 +32,7 @@ def camera(lens: Lens | None = None) -> Camera:
 
 
 def target_of(method, uniformity=None) -> Target:
-    return Target(SIZE, SIGMA, srgb_response(10), WHITE, method, uniformity)
+    return Target(SIZE, GaussianPsf(SIGMA), srgb_response(10), WHITE, method, uniformity)
 
 
 def stars(gl, rng, count=40):
@@ -114,7 +115,7 @@ def test_a_glow_has_its_profile_about_a_direction_on_and_off_the_image(lens):
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     seen = cam.rays(x.ravel().astype(float), y.ravel().astype(float))
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    with Renderer(Target(SIZE, SIGMA)) as gl:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
         for direction in ([0.1, -0.05, 0.99], [1.0, 0.2, -0.3]):
             towards = np.array(direction) / np.linalg.norm(direction)

@@ -13,6 +13,7 @@ from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.extended import LightMap
+from hilstar.scene.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA = (256, 192), (0.85, 0.85)
@@ -27,7 +28,7 @@ class Rasterised(Renderer):
 
 @pytest.fixture
 def gl():
-    with Renderer(Target(SIZE, SIGMA)) as renderer:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as renderer:
         assert (renderer._host is not None) == renderer.gl_renderer.startswith("llvmpipe")
         yield renderer
         assert renderer.gl_error() == "GL_NO_ERROR"
@@ -41,7 +42,7 @@ def stars(gl: Renderer, count: int, rng: np.random.Generator, size=SIZE):
 @pytest.mark.parametrize("size", [SIZE, (255, 33), (7, 5), (640, 2)])
 def test_frames_of_any_number_of_stars_follow_each_other(size, rng):
     """Few are made black one by one, more by a clear; few are one band, more several, and the buffer grows."""
-    with Renderer(Target(size, SIGMA)) as gl, Rasterised(Target(size, SIGMA)) as raster:
+    with Renderer(Target(size, GaussianPsf(SIGMA))) as gl, Rasterised(Target(size, GaussianPsf(SIGMA))) as raster:
         assert raster._host is None
         for count in (3, 40, 2, 9000, 1, 300, 128, 129, 0, 40, 300, 131, 2, 0, 3):
             sprites = stars(gl, count, rng, size)
@@ -57,7 +58,7 @@ def test_frames_of_any_number_of_stars_follow_each_other(size, rng):
 
 
 def test_few_stars_on_a_large_image_are_made_black_without_a_clear(rng, monkeypatch):
-    with Renderer(Target((1024, 768), SIGMA)) as gl, Renderer(Target((1024, 768), SIGMA)) as fresh:
+    with Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as gl, Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as fresh:
         monkeypatch.setattr(host_image, "MAX_ERASED", 1.0)
         for count in (200, 150, 3, 2000, 100, 1, 400, 0):
             sprites = stars(gl, count, rng, (1024, 768))
@@ -79,7 +80,7 @@ def test_the_same_stars_give_the_same_bits_in_any_number_of_bands(gl, rng, monke
     gl.draw(replace(sprites, data=sprites.data[::-1]))
     assert not np.array_equal(gl.linear(), once)  # or the test could not fail
     monkeypatch.setattr(host_image, "BANDS", 4)
-    with Renderer(Target(SIZE, SIGMA)) as other:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as other:
         other.draw(sprites)
         assert np.array_equal(other.linear(), once)
 
@@ -88,7 +89,7 @@ def test_the_same_stars_give_the_same_bits_in_any_number_of_bands(gl, rng, monke
 def test_no_star_is_lost_where_all_stand_in_one_band(sigma, rng):
     """llvmpipe ends a shader's loops after 65 535 rounds in all: as many stars take several passes."""
     count = 30_000 if sigma == SIGMA else 700
-    with Renderer(Target((512, 256), sigma)) as gl:
+    with Renderer(Target((512, 256), GaussianPsf(sigma))) as gl:
         pixels = rng.uniform([100, 122], [400, 124], size=(count, 2))
         gl.draw(sprites_at(pixels, np.ones(count), gl.footprint_px))
         assert gl.linear().sum(dtype=np.float64) == pytest.approx(count, rel=1e-5)
@@ -97,7 +98,7 @@ def test_no_star_is_lost_where_all_stand_in_one_band(sigma, rng):
 def test_extended_light_and_stars_alone_take_turns(gl, rng):
     light = LightMap(np.full((8, 9), 5.0, dtype=np.float32), (20, 30))
     some, other = stars(gl, 50, rng), stars(gl, 60, rng)
-    with Rasterised(Target(SIZE, SIGMA)) as raster:
+    with Rasterised(Target(SIZE, GaussianPsf(SIGMA))) as raster:
         for sprites in (some, replace(other, extended=(light,)), other, replace(some, extended=(light,)), some):
             gl.draw(sprites)
             raster.draw(sprites)
@@ -105,11 +106,11 @@ def test_extended_light_and_stars_alone_take_turns(gl, rng):
 
 
 def test_the_image_outlives_its_renderer_and_cannot_be_written_to(rng):
-    with Renderer(Target((1024, 768), SIGMA)) as gl:
+    with Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as gl:
         gl.draw(sprites_at(np.array([[500.0, 400.0]]), np.array([1e6]), gl.footprint_px))
         image = gl.linear()
     del gl
-    with Renderer(Target((1024, 768), SIGMA)) as other:
+    with Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as other:
         other.draw(stars(other, 100, rng, (1024, 768)))
     assert image.sum(dtype=np.float64) == pytest.approx(1e6, rel=1e-5)
     with pytest.raises(ValueError, match="read-only"):
@@ -120,7 +121,7 @@ def test_renderers_that_come_and_go_leave_no_memory_behind(rng):
     """Each has 8 MB that it writes to."""
     resident_mb = []
     for _ in range(16):
-        with Renderer(Target((1920, 1080), SIGMA)) as gl:
+        with Renderer(Target((1920, 1080), GaussianPsf(SIGMA))) as gl:
             gl.draw(stars(gl, 5000, rng, (1920, 1080)))
             gl.draw(None)
         pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -130,12 +131,12 @@ def test_renderers_that_come_and_go_leave_no_memory_behind(rng):
 
 def test_an_older_opengl_rasterises(monkeypatch, rng):
     monkeypatch.setattr(host_image, "PINNED_MEMORY", "GL_NO_such_extension")
-    with Renderer(Target(SIZE, SIGMA)) as gl:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         assert gl._host is None
         gl.draw(sprites_at(np.array([[50.0, 40.0]]), np.array([1e6]), gl.footprint_px))
         assert gl.linear().sum(dtype=np.float64) == pytest.approx(1e6, rel=1e-5)
 
 
 def test_the_study_of_trade_offs_measures_the_rasterised_sprites():
-    with VariantRenderer(Target(SIZE, SIGMA), SplatVariant()) as gl:
+    with VariantRenderer(Target(SIZE, GaussianPsf(SIGMA)), SplatVariant()) as gl:
         assert gl._host is None

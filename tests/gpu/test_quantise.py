@@ -14,7 +14,7 @@ from hilstar.monitor.response import bit_stealing_response, gamma_response, srgb
 from hilstar.render.backend import Target
 from hilstar.render.encoder import CUT_WINGS
 from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf
 from tests.support.stars import sprites_at
 
 SIZE = (256, 192)
@@ -39,7 +39,7 @@ def uneven(rng) -> np.ndarray:
 
 
 def target_of(response, method, uniformity=None) -> Target:
-    return Target(SIZE, SIGMA, response, WHITE, method, uniformity)
+    return Target(SIZE, GaussianPsf(SIGMA), response, WHITE, method, uniformity)
 
 
 def stars(count, rng, footprint):
@@ -108,10 +108,10 @@ def test_where_wings_meet_round_leaves_out_no_more_than_it_says(rng):
 @pytest.mark.usefixtures("each_way")
 def test_a_star_alone_has_the_levels_of_its_whole_light(sigma):
     """At 144 phases, from one that lights no pixel to one that clips."""
-    step = footprint_px(sigma) + 3
+    step = GaussianPsf(sigma).footprint_px + 3
     rows, columns = np.mgrid[1:13, 1:13].reshape(2, -1)
     pixels = np.column_stack([columns * step + columns / 12, rows * step + rows / 12])
-    with Renderer(Target((60 * step, 15 * step), sigma, GREY, WHITE)) as gl:
+    with Renderer(Target((60 * step, 15 * step), GaussianPsf(sigma), GREY, WHITE)) as gl:
         gl.draw(sprites_at(pixels, 10.0 ** np.linspace(1.5, 7.5, 144), gl.footprint_px))
         found = gl.levels().copy()
         light, panel = gl.linear(), gl.target.panel()
@@ -145,7 +145,7 @@ def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
         for count in (130, 20):
             sprites = apart(count, rng, gl.footprint_px)
             gl.draw(sprites)
-            found, oracle = gl.levels(), ExactQuantiser(panel, SIZE, SIGMA).levels(sprites)
+            found, oracle = gl.levels(), ExactQuantiser(panel, SIZE, GaussianPsf(SIGMA)).levels(sprites)
             assert (found != oracle).sum() <= OTHER_PIXELS * (oracle > 0).sum() + A_STAR
             light = panel.light_e_per_s().astype(float)
             other = np.nonzero(found != oracle)
@@ -173,7 +173,7 @@ def test_exact_paths_are_those_of_its_quantiser(rng):
         sprites = replace(data, star=star, per_star=int(nodes.max()))
         gl.draw(sprites)
         wanted = gl.linear().astype(float)
-        for levels in (gl.levels().copy(), ExactQuantiser(panel, SIZE, SIGMA).levels(sprites)):
+        for levels in (gl.levels().copy(), ExactQuantiser(panel, SIZE, GaussianPsf(SIGMA)).levels(sprites)):
             assert abs(shown_light(levels, panel).sum() - wanted.sum()) < 12 * step
             assert np.abs(shown_light(levels, panel) - np.minimum(wanted, WHITE)).max() < np.diff(panel.light_e_per_s()).max()
         assert gl.gl_error() == "GL_NO_ERROR"
@@ -184,11 +184,13 @@ def test_overlapping_stars_are_exact_together(rng):
     """2000 stars over each other: light as right as that of the oracle, rounding is off by much more."""
     target = target_of(RESPONSES["srgb8"], "exact")
     panel = target.panel()
-    sprites = sprites_at(rng.uniform([0, 0], SIZE, (2000, 2)), 10.0 ** rng.uniform(3.5, 5, 2000), footprint_px(SIGMA))
+    sprites = sprites_at(
+        rng.uniform([0, 0], SIZE, (2000, 2)), 10.0 ** rng.uniform(3.5, 5, 2000), GaussianPsf(SIGMA).footprint_px
+    )
     with Renderer(target) as gl:
         gl.draw(sprites)
         wanted, found = gl.linear().astype(float), gl.levels().copy()
-    oracle = ExactQuantiser(panel, SIZE, SIGMA).levels(sprites)
+    oracle = ExactQuantiser(panel, SIZE, GaussianPsf(SIGMA)).levels(sprites)
     rounded = round_levels(wanted.astype(np.float32), panel)
     blocks = [
         2.5 * np.log10(block_sums(shown_light(levels, panel)) / block_sums(np.minimum(wanted, WHITE)))
@@ -228,13 +230,13 @@ def block_sums(image, side=16):
 
 
 def test_without_compute_shaders_exact_is_numpy_s(monkeypatch, rng):
-    monkeypatch.setattr("hilstar.render.backend.MIN_COMPUTE_VERSION", 999)
+    monkeypatch.setattr("hilstar.monitor.exact.COMPUTE_VERSION", 999)
     target = target_of(RESPONSES["srgb8"], "exact")
     with Renderer(target) as gl:
         for count in (300, 20):
             sprites = stars(count, rng, gl.footprint_px)
             gl.draw(sprites)
-            assert np.array_equal(gl.levels(), ExactQuantiser(target.panel(), SIZE, SIGMA).levels(sprites))
+            assert np.array_equal(gl.levels(), ExactQuantiser(target.panel(), SIZE, GaussianPsf(SIGMA)).levels(sprites))
 
 
 def test_exact_and_round_draw_one_sky(rng):
@@ -284,5 +286,5 @@ def test_a_uniformity_map_of_another_size_is_refused(method):
 
 
 def test_a_target_without_a_monitor_has_no_texture():
-    with Renderer(Target((32, 32), SIGMA)) as gl, pytest.raises(TypeError, match="no monitor response"):
+    with Renderer(Target((32, 32), GaussianPsf(SIGMA))) as gl, pytest.raises(TypeError, match="no monitor response"):
         _ = gl.codes_texture

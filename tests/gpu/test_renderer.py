@@ -14,7 +14,7 @@ from hilstar.render import context as context_module
 from hilstar.render.backend import Target
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import MAX_CUT, footprint_px
+from hilstar.scene.psf import MAX_CUT, GaussianPsf
 from hilstar.scene.sprites import Sprites
 from tests.support.stars import sprites_at
 
@@ -44,14 +44,14 @@ def draw(target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray) -> tup
 
 
 def target_of(resolution=(256, 192), sigma=(0.85, 0.85), bits=8, white=1e6) -> Target:
-    return Target(resolution, sigma, None if bits is None else srgb_response(bits), white)
+    return Target(resolution, GaussianPsf(sigma), None if bits is None else srgb_response(bits), white)
 
 
 @BOTH_WAYS
 @pytest.mark.parametrize("sigma", [(0.4, 0.4), (0.55, 0.55), (0.85, 0.85), (1.3, 0.7), (0.5, 2.5), (3.0, 3.0)])
 def test_an_isolated_star_has_its_flux_and_its_centroid_at_every_phase(sigma, bits):
     """A grid of 12 x 12 phases of a pixel, each star in a field of its own."""
-    step = footprint_px(sigma) + 3
+    step = GaussianPsf(sigma).footprint_px + 3
     phases = np.linspace(-0.5, 0.5, 12)
     rows, columns = np.mgrid[0:12, 0:12]
     pixels = np.column_stack(((columns * step + step).ravel() + phases[columns.ravel()], (rows * step + step).ravel()))
@@ -83,9 +83,12 @@ def test_every_pixel_is_that_of_the_oracle(sigma, bits, rng):
     pixels = rng.uniform([-5, -5], [260, 197], size=(60, 2))
     flux = 10.0 ** rng.uniform(2, 6, 60)
     linear, _, sprites = draw(target_of(sigma=sigma, bits=bits), pixels, flux)
-    oracle = linear_image(sprites, (256, 192), sigma)
+    oracle = linear_image(sprites, (256, 192), GaussianPsf(sigma))
     # Where stars overlap, each brings its own error.
-    scale = linear_image(replace(sprites, data=sprites.data), (256, 192), (sigma[0] * 1.5, sigma[1] * 1.5)) + flux.max()
+    scale = (
+        linear_image(replace(sprites, data=sprites.data), (256, 192), GaussianPsf((sigma[0] * 1.5, sigma[1] * 1.5)))
+        + flux.max()
+    )
     assert (np.abs(linear - oracle) / scale).max() < PIXEL_LIMIT
     assert linear.min() >= 0
 
@@ -95,7 +98,7 @@ def test_stars_partly_off_the_edge_are_drawn_partly(bits):
     pixels = np.array([[-0.5, 50.0], [-3.0, 90.0], [100.0, -0.5], [255.5, 60.0], [258.0, 20.0], [130.0, 193.5], [-0.5, -0.5]])
     flux = np.full(len(pixels), 1e6)
     linear, _, sprites = draw(target_of(bits=bits), pixels, flux)
-    oracle = linear_image(sprites, (256, 192), (0.85, 0.85))
+    oracle = linear_image(sprites, (256, 192), GaussianPsf((0.85, 0.85)))
     assert np.abs(linear - oracle).max() < PIXEL_LIMIT * 1e6
     # A star on the very edge gives half its light, one on the corner a quarter.
     assert linear[40:60, :10].sum() == pytest.approx(0.5e6, rel=FLUX_LIMIT)
@@ -105,11 +108,11 @@ def test_stars_partly_off_the_edge_are_drawn_partly(bits):
 
 def test_the_footprint_cuts_no_more_than_it_says():
     for sigma in ((0.4, 0.4), (0.85, 0.85), (3.0, 1.0)):
-        size = footprint_px(sigma)
+        size = GaussianPsf(sigma).footprint_px
         for phase in (-0.5, -0.25, 0.0, 0.4999, 0.5):
             sprite = sprites_at(np.array([[100 + phase, 80 + phase]]), np.ones(1), size)
-            cut = linear_image(sprite, (256, 192), sigma, footprint_px=2 * size + 9).sum()
-            kept = linear_image(sprite, (256, 192), sigma).sum()
+            cut = linear_image(sprite, (256, 192), GaussianPsf(sigma), footprint_px=2 * size + 9).sum()
+            kept = linear_image(sprite, (256, 192), GaussianPsf(sigma)).sum()
             assert 0 <= cut - kept <= MAX_CUT * 1.000001
 
 
@@ -131,7 +134,7 @@ def test_codes_are_those_of_the_oracle_pixel_for_pixel(bits, count, rng):
 def test_overlapping_stars_add_up(bits, rng):
     pixels = np.full((1000, 2), 100.25) + rng.normal(scale=0.01, size=(1000, 2))
     linear, _, sprites = draw(target_of(bits=bits), pixels, np.ones(1000))
-    oracle = linear_image(sprites, (256, 192), (0.85, 0.85))
+    oracle = linear_image(sprites, (256, 192), GaussianPsf((0.85, 0.85)))
     # 1000 additions round by up to half a step of the running sum each: 1000 x 6e-8 at the very worst.
     assert np.abs(linear - oracle).max() / oracle.max() < 6e-5
     assert linear.sum(dtype=np.float64) == pytest.approx(1000, rel=6e-5)

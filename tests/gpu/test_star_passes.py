@@ -13,7 +13,7 @@ from hilstar.render.backend import SpriteSide, Target
 from hilstar.render.renderer import Renderer
 from hilstar.render.star_passes import MAX_UNIT, WINGS
 from hilstar.scene.extended import LightMap
-from hilstar.scene.psf import footprint_px, outside_share, pixel_shares, share_bound
+from hilstar.scene.psf import GaussianPsf, pixel_shares
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
@@ -25,7 +25,7 @@ CUT = 1e-4  # of a star: what lies past a sprite two pixels smaller
 
 def stars(count, rng, size=SIZE, decades=(1, 6)):
     pixels = rng.uniform([-5, -5], [size[0] + 5, size[1] + 5], size=(count, 2))
-    return sprites_at(pixels, 10.0 ** rng.uniform(*decades, count), footprint_px(SIGMA))
+    return sprites_at(pixels, 10.0 ** rng.uniform(*decades, count), GaussianPsf(SIGMA).footprint_px)
 
 
 def covering(sprites, size):
@@ -42,7 +42,7 @@ def covering(sprites, size):
 def test_levels_are_those_of_the_light_but_for_what_lies_beyond_reach(name, uneven, count, rng):
     response = PANELS[name]
     map_ = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if uneven else None
-    with Renderer(Target(SIZE, SIGMA, response, WHITE, uniformity=map_)) as gl:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA), response, WHITE, uniformity=map_)) as gl:
         sprites = stars(count, rng)
         gl.draw(sprites)
         found, whole, panel = gl.levels().copy(), gl.linear().astype(np.float64), gl.target.panel()
@@ -58,7 +58,7 @@ def test_levels_are_those_of_the_light_but_for_what_lies_beyond_reach(name, unev
 
 
 def test_the_order_of_stars_changes_nothing(rng):
-    with Renderer(Target(SIZE, SIGMA, PANELS["srgb10"], WHITE)) as gl:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA), PANELS["srgb10"], WHITE)) as gl:
         sprites = stars(3000, rng)
         gl.draw(sprites)
         first = gl.levels().copy()
@@ -71,7 +71,7 @@ def test_the_order_of_stars_changes_nothing(rng):
 @pytest.mark.parametrize("count", [1, 100, 20_000])
 def test_no_sum_is_too_large_for_its_pixel(count):
     """Any number of stars far brighter than white, on one pixel."""
-    with Renderer(Target(SIZE, SIGMA, PANELS["srgb8"], WHITE)) as gl:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA), PANELS["srgb8"], WHITE)) as gl:
         gl.draw(sprites_at(np.full((count, 2), 100.0), np.full(count, 1e12), gl.footprint_px))
         found = gl.levels()
         assert (found[97:104, 97:104] == 255).all()
@@ -82,7 +82,7 @@ def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
     """A panel of 16 bits, and on 8 bits so many stars of white that a unit would be much of a step: the same as by points."""
     bright = stars(20_000, rng, decades=(6, 7))
     for response, sprites in ((srgb_response(16), stars(300, rng)), (gamma_response(8, 3.0), bright)):
-        target = Target(SIZE, SIGMA, response, WHITE)
+        target = Target(SIZE, GaussianPsf(SIGMA), response, WHITE)
         with Renderer(target) as gl:
             assert gl._units is None or gl._units.unit_for(sprites) is None
             gl.draw(sprites)
@@ -92,7 +92,7 @@ def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
 @pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
 def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
     """Stars, none, few and many, too many for units, and extended light: each frame is as if it were the first."""
-    target = Target(SIZE, SIGMA, gamma_response(8), WHITE, quantisation)
+    target = Target(SIZE, GaussianPsf(SIGMA), gamma_response(8), WHITE, quantisation)
     glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
     few, many, bright = stars(9, rng), stars(600, rng), stars(20_000, rng, decades=(6, 7))
     lit = replace(few, extended=(glow,))
@@ -114,8 +114,8 @@ def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
 
 @pytest.mark.parametrize("sigma", [(0.3, 0.3), (0.4, 0.4), (0.85, 0.85), (1.3, 0.7), (3.0, 1.0)])
 def test_no_pixel_outside_the_ellipse_has_more_than_its_share(sigma):
-    size = footprint_px(sigma)
-    axes, factor = share_bound(sigma, size)
+    size = GaussianPsf(sigma).footprint_px
+    axes, factor = GaussianPsf(sigma).reach
     places = np.linspace(-size / 2, size / 2, 301)
     share = np.outer(pixel_shares(places, sigma[1]), pixel_shares(places, sigma[0]))
     reach = places[None, :] ** 2 / axes[0] + places[:, None] ** 2 / axes[1]
@@ -129,11 +129,14 @@ def test_no_pixel_outside_the_ellipse_has_more_than_its_share(sigma):
 def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
     """Sides as `effort = "auto"` chooses them: a quarter of what lights a pixel, and nothing past the largest side."""
     response = PANELS["srgb8"]
-    lit, size = response.threshold[0] * WHITE, footprint_px(SIGMA)
-    sides = (SpriteSide(3e38, size - 2), *(SpriteSide(0.25 * lit / outside_share(k, SIGMA), k) for k in range(size - 4, 1, -2)))
+    lit, size = response.threshold[0] * WHITE, GaussianPsf(SIGMA).footprint_px
+    sides = (
+        SpriteSide(3e38, size - 2),
+        *(SpriteSide(0.25 * lit / GaussianPsf(SIGMA).outside_share(k), k) for k in range(size - 4, 1, -2)),
+    )
     with (
-        Renderer(Target(SIZE, SIGMA, response, WHITE, sides=sides)) as gl,
-        Renderer(Target(SIZE, SIGMA, response, WHITE)) as all_,
+        Renderer(Target(SIZE, GaussianPsf(SIGMA), response, WHITE, sides=sides)) as gl,
+        Renderer(Target(SIZE, GaussianPsf(SIGMA), response, WHITE)) as all_,
     ):
         sprites = stars(400, rng)
         gl.draw(sprites)
@@ -151,7 +154,7 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
 @pytest.mark.parametrize("sigma", [(24.0, 24.0), (25.0, 25.0)])
 def test_the_largest_sprites_are_whole(sigma):
     """A shader's loops may end early without a word: the largest sprites drawn star by star, and the smallest that are not."""
-    target = Target((400, 300), sigma, PANELS["srgb8"], WHITE)
+    target = Target((400, 300), GaussianPsf(sigma), PANELS["srgb8"], WHITE)
     with Renderer(target) as gl:
         assert (gl._units is not None) == (sigma[0] < 24.5)
         gl.draw(sprites_at(np.array([[200.2, 150.3]]), np.array([1e9]), gl.footprint_px))

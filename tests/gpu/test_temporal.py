@@ -14,7 +14,7 @@ from hilstar.render.backend import Target
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer
 from hilstar.scene.extended import LightMap
-from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import pack_sprites
 from tests.support.centroiders import family_errors_px
 
@@ -22,7 +22,7 @@ WHITE = 1e6
 SIGMA = (0.85, 0.85)
 TILE, SIDE = 22, 12
 SIZE = (TILE * SIDE, TILE * SIDE)
-SIX_MAG = WHITE * 10 ** (-0.4 * 6.0) / peak_share(SIGMA)
+SIX_MAG = WHITE * 10 ** (-0.4 * 6.0) / GaussianPsf(SIGMA).peak_share
 FRAMES = 6
 AIM_MAG, AIM_PX, OF_FEW = 0.003, 0.004, 1.15  # as in tests/unit/monitor/test_temporal.py
 # The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it may take the other.
@@ -33,7 +33,7 @@ UNEVEN = np.random.default_rng(5).uniform(0.8, 1.2, SIZE[::-1]).astype(np.float3
 
 def stars(x, y, flux, numbers=None):
     numbers = np.arange(len(x)) if numbers is None else numbers
-    return pack_sprites(x, y, np.broadcast_to(np.asarray(flux, float), x.shape), numbers, SIZE, footprint_px(SIGMA))
+    return pack_sprites(x, y, np.broadcast_to(np.asarray(flux, float), x.shape), numbers, SIZE, GaussianPsf(SIGMA).footprint_px)
 
 
 def places():
@@ -51,9 +51,9 @@ def flux_mag(shown, wanted):
 
 @pytest.mark.parametrize("make", [srgb_response, gamma_response])
 def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(make):
-    target = Target(SIZE, SIGMA, make(8), WHITE, "temporal")
+    target = Target(SIZE, GaussianPsf(SIGMA), make(8), WHITE, "temporal")
     sprites = stars(*places(), SIX_MAG)
-    sky = tiles(linear_image(sprites, SIZE, SIGMA))
+    sky = tiles(linear_image(sprites, SIZE, GaussianPsf(SIGMA)))
     with Renderer(target) as gl:
         frames = []
         for frame in range(12):
@@ -73,11 +73,11 @@ def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(make
 @pytest.mark.parametrize("bits", [1, 8])
 def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
     """Each frame begins with what the GPU's last one left; some stars go and come, and are half off the image."""
-    target = Target(SIZE, SIGMA, table_response(bits, np.linspace(0, 1, 2**bits)), WHITE, "temporal", uniformity)
+    target = Target(SIZE, GaussianPsf(SIGMA), table_response(bits, np.linspace(0, 1, 2**bits)), WHITE, "temporal", uniformity)
     panel, rng = target.panel(), np.random.default_rng(3)
     x, y = places()
     every = stars(x, y - 11, 10 ** rng.uniform(4, 6.5, len(x)))
-    oracle = TemporalQuantiser(panel, SIZE, SIGMA)
+    oracle = TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA))
     with Renderer(target) as gl:
         for frame in range(6):
             keep = rng.random(len(every)) < 0.8
@@ -94,9 +94,9 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
 
 
 def test_without_compute_shaders_it_is_numpy_s(monkeypatch):
-    monkeypatch.setattr("hilstar.render.backend.MIN_COMPUTE_VERSION", 999)
-    target = Target(SIZE, SIGMA, srgb_response(8), WHITE, "temporal")
-    oracle, sprites = TemporalQuantiser(target.panel(), SIZE, SIGMA), stars(*places(), SIX_MAG)
+    monkeypatch.setattr("hilstar.monitor.exact.COMPUTE_VERSION", 999)
+    target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(8), WHITE, "temporal")
+    oracle, sprites = TemporalQuantiser(target.panel(), SIZE, GaussianPsf(SIGMA)), stars(*places(), SIX_MAG)
     with Renderer(target) as gl:
         for frame in range(3):
             gl.draw(sprites, frame)
@@ -109,8 +109,8 @@ def test_paths_keep_their_light_over_the_frames():
     x, y = places()
     way = np.repeat(np.arange(len(x)) * 2.4, 5)
     numbers = np.repeat(np.arange(len(x)), 5)
-    oracle, errors = TemporalQuantiser(panel, SIZE, SIGMA), []
-    with Renderer(Target(SIZE, SIGMA, panel.response, WHITE, "temporal")) as gl:
+    oracle, errors = TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)), []
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA), panel.response, WHITE, "temporal")) as gl:
         shown, sky = np.zeros((2, *SIZE)), np.zeros(SIZE)
         for frame in range(FRAMES):
             at = np.tile(np.arange(5) * 1.2 - 2.4, len(x)) + 1.0 * (frame - 2.5)
@@ -119,7 +119,7 @@ def test_paths_keep_their_light_over_the_frames():
             gl.draw(sprites, frame)
             shown[0] += shown_light(gl.levels(), panel)
             shown[1] += shown_light(oracle.levels(sprites), panel)
-            sky += linear_image(sprites, SIZE, SIGMA)
+            sky += linear_image(sprites, SIZE, GaussianPsf(SIGMA))
         errors = [flux_mag(tiles(image), tiles(sky)) for image in shown]
         assert gl.gl_error() == "GL_NO_ERROR"
     assert max(errors) < AIM_MAG
@@ -131,7 +131,7 @@ def test_frames_with_extended_light_go_on_where_others_stopped():
     sprites = stars(*places(), 1.3 * WHITE / 3)
     none = replace(sprites, data=sprites.data[:0], star=sprites.star[:0], x_px=sprites.x_px[:0], y_px=sprites.y_px[:0])
     light = LightMap(np.full(SIZE[::-1], 0.02 * WHITE, dtype=np.float32))
-    with Renderer(Target(SIZE, SIGMA, panel.response, WHITE, "temporal")) as gl, Renderer(gl.target) as floor:
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA), panel.response, WHITE, "temporal")) as gl, Renderer(gl.target) as floor:
         total = np.zeros(len(sprites))
         for frame in range(9):
             lights = (light,) if frame % 2 else ()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hilstar.bench.build import load
-from hilstar.monitor.quantise import QUANTISERS
+from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.notices import Notices
 from hilstar.render.backend import SpriteSide, Target
@@ -23,7 +23,7 @@ from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.replay import DrawnBy, Wanted, plan_play, replay
 from hilstar.run.serve import Outlet
 from hilstar.scene.extended import LightMap
-from hilstar.scene.psf import footprint_px, outside_share
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import Sprites, pack_sprites
 from tests.support.benches import bench_text
 from tests.support.waiting import PATIENCE_S
@@ -43,7 +43,7 @@ def stars(count: int, sigma_px, rng, per_star: int = 1) -> Sprites:
     along = np.arange(per_star)
     x, y = (place[:, :1] + 0.6 * along).ravel(), (place[:, 1:] + 0.35 * along).ravel()
     number = np.repeat(np.arange(count), per_star)
-    packed = pack_sprites(x, y, np.repeat(rate / per_star, per_star), number, SIZE, footprint_px(sigma_px))
+    packed = pack_sprites(x, y, np.repeat(rate / per_star, per_star), number, SIZE, GaussianPsf(sigma_px).footprint_px)
     return replace(packed, per_star=per_star)
 
 
@@ -80,8 +80,8 @@ def assert_same(star_by_star: list[np.ndarray], by_points: list[np.ndarray]) -> 
 
 def shrunk(sigma_px) -> tuple[SpriteSide, ...]:
     """Sides as `effort` chooses them: a quarter of what lights a pixel may be left out."""
-    size, lit = footprint_px(sigma_px), SRGB8.threshold[0] * WHITE
-    sides = [SpriteSide(0.25 * lit / outside_share(side, sigma_px), side) for side in range(size - 4, 1, -2)]
+    size, lit = GaussianPsf(sigma_px).footprint_px, SRGB8.threshold[0] * WHITE
+    sides = [SpriteSide(0.25 * lit / GaussianPsf(sigma_px).outside_share(side), side) for side in range(size - 4, 1, -2)]
     return (SpriteSide(3e38, size - 2), *sides)
 
 
@@ -101,7 +101,7 @@ def shrunk(sigma_px) -> tuple[SpriteSide, ...]:
 )
 def test_both_ways_choose_the_same_codes(quantisation, response, sigma_px, count, per_star, rng, monkeypatch):
     frames = [stars(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
-    assert_same(*both_ways(Target(SIZE, sigma_px, response, WHITE, quantisation), frames, monkeypatch))
+    assert_same(*both_ways(Target(SIZE, GaussianPsf(sigma_px), response, WHITE, quantisation), frames, monkeypatch))
 
 
 @pytest.mark.parametrize("quantisation", ["round", "exact"])
@@ -109,7 +109,7 @@ def test_both_ways_choose_the_same_codes(quantisation, response, sigma_px, count
 def test_so_they_do_on_an_uneven_panel_and_with_smaller_sprites(quantisation, changed, rng, monkeypatch):
     uneven = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if changed == "uneven" else None
     sides = shrunk(USUAL) if changed == "smaller sprites" else ()
-    target = Target(SIZE, USUAL, SRGB8, WHITE, quantisation, uneven, sides)
+    target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation, uneven, sides)
     assert_same(*both_ways(target, [stars(300, USUAL, rng) for _ in range(FRAMES)], monkeypatch))
 
 
@@ -118,7 +118,7 @@ def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
     glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
     frames = [stars(count, USUAL, rng) for count in (200, 300, 20, 0, 200)]
     frames[1] = replace(frames[1], extended=(glow,))
-    assert_same(*both_ways(Target(SIZE, USUAL, SRGB8, WHITE), frames, monkeypatch))
+    assert_same(*both_ways(Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE), frames, monkeypatch))
 
 
 @pytest.mark.parametrize("sigma_px", [(0.4, 0.4), USUAL, (1.2, 0.8)])
@@ -126,8 +126,10 @@ def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
 def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, rng):
     """`temporal` chooses among all near pixels, some of which lie a little beyond its reach: they are erased too."""
     frames = [stars(600, sigma_px, rng) for _ in range(12)]
-    side = footprint_px(sigma_px)
-    for codes, sprites in zip(drawn(Target(SIZE, sigma_px, SRGB8, WHITE, "temporal"), frames), frames, strict=True):
+    side = GaussianPsf(sigma_px).footprint_px
+    for codes, sprites in zip(
+        drawn(Target(SIZE, GaussianPsf(sigma_px), SRGB8, WHITE, "temporal"), frames), frames, strict=True
+    ):
         under = np.zeros(SIZE[::-1], dtype=bool)
         for x, y in sprites.data["pixel"] - (side - 1) // 2:
             under[max(y, 0) : max(y + side, 0), max(x, 0) : max(x + side, 0)] = True
@@ -186,6 +188,7 @@ DRAW = """
 import sys
 import hilstar, numpy as np
 from hilstar.rotation import from_radec_roll_deg
+from hilstar.scene.psf import GaussianPsf
 with hilstar.load("bench.toml") as bench:
     frames = [bench.frame(from_radec_roll_deg(84.0, -1.0 + k, 2.0 * k), number=k).levels.copy() for k in range(6)]
     np.savez(sys.argv[1], *frames)

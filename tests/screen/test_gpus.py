@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from hilstar.render.context import gpus
-from hilstar.run.record.ledger_reader import read_run
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.commands import run_hilstar
+from tests.support.ledgers import read_run
 from tests.support.x11.screens import xvfb
 
 

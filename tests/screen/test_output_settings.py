@@ -13,10 +13,10 @@ import pytest
 from hilstar.monitor.window.output_settings import OutputState, findings
 from hilstar.monitor.window.randr import Randr, lit_outputs
 from hilstar.monitor.window.watch import PresentEvents, is_straight, presented_as
-from hilstar.run.record.ledger_reader import read_run, run_records
-from hilstar.run.record.ledger_records import EventRecord
+from hilstar.run.record.ledger_records import EventRecord, run_records
 from tests.screen.test_monitors import bench, showing
 from tests.support.commands import run_hilstar
+from tests.support.ledgers import read_run
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.xorg import Xorg, xorg
 from tests.unit.monitor.test_output_settings import HALF, edid

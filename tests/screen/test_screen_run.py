@@ -15,8 +15,8 @@ from PIL import Image
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.resources import resource_path
 from hilstar.rotation import angle_between_rad, propagate
-from hilstar.run.record.ledger_reader import read_run
 from tests.support.commands import HILSTAR, run_hilstar, run_hilstar_here
+from tests.support.ledgers import read_run
 from tests.support.live_runs import MAX_EXTRAPOLATION_NS
 from tests.support.run_page import run_data_of
 from tests.support.senders import free_port

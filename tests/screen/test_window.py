@@ -12,10 +12,10 @@ import pytest
 from PIL import Image
 
 from hilstar.rotation import propagate
-from hilstar.run.record.ledger_reader import frame_records
+from hilstar.run.record.ledger_records import frame_records
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import run_hilstar
-from tests.support.waiting import PATIENCE_S, best_of_three, in_time
+from tests.support.waiting import PATIENCE_S
 from tests.support.x11.events import client
 from tests.support.x11.screens import Screen, Shown, codes_of, lines_over, xvfb
 
@@ -62,7 +62,6 @@ def test_bit_stealing_reaches_the_screen(screen, bench_file):
         assert (shown.wait_for(codes) == codes).all()
 
 
-@best_of_three
 def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(screen, bench_file, tmp_path):
     folder = tmp_path
     rate = np.array([0.01, 0.02, 0.0])
@@ -80,7 +79,7 @@ def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(scree
     names = sorted(path.name for path in (folder / "shown").glob("*.png"))
     assert len(names) == len(frames)
     assert names == sorted(path.name for path in (folder / "again").glob("*.png"))
-    in_time(len(frames) > 20, len(frames))
+    assert len(frames) > 1
     for name in names:
         one, other = (np.array(Image.open(folder / run / name)) for run in ("shown", "again"))
         assert (one == other).all()
@@ -159,12 +158,11 @@ def test_a_display_that_is_not_there_gets_one_line(screen, bench_file):
     assert "--headless" in said
 
 
-@best_of_three
 def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
     """Two levels: black and white; the square of the first white one stays 5 s."""
     command = ["calibrate", "plan", "-o", str(tmp_path / "plan.csv"), "--levels", "2", "--repeats", "1", "--show"]
     with subprocess.Popen(
-        [sys.executable, "-m", "hilstar", *command, "--seconds", "0.4"], stderr=subprocess.PIPE, text=True, env=screen.env
+        [sys.executable, "-m", "hilstar", *command, "--seconds", "3"], stderr=subprocess.PIPE, text=True, env=screen.env
     ) as process:
         seen = set()
         end = time.monotonic() + PATIENCE_S
@@ -173,7 +171,7 @@ def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
             seen.add((int(pixels[240, 320].max()), int(pixels[20, 20].max())))
             time.sleep(0.02)
         said = process.communicate(timeout=PATIENCE_S)[1]
-    in_time({(0, 0), (127, 0), (255, 0)} <= seen, seen)
+    assert {(0, 0), (127, 0), (255, 0)} <= seen, seen
     assert "code 255, channel w" in said
 
 

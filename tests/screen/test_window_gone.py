@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.run.record.ledger_reader import frame_records
+from hilstar.run.record.ledger_records import frame_records
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR
 from tests.support.waiting import PATIENCE_S, wait_for

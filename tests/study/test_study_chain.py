@@ -13,12 +13,12 @@ import pytest
 
 from hilstar import charts
 from hilstar.bench.bench_file import bench_file_of
-from hilstar.render.reference import linear_image
+from hilstar.study import predictors
 from hilstar.study.chain import choices, run
 from hilstar.study.chain.choices import Combination, Parts, five_scenes, lead_ns
 from hilstar.study.chain.measuring import Rounds, SceneMeasurement, error_budget
 from hilstar.study.chain.run import NOT_JUDGED, CombinationRow, beating, front
-from hilstar.study.chain.tracker import MATCH_PX, StudyTracker, add_light, off, points
+from hilstar.study.chain.tracker import MATCH_PX, StudyTracker, off
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
@@ -131,7 +131,7 @@ def test_the_budget_adds_up_to_the_whole_error_of_auto(study):
 
 
 def test_the_sky_itself_is_measured_where_the_stars_are(parts, monkeypatch):
-    monkeypatch.setattr(choices, "JITTER", ())
+    monkeypatch.setattr(predictors, "JITTER", ())
     for number, limit_px in ((1, FLOOR_PX), (3, PATH_FLOOR_PX)):
         (judge,) = scene_of(parts, number).judges
         true = judge.true[judge.judged]
@@ -140,17 +140,8 @@ def test_the_sky_itself_is_measured_where_the_stars_are(parts, monkeypatch):
         assert np.median(off_px) < limit_px
 
 
-def test_light_of_all_sprites_at_once_is_the_oracle_s(parts):
-    bench = parts[0].own
-    sprites, sigma_px = points(bench, choices.five_scenes(bench)[1].q_icrs_to_cam), bench.config.render.sprite_sigma_px
-    image = np.zeros(bench.camera.resolution_px[::-1])
-    add_light(image, sprites, sigma_px)
-    expected = linear_image(sprites, bench.camera.resolution_px, sigma_px)
-    assert np.allclose(image, expected, rtol=0, atol=1e-12 * expected.max())
-
-
 def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monkeypatch):
-    monkeypatch.setattr(choices, "JITTER", ())
+    monkeypatch.setattr(predictors, "JITTER", ())
     scene, bench = scene_of(parts, 3), parts[0].own
     (judge,) = scene.judges
     sample_ns, lead = NS_PER_S // choices.PACKET_HZ, lead_ns(bench.config)
@@ -161,11 +152,11 @@ def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monk
     late_s = age_s + row_s + bench.scan.hold_s / 2
     expected = np.sqrt(np.mean((3600 * late_s * np.linalg.norm(np.cross(true, choices.AXIS), axis=1)) ** 2))
     held = Combination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
-    assert scene.error(held).arcsec == pytest.approx(expected, rel=LATE_SHARE)
+    assert scene.error(held).error_arcsec == pytest.approx(expected, rel=LATE_SHARE)
 
 
 def test_a_star_that_runs_with_the_scan_loses_no_light(parts, monkeypatch):
-    monkeypatch.setattr(choices, "JITTER", ())
+    monkeypatch.setattr(predictors, "JITTER", ())
     scene, bench = scene_of(parts, 4), parts[0].own
     (judge,) = scene.judges
     moved_px = math.radians(10.0) * choices.AXIS[0] * bench.camera.focal_length_px

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.monitor.phases import SIGMA_PX, fainter, measure, phase_grid
+from hilstar.monitor.phases import USUAL_PSF, fainter, measure, phase_grid
 from hilstar.render.reference import linear_image
 from hilstar.study.codes import AIMS, BITS, WAYS
 from hilstar.study.quantisation import run
@@ -20,7 +20,7 @@ MOST_LEFT = 0.6
 
 def test_the_measure_finds_the_error_that_was_put_in():
     sprites, tile = phase_grid(4)
-    image = linear_image(sprites, (4 * tile, 4 * tile), SIGMA_PX)
+    image = linear_image(sprites, (4 * tile, 4 * tile), USUAL_PSF)
     errors = measure(image, np.roll(image, 1, axis=1) * 10 ** (-0.4 * 0.03), tile)
     assert (errors.flux_rms_mag, errors.flux_max_mag) == pytest.approx((0.03, 0.03), abs=1e-6)
     assert (errors.centroid_rms_px, errors.centroid_max_px) == pytest.approx((1, 1), abs=1e-4)

@@ -19,10 +19,10 @@ from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
 from hilstar.study import sweep
 from hilstar.study.codes import star_field
-from hilstar.study.sweep import MIN_ROUNDS, interleaved, pareto_front
+from hilstar.study.sweep import MAX_ROUNDS, MIN_ROUNDS, in_turn, pareto_front
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import LIMITS_V_MAG, trapezoid
-from hilstar.study.tradeoff.places import SIGMA_PX
+from hilstar.study.tradeoff.places import SPRITE_PSF
 from hilstar.study.tradeoff.run import STEPS, draw, table_lines
 from hilstar.study.tradeoff.table import Figure, Trial, Trials, measured
 
@@ -156,7 +156,7 @@ def planted(clock, own_ms, floor=0.0):
 
 def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(clock):
     step = measured(planted(clock, 4.0), 0.02)
-    assert [row.method for row in step.rows if not row.on_front] == ["slow and rough"]
+    assert [row.method for row in step.trials if not row.on_front] == ["slow and rough"]
     assert step.default.beaten == "" and step.default.time_ms == pytest.approx(4.0)
     beaten = measured(planted(clock, 4.0, floor=1.0), 0.02)  # all errors count as none: the fastest is best
     assert not beaten.default.on_front
@@ -166,20 +166,22 @@ def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(c
 
 def test_every_round_has_every_work_and_slow_works_drop_out(clock):
     calls = []
-    times = interleaved([clock(50.0, calls), clock(1.5, calls)], 0.02)
+    slow, fast = clock(50.0, calls), clock(1.5, calls)
+    works = {"slow": lambda _: slow(), "fast": lambda _: fast()}
+    times = in_turn(works, MAX_ROUNDS, 0.01)
     rounds = [sorted(calls[k : k + 2]) for k in range(0, 2 * (MIN_ROUNDS + 1), 2)]
     assert rounds == [[1.5, 50.0]] * (MIN_ROUNDS + 1)
     # The slow one has had its 10 ms after one round; the fast one is over its own after the seventh.
-    assert [len(taken) for taken in times] == [MIN_ROUNDS, 7]
+    assert {name: len(taken) for name, taken in times.items()} == {"slow": MIN_ROUNDS, "fast": 7}
 
 
 def test_the_variants_that_change_nothing_or_only_the_profile_draw_the_same_stars():
     field = star_field((160, 120), 10)
-    wanted = linear_image(field, (160, 120), SIGMA_PX)
+    wanted = linear_image(field, (160, 120), SPRITE_PSF)
     brightest = float(field.data["electrons_per_s"].max())
     drawn = {}
     for variant in (SplatVariant(), SplatVariant("exp erf"), SplatVariant("table", table_size=4096), SplatVariant("centre")):
-        with VariantRenderer(Target((160, 120), SIGMA_PX), variant) as renderer:
+        with VariantRenderer(Target((160, 120), SPRITE_PSF), variant) as renderer:
             renderer.draw_and_wait(field)
             drawn[variant.profile] = np.abs(renderer.linear() - wanted).max()
             assert renderer.gl_error() == "GL_NO_ERROR" and renderer.texel == "R32F"
@@ -189,7 +191,7 @@ def test_the_variants_that_change_nothing_or_only_the_profile_draw_the_same_star
 
 
 def test_half_floats_are_told_apart_and_smaller_sprites_are_smaller():
-    with VariantRenderer(Target((64, 64), SIGMA_PX), SplatVariant(half_float=True, footprint_px=6)) as renderer:
+    with VariantRenderer(Target((64, 64), SPRITE_PSF), SplatVariant(half_float=True, footprint_px=6)) as renderer:
         assert (renderer.texel, renderer.footprint_px) == ("R16F", 6)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from hilstar.monitor.quantise import Panel, round_levels, shown_light
 from hilstar.monitor.response import Response, gamma_response, srgb_response
 from hilstar.render.reference import linear_image
-from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import Sprites, pack_sprites
 from tests.support.centroiders import family_errors_px
 
@@ -46,7 +46,7 @@ class Scene:
     @property
     def linear(self) -> np.ndarray:
         """What is asked for, e-/s, before the panel's white."""
-        return linear_image(self.sprites, (SIDE, SIDE), self.sigma_px)
+        return linear_image(self.sprites, (SIDE, SIDE), GaussianPsf(self.sigma_px))
 
     @property
     def wanted(self) -> np.ndarray:
@@ -57,13 +57,13 @@ class Scene:
 
 def flux_of(mag, sigma_px=USUAL):
     """Electrons per second of a star so many magnitudes under the one whose peak is white."""
-    return WHITE * 10 ** (-0.4 * np.asarray(mag)) / peak_share(sigma_px)
+    return WHITE * 10 ** (-0.4 * np.asarray(mag)) / GaussianPsf(sigma_px).peak_share
 
 
 def sprites_of(x_px, y_px, mag, sigma_px=USUAL):
     x, y = (np.concatenate([np.atleast_1d(part) for part in axis]).astype(float) for axis in (x_px, y_px))
     light = np.concatenate([np.full(np.size(part), flux_of(m, sigma_px)) for part, m in zip(x_px, mag, strict=True)])
-    return pack_sprites(x, y, light, np.arange(len(x)), (SIDE, SIDE), footprint_px(sigma_px))
+    return pack_sprites(x, y, light, np.arange(len(x)), (SIDE, SIDE), GaussianPsf(sigma_px).footprint_px)
 
 
 def middles():

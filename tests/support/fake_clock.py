@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
-from hilstar.run.host_clock import HostClock
+from hilstar.process.scheduling import HostClock
 
 
 class FakeClock(HostClock):
@@ -14,9 +15,14 @@ class FakeClock(HostClock):
         self.ns = start_ns
         self.wakes_late_ns = wakes_late_ns
         self.waited_until: list[int] = []
+        self.slept_s: list[float] = []
 
     def now_ns(self) -> int:
         return self.ns
+
+    def sleep(self, seconds: float) -> None:
+        self.slept_s.append(seconds)
+        self.work(seconds * 1e9)
 
     def work(self, ns: float) -> None:
         """Let time pass."""
@@ -34,10 +40,18 @@ class FakeClock(HostClock):
 class WellGpu:
     """What a screen and a frame loop ask of a renderer whose GPU is well."""
 
-    codes_texture = context = None
+    def __init__(self, take_back_buffer: Callable[[], None] = lambda: None) -> None:
+        self.take_back_buffer = take_back_buffer
 
-    def __init__(self) -> None:
-        self.tables: list[object] = []
+    def show_on(self, view: object) -> None:
+        """Any screen."""
+
+    def present(self, *values: object) -> None:
+        """At once."""
+
+    def changed_codes(self) -> str:
+        """None."""
+        return ""
 
     def remember_tables(self) -> None:
         """Nothing to remember."""

@@ -10,8 +10,8 @@ from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.run.loop import Limit
 from hilstar.run.open_link import AnyLink
+from hilstar.run.pacer import Shown
 from hilstar.run.serve import Outlet, Running, serve
-from hilstar.run.shown import Shown
 from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_MS
 from tests.support.waiting import PATIENCE_S

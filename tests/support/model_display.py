@@ -6,13 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
-import pytest
-
 from hilstar.bench.build import scan_of
 from hilstar.bench.config import parse_config
 from hilstar.frame.view import View
 from hilstar.monitor.window.x11 import BackBuffer, SwapStamps
-from hilstar.run.screen import screen as screen_room
 from hilstar.run.screen.screen import Screen
 from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock, WellGpu
@@ -44,22 +41,17 @@ def plain_window(hz: float = 60.0, **changes: object) -> SimpleNamespace:
     return SimpleNamespace(**plain | changes)
 
 
-def model_screen(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, hz: float = 60, **display: object
-) -> tuple[Screen, ModelDisplay]:
+def model_screen(folder: Path, hz: float = 60, **display: object) -> tuple[Screen, ModelDisplay]:
     """The small bench on a model display, before the gate: all but the window and what is drawn on it is real."""
     clock = FakeClock(FIRST_NS + 123_456)
     model = ModelDisplay(clock, round(1e9 / hz), **display)
-    presenter = SimpleNamespace(present=lambda *values: None, wait=model.wait, table=None)
-    monkeypatch.setattr(screen_room, "Presenter", lambda texture, view: presenter)
-    monkeypatch.setattr(screen_room, "changed_codes", lambda context, screen_px, bits: "")
     config = parse_config(folder / "bench.toml", SMALL_BENCH.replace("[collimator]", f"refresh_hz = {hz}\n[collimator]"))
     bench = SimpleNamespace(
         config=config,
         scan=scan_of(config.monitor),
         camera=SimpleNamespace(boresight_px=(0.0, 0.0)),
         calibration=SimpleNamespace(response=SimpleNamespace(rgb=None)),
-        renderer=WellGpu(),
+        renderer=WellGpu(model.wait),
         draw=lambda q: None,
         view=View,
         light=lambda view, faults: clock.work(DRAW_NS),

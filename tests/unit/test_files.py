@@ -18,7 +18,7 @@ from hilstar.files import (
     check_ending,
     check_outputs,
     files_named_in,
-    open_lock,
+    lock_alone,
     refuse_existing,
     whole_file,
     write_whole,
@@ -126,7 +126,7 @@ def test_a_lock_file_is_no_way_to_another_file(tmp_path):
     victim.write_text("theirs")
     (tmp_path / ".lock").symlink_to(victim)
     with pytest.raises(InputError, match="cannot be written"):
-        open_lock(tmp_path / ".lock")
+        lock_alone(tmp_path / ".lock", "held")
     assert victim.read_text() == "theirs"
 
 

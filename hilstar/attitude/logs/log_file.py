@@ -73,7 +73,7 @@ def read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
 def _sample(row: list[str], places: dict[str, int]) -> AttitudeSample | Refusal:
     try:
         cells = {name: row[place].strip() for name, place in places.items()}
-        t_ns = _t_ns(cells["t_s"])
+        t_ns = ns_of_seconds(cells["t_s"])
         q = tuple(float(cells[name]) for name in CSV_COLUMNS[1:])
         turning = [cells.get(name, "") for name in RATE_COLUMNS]
         rate = tuple(map(float, turning)) if any(turning) else None
@@ -89,8 +89,11 @@ def _sample(row: list[str], places: dict[str, int]) -> AttitudeSample | Refusal:
     return checked_sample(t_ns, q, rate, sequence, discontinuity)
 
 
-def _t_ns(seconds: str) -> int:
-    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns."""
+def ns_of_seconds(seconds: str) -> int:
+    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns.
+
+    Raises ValueError or ArithmeticError.
+    """
     value = Decimal(seconds)
     if not value.is_finite() or value.adjusted() > 40:
         raise ValueError

@@ -13,6 +13,7 @@ The library's writer obeys neither 1 nor 2, and its index grows by a megabyte in
 
 from __future__ import annotations
 
+import bz2
 import contextlib
 import io
 import logging
@@ -91,7 +92,7 @@ ATTITUDE_SCHEMA = msgspec.json.encode(
 )
 
 
-class DamageError(Exception):
+class DamageError(ValueError):
     """What is wrong with a file."""
 
 
@@ -247,6 +248,21 @@ def _refused(path: Path, file: IO[bytes], error: Exception) -> InputError:
     return InputError(f"{path}: is damaged before byte {file.tell()} ({detail}); record the log again")
 
 
+def unpacked(data: bytes, compression: str, limit: int, exact: bool = True) -> bytes:
+    """What was packed: `limit` bytes, or if not `exact` at most so many. Raises DamageError, and what the unpackers raise."""
+    if compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+            whole = stream.read(limit + 1)
+    elif compression in {"bz2", "lz4"}:
+        unpacker = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
+        whole = unpacker.decompress(data, max_length=limit + 1)
+    else:
+        whole = data
+    if len(whole) > limit or (exact and len(whole) != limit):
+        raise DamageError(f"a chunk contains {'more' if len(whole) > limit else 'less'} than the {limit} bytes that it states")
+    return whole
+
+
 def _unpacked(chunk: Chunk, room: int) -> bytes:
     """A chunk's content, once its size and CRC are those that it states."""
     size = chunk.uncompressed_size
@@ -254,17 +270,9 @@ def _unpacked(chunk: Chunk, room: int) -> bytes:
         raise TooLargeError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
     if size > room:
         raise TooLargeError(f"unpacks to more than {MAX_INFLATION} times its size")
-    if chunk.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
-            data = stream.read(size + 1)
-    elif chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    elif chunk.compression:
+    if chunk.compression not in {"", "zstd", "lz4"}:
         raise DamageError(f"compression {chunk.compression[:20]!r} is neither zstd nor lz4")
-    else:
-        data = chunk.data
-    if len(data) != size:
-        raise DamageError(f"a chunk contains {'more' if len(data) > size else 'less'} than the {size} bytes that it states")
+    data = unpacked(chunk.data, chunk.compression, size)
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise DamageError("the CRC-32 of a chunk does not match")
     return data

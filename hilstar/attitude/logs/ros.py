@@ -14,7 +14,7 @@ tf is a tree of frames; a chain of transforms gives the attitude of one frame in
 changes is static, whichever topic it comes on. Where several transforms of a chain move, the attitudes have the times of the
 one with the most samples, and the others are interpolated to those (SLERP, as in tf2), never extrapolated.
 
-Type definitions in the bag are compared with those of rosbags and never compiled: rosbags turns a definition into Python code.
+Type definitions in the bag are compared with those of rosbags and never registered: that would turn them into Python code.
 """
 
 from __future__ import annotations
@@ -46,9 +46,7 @@ if TYPE_CHECKING:
 
 TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
 TF_TEXT = "geometry_msgs/TransformStamped[] transforms"
-ALIASES = {"Header": "std_msgs/Header"}
 MAX_DEFINITION_CHARACTERS = 100_000
-Sections = dict[str, list[tuple[str, str]]]
 Numbers = tuple[float, ...]
 IntArray = npt.NDArray[np.int64]
 MAX_EDGES = 10_000
@@ -90,39 +88,16 @@ def check_definition(where: str, topic: BagTopic) -> None:
     """Refuse (InputError) a type that only has the name of ROS's own."""
     if not topic.definition:
         return
-    version = 1 if topic.encoding == "ros1" else 2
-    name = own_name(topic.type)
-    text, _ = typestore(topic.encoding).generate_msgdef(name, ros_version=version)
-    ours, theirs = _sections(text, name), _sections(topic.definition[:MAX_DEFINITION_CHARACTERS], name)
-    if any(theirs.get(kind, fields) != fields for kind, fields in ours.items()):  # some writers leave out the inner types
+    from rosbags.typesys import TypesysError, get_types_from_msg
+
+    text, ours = topic.definition[:MAX_DEFINITION_CHARACTERS], typestore(topic.encoding).fielddefs
+    try:
+        theirs = get_types_from_msg("\n".join(text.splitlines()), own_name(topic.type))
+    except TypesysError:
+        theirs = {}
+    # Some writers leave out the inner types.
+    if not theirs or any(kind in ours and ours[kind][1] != fields for kind, (_, fields) in theirs.items()):
         raise InputError(f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it")
-
-
-def _sections(text: str, name: str) -> Sections:
-    """The fields, type and name, of a definition and of those that it has after its lines of equals signs."""
-    sections: Sections = {}
-    current = _short(name)
-    for line in text.splitlines():
-        words = line.partition("#")[0].split()
-        if not words or set(line.strip()) == {"="}:
-            continue
-        if words[0] == "MSG:" and len(words) == 2:
-            current = _short(words[1])
-        elif "=" not in line.partition("#")[0] and len(words) >= 2:
-            sections.setdefault(current, []).append((_field_type(words[0], current), words[1]))
-    return sections
-
-
-def _field_type(text: str, owner: str) -> str:
-    base, bracket, size = text.partition("[")
-    base = _short(ALIASES.get(base, base))
-    if "/" not in base and base[:1].isupper():
-        base = f"{owner.partition('/')[0]}/{base}"
-    return base + bracket + size
-
-
-def _short(name: str) -> str:
-    return name.replace("/msg/", "/")
 
 
 class RosTurn(NamedTuple):

@@ -11,7 +11,6 @@ A bag states the unpacked sizes of its chunks, which may be false: nothing is un
 
 from __future__ import annotations
 
-import bz2
 import contextlib
 import io
 import os
@@ -20,15 +19,14 @@ import sqlite3
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple, Protocol
+from typing import IO, Any, Literal, NamedTuple
 from urllib.parse import quote
 
-import lz4.frame
 import zstandard
 from mcap.records import Channel, Schema
 from mcap.records import Message as McapMessage
 
-from hilstar.attitude.logs.mcap_log import ROS_ENCODINGS, records_of
+from hilstar.attitude.logs.mcap_log import ROS_ENCODINGS, records_of, unpacked
 from hilstar.errors import InputError, shortened
 from hilstar.files import temporary_folder
 from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, open_regular, read_text, refuse_kind, size_text
@@ -73,49 +71,24 @@ class Message(NamedTuple):
     data: bytes
 
 
-class Storage(Protocol):
-    """One file of a bag."""
-
-    def topics(self) -> list[BagTopic]:
-        """Its topics. Raises InputError for damage."""
-
-    def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic as recorded. Raises InputError for damage."""
-
-    def told(self) -> list[tuple[str, str]]:
-        """Notices of the file: that it was cut short."""
-
-
 def type_name(text: str) -> str:
     """A type as PACKAGE/msg/NAME, however a bag writes it."""
     parts = text.replace("::", "/").split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else "/".join(parts)
 
 
-def unpacked(data: bytes, compression: str, size: int | None = None) -> bytes:
-    """A chunk or a message, unpacked to the `size` that the bag states. Raises ValueError, and what the unpackers raise."""
-    limit = MAX_CHUNK_BYTES if size is None else size
-    if limit > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk of {size_text(limit)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
-    if compression == "bz2":
-        whole = bz2.BZ2Decompressor().decompress(data, max_length=limit + 1)
-    elif compression == "lz4":
-        whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit + 1)
-    elif compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-            whole = stream.read(limit + 1)
-    elif compression == "none":
-        whole = data
-    else:
+def chunk_bytes(data: bytes, compression: str, size: int) -> bytes:
+    """A chunk, unpacked to the `size` that the bag states. Raises ValueError, and what the unpackers raise."""
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
+    if compression not in {"none", "bz2", "lz4", "zstd"}:
         raise ValueError(f"compression {compression[:20]!r} is not one of bz2, lz4 and zstd")
-    if len(whole) > limit or (size is not None and len(whole) != size):
-        raise ValueError(f"a chunk contains {'more' if len(whole) > limit else 'less'} than the {limit} bytes that it states")
-    return whole
+    return unpacked(data, compression, size)
 
 
 def message_bytes(data: bytes) -> bytes:
     """A message's bytes, unpacked where the recorder packed each by itself (no CDR begins as Zstandard does)."""
-    return unpacked(data, "zstd") if data[:4] == ZSTD_MAGIC else data
+    return unpacked(data, "zstd", MAX_CHUNK_BYTES, exact=False) if data[:4] == ZSTD_MAGIC else data
 
 
 def unpack_file(path: Path, source: IO[bytes], target: IO[bytes]) -> None:
@@ -139,7 +112,7 @@ def damaged(path: Path, reason: object, where: str = "") -> InputError:
 
 
 class Db3File:
-    """A .db3 file; see Storage."""
+    """A .db3 file: topics, messages as recorded, and notices of what is missing. Its methods raise InputError for damage."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -203,7 +176,7 @@ class Db3File:
 
 
 class McapBag:
-    """An .mcap file; see Storage."""
+    """An .mcap file, as `Db3File`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -260,7 +233,7 @@ class CutError(Exception):
 
 
 class BagFile:
-    """A .bag file; see Storage."""
+    """A .bag file, as `Db3File`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -320,7 +293,7 @@ class BagFile:
                 while (record := _record(file, MAX_CHUNK_BYTES)) is not None:
                     fields, data = record
                     if _operation(fields) == CHUNK:
-                        chunk = unpacked(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
+                        chunk = chunk_bytes(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
                         room -= len(chunk)
                         if room < 0:
                             raise ValueError(f"unpacks to more than {MAX_INFLATION} times its size")
@@ -386,6 +359,9 @@ def _fields(data: bytes) -> Fields:
 
 def _operation(fields: Fields) -> int:
     return fields[b"op"][0] if fields.get(b"op") else 0
+
+
+Storage = Db3File | McapBag | BagFile  # one file of a bag
 
 
 class Bag:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from decimal import Decimal, DecimalException
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.attitude.logs.log_file import read_log
+from hilstar.attitude.logs.log_file import ns_of_seconds, read_log
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.csv_tables import finite_numbers, is_valid, read_rows
 from hilstar.errors import InputError, shortened
@@ -98,11 +97,9 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
 
 
 def _time(path: Path, line: int, cell: str) -> int:
-    """Decimal seconds as nanoseconds: a float of today's Unix time would be off by 100 ns."""
     try:
-        value = Decimal(cell)
-        t_ns = int(value.scaleb(9).to_integral_value()) if value.is_finite() and value.adjusted() < 12 else None
-    except DecimalException:
+        t_ns = ns_of_seconds(cell)
+    except (ArithmeticError, ValueError):
         t_ns = None
     if t_ns is None or abs(t_ns) > MAX_T_NS:
         raise InputError(f"{path}:{line}: t_s = {shortened(cell)!r} is no time; write seconds, of any clock that runs evenly")

@@ -1,7 +1,7 @@
 """A separate process that reads a link, so that no stamp waits for Python's lock: its owner's end, and the records between.
 
 The contract:
-1. This process gives an `ReadOrder`: a ZeroMQ stream to open, an open device to read (its descriptor goes along), or nothing to
+1. This process gives a `ReadOrder`: a ZeroMQ stream to open, an open device to read (its descriptor goes along), or nothing to
    read any more. A new order replaces the last one.
 2. The other process (`apart_child`) stamps each message and hands it over in a record that carries the order's number. Records
    of an earlier order are dropped here.
@@ -13,19 +13,22 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import select
 import socket
 import struct
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple, Protocol
 
 import msgspec
 
 from hilstar.attitude.wire.links import LinkCounts, RawMessage
 from hilstar.notices import Notices
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.units import NS_PER_S
 
 CHILD = "hilstar.attitude.wire.apart_child"
 LENGTH = struct.Struct("<I")  # bytes of the record that follows
@@ -41,69 +44,48 @@ READY_WITHIN_S = 5.0
 ENDS_WITHIN_S = 0.3  # in order; a signal leaves a command a second for all its ends
 
 
-class ZmqStream(msgspec.Struct, frozen=True):
-    """A SUB socket to open: what `ZmqReceiver` takes, with the key files as absolute paths."""
+class RawLink(Protocol):
+    """What the other process reads: messages as they arrive, not decoded."""
 
-    endpoint: str
-    bind: bool
-    topic: bytes
-    max_part_bytes: int
-    secret_key: str | None = None
-    server_key: str | None = None
-    allowed_clients: str | None = None
+    link_counts: LinkCounts
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """Whether something waits."""
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """The messages so far; waits at most `timeout_ms`. Raises OSError where a device no longer answers."""
+
+    def close(self) -> None:
+        """Close this process's end of it."""
 
 
-class ReadOrder(msgspec.Struct, frozen=True):
-    """What to read from now on: a stream; or the device whose descriptor goes along; or nothing."""
+OpenStream = Callable[[Notices], RawLink]
+
+
+class ReadOrder(NamedTuple):
+    """What to read from now on: a stream to open; or the device whose descriptor goes along; or nothing."""
 
     number: int
-    stream: ZmqStream | None = None
+    stream: OpenStream | None = None
     device: bool = False
 
 
-class MessageRecord(msgspec.Struct, frozen=True, tag=True):
-    """A message that came."""
+class Record(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What the other process hands over, of one order: any of these; a record of nothing is a sign of life.
 
-    order: int
-    message: RawMessage
+    A message that came; why the device does not `answer` any more; what the counts have grown by since the last record that
+    had them; a notice of the link, told where it is lasting, else only mentioned; why the process ends.
+    """
 
-
-class GoneRecord(msgspec.Struct, frozen=True, tag=True):
-    """The device does not answer any more, and why."""
-
-    order: int
-    why: str
-
-
-class CountsRecord(msgspec.Struct, frozen=True, tag=True):
-    """What the counts of the link have grown by since the last such record."""
-
-    order: int
-    counts: LinkCounts
-
-
-class NoticeRecord(msgspec.Struct, frozen=True, tag=True):
-    """A notice of the link; `lasting` notices are told, others only mentioned."""
-
-    order: int
-    kind: str
-    detail: str
-    who: str = ""
+    order: int = 0
+    message: RawMessage | None = None
+    gone: str | None = None
+    counts: LinkCounts | None = None
+    notice: tuple[str, str, str] | None = None
     lasting: bool = True
+    end: str | None = None
 
 
-class EndRecord(msgspec.Struct, frozen=True, tag=True):
-    """The process ends, and why."""
-
-    why: str
-
-
-class SignRecord(msgspec.Struct, frozen=True, tag=True):
-    """The process is ready, and lives."""
-
-
-LinkRecord = MessageRecord | GoneRecord | CountsRecord | NoticeRecord
-Record = LinkRecord | EndRecord | SignRecord
 _encoder, _decoder = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(Record)
 
 
@@ -144,21 +126,21 @@ class ReaderProcess:
     `generation` counts its starts. Its end raises nothing.
     """
 
-    def __init__(self, notices: Notices, module: str = CHILD) -> None:
+    def __init__(self, notices: Notices, module: str = CHILD, clock: HostClock = HOST_CLOCK) -> None:
         self.generation = 0
-        self._notices, self._module = notices, module
+        self._notices, self._module, self._clock = notices, module, clock
         self._order, self._file = ReadOrder(0), -1
         self._process: subprocess.Popen[bytes] | None = None
         self._wire: socket.socket | None = None
         self._stream = RecordStream()
         self._why, self._ready = "", False
-        self._begun_s = self._again_s = self._silent_s = 0.0
-        self._back_off_s = MIN_BACK_OFF_S
+        self._silent_s, self._back_off_s = 0.0, MIN_BACK_OFF_S
+        self._again = clock.within(0.0)
         self._begin()
 
     def _begin(self) -> None:
         self.generation += 1
-        self._begun_s, self._why, self._stream = time.monotonic(), "", RecordStream()
+        self._steady, self._why, self._stream = self._clock.within(STEADY_S), "", RecordStream()
         self._ready, self._silent_s = False, 0.0
         wire, its_wire = socket.socketpair()
         wire.setblocking(False)
@@ -183,38 +165,30 @@ class ReaderProcess:
     def _give(self) -> None:
         """Send the order; it is lost where the process has ended, which `take` notices."""
         if self._wire is not None and self._order.number:
-            line = msgspec.json.encode(self._order) + b"\n"
+            line = pickle.dumps(self._order).hex().encode() + b"\n"
             with contextlib.suppress(OSError):
                 socket.send_fds(self._wire, [line], [self._file] if self._order.device else [])
 
-    def read_stream(self, stream: ZmqStream) -> None:
-        """Order a ZeroMQ stream to be opened and read."""
-        self._order = ReadOrder(self._order.number + 1, stream)
-        self._give()
-
-    def read_device(self, file: int) -> None:
-        """Order an open device to be read; this process still writes to it and closes it."""
-        self._order, self._file = ReadOrder(self._order.number + 1, device=True), file
-        self._give()
-
-    def read_nothing(self) -> None:
-        """Release the device before it is closed here: otherwise its line stays open and locked."""
-        self._order = ReadOrder(self._order.number + 1)
+    def read(self, stream: OpenStream | None = None, device: int | None = None) -> None:
+        """Order a stream to be opened, or a device, whose descriptor this process keeps; with neither, the device is let go."""
+        self._order = ReadOrder(self._order.number + 1, stream, device is not None)
+        self._file = -1 if device is None else device
         self._give()
 
     def wait(self, timeout_ms: float) -> bool:
         """True once the process has said something that was not taken, or has ended; begins it again where that is due."""
-        if self._wire is None and time.monotonic() >= self._again_s:
+        if self._wire is None and self._again.over:
             self._begin()
         if self._wire is None:
-            time.sleep(max(0.0, min(self._again_s - time.monotonic(), timeout_ms / 1000)))
+            self._clock.sleep(min(self._again.left_s, timeout_ms / 1000))
             return False
         poll = select.poll()
         poll.register(self._wire, select.POLLIN)
-        begun_s = time.monotonic()
+        begun_ns = self._clock.now_ns()
         said = bool(poll.poll(timeout_ms))
         # Only what was waited here counts: this process may have been stopped itself.
-        self._silent_s = 0.0 if said else self._silent_s + min(time.monotonic() - begun_s, timeout_ms / 1000)
+        waited_s = min((self._clock.now_ns() - begun_ns) / NS_PER_S, timeout_ms / 1000)
+        self._silent_s = 0.0 if said else self._silent_s + waited_s
         limit_s = (STALLED_S if self._would_run() else HUNG_S) if self._ready and self._silent_s > HUNG_S else STARTS_S
         if self._silent_s > limit_s:
             self._ended(f"no sign of life for {limit_s:g} s")
@@ -230,12 +204,12 @@ class ReaderProcess:
 
     def await_ready(self) -> None:
         """Wait until the process has imported what it needs; not for long, and not for one that failed."""
-        deadline_s = time.monotonic() + READY_WITHIN_S
-        while not self._ready and self._wire is not None and time.monotonic() < deadline_s:
+        deadline = self._clock.within(READY_WITHIN_S)
+        while not self._ready and self._wire is not None and not deadline.over:
             if self.wait(READY_WITHIN_S * 1000):
                 self.take()
 
-    def take(self) -> list[LinkRecord]:
+    def take(self) -> list[Record]:
         """What has come of the order, without waiting."""
         if self._wire is None:
             return []
@@ -248,26 +222,23 @@ class ReaderProcess:
         if not chunk:
             self._ended("")
             return []
-        taken: list[LinkRecord] = []
+        taken: list[Record] = []
         try:
             for record in self._stream.feed(chunk):
-                match record:
-                    case SignRecord():
-                        self._ready = True
-                    case EndRecord(why):
-                        self._why = why
-                    case _ if record.order == self._order.number:
-                        taken.append(record)
+                self._ready = True
+                if record.end is not None:
+                    self._why = record.end
+                elif record.order == self._order.number != 0:
+                    taken.append(record)
         except ValueError as error:
             self._ended(str(error))
         return taken
 
     def _ended(self, why: str) -> None:
         code = self._stop(0.0)
-        now_s = time.monotonic()
-        if now_s - self._begun_s > STEADY_S:
+        if self._steady.over:
             self._back_off_s = MIN_BACK_OFF_S
-        self._again_s = now_s + self._back_off_s
+        self._again = self._clock.within(self._back_off_s)
         self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
         why = self._why or why or (f"signal {-code}" if code < 0 else f"exit code {code}")
         self._notices.tell("receiver-failed", f"the attitude receiver stopped ({why}); restarting it")

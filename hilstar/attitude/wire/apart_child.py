@@ -7,35 +7,20 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import select
 import signal
 import socket
 import sys
-import time
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import NoReturn, Protocol
+from typing import NoReturn
 
-import msgspec
-
-from hilstar.attitude.wire.apart import (
-    CountsRecord,
-    EndRecord,
-    GoneRecord,
-    MessageRecord,
-    NoticeRecord,
-    ReadOrder,
-    Record,
-    SignRecord,
-    ZmqStream,
-    pack,
-)
+from hilstar.attitude.wire.apart import RawLink, ReadOrder, Record, pack
 from hilstar.attitude.wire.links import LinkCounts, RawMessage
 from hilstar.errors import HilstarError, one_line
 from hilstar.notices import Notices
 from hilstar.process.interrupts import ENDING, end_with_parent
-from hilstar.process.scheduling import PromptWhileLight
+from hilstar.process.scheduling import HOST_CLOCK, HostClock, PromptWhileLight
 
 WANTED_BUFFER_BYTES = 1 << 20  # for some hundred unread messages; the kernel may give less
 MAX_ORDER_BYTES = 65_536
@@ -47,19 +32,18 @@ POLL_MS = 20
 class Wire:
     """This end of the socket pair; a peer that is gone raises EOFError."""
 
-    def __init__(self, made: socket.socket) -> None:
-        self._socket = made
-        self._signed_s = -LIFE_S
+    def __init__(self, made: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
+        self._socket, self._clock = made, clock
+        self._next_sign = clock.within(0.0)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WANTED_BUFFER_BYTES)
         self._poll = select.poll()
         self._poll.register(made, select.POLLIN)
 
     def sign(self) -> None:
         """Say that this process is ready, and from time to time that it still is."""
-        now_s = time.monotonic()
-        if now_s - self._signed_s >= LIFE_S:
-            self._signed_s = now_s
-            self.put(SignRecord())
+        if self._next_sign.over:
+            self._next_sign = self._clock.within(LIFE_S)
+            self.put(Record())
 
     def put(self, record: Record) -> None:
         """Hand a record over; waits while the other side does not read, so that nothing grows here."""
@@ -81,39 +65,24 @@ class Wire:
                 said += more
         except OSError as error:
             raise EOFError from error
-        newest = msgspec.json.decode(said.splitlines()[-1], type=ReadOrder)
+        newest: ReadOrder = pickle.loads(bytes.fromhex(said.splitlines()[-1].decode()))
         return newest, files[0] if newest.device and files else None
 
 
-class Source(Protocol):
-    """The thing to read. `empty_ns` is the last host time at which nothing waited."""
+class OpenDevice:
+    """A serial device, which the process that shows stars has opened and set up."""
 
-    empty_ns: int
+    def __init__(self, file: int, clock: HostClock = HOST_CLOCK) -> None:
+        self.link_counts = LinkCounts()
+        self._file, self._clock = file, clock
 
-    def waits(self) -> bool:
-        """Whether something waits."""
-
-    def take(self, timeout_ms: int) -> Sequence[RawMessage]:
-        """The messages so far, stamped; waits at most `timeout_ms`. Raises OSError where a device no longer answers."""
-
-    def close(self) -> None:
-        """Close this process's end of it."""
-
-
-class DeviceSource:
-    """An open serial device, which the process that shows stars has opened and set up."""
-
-    def __init__(self, file: int) -> None:
-        self.empty_ns = 0  # bytes that already wait may have come at any time
-        self._file = file
-
-    def waits(self) -> bool:
+    def wait_for_message(self, timeout_ms: int) -> bool:
         """Whether a byte waits."""
-        return bool(select.select([self._file], [], [], 0)[0])
+        return bool(select.select([self._file], [], [], timeout_ms / 1000)[0])
 
-    def take(self, timeout_ms: int) -> Sequence[RawMessage]:
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
         """The bytes that came, as one message."""
-        if not select.select([self._file], [], [], timeout_ms / 1000)[0]:
+        if not self.wait_for_message(timeout_ms):
             return []
         try:
             chunk = os.read(self._file, MAX_READ_BYTES)
@@ -121,7 +90,7 @@ class DeviceSource:
             return []
         if not chunk:
             raise OSError(0, "it was readable, and nothing came")
-        return [RawMessage(time.monotonic_ns(), [chunk])]
+        return [RawMessage(self._clock.now_ns(), [chunk])]
 
     def close(self) -> None:
         """Close this process's copy of the device."""
@@ -141,93 +110,74 @@ class ForwardedNotices(Notices):
         """Forward the growth of the counts."""
         grown, self._counted = self.link_counts - self._counted, replace(self.link_counts)
         if grown != LinkCounts():
-            self._wire.put(CountsRecord(self._order, grown))
+            self._wire.put(Record(self._order, counts=grown))
 
     def tell(self, kind: str, detail: str, who: str = "") -> None:
         """Forward a lasting notice."""
-        with contextlib.suppress(EOFError):
-            self.count()
-            self._wire.put(NoticeRecord(self._order, kind, detail, who))
+        self._forward(Record(self._order, notice=(kind, detail, who)))
 
     def mention(self, kind: str, detail: str) -> None:
         """Forward a mention."""
+        self._forward(Record(self._order, notice=(kind, detail, ""), lasting=False))
+
+    def _forward(self, record: Record) -> None:
         with contextlib.suppress(EOFError):
             self.count()
-            self._wire.put(NoticeRecord(self._order, kind, detail, lasting=False))
+            self._wire.put(record)
 
 
-class ZmqSource:
-    """A SUB socket, opened here. Raises InputError where it cannot be."""
+class Reading:
+    """An order that is carried out. Raises InputError where its socket cannot be opened."""
 
-    def __init__(self, stream: ZmqStream, notices: ForwardedNotices) -> None:
-        from hilstar.attitude.wire.keys import CurveKeys  # libzmq takes 30 ms, and a serial line needs none of it
-        from hilstar.attitude.wire.zmq_links import ZmqReceiver
+    def __init__(self, wire: Wire, order: ReadOrder, file: int | None, clock: HostClock = HOST_CLOCK) -> None:
+        self._wire, self._number, self._clock = wire, order.number, clock
+        self._notices = ForwardedNotices(wire, order.number)
+        self._empty_ns = clock.now_ns()
+        self.link: RawLink | None = None
+        if order.stream is not None:
+            self.link = order.stream(self._notices)
+            self._notices.link_counts = self.link.link_counts
+        elif file is not None:
+            self._empty_ns = 0  # bytes that already wait may have come at any time
+            self.link = OpenDevice(file, clock)
 
-        files = (stream.secret_key, stream.server_key, stream.allowed_clients)
-        self._notices = notices
-        self._link = ZmqReceiver(
-            stream.endpoint,
-            bind=stream.bind,
-            keys=CurveKeys(*(None if each is None else Path(each) for each in files)),
-            notices=notices,
-            topic=stream.topic,
-            max_part_bytes=stream.max_part_bytes,
-        )
-        notices.link_counts = self._link.link_counts
-        self.empty_ns = time.monotonic_ns()
-
-    def waits(self) -> bool:
-        """Whether a message waits."""
-        return self._link.wait_for_message(0)
-
-    def take(self, timeout_ms: int) -> Sequence[RawMessage]:
-        """The messages that came."""
-        taken = self._link.taken(timeout_ms)
+    def hand_over(self, link: RawLink) -> None:
+        """Stamp and hand over what came; a device that does not answer any more is said, and closed."""
+        asked_ns = self._clock.now_ns()
+        try:
+            waits = link.wait_for_message(0)
+            if not waits:
+                self._empty_ns = asked_ns
+            taken = link.taken(POLL_MS)
+        except OSError as error:
+            self.close()
+            self._wire.put(Record(self._number, gone=error.strerror or str(error)))
+            return
         self._notices.count()
-        return taken
+        for k, message in enumerate(taken):
+            # The newest of those that arrived while this process slept woke it; the others had to wait.
+            timely = not waits and k == len(taken) - 1
+            self._wire.put(Record(self._number, message._replace(empty_ns=self._empty_ns, timely=timely)))
 
     def close(self) -> None:
-        """Close the socket."""
-        self._link.close()
-
-
-def _source(wire: Wire, order: ReadOrder, file: int | None) -> Source | None:
-    if order.stream is not None:
-        return ZmqSource(order.stream, ForwardedNotices(wire, order.number))
-    return None if file is None else DeviceSource(file)
-
-
-def _hand_over(wire: Wire, order: int, source: Source) -> None:
-    """Stamp and hand over what came."""
-    asked_ns = time.monotonic_ns()
-    waits = source.waits()
-    if not waits:
-        source.empty_ns = asked_ns
-    taken = source.take(POLL_MS)
-    for k, message in enumerate(taken):
-        # The newest of those that arrived while this process slept woke it; the others had to wait.
-        timely = not waits and k == len(taken) - 1
-        wire.put(MessageRecord(order, message._replace(empty_ns=source.empty_ns, timely=timely)))
+        """Read no more."""
+        if self.link is not None:
+            self.link.close()
+        self.link = None
 
 
 def read_as_ordered(wire: Wire) -> NoReturn:
     """Read what is ordered until the other side is gone (EOFError). Raises InputError where a socket cannot be opened."""
     priority = PromptWhileLight()
-    number, source = 0, None
+    reading = Reading(wire, ReadOrder(0), None)
     while True:
         wire.sign()
-        ordered = wire.order(LIFE_S * 1000 if source is None else 0)
+        ordered = wire.order(LIFE_S * 1000 if reading.link is None else 0)
         if ordered is not None:
-            if source is not None:
-                source.close()
-            number, source = ordered[0].number, _source(wire, *ordered)
-        if source is not None:
-            try:
-                _hand_over(wire, number, source)
-            except OSError as error:
-                source.close()
-                source = None
-                wire.put(GoneRecord(number, error.strerror or str(error)))
+            reading.close()
+            reading = Reading(wire, *ordered)
+        if reading.link is not None:
+            reading.hand_over(reading.link)
         priority.tend()
 
 
@@ -247,7 +197,7 @@ def main() -> NoReturn:
         code = 1
         why = str(error) if isinstance(error, HilstarError) else f"{type(error).__name__}: {error}"
         with contextlib.suppress(EOFError):
-            wire.put(EndRecord(one_line(why)))
+            wire.put(Record(end=one_line(why)))
     os._exit(code)  # threads of libraries are not waited for
 
 

@@ -6,23 +6,24 @@ whose messages are passed over in a flood keeps them as `RawMessage` until they 
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from operator import add, sub
-from types import TracebackType
-from typing import ClassVar, Generic, Literal, NamedTuple, Self, TypeAlias, TypeVar
+from typing import ClassVar, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal, Status
 from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.notices import Notices
+from hilstar.process.closing import Closing
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.units import NS_PER_S
 
 MAX_PACKETS_PER_S = 3000  # decoded: some 10 % of one core, and more than any serial line carries
 MAX_BURST = 1000  # as many as may have waited while the receiver was stopped
 PAUSE_S = 0.005  # a flooded receiver rests: the frame loop needs the interpreter lock
-OVER_S = 1.0  # a flood is over once no packet was dropped for this long
+OVER_NS = NS_PER_S  # a flood is over once no packet was dropped for this long
 MAX_LOOKED_AT = 1000  # passed-over packets searched for a discontinuity, which is declared once
 T = TypeVar("T")
 E_co = TypeVar("E_co", bound=Event, covariant=True)
@@ -58,47 +59,35 @@ class LinkCounts:
 class FloodGate:
     """Admits MAX_PACKETS_PER_S, and MAX_BURST at once, the newest. The others are passed over: counted and reported."""
 
-    def __init__(self, counts: LinkCounts, notices: Notices, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._counts = counts
-        self._notices = notices
-        self._now_s = now_s
+    def __init__(self, counts: LinkCounts, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        self._counts, self._notices, self._clock = counts, notices, clock
         self._left = float(MAX_BURST)
-        self._seen_s = now_s()
-        self._dropped_s = -OVER_S
+        self._seen_ns = clock.now_ns()
+        self._dropped_ns = self._seen_ns - OVER_NS - 1
 
     def newest(self, waiting: list[T], declares_discontinuity: Callable[[T], bool]) -> list[T]:
         """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses where others are passed over.
 
         The newest passed-over message that declares a discontinuity is taken too: no attitude is interpolated across it.
         """
-        passed_over = len(waiting) - self._admit(len(waiting))
+        now_ns = self._clock.now_ns()
+        self._left = min(self._left + (now_ns - self._seen_ns) * MAX_PACKETS_PER_S / NS_PER_S, MAX_BURST)
+        self._seen_ns = now_ns
+        passed_over = max(len(waiting) - int(self._left), 0)
+        self._left -= len(waiting) - passed_over
+        if not passed_over:
+            return waiting
+        self._counts.flooded += passed_over
+        if now_ns - self._dropped_ns > OVER_NS:
+            limits = f"over {MAX_PACKETS_PER_S} packets per second, or {MAX_BURST} at once"
+            self._notices.tell("flood", f"{limits}: taking the newest, passing over the others unread")
+        self._dropped_ns = now_ns
+        self._clock.sleep(PAUSE_S)
         for k in range(passed_over - 1, max(passed_over - MAX_LOOKED_AT, 0) - 1, -1):
             if declares_discontinuity(waiting[k]):
                 self._counts.flooded -= 1
                 return [waiting[k], *waiting[passed_over:]]
         return waiting[passed_over:]
-
-    def _admit(self, waiting: int) -> int:
-        """How many of the waiting packets may be decoded."""
-        now_s = self._now_s()
-        self._left = min(self._left + (now_s - self._seen_s) * MAX_PACKETS_PER_S, MAX_BURST)
-        self._seen_s = now_s
-        admitted = min(waiting, int(self._left))
-        self._left -= admitted
-        if admitted < waiting:
-            self._drop(waiting - admitted, now_s)
-        return admitted
-
-    def _drop(self, count: int, now_s: float) -> None:
-        self._counts.flooded += count
-        if now_s - self._dropped_s > OVER_S:
-            self._notices.tell(
-                "flood",
-                f"over {MAX_PACKETS_PER_S} packets per second, or {MAX_BURST} at once: taking the newest,"
-                " passing over the others unread",
-            )
-        self._dropped_s = now_s
-        time.sleep(PAUSE_S)
 
 
 class RawMessage(NamedTuple):
@@ -150,7 +139,7 @@ class TrackerCamera:
 Pictures = Callable[[AttitudeSample], bytes]
 
 
-class Link(ABC):
+class Link(Closing, ABC):
     """A link into hilstar, closed when its `with` ends.
 
     `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"), `conventions` what its numbers mean.
@@ -164,21 +153,19 @@ class Link(ABC):
     asks_for_pictures: ClassVar[bool] = False
     verb: str
     endpoint: str
-    link_counts: LinkCounts
     conventions: Conventions = PACKETS
+
+    def __init__(self, notices: Notices | None, clock: HostClock) -> None:
+        self._notices, self._clock = Notices() if notices is None else notices, clock
+        self.link_counts = LinkCounts()
+        self._gate = FloodGate(self.link_counts, self._notices, clock)
 
     @abstractmethod
     def close(self) -> None:
         """Close the link."""
 
-    def await_ready(self) -> None:  # noqa: B027 - most links are ready once they are open
+    def await_ready(self) -> None:
         """Wait until a sender is heard from the first read on: for a process that reads, and not for long."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 class StreamLink(Link):

@@ -18,7 +18,6 @@ import contextlib
 import re
 import select
 import socket
-import time
 from collections.abc import Sequence
 from datetime import date
 
@@ -26,12 +25,13 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.endpoint import AllowedSenders, Endpoint, check_use, parse_endpoint
-from hilstar.attitude.wire.links import Arrival, FloodGate, Link, LinkCounts, LockstepLink, RawMessage, StreamLink
+from hilstar.attitude.wire.links import Arrival, Link, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, Status, checked_sample
 from hilstar.attitude.wire.source import Conventions, Mounting, components
 from hilstar.attitude.wire.udp import ANCILLARY_BYTES, KernelStamps
 from hilstar.errors import InputError, shortened
 from hilstar.notices import Notices
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.units import NS_PER_S
 
 MAX_MESSAGE_BYTES = 65_536  # 42's own buffer holds 16 384
@@ -165,20 +165,19 @@ class _Connection(Link):
         bind: bool = False,
         allowed: AllowedSenders | None = None,
         notices: Notices | None = None,
+        clock: HostClock = HOST_CLOCK,
     ) -> None:
+        super().__init__(notices, clock)
         place = parse_endpoint(endpoint)
         check_use(place, endpoint, bind=bind)
         if place.path is not None:
             raise InputError(f"{endpoint}: 42 speaks TCP; write tcp://HOST:PORT, such as tcp://127.0.0.1:10001")
         self.endpoint, self.verb = endpoint, "bound to" if bind else "connecting to"
-        self.link_counts = LinkCounts()
         self._host, self._port = _host_and_port(place)
         self._reader, self._splitter = reader, MessageSplitter()
         self._allowed = AllowedSenders() if allowed is None else allowed
-        self._notices = Notices() if notices is None else notices
-        self._gate = FloodGate(self.link_counts, self._notices)
         self._connection: socket.socket | None = None
-        self._retry_s = 0.0
+        self._retry = clock.within(0.0)
         self._listener = self._listen() if bind else None
 
     def _listen(self) -> socket.socket:
@@ -221,7 +220,7 @@ class _Connection(Link):
             except BlockingIOError:
                 return b"", 0
             if chunk:
-                return chunk, self._stamps.arrived_ns(ancillary, time.monotonic_ns())
+                return chunk, self._stamps.arrived_ns(ancillary, self._clock.now_ns())
         self._lose()
         return b"", 0
 
@@ -232,11 +231,10 @@ class _Connection(Link):
                 self._connection.send(ACK * count)
 
     def _connect(self, timeout_ms: int) -> None:
-        wait_s = self._retry_s - time.monotonic()
-        if wait_s > 0:
-            time.sleep(min(wait_s, timeout_ms / 1000))
+        if not self._retry.over:
+            self._clock.sleep(min(self._retry.left_s, timeout_ms / 1000))
             return
-        self._retry_s = time.monotonic() + RETRY_S
+        self._retry = self._clock.within(RETRY_S)
         with contextlib.suppress(OSError):
             self._take(socket.create_connection((self._host, self._port), timeout=CONNECT_S))
 
@@ -267,7 +265,7 @@ class _Connection(Link):
         for option, value in KEEPALIVE.items():
             made.setsockopt(socket.IPPROTO_TCP, option, value)
         self._splitter = MessageSplitter()
-        self._connection, self._stamps = made, KernelStamps(made)
+        self._connection, self._stamps = made, KernelStamps(made, self._clock)
         if self.link_counts.connections > 1:
             self._notices.tell("back", "42 is connected again")
 
@@ -284,7 +282,7 @@ class _Connection(Link):
         poll = select.poll()
         for each in waited:
             poll.register(each, select.POLLIN)
-        asked_ns = time.monotonic_ns()
+        asked_ns = self._clock.now_ns()
         waits = bool(poll.poll(timeout_ms))
         if not waits and self._connection is not None:
             self._stamps.empty_ns = asked_ns

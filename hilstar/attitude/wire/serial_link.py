@@ -7,7 +7,6 @@ import os
 import re
 import select
 import termios
-import time
 import warnings
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -15,8 +14,8 @@ from typing import NamedTuple
 import serial
 from serial.tools import list_ports
 
-from hilstar.attitude.wire.apart import GoneRecord, MessageRecord, ReaderProcess
-from hilstar.attitude.wire.links import Arrival, FloodGate, LinkCounts, RawMessage, StreamLink
+from hilstar.attitude.wire.apart import ReaderProcess
+from hilstar.attitude.wire.links import Arrival, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import (
     DELIMITER,
     Event,
@@ -29,13 +28,14 @@ from hilstar.attitude.wire.packet import (
 )
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.units import NS_PER_S
 
 DEFAULT_BAUD = 115_200
 MIN_BACK_OFF_S = 0.05
 MAX_BACK_OFF_S = 0.4  # a device that comes back is opened within a second
 MAX_READ_BYTES = 65_536  # in one go
-MAX_DRAIN_S = 0.5
+MAX_DRAIN_S, DRAIN_LOOK_S = 0.5, 0.005
 BITS_PER_BYTE = 10  # 8N1
 FRAMING_BYTES = 2  # the COBS byte and the 0x00
 READ_S = 0.05
@@ -73,10 +73,6 @@ class Framed(NamedTuple):
     chunk: RawMessage
     last: bool
 
-    def declares_discontinuity(self) -> bool:
-        """Whether it is an attitude that must not be interpolated to."""
-        return frame_declares_discontinuity(self.body)
-
     def arrival(self) -> Arrival[Event]:
         """What it says; frames before the chunk's last were there earlier, and waited for it."""
         chunk = self.chunk
@@ -93,17 +89,14 @@ class SerialLink(StreamLink):
     two_way = True
     verb = "reading"
 
-    def __init__(self, port: str, baud: int, notices: Notices | None = None) -> None:
-        self.link_counts = LinkCounts()
+    def __init__(self, port: str, baud: int, notices: Notices | None = None, clock: HostClock = HOST_CLOCK) -> None:
+        super().__init__(notices, clock)
         self.endpoint = f"serial:{port}@{baud}"
+        self._port, self._baud = port, baud
         self._reopened = 0
-        self._port = port
-        self._baud = baud
-        self._notices = Notices() if notices is None else notices
-        self._gate = FloodGate(self.link_counts, self._notices)
         self._decoder = StreamDecoder()
         self._back_off_s = MIN_BACK_OFF_S
-        self._retry_s = 0.0
+        self._retry = clock.within(0.0)
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
@@ -132,8 +125,11 @@ class SerialLink(StreamLink):
         except (OSError, TypeError) as error:  # pyserial raises TypeError for a port closed meanwhile
             self._lose(str(error))
             return []
-        waiting = [framed for chunk in chunks for framed in self._framed(chunk)]
-        return [framed.arrival() for framed in self._gate.newest(waiting, Framed.declares_discontinuity)]
+        waiting: list[Framed] = []
+        for chunk in chunks:
+            bodies = self._decoder.frames(chunk.parts[0])
+            waiting += [Framed(body, chunk, k == len(bodies)) for k, body in enumerate(bodies, 1)]
+        return [each.arrival() for each in self._gate.newest(waiting, lambda each: frame_declares_discontinuity(each.body))]
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
         """What has come, read now."""
@@ -141,12 +137,8 @@ class SerialLink(StreamLink):
             device.timeout = timeout_ms / 1000
         data = device.read(1)
         data += device.read(min(device.in_waiting, MAX_READ_BYTES)) if data else b""
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.now_ns()
         return [RawMessage(now_ns, [data], now_ns)] if data else []
-
-    def _framed(self, chunk: RawMessage) -> list[Framed]:
-        bodies = self._decoder.frames(chunk.parts[0])
-        return [Framed(body, chunk, k == len(bodies)) for k, body in enumerate(bodies, 1)]
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once unread bytes wait."""
@@ -166,15 +158,14 @@ class SerialLink(StreamLink):
         if device is None:
             return False
         # pyserial's own write, asked not to wait, spins for ever on a full line.
-        deadline_s = time.monotonic() + patience_s
+        deadline = self._clock.within(patience_s)
         try:
             while data:
                 with contextlib.suppress(BlockingIOError):
                     data = data[os.write(device.fileno(), data) :]
-                wait_s = deadline_s - time.monotonic()
-                if not data or wait_s <= 0:
+                if not data or deadline.over:
                     break
-                select.select([], [device.fileno()], [], wait_s)
+                select.select([], [device.fileno()], [], deadline.left_s)
         except (OSError, ValueError, TypeError) as error:
             self._lose(str(error))
             return False
@@ -182,13 +173,13 @@ class SerialLink(StreamLink):
 
     def drain(self) -> None:
         """Wait until the bytes sent have left the machine; drop those that a stalled line does not take."""
-        deadline_s = time.monotonic() + MAX_DRAIN_S
+        deadline = self._clock.within(MAX_DRAIN_S)
         with contextlib.suppress(OSError, TypeError, termios.error):
             while self._device is not None and self._device.out_waiting:
-                if time.monotonic() > deadline_s:  # closing it would block for half a minute
+                if deadline.over:  # closing it would block for half a minute
                     self._device.reset_output_buffer()
                     return
-                time.sleep(0.005)
+                self._clock.sleep(DRAIN_LOOK_S)
 
     def wire_ns(self, packet: Packet) -> int:
         """How long a packet's frame takes at this baud rate."""
@@ -199,18 +190,17 @@ class SerialLink(StreamLink):
         self._notices.tell("lost", f"{self.endpoint} disconnected ({one_line(why)}); waiting for it to come back")
         self._shut()
         self._back_off_s = MIN_BACK_OFF_S
-        self._retry_s = time.monotonic() + self._back_off_s
+        self._retry = self._clock.within(self._back_off_s)
 
     def _reopen(self, timeout_ms: int) -> None:
-        wait_s = self._retry_s - time.monotonic()
-        if wait_s > 0:
-            time.sleep(min(wait_s, timeout_ms / 1000))
+        if not self._retry.over:
+            self._clock.sleep(min(self._retry.left_s, timeout_ms / 1000))
             return
         try:
             self._device = self._open()
         except (OSError, ValueError):
             self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
-            self._retry_s = time.monotonic() + self._back_off_s
+            self._retry = self._clock.within(self._back_off_s)
             return
         self._reopened += 1
         self._notices.tell("back", f"{self.endpoint} is back")
@@ -236,9 +226,9 @@ class SerialApart(SerialLink):
     stamped = True
     _given: serial.Serial | None = None  # the device that the process reads
 
-    def __init__(self, port: str, baud: int, notices: Notices | None = None) -> None:
-        super().__init__(port, baud, notices)
-        self._reader = ReaderProcess(self._notices)
+    def __init__(self, port: str, baud: int, notices: Notices | None = None, clock: HostClock = HOST_CLOCK) -> None:
+        super().__init__(port, baud, notices, clock)
+        self._reader = ReaderProcess(self._notices, clock=clock)
 
     def await_ready(self) -> None:
         """Wait until the device can be read, or for a moment."""
@@ -247,23 +237,21 @@ class SerialApart(SerialLink):
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
         if self._given is not device:
             self._given = device
-            self._reader.read_device(device.fileno())
-        chunks = []
-        for record in self._reader.take() if self._reader.wait(timeout_ms) else ():
-            if isinstance(record, MessageRecord):
-                chunks.append(record.message)
-            elif isinstance(record, GoneRecord):
-                self._lose(record.why)
-        return chunks
+            self._reader.read(device=device.fileno())
+        records = self._reader.take() if self._reader.wait(timeout_ms) else []
+        for record in records:
+            if record.gone is not None:
+                self._lose(record.gone)
+        return [record.message for record in records if record.message is not None]
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once something has come that was not read."""
         return self._device is not None and self._reader.wait(timeout_ms)
 
     def _shut(self) -> None:
-        if self._given is not None:
+        if self._given is not None:  # else its line would stay open and locked
             self._given = None
-            self._reader.read_nothing()
+            self._reader.read()
         super()._shut()
 
     def close(self) -> None:
@@ -274,26 +262,19 @@ class SerialApart(SerialLink):
 
 def opening_fault(error: BaseException, port: str) -> str:
     """Why a port could not be opened, and what to do."""
-    return f"{_why(error)}; {_instead(error, port)}"
-
-
-def _why(error: BaseException) -> str:
-    reason = getattr(error, "strerror", None) or str(error)
-    return " ".join(str(reason).split())
-
-
-def _instead(error: BaseException, port: str) -> str:
     text = str(error).lower()
     if "permission" in text:
-        return "join the group that owns it (often dialout)"
-    if "lock" in text or "resource temporarily" in text:
-        return "stop the program that has it"
-    if isinstance(error, ValueError):
-        return "write a baud rate that the port supports, such as 115200 or 921600"
-    return f"write the serial port, such as /dev/ttyUSB0 (ls /dev/serial/by-id lists them), not {port!r}"
+        instead = "join the group that owns it (often dialout)"
+    elif "lock" in text or "resource temporarily" in text:
+        instead = "stop the program that has it"
+    elif isinstance(error, ValueError):
+        instead = "write a baud rate that the port supports, such as 115200 or 921600"
+    else:
+        instead = f"write the serial port, such as /dev/ttyUSB0 (ls /dev/serial/by-id lists them), not {port!r}"
+    return f"{' '.join(str(getattr(error, 'strerror', None) or error).split())}; {instead}"
 
 
-def read_lines(port: str, baud: int, seconds: float) -> Iterator[tuple[int, bytes]]:
+def read_lines(port: str, baud: int, seconds: float, clock: HostClock = HOST_CLOCK) -> Iterator[tuple[int, bytes]]:
     """Host time (monotonic ns, less the time on the wire) and text of each line that arrives within `seconds`.
 
     Raises InputError where the port cannot be opened, or disappears.
@@ -305,16 +286,15 @@ def read_lines(port: str, baud: int, seconds: float) -> Iterator[tuple[int, byte
         raise InputError(f"{name}: {opening_fault(error, port)}") from error
     with device:
         device.reset_input_buffer()
-        end_s = time.monotonic() + seconds
-        line = b""
-        while time.monotonic() < end_s:
+        end, line = clock.within(seconds), b""
+        while not end.over:
             try:
                 byte = device.read(1)
             except (OSError, TypeError) as error:
                 raise InputError(f"{name}: disconnected ({error}); plug it in and start again") from error
             if byte == b"\n":
                 wire_ns = (len(line) + 1) * BITS_PER_BYTE * NS_PER_S // baud
-                yield time.monotonic_ns() - wire_ns, line.strip()
+                yield clock.now_ns() - wire_ns, line.strip()
                 line = b""
             else:
                 line = (line + byte)[-MAX_LINE_BYTES:]

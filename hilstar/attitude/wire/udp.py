@@ -17,7 +17,6 @@ import errno
 import select
 import socket
 import struct
-import time
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,10 +24,11 @@ from functools import partial
 from typing import Any
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
-from hilstar.attitude.wire.links import PAUSE_S, Arrival, FloodGate, LinkCounts, StreamLink
+from hilstar.attitude.wire.links import PAUSE_S, Arrival, StreamLink
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, declares_discontinuity, decode, encode
 from hilstar.errors import InputError
 from hilstar.notices import Notices
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.units import NS_PER_S
 
 SO_ATTACH_FILTER = 26  # asm-generic/socket.h
@@ -52,44 +52,24 @@ MEMINFO = struct.Struct("=9I")  # linux/sock_diag.h; the last is SK_MEMINFO_DROP
 SocketAddress = tuple[Any, ...]
 MAX_TAKEN = 1000  # in one go
 MAX_STRANGERS = 1000  # datagrams a second of senders that are not allowed, before the kernel is asked
-LOOK_S = 1.0
+LOOK_NS = NS_PER_S
 MAX_CREDIT_BYTES = 4096
 MAX_PEERS = 64  # whose credit is kept
 
 
-def program(networks: Sequence[Network], version: int) -> bytes:
+def filter_program(networks: Sequence[Network], version: int) -> bytes:
     """The program that keeps what comes from these networks, all of that IP version, and drops the rest."""
-    code = b"".join(_keep(network, SOURCE_AT[version]) for network in networks if network.version == version)
-    return code + INSTRUCTION.pack(RETURN, 0, 0, NOTHING)
-
-
-def _keep(network: Network, source_at: int) -> bytes:
-    """Return the whole datagram where the source address lies in the network; go on after this otherwise."""
-    address, mask = network.network_address.packed, network.netmask.packed
-    words = range(0, len(address), WORD_BYTES)
-    left = 3 * len(words) + 1
     code = []
-    for at in words:
-        wanted, bits = (int.from_bytes(each[at : at + WORD_BYTES], "big") for each in (address, mask))
-        left -= 3
-        code.append(INSTRUCTION.pack(LOAD_WORD, 0, 0, SKF_NET_OFF + source_at + at))
-        code.append(INSTRUCTION.pack(AND, 0, 0, bits))
-        code.append(INSTRUCTION.pack(JUMP_IF_EQUAL, 0, left, wanted))
-    return b"".join([*code, INSTRUCTION.pack(RETURN, 0, 0, WHOLE)])
-
-
-def keep_only(receiving: socket.socket, networks: Sequence[Network]) -> bool:
-    """Have the kernel drop datagrams from other addresses; False where it does not take the filter."""
-    code = program(networks, 6 if receiving.family == socket.AF_INET6 else 4)
-    count = len(code) // INSTRUCTION.size
-    if count > MAX_INSTRUCTIONS:
-        return False
-    kept = ctypes.create_string_buffer(code, len(code))
-    try:
-        receiving.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, struct.pack("@HP", count, ctypes.addressof(kept)))
-    except OSError:
-        return False
-    return True
+    for network in networks:
+        address, mask = network.network_address.packed, network.netmask.packed
+        words = range(0, len(address), WORD_BYTES) if network.version == version else ()
+        for k, at in enumerate(words):  # each word of the source address must be the network's, else go on after this network
+            wanted, bits = (int.from_bytes(each[at : at + WORD_BYTES], "big") for each in (address, mask))
+            code.append(INSTRUCTION.pack(LOAD_WORD, 0, 0, SKF_NET_OFF + SOURCE_AT[version] + at))
+            code.append(INSTRUCTION.pack(AND, 0, 0, bits))
+            code.append(INSTRUCTION.pack(JUMP_IF_EQUAL, 0, 3 * (len(words) - k - 1) + 1, wanted))
+        code += [INSTRUCTION.pack(RETURN, 0, 0, WHOLE)] * bool(words)
+    return b"".join([*code, INSTRUCTION.pack(RETURN, 0, 0, NOTHING)])
 
 
 class KernelStamps:
@@ -99,8 +79,9 @@ class KernelStamps:
     of the last byte read.
     """
 
-    def __init__(self, receiving: socket.socket) -> None:
-        self.empty_ns = time.monotonic_ns()
+    def __init__(self, receiving: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
+        self._clock = clock
+        self.empty_ns = clock.now_ns()
         with contextlib.suppress(OSError):
             receiving.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
 
@@ -113,23 +94,22 @@ class KernelStamps:
         for _, kind, stamp in ancillary:
             if kind == SO_TIMESTAMPNS and len(stamp) == TIMESPEC.size:
                 seconds, ns = TIMESPEC.unpack(stamp)
-                offset_ns = monotonic_minus_realtime_ns() if offset_ns is None else offset_ns
+                offset_ns = self.monotonic_minus_realtime_ns() if offset_ns is None else offset_ns
                 stamped_ns: int = seconds * NS_PER_S + ns + offset_ns
                 return min(max(stamped_ns, self.empty_ns), now_ns)
         return now_ns
 
-
-def monotonic_minus_realtime_ns() -> int:
-    """The offset between the two clocks of this machine, both read within a few microseconds where that succeeds."""
-    best_ns, offset_ns = None, 0
-    for _ in range(CLOCK_TRIES):
-        before_ns, realtime_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        took_ns = after_ns - before_ns
-        if best_ns is None or took_ns < best_ns:
-            best_ns, offset_ns = took_ns, (before_ns + after_ns) // 2 - realtime_ns
-        if took_ns < NEAR_NS:
-            break
-    return offset_ns
+    def monotonic_minus_realtime_ns(self) -> int:
+        """The offset between the two clocks of this machine, both read within a few microseconds where that succeeds."""
+        best_ns, offset_ns = None, 0
+        for _ in range(CLOCK_TRIES):
+            before_ns, realtime_ns, after_ns = self._clock.now_ns(), self._clock.realtime_ns(), self._clock.now_ns()
+            took_ns = after_ns - before_ns
+            if best_ns is None or took_ns < best_ns:
+                best_ns, offset_ns = took_ns, (before_ns + after_ns) // 2 - realtime_ns
+            if took_ns < NEAR_NS:
+                break
+        return offset_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,26 +124,27 @@ class Datagram:
 class Datagrams:
     """A socket, bound to a place of this machine or connected to a peer, that never waits but in `wait`."""
 
-    def __init__(self, made: socket.socket) -> None:
-        self._socket = made
+    def __init__(self, made: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
+        self._socket, self._clock = made, clock
         self._poll = select.poll()
         self._poll.register(made, select.POLLIN)
         made.setblocking(False)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WANTED_BUFFER_BYTES)
-        self._stamps = KernelStamps(made)
+        self._stamps = KernelStamps(made, clock)
 
     @classmethod
-    def bound(cls, place: UdpPlace) -> Datagrams:
+    def bound(cls, place: UdpPlace, clock: HostClock = HOST_CLOCK) -> Datagrams:
         """Bound to a place. Raises InputError where it cannot be."""
         made = socket.socket(socket.AF_INET6 if place.host.version == 6 else socket.AF_INET, socket.SOCK_DGRAM)
         try:
             if place.host.version == 6:
                 made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            made.bind(_first_address(str(place.host), place.port))
+            found = socket.getaddrinfo(str(place.host), place.port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)
+            made.bind(found[0][4])
         except OSError as error:
             made.close()
             raise InputError(f"{place}: {_trouble(error)}") from error
-        return cls(made)
+        return cls(made, clock)
 
     @classmethod
     def connected(cls, host: str, port: int) -> Datagrams:
@@ -184,7 +165,7 @@ class Datagrams:
 
     def wait(self, timeout_ms: float) -> bool:
         """True once a datagram waits."""
-        asked_ns = time.monotonic_ns()
+        asked_ns = self._clock.now_ns()
         if self._poll.poll(timeout_ms):
             return True
         self._stamps.empty_ns = asked_ns
@@ -192,10 +173,10 @@ class Datagrams:
 
     def take(self, count: int) -> list[Datagram]:
         """The datagrams that wait, oldest first, `count` at most."""
-        offset_ns = monotonic_minus_realtime_ns()
+        offset_ns = self._stamps.monotonic_minus_realtime_ns()
         taken: list[Datagram] = []
         for _ in range(count):
-            asked_ns = time.monotonic_ns()
+            asked_ns = self._clock.now_ns()
             try:
                 data, ancillary, _, sender = self._socket.recvmsg(MAX_DATAGRAM_BYTES, ANCILLARY_BYTES)
             except BlockingIOError:
@@ -219,8 +200,17 @@ class Datagrams:
         return False
 
     def keep_only(self, networks: Sequence[Network]) -> bool:
-        """Have the kernel drop datagrams from other addresses; False where it cannot."""
-        return keep_only(self._socket, networks)
+        """Have the kernel drop datagrams from other addresses; False where it does not take the filter."""
+        code = filter_program(networks, 6 if self._socket.family == socket.AF_INET6 else 4)
+        count = len(code) // INSTRUCTION.size
+        if count > MAX_INSTRUCTIONS:
+            return False
+        kept = ctypes.create_string_buffer(code, len(code))
+        with contextlib.suppress(OSError):
+            pointer = struct.pack("@HP", count, ctypes.addressof(kept))
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, pointer)
+            return True
+        return False
 
     def dropped(self) -> int:
         """How many datagrams the kernel dropped so far: by that filter, or for want of room."""
@@ -232,10 +222,6 @@ class Datagrams:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-def _first_address(host: str, port: int) -> SocketAddress:
-    return socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)[0][4]
 
 
 def _trouble(error: OSError) -> str:
@@ -278,16 +264,14 @@ class UdpLink(StreamLink):
     two_way = stamped = True
     verb = "bound to"
 
-    def __init__(self, place: UdpPlace, allowed: AllowedSenders, notices: Notices | None = None) -> None:
-        self.link_counts = LinkCounts()
-        self._notices = Notices() if notices is None else notices
-        self._allowed = allowed
-        self._gate = FloodGate(self.link_counts, self._notices)
-        self._credit = Credit()
-        self._strangers = self._dropped = 0
+    def __init__(
+        self, place: UdpPlace, allowed: AllowedSenders, notices: Notices | None = None, clock: HostClock = HOST_CLOCK
+    ) -> None:
+        super().__init__(notices, clock)
+        self._allowed, self._credit = allowed, Credit()
+        self._strangers = self._dropped = self._looked_ns = 0
         self._filtered = False
-        self._looked_s = 0.0
-        self._datagrams = Datagrams.bound(place)
+        self._datagrams = Datagrams.bound(place, clock)
         self.endpoint = str(UdpPlace(place.host, self._datagrams.port))
 
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
@@ -299,7 +283,7 @@ class UdpLink(StreamLink):
         self._look(len(taken) - len(waiting))
         admitted = self._gate.newest(waiting, lambda datagram: declares_discontinuity(datagram.data))
         if len(taken) == MAX_TAKEN:
-            time.sleep(PAUSE_S)
+            self._clock.sleep(PAUSE_S)
         return [self._arrival(datagram) for datagram in admitted]
 
     def _admits(self, datagram: Datagram) -> bool:
@@ -314,14 +298,14 @@ class UdpLink(StreamLink):
     def _look(self, strangers: int) -> None:
         """Count what the kernel dropped, and have it drop the strangers where they are many."""
         self._strangers += strangers
-        now_s = time.monotonic()
+        now_ns = self._clock.now_ns()
         if self._strangers > MAX_STRANGERS and not self._filtered:
             self._filtered = True
             if self._datagrams.keep_only(self._allowed.networks):
                 said = f"over {MAX_STRANGERS} datagrams a second from senders that are not allowed: the kernel drops them now"
                 self._notices.tell("flood", said)
-        if now_s - self._looked_s > LOOK_S:
-            self._looked_s, self._strangers = now_s, 0
+        if now_ns - self._looked_ns > LOOK_NS:
+            self._looked_ns, self._strangers = now_ns, 0
             dropped = self._datagrams.dropped()
             self.link_counts.flooded += dropped - self._dropped
             self._dropped = dropped

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import time
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal
@@ -40,11 +39,10 @@ from hilstar.attitude.wire.packet import (
 )
 from hilstar.attitude.wire.source import Conventions, Mounting
 from hilstar.attitude.wire.vizard_message import (
-    CelestialBody,
     Components,
     SimUpdate,
+    VizBody,
     VizCamera,
-    VizSpacecraft,
     WireFormatError,
     decode_update,
 )
@@ -52,6 +50,7 @@ from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqReceiver
 from hilstar.attitude.wire.zmq_socket import ZmqSocket
 from hilstar.errors import InputError, printable, shortened
 from hilstar.notices import Notices
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.rotation import angle_between_rad, conjugate, multiply, rate_between_rad_s
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
@@ -193,14 +192,14 @@ class Follower:
             sample = self._mounting.sample(self._rates.moving(sample))
         return sample, update
 
-    def _state(self, update: SimUpdate, craft: VizSpacecraft) -> tuple[FloatArray | None, FloatArray | None] | Refusal:
+    def _state(self, update: SimUpdate, craft: VizBody) -> tuple[FloatArray | None, FloatArray | None] | Refusal:
         """Place and velocity, as far as they are taken."""
         if self._taken == "state":
             return state_about_earth(update, craft)
         velocity = velocity_km_s(craft) if self._taken == "velocity" else None
         return velocity if isinstance(velocity, Refusal) else (None, velocity)
 
-    def _chosen(self, spacecraft: tuple[VizSpacecraft, ...]) -> VizSpacecraft | Refusal:
+    def _chosen(self, spacecraft: tuple[VizBody, ...]) -> VizBody | Refusal:
         """The spacecraft that is followed; parts of others (a parent is named) are taken only by their own name."""
         if self._name is None:
             found = [craft for craft in spacecraft if craft.parent in {"", craft.name}]
@@ -242,17 +241,17 @@ def disagreement(camera: VizCamera, tracker: TrackerCamera) -> str | None:
     return f"Basilisk's camera {camera.identity} is not the bench's [tracker], whose pictures it gets: {'; '.join(differences)}"
 
 
-def velocity_km_s(craft: VizSpacecraft) -> FloatArray | Refusal:
+def velocity_km_s(craft: VizBody) -> FloatArray | Refusal:
     """The spacecraft's velocity (3,) against N's origin, or why it is not taken."""
     return _checked_velocity(craft, craft.velocity_m_s)
 
 
-def state_about_earth(update: SimUpdate, craft: VizSpacecraft) -> tuple[FloatArray, FloatArray] | Refusal:
+def state_about_earth(update: SimUpdate, craft: VizBody) -> tuple[FloatArray, FloatArray] | Refusal:
     """Place (3,), km, and velocity (3,), km/s, about the Earth's centre, or why they are not taken.
 
     The Earth is where the message has it; without one it stands at N's origin.
     """
-    earth = next((body for body in update.bodies if body.name.lower() in EARTHS), CelestialBody())
+    earth = next((body for body in update.bodies if body.name.lower() in EARTHS), VizBody())
     velocity = _checked_velocity(craft, _against(craft.velocity_m_s, earth.velocity_m_s))
     if isinstance(velocity, Refusal):
         return velocity
@@ -264,7 +263,7 @@ def state_about_earth(update: SimUpdate, craft: VizSpacecraft) -> tuple[FloatArr
     return Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
 
 
-def named(craft: VizSpacecraft) -> str:
+def named(craft: VizBody) -> str:
     """A spacecraft's name for a person."""
     return shortened(printable(craft.name)) or "one without a name"
 
@@ -273,7 +272,7 @@ def _against(own: Components, other: Components) -> Components:
     return tuple(a - b for a, b in zip(own, other, strict=True)) if len(own) == len(other) == 3 else own
 
 
-def _checked_velocity(craft: VizSpacecraft, found_m_s: Components) -> FloatArray | Refusal:
+def _checked_velocity(craft: VizBody, found_m_s: Components) -> FloatArray | Refusal:
     speed_m_s = math.hypot(*found_m_s)
     if len(found_m_s) == 3 and speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
         return np.array(found_m_s) / M_PER_KM
@@ -287,9 +286,18 @@ class VizardLive(ZmqSocket, LockstepLink):
 
     asks_for_pictures = True
 
-    def __init__(self, endpoint: str, follower: Follower, *, bind: bool = True, notices: Notices | None = None) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        follower: Follower,
+        *,
+        bind: bool = True,
+        notices: Notices | None = None,
+        clock: HostClock = HOST_CLOCK,
+    ) -> None:
         check_loopback(endpoint)
-        super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices, max_part_bytes=MAX_UPDATE_BYTES)
+        size = MAX_UPDATE_BYTES
+        super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices, max_part_bytes=size, clock=clock)
         self._follower, self.conventions = follower, follower.conventions
         self._tracker: TrackerCamera | None = None
         self._pictures: Pictures | None = None
@@ -306,7 +314,7 @@ class VizardLive(ZmqSocket, LockstepLink):
         parts = self._take_parts() if self._waits(timeout_ms) else None
         if parts is None:
             return None
-        host_ns, word = time.monotonic_ns(), parts[0]
+        host_ns, word = self._clock.now_ns(), parts[0]
         if word == SIM_UPDATE:
             return self._step(host_ns, parts)
         if word.startswith(REQUEST_IMAGE) and (number := word[len(REQUEST_IMAGE) :][:MAX_DIGITS]).isdigit():
@@ -383,13 +391,13 @@ class Opening:
 class BroadcastDecoder(PacketDecoder):
     """What SIM_UPDATE messages mean; the very first ones are held back for a moment."""
 
-    def __init__(self, follower: Follower) -> None:
-        self._follower, self.conventions = follower, follower.conventions
+    def __init__(self, follower: Follower, clock: HostClock = HOST_CLOCK) -> None:
+        self._follower, self.conventions, self._clock = follower, follower.conventions, clock
         self._opening = Opening()
 
     def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[Event]]:
         """What messages say, and those that were held back."""
-        return self._opening.passed(super().arrivals(messages), time.monotonic_ns())
+        return self._opening.passed(super().arrivals(messages), self._clock.now_ns())
 
     def _arrival(self, message: RawMessage) -> Arrival[Event]:
         parts = list(message.parts)

@@ -16,11 +16,12 @@ import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, NamedTuple
 
 from hilstar.attitude.wire.packet import INT64
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+FIXED_BYTES = {FIXED64: 8, FIXED32: 4}
 MAX_FIELDS = 20_000  # some 30 ms; a spacecraft has 5 to 30
 MAX_PACKED_BYTES = 4096
 MAX_FIELD_NUMBER = 2**29 - 1
@@ -28,14 +29,7 @@ DOUBLE = struct.Struct("<d")
 INT64_SIGN = 1 << 63
 
 Value = int | memoryview
-Field = tuple[int, int, Value]
-CURRENT_TIME, CELESTIAL_BODIES, SPACECRAFT, CAMERAS = 1, 2, 3, 4  # fields of a VizMessage
-FRAME_NUMBER, SIM_TIME_ELAPSED = 1, 2  # fields of a TimeStamp
-NAME, POSITION, VELOCITY, ROTATION, PARENT_NAME = 1, 2, 3, 4, 19  # fields of a Spacecraft; a CelestialBody has the first three
-CAMERA_ID, FIELD_OF_VIEW, RESOLUTION, CAMERA_DIR_B = 1, 3, 4, 8  # fields of a CameraConfig
-
 Components = tuple[float, ...]
-T = TypeVar("T")
 
 
 class WireFormatError(ValueError):
@@ -48,7 +42,7 @@ class FieldReader:
     def __init__(self) -> None:
         self._left = MAX_FIELDS
 
-    def fields(self, message: memoryview) -> Iterator[Field]:
+    def fields(self, message: memoryview) -> Iterator[tuple[int, int, Value]]:
         """Number, wire type and value of each field: an int of a varint, else the bytes. Raises WireFormatError."""
         at = 0
         while at < len(message):
@@ -59,26 +53,34 @@ class FieldReader:
             number, kind = tag >> 3, tag & 7
             if not 0 < number <= MAX_FIELD_NUMBER:
                 raise WireFormatError(f"a field of number {number}")
+            if kind not in {VARINT, BYTES, *FIXED_BYTES}:
+                raise WireFormatError(f"a field of wire type {kind}")
+            if kind in FIXED_BYTES:
+                size = FIXED_BYTES[kind]
+            else:
+                size, at = _varint(message, at)
             if kind == VARINT:
-                value, at = _varint(message, at)
-                yield number, kind, value
+                yield number, kind, size
                 continue
-            size, at = _size(kind, message, at)
             if size > len(message) - at:
                 raise WireFormatError(f"cut short: {size} bytes announced, {len(message) - at} there")
             yield number, kind, message[at : at + size]
             at += size
 
-
-def _size(kind: int, message: memoryview, at: int) -> tuple[int, int]:
-    """How many bytes a field that is no varint has, and where they begin."""
-    if kind == BYTES:
-        return _varint(message, at)
-    if kind == FIXED64:
-        return 8, at
-    if kind == FIXED32:
-        return 4, at
-    raise WireFormatError(f"a field of wire type {kind}")
+    def read(self, message: memoryview, form: Form) -> dict[str, Any]:
+        """The fields of a message that its form names. Raises WireFormatError."""
+        found: dict[str, Any] = {}
+        for number, kind, value in self.fields(message):
+            if number not in form:
+                continue
+            name, read, most = form[number]
+            content = read(kind, value)
+            if most:
+                content = found.get(name, ()) + content
+                if len(content) > most:
+                    raise WireFormatError(f"over {most} components where {most} are wanted")
+            found[name] = content
+        return found
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
@@ -91,47 +93,44 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
     raise WireFormatError("a number that is cut short, or longer than 10 bytes")
 
 
-def as_int64(kind: int, value: Value) -> int:
-    """An int32 or int64 field. Raises WireFormatError."""
+def _int64(kind: int, value: Value) -> int:
     if kind != VARINT or not isinstance(value, int):
         raise WireFormatError(f"wire type {kind} where an integer is wanted")
     return value - 2 * INT64_SIGN if value & INT64_SIGN else value
 
 
-def as_int64s(kind: int, value: Value) -> tuple[int, ...]:
-    """A repeated integer, packed, or one element of one that is not. Raises WireFormatError."""
-    if kind == VARINT:
-        return (as_int64(kind, value),)
-    packed, numbers, at = _packed(kind, value), [], 0
-    while at < len(packed):
-        number, at = _varint(packed, at)
-        numbers.append(as_int64(VARINT, number))
-    return tuple(numbers)
-
-
-def as_double(kind: int, value: Value) -> float:
-    """A double field. Raises WireFormatError."""
+def _double(kind: int, value: Value) -> float:
     if kind != FIXED64 or isinstance(value, int):
         raise WireFormatError(f"wire type {kind} where a double is wanted")
     return float(DOUBLE.unpack(value)[0])
 
 
-def as_message(kind: int, value: Value) -> memoryview:
-    """The bytes of a message or a string. Raises WireFormatError."""
+def _message(kind: int, value: Value) -> memoryview:
     if kind != BYTES or isinstance(value, int):
         raise WireFormatError(f"wire type {kind} where a message or a text is wanted")
     return value
 
 
-def as_text(kind: int, value: Value) -> str:
-    """A string field; what is not UTF-8 in it is replaced. Raises WireFormatError."""
-    return bytes(as_message(kind, value)).decode("utf-8", "replace")
+def _text(kind: int, value: Value) -> str:
+    """A string; what is not UTF-8 in it is replaced."""
+    return bytes(_message(kind, value)).decode("utf-8", "replace")
 
 
-def as_doubles(kind: int, value: Value) -> tuple[float, ...]:
-    """A repeated double, packed, or one element of one that is not. Raises WireFormatError."""
+def _int64s(kind: int, value: Value) -> tuple[int, ...]:
+    """A repeated integer, packed, or one element of one that is not."""
+    if kind == VARINT:
+        return (_int64(kind, value),)
+    packed, numbers, at = _packed(kind, value), [], 0
+    while at < len(packed):
+        number, at = _varint(packed, at)
+        numbers.append(_int64(VARINT, number))
+    return tuple(numbers)
+
+
+def _doubles(kind: int, value: Value) -> tuple[float, ...]:
+    """A repeated double, packed, or one element of one that is not."""
     if kind == FIXED64:
-        return (as_double(kind, value),)
+        return (_double(kind, value),)
     packed = _packed(kind, value)
     if len(packed) % DOUBLE.size:
         raise WireFormatError(f"{len(packed)} bytes of doubles")
@@ -139,17 +138,18 @@ def as_doubles(kind: int, value: Value) -> tuple[float, ...]:
 
 
 def _packed(kind: int, value: Value) -> memoryview:
-    packed = as_message(kind, value)
+    packed = _message(kind, value)
     if len(packed) > MAX_PACKED_BYTES:
         raise WireFormatError(f"{len(packed)} bytes of numbers where a few are wanted")
     return packed
 
 
 @dataclass(frozen=True, slots=True)
-class VizSpacecraft:
-    """One spacecraft: position (m), velocity (m/s) and `sigma_bn` (MRP) in and from Basilisk's inertial frame N.
+class VizBody:
+    """A spacecraft or planet: position (m), velocity (m/s) and `sigma_bn` (MRP) in and from Basilisk's inertial frame N.
 
-    Each has three components, or none where the message has none. A part of another spacecraft names it as its `parent`.
+    Each has three components, or none where the message has none; a planet has no `sigma_bn`. A part of another spacecraft
+    names it as its `parent`.
     """
 
     name: str = ""
@@ -157,15 +157,6 @@ class VizSpacecraft:
     position_m: Components = ()
     velocity_m_s: Components = ()
     sigma_bn: Components = ()
-
-
-@dataclass(frozen=True, slots=True)
-class CelestialBody:
-    """A planet of the simulation: position (m) and velocity (m/s) in N, with three components each or none."""
-
-    name: str = ""
-    position_m: Components = ()
-    velocity_m_s: Components = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,70 +175,49 @@ class SimUpdate:
 
     t_ns: int
     frame: int
-    spacecraft: tuple[VizSpacecraft, ...]
+    spacecraft: tuple[VizBody, ...]
     cameras: tuple[VizCamera, ...]
-    bodies: tuple[CelestialBody, ...] = ()
+    bodies: tuple[VizBody, ...] = ()
+
+
+class FormField(NamedTuple):
+    """A field of a message: its name here, how it is read, and how many components it has; 0 where it is no list."""
+
+    name: str
+    read: Callable[[int, Value], Any]
+    components: int = 0
+
+
+Form = dict[int, FormField]
+CURRENT_TIME, CELESTIAL_BODIES, SPACECRAFT, CAMERAS = 1, 2, 3, 4  # fields of a VizMessage
+TIME_STAMP = {1: FormField("frame", _int64), 2: FormField("elapsed_ns", _double)}
+PLANET = {1: FormField("name", _text), 2: FormField("position_m", _doubles, 3), 3: FormField("velocity_m_s", _doubles, 3)}
+CRAFT = {**PLANET, 4: FormField("sigma_bn", _doubles, 3), 19: FormField("parent", _text)}
+CAMERA = {
+    1: FormField("identity", _int64),
+    3: FormField("field_of_view_deg", _double),
+    4: FormField("resolution_px", _int64s, 2),
+    8: FormField("sigma", _doubles, 3),
+}
 
 
 def decode_update(message: bytes) -> SimUpdate:
     """A VizMessage. Raises WireFormatError for bytes that are none, and for one without a time."""
-    stamp: dict[int, float] | None = None
-    spacecraft: list[VizSpacecraft] = []
-    cameras: list[VizCamera] = []
-    bodies: list[CelestialBody] = []
+    stamp: dict[str, Any] | None = None
+    spacecraft, cameras, bodies = [], [], []
     reader = FieldReader()
     for number, kind, value in reader.fields(memoryview(message)):
         if number == CURRENT_TIME:
-            stamp = (stamp or {}) | _time_stamp(reader.fields(as_message(kind, value)))
+            stamp = (stamp or {}) | reader.read(_message(kind, value), TIME_STAMP)
         elif number == SPACECRAFT:
-            spacecraft.append(_spacecraft(reader.fields(as_message(kind, value))))
+            spacecraft.append(VizBody(**reader.read(_message(kind, value), CRAFT)))
         elif number == CELESTIAL_BODIES:
-            body = _spacecraft(reader.fields(as_message(kind, value)), (POSITION, VELOCITY))
-            bodies.append(CelestialBody(body.name, body.position_m, body.velocity_m_s))
+            bodies.append(VizBody(**reader.read(_message(kind, value), PLANET)))
         elif number == CAMERAS:
-            cameras.append(_camera(reader.fields(as_message(kind, value))))
+            cameras.append(VizCamera(**reader.read(_message(kind, value), CAMERA)))
     if stamp is None:
         raise WireFormatError("no currentTime")
-    time_ns = stamp.get(SIM_TIME_ELAPSED, 0.0)
+    time_ns = stamp.get("elapsed_ns", 0.0)
     if not math.isfinite(time_ns) or round(time_ns) not in INT64:
         raise WireFormatError(f"simTimeElapsed {time_ns:g} ns")
-    return SimUpdate(round(time_ns), int(stamp.get(FRAME_NUMBER, 0)), tuple(spacecraft), tuple(cameras), tuple(bodies))
-
-
-def _time_stamp(fields: Iterator[Field]) -> dict[int, float]:
-    readers: dict[int, Callable[[int, Value], float]] = {FRAME_NUMBER: as_int64, SIM_TIME_ELAPSED: as_double}
-    return {number: readers[number](kind, value) for number, kind, value in fields if number in readers}
-
-
-def _spacecraft(fields: Iterator[Field], wanted: tuple[int, ...] = (POSITION, VELOCITY, ROTATION)) -> VizSpacecraft:
-    texts: dict[int, str] = {}
-    vectors: dict[int, Components] = {}
-    for number, kind, value in fields:
-        if number in {NAME, PARENT_NAME}:
-            texts[number] = as_text(kind, value)
-        elif number in wanted:
-            vectors[number] = _extended(vectors.get(number, ()), as_doubles(kind, value), 3)
-    position, velocity, rotation = (vectors.get(number, ()) for number in (POSITION, VELOCITY, ROTATION))
-    return VizSpacecraft(texts.get(NAME, ""), texts.get(PARENT_NAME, ""), position, velocity, rotation)
-
-
-def _camera(fields: Iterator[Field]) -> VizCamera:
-    identity, field_deg = 0, 0.0
-    resolution: tuple[int, ...] = ()
-    sigma: Components = ()
-    for number, kind, value in fields:
-        if number == CAMERA_ID:
-            identity = as_int64(kind, value)
-        elif number == FIELD_OF_VIEW:
-            field_deg = as_double(kind, value)
-        elif number == RESOLUTION:
-            resolution = _extended(resolution, as_int64s(kind, value), 2)
-        elif number == CAMERA_DIR_B:
-            sigma = _extended(sigma, as_doubles(kind, value), 3)
-    return VizCamera(identity, field_deg, resolution, sigma)
-
-
-def _extended(so_far: tuple[T, ...], more: tuple[T, ...], wanted: int) -> tuple[T, ...]:
-    if len(so_far) + len(more) > wanted:
-        raise WireFormatError(f"over {wanted} components where {wanted} are wanted")
-    return so_far + more
+    return SimUpdate(round(time_ns), stamp.get("frame", 0), tuple(spacecraft), tuple(cameras), tuple(bodies))

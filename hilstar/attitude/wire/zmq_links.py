@@ -5,15 +5,15 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
-import time
 from collections.abc import Iterable
+from functools import partial
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import msgspec
 import zmq
 
-from hilstar.attitude.wire.apart import CountsRecord, LinkRecord, MessageRecord, NoticeRecord, ReaderProcess, ZmqStream
+from hilstar.attitude.wire.apart import OpenStream, ReaderProcess
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival, FloodGate, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import (
@@ -31,6 +31,7 @@ from hilstar.attitude.wire.source import PACKETS, Conventions, Mounting
 from hilstar.attitude.wire.zmq_socket import MAX_PART_BYTES, QUEUE_MESSAGES, ZmqSocket
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
 
 MAX_TAKEN_BYTES = 8_000_000  # in one go
 SEND_QUEUE_MESSAGES = 10_000
@@ -58,10 +59,6 @@ class PacketDecoder:
 PACKET_DECODER = PacketDecoder()
 
 
-def _discontinuous(message: RawMessage) -> bool:
-    return declares_discontinuity(message.parts[-1])
-
-
 class ZmqReceiver(ZmqSocket, StreamLink):
     """A SUB socket that takes every message that begins with `topic`; it connects, or binds with `bind`."""
 
@@ -75,26 +72,26 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         topic: bytes = b"",
         max_part_bytes: int = MAX_PART_BYTES,
         decoder: PacketDecoder = PACKET_DECODER,
+        clock: HostClock = HOST_CLOCK,
     ) -> None:
-        self.topic, self.decoder = topic, decoder
+        self.topic, self.decoder, self.bound = topic, decoder, bind
         self.conventions, self.stamped = decoder.conventions, decoder.stamped
-        super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices, max_part_bytes=max_part_bytes)
+        super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices, max_part_bytes=max_part_bytes, clock=clock)
         if not bind:  # a connecting socket hears nothing until a sender binds there
             self.verb = "waiting for a sender at"
         self._shut()
-        self._gate = FloodGate(self.link_counts, self._notices)
-        self._reconnect_s = 0.0
+        self._gate = FloodGate(self.link_counts, self._notices, clock)
+        self._lost_until = clock.within(0.0)
 
     @property
     def reconnects(self) -> int:
         """How often the sender reconnected."""
         return 0 if self._bind else super().reconnects
 
-    def stream(self) -> ZmqStream:
-        """What another process needs to open the same socket."""
-        files = (self._keys.secret_key, self._keys.server_key, self._keys.allowed_clients)
-        paths = (None if each is None else str(each.absolute()) for each in files)
-        return ZmqStream(self.endpoint, self._bind, self.topic, self._max_part_bytes, *paths)
+    def opener(self) -> OpenStream:
+        """What another process opens the same socket by."""
+        more: dict[str, Any] = {"keys": self._keys, "topic": self.topic, "max_part_bytes": self._max_part_bytes}
+        return partial(_open_again, self.endpoint, bind=self._bind, **more)
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
         super()._configure(made)
@@ -111,32 +108,29 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         waiting: list[RawMessage] = []
         taken_bytes = 0
         while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (parts := self._take_parts()) is not None:
-            waiting.append(RawMessage(time.monotonic_ns(), parts))
+            waiting.append(RawMessage(self._clock.now_ns(), parts))
             taken_bytes += sum(map(len, parts))
-        return self._gate.newest(waiting, _discontinuous)
+        return self._gate.newest(waiting, lambda message: declares_discontinuity(message.parts[-1]))
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once a message waits."""
         return self._waits(timeout_ms)
 
     def _tend(self) -> None:
+        """Connect anew where the peer is lost: libzmq does so, but not after a part over MAXMSGSIZE or a rejection."""
         super()._tend()
-        if not self._bind:
-            self._connect_anew_if_lost()
+        keeper = self._keeper
+        if self._bind or keeper is None or self._socket is None or not keeper.lost:
+            self._lost_until = self._clock.within(RECONNECT_S)
+        elif self._lost_until.over:
+            keeper.lost = False
+            with contextlib.suppress(zmq.ZMQError):  # the ended session may be gone already
+                self._socket.disconnect(self._address)
+            self._socket.connect(self._address)
 
-    def _connect_anew_if_lost(self) -> None:
-        """libzmq itself reconnects after a lost peer, but not after a part over MAXMSGSIZE or a rejection."""
-        if self._keeper is None or self._socket is None or not self._keeper.lost:
-            return
-        now_s = time.monotonic()
-        if not self._reconnect_s:
-            self._reconnect_s = now_s + RECONNECT_S
-        if now_s < self._reconnect_s:
-            return
-        self._keeper.lost, self._reconnect_s = False, 0.0
-        with contextlib.suppress(zmq.ZMQError):  # the ended session may be gone already
-            self._socket.disconnect(self._address)
-        self._socket.connect(self._address)
+
+def _open_again(endpoint: str, notices: Notices, **more: Any) -> ZmqReceiver:
+    return ZmqReceiver(endpoint, notices=notices, **more)
 
 
 class ZmqApart(StreamLink):
@@ -148,20 +142,20 @@ class ZmqApart(StreamLink):
 
     stamped = True
 
-    def __init__(self, link: ZmqReceiver, notices: Notices | None = None) -> None:
+    def __init__(self, link: ZmqReceiver, notices: Notices | None = None, clock: HostClock = HOST_CLOCK) -> None:
+        super().__init__(notices, clock)
         link.close()
         self.verb, self.endpoint, self.conventions = link.verb, link.endpoint, link.conventions
         self.link_counts = link.link_counts
-        self._decoder, self._stream = link.decoder, link.stream()
-        self._notices = Notices() if notices is None else notices
+        self._decoder, self._bind, self._opener = link.decoder, link.bound, link.opener()
         self._waiting: list[RawMessage] = []
         self._ordered = False
-        self._reader = ReaderProcess(self._notices)
+        self._reader = ReaderProcess(self._notices, clock=clock)
 
     @property
     def reconnects(self) -> int:
         """How often the sender reconnected."""
-        return 0 if self._stream.bind else super().reconnects
+        return 0 if self._bind else super().reconnects
 
     def await_ready(self) -> None:
         """Wait until the socket can be opened at once, or for a moment."""
@@ -177,28 +171,26 @@ class ZmqApart(StreamLink):
         """True once a message has come."""
         if not self._ordered:
             self._ordered = True
-            self._reader.read_stream(self._stream)
-        deadline_s = time.monotonic() + timeout_ms / 1000
+            self._reader.read(self._opener)
+        deadline = self._clock.within(timeout_ms / 1000)
         while not self._waiting:
-            left_ms = math.ceil(max(0.0, deadline_s - time.monotonic()) * 1000)
+            left_ms = math.ceil(deadline.left_s * 1000)
             if self._reader.wait(left_ms):
-                for record in self._reader.take():
-                    self._take(record)
+                self._take()
             elif not left_ms:
                 break
         return bool(self._waiting)
 
-    def _take(self, record: LinkRecord) -> None:
-        match record:
-            case MessageRecord(_, message):
-                self._waiting.append(message)
-            case CountsRecord(_, counts):
-                self.link_counts += counts
-            case NoticeRecord(_, kind, detail, who, lasting):
-                if lasting:
-                    self._notices.tell(kind, detail, who)
-                else:
-                    self._notices.mention(kind, detail)
+    def _take(self) -> None:
+        for record in self._reader.take():
+            if record.message is not None:
+                self._waiting.append(record.message)
+            if record.counts is not None:
+                self.link_counts += record.counts
+            if record.notice is not None and record.lasting:
+                self._notices.tell(*record.notice)
+            elif record.notice is not None:
+                self._notices.mention(*record.notice[:2])
 
     def close(self) -> None:
         """End the process, and with it the socket."""
@@ -211,9 +203,9 @@ class ZmqSender(ZmqSocket):
     LINGER_MS, STOPPED_LINGER_MS = 2000, 200  # for a slow subscriber, without and with a signal
     status: Status | None = None  # no way back
 
-    def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
-        self._tended_s = 0.0
-        super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys, notices=notices)
+    def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, clock: HostClock = HOST_CLOCK) -> None:
+        self._tended_until = clock.within(0.0)
+        super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys, notices=None, clock=clock)
         self._ready()
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
@@ -227,9 +219,8 @@ class ZmqSender(ZmqSocket):
 
     def put(self, message: bytes) -> None:
         """Send one message, never waiting."""
-        now_s = time.monotonic()
-        if now_s - self._tended_s > TEND_S:
-            self._tended_s = now_s
+        if self._tended_until.over:
+            self._tended_until = self._clock.within(TEND_S)
             self._tend()
             for _ in range(QUEUE_MESSAGES):  # libzmq keeps subscriptions until they are read
                 if self._take() is None:
@@ -244,8 +235,16 @@ class ZmqSender(ZmqSocket):
 class ZmqLockstep(ZmqSocket, LockstepLink):
     """A REP socket: one request is one attitude and gets one reply; it binds, or connects with `bind=False`."""
 
-    def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
-        super().__init__(zmq.REP, endpoint, bind=bind, keys=keys, notices=notices)
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        bind: bool = True,
+        keys: CurveKeys = NO_KEYS,
+        notices: Notices | None = None,
+        clock: HostClock = HOST_CLOCK,
+    ) -> None:
+        super().__init__(zmq.REP, endpoint, bind=bind, keys=keys, notices=notices, clock=clock)
         self._json = False
 
     def receive(self, timeout_ms: int) -> Arrival[Event] | None:
@@ -256,9 +255,9 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
         message = self._take() if self._waits(timeout_ms) else None
         if message is None:
             return None
-        host_ns, event = time.monotonic_ns(), decode(message)
+        host_ns, event = self._clock.now_ns(), decode(message)
         if isinstance(event, TimeRequest):
-            self._answer(encode(TimeReply(event.sequence, event.t1_ns, host_ns, time.monotonic_ns())))
+            self._answer(encode(TimeReply(event.sequence, event.t1_ns, host_ns, self._clock.now_ns())))
             return None
         self._json = message[:64].lstrip()[:1] == b"{"
         return Arrival(host_ns, event, message)

@@ -16,10 +16,8 @@ import os
 import resource
 import socket
 import struct
-import time
 from collections.abc import Iterator
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import zmq
 
@@ -28,6 +26,8 @@ from hilstar.attitude.wire.keys import AllowList, CurveKeys, check_reach, load_p
 from hilstar.attitude.wire.links import PAUSE_S, LinkCounts
 from hilstar.errors import InputError
 from hilstar.notices import Notices
+from hilstar.process.closing import Closing
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
@@ -70,12 +70,12 @@ class MemoryWatch:
     memory of the process shows it. Without /proc nothing is watched.
     """
 
-    def __init__(self) -> None:
-        self._file = -1
+    def __init__(self, clock: HostClock = HOST_CLOCK) -> None:
+        self._clock, self._file = clock, -1
         with contextlib.suppress(OSError):  # kept open: a process out of descriptors must still see its memory
             self._file = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
         self._base_bytes = self._used_bytes()
-        self._looked_s = 0.0
+        self._next_look = clock.within(0.0)
 
     def begin(self) -> None:
         """Count from what is used now."""
@@ -83,21 +83,21 @@ class MemoryWatch:
 
     def grown_bytes(self) -> int:
         """The growth since `begin`; looked up at most every LOOK_S, 0 in between."""
-        now_s = time.monotonic()
-        if now_s - self._looked_s < LOOK_S:
+        if not self._next_look.over:
             return 0
-        self._looked_s = now_s
+        self._next_look = self._clock.within(LOOK_S)
         return self._used_bytes() - self._base_bytes
 
     def await_release(self) -> None:
         """Wait a moment for freed memory to be returned; what remains was not the link's, and becomes the new baseline."""
-        deadline_s = time.monotonic() + FREED_WITHIN_S
+        deadline = self._clock.within(FREED_WITHIN_S)
         while (used_bytes := self._used_bytes()) > self._base_bytes + MAX_GROWTH_BYTES / 2:
-            if time.monotonic() > deadline_s:
+            if deadline.over:
                 self._base_bytes = used_bytes
                 return
-            time.sleep(LOOK_S)
-            _give_back_what_is_free()
+            self._clock.sleep(LOOK_S)
+            with contextlib.suppress(AttributeError, OSError):  # else glibc keeps freed memory, which would count as growth
+                ctypes.CDLL(None).malloc_trim(0)
 
     def _used_bytes(self) -> int:
         if self._file < 0:
@@ -111,12 +111,6 @@ class MemoryWatch:
         if self._file >= 0:
             os.close(self._file)
         self._file = -1
-
-
-def _give_back_what_is_free() -> None:
-    """Otherwise glibc keeps freed memory, which would count as growth."""
-    with contextlib.suppress(AttributeError, OSError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def raise_file_limit() -> None:
@@ -134,35 +128,29 @@ class Doorkeeper:
     `lost` says that a connection has ended; the code that acts on it resets it. `place` is the port or path that was bound.
     """
 
-    def __init__(self, watched: zmq.Socket[bytes], *, bound: bool, counts: LinkCounts, notices: Notices) -> None:
+    def __init__(
+        self, watched: zmq.Socket[bytes], *, bound: bool, counts: LinkCounts, notices: Notices, clock: HostClock = HOST_CLOCK
+    ) -> None:
         self.lost = False
         self.place: int | str = ""
-        self._watched = watched
-        self._bound = bound
-        self._counts = counts
-        self._notices = notices
+        self._watched, self._bound, self._counts, self._notices, self._clock = watched, bound, counts, notices, clock
         self._open: dict[int, str] = {}  # file descriptor: peer, in the order of arrival
         self._shut: set[int] = set()
         self._failure = ""
-        self._monitor = watched.get_monitor_socket(EVENTS)
-
-    @property
-    def monitor(self) -> zmq.Socket[bytes]:
-        """The socket to poll for events."""
-        return self._monitor
+        self.monitor = watched.get_monitor_socket(EVENTS)
 
     def tend(self) -> None:
         """Take the events so far."""
         events = 0
         with contextlib.suppress(zmq.ZMQError):
             while events < MAX_EVENTS:
-                what, _peer_endpoint = self._monitor.recv_multipart(zmq.NOBLOCK)
+                what, _peer_endpoint = self.monitor.recv_multipart(zmq.NOBLOCK)
                 self._take(*EVENT.unpack(what))
                 events += 1
         if self._bound and len(self._open) > MAX_CONNECTIONS:
             self._shut_newest()
         if events > FEW_EVENTS:
-            time.sleep(PAUSE_S)
+            self._clock.sleep(PAUSE_S)
 
     def _take(self, event: int, value: int) -> None:
         if event == zmq.EVENT_ACCEPTED:
@@ -229,7 +217,7 @@ class Doorkeeper:
         self.tend()  # libzmq blocks on a full monitor, and would block for ever on a closed one
         with contextlib.suppress(zmq.ZMQError):
             self._watched.disable_monitor()
-        self._monitor.close(linger=0)
+        self.monitor.close(linger=0)
 
 
 @contextlib.contextmanager
@@ -256,7 +244,7 @@ def zmq_version() -> str:
     return zmq.zmq_version()
 
 
-class ZmqSocket:
+class ZmqSocket(Closing):
     """A socket and its context, bound or connected; reopened after a flood.
 
     A socket that binds is opened at once, to check that it can be. One that receives a stream is then closed until its first
@@ -273,8 +261,9 @@ class ZmqSocket:
         keys: CurveKeys,
         notices: Notices | None,
         max_part_bytes: int = MAX_PART_BYTES,
+        clock: HostClock = HOST_CLOCK,
     ) -> None:
-        self._max_part_bytes = max_part_bytes
+        self._max_part_bytes, self._clock = max_part_bytes, clock
         self._place = parse_endpoint(endpoint)
         check_reach(self._place, endpoint, bind=bind, keys=keys)
         check_use(self._place, endpoint, bind=bind)
@@ -288,7 +277,7 @@ class ZmqSocket:
         self._server_key = None if bind or keys.server_key is None else load_public(keys.server_key)
         allowed = AllowList(keys.allowed_clients) if bind and keys.allowed_clients is not None else None
         raise_file_limit()
-        self._memory = MemoryWatch()
+        self._memory = MemoryWatch(clock)
         self._context = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
         self._socket: zmq.Socket[bytes] | None = None
@@ -317,7 +306,7 @@ class ZmqSocket:
         self._configure(made)
         self._secure(made)
         self._socket = made
-        self._keeper = Doorkeeper(made, bound=self._bind, counts=self.link_counts, notices=self._notices)
+        self._keeper = Doorkeeper(made, bound=self._bind, counts=self.link_counts, notices=self._notices, clock=self._clock)
         self._poller = zmq.Poller()
         self._poller.register(made, zmq.POLLIN)
         self._poller.register(self._keeper.monitor, zmq.POLLIN)
@@ -333,18 +322,18 @@ class ZmqSocket:
 
     def _bind_within(self, made: zmq.Socket[bytes], patience_s: float) -> None:
         """Bind, waiting for a previous socket of this process at the same place to close."""
-        deadline_s = time.monotonic() + patience_s
+        deadline = self._clock.within(patience_s)
         path = self._place.path
-        while path is not None and path.exists() and time.monotonic() < deadline_s:
-            time.sleep(BIND_RETRY_S)
+        while path is not None and path.exists() and not deadline.over:
+            self._clock.sleep(BIND_RETRY_S)
         check_use(self._place, self.endpoint, bind=True)
         while True:
             try:
                 made.bind(self._address)
             except zmq.ZMQError as error:
-                if error.errno != zmq.EADDRINUSE or time.monotonic() > deadline_s:
+                if error.errno != zmq.EADDRINUSE or deadline.over:
                     raise
-                time.sleep(BIND_RETRY_S)
+                self._clock.sleep(BIND_RETRY_S)
                 continue
             self._address = self.endpoint = made.getsockopt_string(zmq.LAST_ENDPOINT)
             return
@@ -378,13 +367,13 @@ class ZmqSocket:
 
     def _waits(self, timeout_ms: float) -> bool:
         """True once a message waits; connections and memory are checked meanwhile."""
-        deadline_s = time.monotonic() + timeout_ms / 1000
+        deadline = self._clock.within(timeout_ms / 1000)
         while True:
             self._tend()
-            ready = dict(self._poller.poll(math.ceil(max(0.0, deadline_s - time.monotonic()) * 1000)))
+            ready = dict(self._poller.poll(math.ceil(deadline.left_s * 1000)))
             if self._socket in ready:
                 return True
-            if time.monotonic() >= deadline_s:
+            if deadline.over:
                 return False
 
     def _tend(self) -> None:
@@ -449,12 +438,6 @@ class ZmqSocket:
 
     def _linger_ms(self) -> int:
         return 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 def _endpoint_trouble(endpoint: str, bind: bool, error: zmq.ZMQError) -> str:

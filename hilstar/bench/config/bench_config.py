@@ -14,7 +14,7 @@ import numpy as np
 from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
-from hilstar.bench.config.hardware import Collimator, Monitor, SyncSettings, Tracker, Verify, check_sync
+from hilstar.bench.config.hardware import Collimator, Monitor, SyncSettings, Tracker, Verify, check_channels, check_sync
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES, RenderSettings
 from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SkySettings, SpacecraftSettings
 from hilstar.errors import InputError, shortened
@@ -24,6 +24,7 @@ from hilstar.units import LIGHT_KM_S, NS_PER_S
 
 TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
 UNIX_JD, DAY_NS = 2_440_587.5, 86_400 * NS_PER_S
+J2000_JD, J2000_JYEAR, JYEAR_DAYS = 2_451_545.0, 2000.0, 365.25
 EPOCH_KEY = "[sky] epoch_utc ="
 FROM_SOURCE, UNIX = "source", "unix"
 TT_FROM_TAI_NS, TAI_FROM_GPS_NS = 32_184_000_000, 19 * NS_PER_S  # TDB is TT within 2 ms
@@ -71,6 +72,13 @@ def epoch_utc_ns(config: BenchConfig) -> int | None:
     return utc_ns_of(config.sky.epoch_utc, EPOCH_KEY)
 
 
+def sky_jd(config: BenchConfig, t_ns: int | None) -> float:
+    """The Julian date of a moment of a bench that has a date (None: the start), UTC. Raises InputError."""
+    if t_ns is None:
+        return J2000_JD + (config.sky.epoch_jyear - J2000_JYEAR) * JYEAR_DAYS
+    return UNIX_JD + ((epoch_utc_ns(config) or 0) + t_ns) / DAY_NS
+
+
 def has_observer(config: BenchConfig) -> bool:
     """Whether the sky is seen from a known place: a spacecraft's, or for its bodies the Earth's centre."""
     bodies = config.sky.bodies
@@ -99,6 +107,7 @@ def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> Bench
                 f"{path}: [sky] observer_velocity_km_s: with [sky.bodies] or [spacecraft] the velocity follows from the"
                 " ephemeris; leave it out"
             )
+    _check_variables(config, path)
     _check_orbit(config, path)
     attitude, orbit = config.attitude, config.spacecraft.orbit
     if orbit not in {None, GEOCENTRE, SOURCE} and attitude.source == "vizard" and attitude.use_velocity:
@@ -115,6 +124,11 @@ def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> Bench
     if utc_ns is None:
         return config
     return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_jyear=jyear(utc_ns)))
+
+
+def _check_variables(config: BenchConfig, path: Path) -> None:
+    if config.sky.variables == "phase" and config.sky.epoch_utc is None:
+        raise InputError(f'{path}: [sky] variables = "phase" needs a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"')
 
 
 def _check_orbit(config: BenchConfig, path: Path) -> None:
@@ -253,8 +267,12 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
     room_km_s = MAX_SPEED_KM_S if config.attitude.source == "vizard" else 0.0
     if math.hypot(*config.sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
         raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
-    if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
-        raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
+    levels = ("electrons_per_px", "zodiacal_v_mag_arcsec2", "zodiacal")
+    given = [name for name in levels if getattr(config.background, name) is not None]
+    if len(given) > 1:
+        raise InputError(f"{path}: [background] has {given[0]} and {given[1]}; write one of them")
+    if config.background.zodiacal is not None and config.sky.epoch_utc is None:
+        raise InputError(f'{path}: [background] zodiacal needs a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"')
     if config.render.flux_at_white_e_per_s is not None and config.render.brightest_v_mag is not None:
         raise InputError(f"{path}: [render] has flux_at_white_e_per_s and brightest_v_mag; write one of them")
     ideal = [
@@ -269,6 +287,7 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
             f"{path}: [faults] endpoint = {config.faults.endpoint}: the attitude comes from there; write another port"
         )
     try:
+        check_channels(config.tracker)
         check_sync(config.sync, config.tracker, config.monitor, config.attitude)
     except InputError as error:  # it names the tables itself
         raise InputError(f"{path}: {error}") from error

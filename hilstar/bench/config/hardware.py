@@ -18,7 +18,32 @@ MS_PER_S = 1000.0
 ONE_PERIOD = {"default": "one refresh period"}
 NETWORK_PORT = "rfc2217://"
 ROUNDING = 1e-6  # relative: 0.1 s at 10 Hz is one exposure after the other
+QUANTUM_EFFICIENCY = "quantum_efficiency"
+ONE_CHANNEL = {"default": "one channel"}
 AS_ASSUMED = {"default": "as the bench assumes"}
+
+
+GAUSSIAN = "gaussian"
+DEFAULT_PSF_SIGMA_PX = (0.55, 0.55)
+
+
+class Optics(Table, frozen=True):
+    """How the tracker's lens spreads a star over the detector.
+
+    The file's first image has odd sides, x right and y down, its first row on top, and the chief ray in its middle, where it
+    stays: with coma a star's centroid lies beside its place. hilstar integrates the pixel. Give at least 1.2 samples a sigma,
+    and all of the light: a star's pixels sum to its rate, whatever lies outside ([errors](where-it-fails.md#the-light)). Large
+    discs are spread by the Gaussian nearest to it.
+    """
+
+    psf: Annotated[
+        str,
+        Meta(
+            description='`"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file with one image of the point '
+            "spread function, the same all over the field and for all colours. Its header has `OVERSAMP`, samples a tracker "
+            "pixel (1 where it is missing), and `PIXINT`, whether the pixel is integrated in it (F where it is missing)."
+        ),
+    ] = GAUSSIAN
 
 
 class Tracker(Table, frozen=True):
@@ -30,6 +55,10 @@ class Tracker(Table, frozen=True):
 
     A curve (`quantum_efficiency`, `transmission`) is interpolated linearly between its points and is zero outside them. Where
     both curves are plain numbers, light from 300 to 1100 nm counts.
+
+    A tracker that tells colours apart has `quantum_efficiency_r`, `_g` and `_b` in place of `quantum_efficiency`. Then
+    `hilstar frame -o` writes the linear image as a cube of three channels, and a bench's full scale and magnitudes are those of
+    all channels together. So is all that the virtual tracker sees: it has no mosaic yet.
     """
 
     aperture_mm: Annotated[Positive, Meta(description="Diameter of the entrance pupil.")]
@@ -37,12 +66,18 @@ class Tracker(Table, frozen=True):
     pixel_pitch_um: Annotated[PixelPitch, Meta(description="Distance between the centres of adjacent pixels.")]
     resolution_px: Annotated[Size, Meta(description="Size of the detector.")]
     quantum_efficiency: Annotated[
-        str | float,
+        str | float | None,
         Meta(
             description='`"ccd47-20"` (back-illuminated, as measured), `"kai-4021"` (approximate), the path of a CSV file with '
-            "the header `wavelength_nm,value`, or one number for all wavelengths."
+            "the header `wavelength_nm,value`, or one number for all wavelengths.",
+            extra={"default": "**required**, or the next three"},
         ),
-    ]
+    ] = None
+    quantum_efficiency_r: Annotated[
+        str | float | None, Meta(description="The same of the red channel alone.", extra=ONE_CHANNEL)
+    ] = None
+    quantum_efficiency_g: Annotated[str | float | None, Meta(description="Of the green channel.", extra=ONE_CHANNEL)] = None
+    quantum_efficiency_b: Annotated[str | float | None, Meta(description="Of the blue channel.", extra=ONE_CHANNEL)] = None
     transmission: Annotated[
         str | float,
         Meta(
@@ -69,10 +104,10 @@ class Tracker(Table, frozen=True):
     psf_sigma_px: Annotated[
         Sigma,
         Meta(
-            description="Gaussian sigma of the tracker's own point spread function, in tracker pixels. It never widens the "
-            "stars on the monitor."
+            description="Gaussian sigma of the tracker's own point spread function, in tracker pixels; not used where "
+            "`[tracker.optics] psf` names a file. It never widens the stars on the monitor."
         ),
-    ] = (0.55, 0.55)
+    ] = DEFAULT_PSF_SIGMA_PX
     principal_point_px: Annotated[
         Point | None,
         Meta(
@@ -96,7 +131,43 @@ class Tracker(Table, frozen=True):
             extra={"default": "the body's axes, with a notice"},
         ),
     ] = None
+    optics: Annotated[Optics, Meta(description="See below.")] = msgspec.field(default_factory=Optics)
     detector: Annotated[DetectorSettings, Meta(description="See below.")] = msgspec.field(default_factory=DetectorSettings)
+
+    @property
+    def quantum_efficiencies(self) -> dict[str, str | float]:
+        """The quantum efficiency of each channel by its key: one, or those of red, green and blue."""
+        given = {key: getattr(self, key) for key in (QUANTUM_EFFICIENCY, *(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb"))}
+        return {key: value for key, value in given.items() if value is not None}
+
+
+def check_channels(tracker: Tracker) -> None:
+    """Refuse (InputError) a tracker with neither one quantum efficiency nor three."""
+    given = tracker.quantum_efficiencies
+    missing = [key for key in (f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb") if key not in given]
+    if QUANTUM_EFFICIENCY in given and len(given) > 1:
+        raise InputError(f"[tracker] has {QUANTUM_EFFICIENCY} and {list(given)[1]}; write one for all light, or _r, _g and _b")
+    if missing and QUANTUM_EFFICIENCY not in given:
+        key = missing[0] if given else QUANTUM_EFFICIENCY
+        raise InputError(f"[tracker] the key {key} is missing; add it (see configs/README.md)")
+
+
+class PrimariesSettings(Table, frozen=True):
+    """The light of the monitor's red, green and blue.
+
+    With it `hilstar budget` says how many electrons per second each channel of the tracker has of each primary at full light:
+    all of them together are full scale. The condition number says how much larger an error of the primaries' mixture can be
+    than that of the channels' light.
+    """
+
+    file: Annotated[
+        str | None,
+        Meta(
+            description="The path of a CSV file with the header `wavelength_nm,r,g,b`: the relative spectral power per nm of "
+            "each primary at full drive, all in one unit.",
+            extra={"default": "not known"},
+        ),
+    ] = None
 
 
 class Monitor(Table, frozen=True):
@@ -166,6 +237,7 @@ class Monitor(Table, frozen=True):
             "7 consecutive frames identify themselves."
         ),
     ] = "toggle"
+    primaries: Annotated[PrimariesSettings, Meta(description="See below.")] = msgspec.field(default_factory=PrimariesSettings)
 
     @property
     def period_ms(self) -> float:

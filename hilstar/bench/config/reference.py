@@ -33,6 +33,7 @@ UNITS = {
     "_deg": "deg",
     "_dn": "DN",
     "_ev": "eV",
+    "_ff": "fF",
     "_hz": "Hz",
     "_mm": "mm",
     "_ms": "ms",

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from hilstar.bench.config.values import Magnitude, NotNegative, Positive, Sigma
+from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.toml_tables import Table
 
 # White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is 100 in the median (38 with
@@ -35,12 +36,11 @@ class RenderSettings(Table, frozen=True):
 
     # results/tradeoff.csv, quantisation: `exact` is 9 times as right as `round`, which does where a panel has levels enough.
     quantisation: Annotated[
-        Literal["round", "dither", "temporal", "exact", "auto"],
+        Literal[Quantisation, "auto"],
         Meta(
-            description='How light becomes codes. `"round"`: the nearest code. `"dither"`: blue noise, exact in the mean over '
-            'pixels. `"exact"`: all codes of a star are chosen together, so that its flux and centroid are right in a single '
-            'frame. `"temporal"`: and so that each frame makes up for what the one before left, by which the mean of any N '
-            'frames is about N times as right. `"auto"`: `round` where that stays within the tolerance, '
+            description="How light becomes codes. "
+            + "".join(f'`"{name}"`: {quantiser.words} ' for name, quantiser in QUANTISERS.items())
+            + '`"auto"`: `round` where that stays within the tolerance, '
             "else `exact`, unless an average field, turning at 1 deg/s, would take it more than half a refresh on two cores "
             "without a GPU and would not take `round` as long; `--explain` of `frame`, `serve` and `replay` says which."
         ),

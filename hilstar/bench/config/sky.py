@@ -60,6 +60,26 @@ class Bodies(Table, frozen=True):
     ] = 6.0
 
 
+class Diffuse(Table, frozen=True):
+    """Light that stands on the sky: galaxies, nebulae, unresolved stars. The virtual tracker always has it.
+
+    The monitor draws it where it passes the first step of light; `hilstar frame --explain` says where none does.
+    """
+
+    map: Annotated[
+        str | None,
+        Meta(
+            description="The path of a FITS image with a WCS, or of a HEALPix map of the whole sky (`pip install"
+            " 'hilstar[healpix]'`). `BUNIT`, of HEALPix `TUNIT1`, is any surface brightness that Astropy knows, at V: such as"
+            " `mag/arcsec2`, `MJy/sr` or `W/(m2 um sr)`.",
+            extra={"default": "none"},
+        ),
+    ] = None
+    bv_mag: Annotated[
+        Magnitude, Meta(description="B-V of its light, by which it becomes electrons as a star's does; the Sun's is 0.65.")
+    ] = 0.65
+
+
 class SkySettings(Table, frozen=True):
     """Which stars there are, and how bright they are."""
 
@@ -114,9 +134,10 @@ class SkySettings(Table, frozen=True):
     ] = "dgs"
     # results/tradeoff.csv, spectrum: real spectra by V-I are 0.026 mag off (95 %), a black body 0.2.
     spectrum: Annotated[
-        Literal["blackbody", "pickles"],
+        Literal["blackbody", "pickles", "mk"],
         Meta(
-            description='`"pickles"`: spectra of real stars (Pickles 1998), chosen by V-I, and by B-V for the hottest. '
+            description='`"pickles"`: spectra of real stars (Pickles 1998), chosen by V-I, and by B-V for the hottest. `"mk"`: '
+            "by the MK type that Hipparcos gives and V-I, dust included; by colour where the type is none of O to M. "
             '`"blackbody"`: a black body at the temperature that the next key derives from B-V.'
         ),
     ] = "pickles"
@@ -127,6 +148,14 @@ class SkySettings(Table, frozen=True):
             "Both are held within 1000 and 200000 K, which matters to nine carbon stars under `wang2021`."
         ),
     ] = "ballesteros2012"
+    variables: Annotated[
+        Literal["mean", "phase"],
+        Meta(
+            description='`"phase"`: stars of your table with `epoch_jd` (of largest light), `period_d` and `amplitude_mag`'
+            " (half of the range) have their light at `epoch_utc`, by a sinusoid about V, all run long. Others have their mean,"
+            ' as all have by `"mean"`.'
+        ),
+    ] = "mean"
     zero_point: Annotated[
         Literal["vega", "iau-bolometric"],
         Meta(
@@ -146,6 +175,7 @@ class SkySettings(Table, frozen=True):
         ),
     ] = (0.0, 0.0, 0.0)
     bodies: Bodies = msgspec.field(default_factory=Bodies)
+    diffuse: Diffuse = msgspec.field(default_factory=Diffuse)
 
 
 class SpacecraftSettings(Table, frozen=True):
@@ -169,7 +199,7 @@ class SpacecraftSettings(Table, frozen=True):
 class Background(Table, frozen=True):
     """Light between the stars. Only the virtual tracker sees it; the monitor shows none.
 
-    Give at most one of the first two keys.
+    Give at most one of the first three keys.
     """
 
     electrons_per_px: Annotated[
@@ -180,6 +210,15 @@ class Background(Table, frozen=True):
         Magnitude | None,
         Meta(
             description="Surface brightness of sunlight through the tracker's optics; the thesis takes 22.1.",
+            extra={"default": "none"},
+        ),
+    ] = None
+    zodiacal: Annotated[
+        Literal["leinert1998"] | None,
+        Meta(
+            description="Zodiacal light by direction from the Sun, with its spectrum (Leinert 1998, tables 17 and 19). It needs"
+            " `[sky] epoch_utc`. A field near the Sun, where the table is blank, is refused; the pictures of a run take the"
+            " nearest tabled light there, and a warning says so. Calibration patterns have no such light.",
             extra={"default": "none"},
         ),
     ] = None

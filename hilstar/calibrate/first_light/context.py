@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,13 +11,14 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera
+from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera, tracker_psf
 from hilstar.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, black
-from hilstar.calibrate.first_light.records import Figure
+from hilstar.calibrate.first_light.records import Figure, KeyChange
 from hilstar.calibrate.first_light.virtual import VirtualBench
 from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError
 from hilstar.files import make_directory
+from hilstar.scene.psf import Psf
 from hilstar.twin.optics import BenchGeometry
 
 MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
@@ -74,6 +76,11 @@ class StepContext:
         """The true bench of a virtual session, None otherwise."""
         return self.source.truth if isinstance(self.source, VirtualBench) else None
 
+    @property
+    def tracker_psf(self) -> Psf:
+        """The tracker's PSF, as the bench file has it. Raises InputError."""
+        return tracker_psf(self.file.config.tracker, self.file.folder)
+
     def geometry(self) -> BenchGeometry:
         """Monitor and tracker as the bench file has them, with an ideal collimator."""
         return BenchGeometry(ideal_monitor(self.file.config), tracker_camera(self.file.config.tracker, self.file.folder))
@@ -85,6 +92,11 @@ class StepContext:
     def with_file(self, file: BenchFile) -> StepContext:
         """A copy with another bench file."""
         return replace(self, file=file)
+
+    def names(self, table: str, key: str, path: Path) -> tuple[KeyChange, ...]:
+        """The change of a key of the bench file that names a file of the session; none where it does already."""
+        name, before = os.path.relpath(path, self.file.folder), getattr(getattr(self.file.config, table), key)
+        return () if before == name else (KeyChange(table=table, key=key, before=before, after=name),)
 
     @property
     def exposure_s(self) -> float:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from operator import ne
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,13 @@ from hilstar.bench.config import Monitor
 from hilstar.calibrate.first_light.context import DarkSubtracted, StepContext
 from hilstar.calibrate.first_light.image_sources import Pattern, black
 from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, with_changes
-from hilstar.calibrate.geometric.calibration import GeometricSummary, calibrate_files, write_calibrated
+from hilstar.calibrate.geometric.calibration import (
+    Calibrated,
+    calibrate_files,
+    notes_for_a_person,
+    parameters_of,
+    write_calibrated,
+)
 from hilstar.calibrate.geometric.dots import DotPlan, dot_image, plan_dots, write_plan
 from hilstar.charts import DARK, INK, ORANGE, TEXT_PT, chart
 from hilstar.errors import InputError
@@ -165,14 +171,7 @@ class ScreenMounting:
 
     def changed(self, other: ScreenMounting) -> int:
         """The number of keys that differ."""
-        return sum(
-            a != b
-            for a, b in (
-                (self.flip_x, other.flip_x),
-                (self.flip_y, other.flip_y),
-                (self.rotate_deg, other.rotate_deg),
-            )
-        )
+        return sum(map(ne, astuple(self), astuple(other)))
 
 
 def mounting_of(monitor: Monitor) -> ScreenMounting:
@@ -337,7 +336,7 @@ def dots_for(context: StepContext) -> DotPlan:
 def focus(context: StepContext) -> StepOutcome:
     """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises InputError."""
     code, found, looked = sharp_dots(context)
-    wanted = float(np.hypot(*context.file.config.tracker.psf_sigma_px) / np.sqrt(2))
+    wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
     picture = context.session / "focus.png"
     sigma = found.psf_sigma_px
     draw_focus(
@@ -423,35 +422,29 @@ def geometry(context: StepContext) -> StepOutcome:
     ideal = context.file.config.tracker.distortion is None
     found = calibrate_files(context.file, paths, context.folder / "plan.csv", dark, tracker_is_ideal=ideal)
     output, picture = context.session / "geometry.toml", context.session / "geometry.png"
-    summary = write_calibrated(output, found, picture)
-    figures = _geometry_figures(summary)
-    collimator = context.file.config.collimator
-    name = os.path.relpath(output, context.file.folder)
-    changes = () if collimator.geometry == name else (_named("collimator", "geometry", collimator.geometry, name),)
+    write_calibrated(output, found, picture)
+    figures = _geometry_figures(found)
     line = (
-        f"{summary.model}: held-out dots {figures['held_out_rms_arcsec']:.2f} arcsec rms,"
+        f"{found.chosen.name}: held-out dots {figures['held_out_rms_arcsec']:.2f} arcsec rms,"
         f" {figures['held_out_max_arcsec']:.2f} max; a star's place is known to {figures['error_rms_arcsec']:.2f} arcsec rms"
     )
-    return StepOutcome("done", line, figures, (output, picture, context.folder / "plan.csv", dark, *paths), (picture,), changes)
+    files = (output, picture, context.folder / "plan.csv", dark, *paths)
+    return StepOutcome("done", line, figures, files, (picture,), context.names("collimator", "geometry", output))
 
 
-def _named(table: str, key: str, before: str | None, after: str) -> KeyChange:
-    return KeyChange(table=table, key=key, before=before, after=after)
-
-
-def _geometry_figures(summary: GeometricSummary) -> dict[str, Figure]:
-    found = {name: each.value for name, each in summary.parameters.items() if "rotation" not in name}
+def _geometry_figures(found: Calibrated) -> dict[str, Figure]:
+    parameters = {name: each.value for name, each in parameters_of(found).items() if "rotation" not in name}
     return {
-        "model": summary.model,
-        "held_out_rms_arcsec": summary.held_out.rms_arcsec,
-        "held_out_max_arcsec": summary.held_out.max_arcsec,
-        "error_rms_arcsec": summary.error.rms_arcsec,
-        "error_max_arcsec": summary.error.max_arcsec,
-        "noise_px": summary.noise_px,
-        "dots_recognised": summary.dots.recognised,
-        "dots_planned": summary.dots.planned,
-        "centroids_lost": int(summary.centroids.lost),
-        "centroids_false": int(summary.centroids.false),
-        **found,
-        "notes": "; ".join(summary.notes) or "none",
+        "model": found.chosen.name,
+        "held_out_rms_arcsec": found.chosen.rms_arcsec,
+        "held_out_max_arcsec": found.chosen.max_arcsec,
+        "error_rms_arcsec": found.uncertainty.rms_arcsec,
+        "error_max_arcsec": found.uncertainty.max_arcsec,
+        "noise_px": found.problem.noise_px,
+        "dots_recognised": found.recognised,
+        "dots_planned": len(found.plan),
+        "centroids_lost": int(found.lost),
+        "centroids_false": int(found.false),
+        **parameters,
+        "notes": "; ".join(notes_for_a_person(found)) or "none",
     }

@@ -11,8 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +23,11 @@ from hilstar.bench.frame_files import write_codes_png
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of
 from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
+from hilstar.process.closing import Closing
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
+from hilstar.render.backend import ScreenView
 from hilstar.render.context import leave_contexts
-from hilstar.render.presenter import Presenter, ScreenView, level_texture, window_context
+from hilstar.render.presenter import Presenter, level_texture, window_context
 from hilstar.run.screen.gate import Timing, pass_gate
 from hilstar.run.screen.screen import Screen
 from hilstar.scene.frame_motion import Orientation
@@ -196,7 +197,7 @@ def _presenter(file: BenchFile, window: Window, codes: CodeImage) -> tuple[Prese
     return Presenter(texture, view), texture.release
 
 
-class PatternDisplay:
+class PatternDisplay(Closing):
     """The window on the bench's display, opened with the first pattern. Free it with `close`, or use it as a context."""
 
     def __init__(self) -> None:
@@ -281,17 +282,34 @@ class PatternDisplay:
             self._window.close()
             self._window = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
-
 
 GRAB_TIMEOUT_S = 120.0
 
 
-class GrabCommand:
+class _ShownHere:
+    """An image source before this program's own display; `dark` is the tracker's image with the monitor switched off."""
+
+    def __init__(self, dark: Path | None, diode: SerialDiode | None) -> None:
+        self._display, self._dark, self._diode = PatternDisplay(), dark, diode
+
+    def gate(self, file: BenchFile) -> Timing | None:
+        """The display's timing."""
+        return self._display.gate(file)
+
+    def unlit(self, stem: Path) -> Path | None:
+        """The image that the user gave, if any."""
+        return self._dark
+
+    def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
+        """Record the user's photodiode."""
+        return None if self._diode is None else self._diode.watch(self._display, file, seconds)
+
+    def close(self) -> None:
+        """Close the window."""
+        self._display.close()
+
+
+class GrabCommand(_ShownHere):
     """Images by a command. It writes the file {output}; {pattern} is a picture of what the screen has to show.
 
     Without {pattern} the session shows the pattern itself; with {exposure_s} it may choose the exposure. `dark` is an image
@@ -307,17 +325,12 @@ class GrabCommand:
             raise InputError(f"--grab {command}: has no {{output}}; write where your command takes the file's name")
         self._shows = any("{pattern}" in word for word in self._words)
         self.sets_exposure = any("{exposure_s}" in word for word in self._words)
-        self._dark, self._diode = dark, diode
         self.identity = f"grab: {command}"
-        self._display = PatternDisplay()
+        super().__init__(dark, None if self._shows else diode)
 
     def gate(self, file: BenchFile) -> Timing | None:
         """The display's timing, None where the command shows the patterns."""
-        return None if self._shows else self._display.gate(file)
-
-    def unlit(self, stem: Path) -> Path | None:
-        """The image that the user gave, if any."""
-        return self._dark
+        return None if self._shows else super().gate(file)
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Run the command while the pattern is shown. Raises NoImage with the last line of its stderr where it fails."""
@@ -335,14 +348,6 @@ class GrabCommand:
         else:
             _run(words, output, lambda done: self._display.show_until(file, pattern, done))
         return output
-
-    def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
-        """Record the user's photodiode before this program's own display."""
-        return None if self._diode is None or self._shows else self._diode.watch(self._display, file, seconds)
-
-    def close(self) -> None:
-        """Close the window."""
-        self._display.close()
 
 
 def _filled(word: str, values: Mapping[str, str]) -> str:
@@ -398,22 +403,14 @@ STILL_S = 0.5  # a file that has not grown for so long is complete
 log = logging.getLogger(__name__)
 
 
-class ByHand:
+class ByHand(_ShownHere):
     """Images that a person saves. Each pattern stays on the display until its file is complete."""
 
     identity = "by hand"
     sets_exposure = True
 
     def __init__(self, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
-        self._display, self._dark, self._diode = PatternDisplay(), dark, diode
-
-    def gate(self, file: BenchFile) -> Timing | None:
-        """The display's timing."""
-        return self._display.gate(file)
-
-    def unlit(self, stem: Path) -> Path | None:
-        """The image that the user gave, if any."""
-        return self._dark
+        super().__init__(dark, diode)
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Wait for a complete image of the pattern."""
@@ -437,14 +434,6 @@ class ByHand:
 
         self._display.show_until(file, pattern, _once_asked(asked, done), press)
         return pressed[0] if pressed else _saved(stem) or stem
-
-    def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
-        """Record the user's photodiode."""
-        return None if self._diode is None else self._diode.watch(self._display, file, seconds)
-
-    def close(self) -> None:
-        """Close the window."""
-        self._display.close()
 
 
 def _once_asked(words: str, done: Callable[[], bool]) -> Callable[[], bool]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -16,9 +16,9 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black, in_channel
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome
+from hilstar.calibrate.first_light.records import Figure, StepOutcome
 from hilstar.calibrate.measurements import PRIMARIES
-from hilstar.calibrate.photometric import PhotometricSummary, Provenance, calibrate_photometric, draw_calibration
+from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
 from hilstar.calibrate.plan import Patch, PlanSettings, plan_patches
 from hilstar.charts import INK, MUTED, chart
 from hilstar.errors import InputError
@@ -308,7 +308,7 @@ def photometry(context: StepContext) -> StepOutcome:
         how = "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar calibrate photometric`)"
         return StepOutcome("skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}")
     assumed = calibration_of(context)
-    sigma_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.file.config.tracker.psf_sigma_px)))
+    sigma_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.tracker_psf.width_px)))
     channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing else "w"
     planned = plan_for(monitor.bits, context.patches, channels)
     readings = Photometer(context, sigma_px, _assumed(context, assumed, channels)).read(planned)
@@ -363,10 +363,10 @@ def calibration_source(file: BenchFile) -> str | Path:
 
 
 def _response_figures(
-    context: StepContext, readings: Readings, found: PhotometricSummary, before: Response, now: Response
+    context: StepContext, readings: Readings, found: dict[str, Any], before: Response, now: Response
 ) -> dict[str, Figure]:
     off = response_error_mag(before, now)
-    first = found.first
+    held = [channel["holdout"] for channel in found["channels"].values()]
     figures: dict[str, Figure] = {
         "gamma": exponent(now),
         "gamma_in_bench_file": exponent(before),
@@ -375,17 +375,17 @@ def _response_figures(
         "black_level": now.black,
         "black_level_in_bench_file": before.black,
         "black_level_measured": "yes" if readings.black_known else "no: give --dark, an image with the monitor switched off",
-        "held_out_rms_mag": max(each.holdout.rms_mag for each in found.channels.values()),
-        "held_out_p95_mag": max(MAG_PER_RELATIVE * each.holdout.p95_percent / 100 for each in found.channels.values()),
-        "held_out_max_mag": max(each.holdout.max_mag for each in found.channels.values()),
-        "noise_percent": 100 * found.noise_relative,
-        "drift_percent": float("nan") if found.drift_percent is None else found.drift_percent,
+        "held_out_rms_mag": max(each["rms_mag"] for each in held),
+        "held_out_p95_mag": max(MAG_PER_RELATIVE * each["p95_percent"] / 100 for each in held),
+        "held_out_max_mag": max(each["max_mag"] for each in held),
+        "noise_percent": 100 * found["noise_relative"],
+        "drift_percent": float("nan") if found["drift_percent"] is None else found["drift_percent"],
         "patches": len(readings.patches),
-        "codes": first.codes,
+        "codes": found["codes"],
         "exposure_s": readings.exposure_s,
         "links": ", ".join(f"{link.ratio:.4f}" for link in readings.links) or "none",
         "links_max_mag": max((abs(float(magnitude(link.ratio))) for link in readings.links), default=0.0),
-        **{f"error_at_{decade}_percent": value for decade, value in first.error_percent.items()},
+        **{f"error_at_{decade}_percent": value for decade, value in found["error_percent"].items()},
     }
     if context.truth is not None:
         true = load_calibration(calibration_source(context.truth), context.truth.config.monitor.bits).response
@@ -415,12 +415,7 @@ def _judged(
     if float(figures["held_out_p95_mag"]) > limit_mag:
         why = "take more readings (--patches), look at stray light, and at whether the monitor was warm"
         return StepOutcome("failed", f"{line}: the levels do not make one smooth response; {why}", figures, files, pictures)
-    name = os.path.relpath(context.session / "response.toml", context.file.folder)
-    changes = (
-        ()
-        if monitor.calibration == name
-        else (KeyChange(table="monitor", key="calibration", before=monitor.calibration, after=name),)
-    )
+    changes = context.names("monitor", "calibration", context.session / "response.toml")
     return StepOutcome("done", line, figures, files, pictures, changes)
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import difflib
 import hashlib
-import html
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +14,7 @@ import msgspec
 from hilstar.bench.bench_file import BenchFile, read_bench_file, with_key
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
+from hilstar.html_pages import Markup, escaped, page_of, picture_of, table_of
 from hilstar.reading import MAX_TOML_BYTES, NOT_JSON, exists, read_bytes, read_text
 from hilstar.run.sync import BeatSummary, beat_line
 
@@ -161,83 +160,51 @@ def rewrite(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
 MAX_PICTURE_BYTES = 50_000_000
 MAX_FILES_LISTED = 12  # per step; the others are counted here, and listed in session.json
 COLOURS = {"done": "#2e7d32", "skipped": "#8a6d00", "failed": "#c62828"}
-PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
-<style>
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }}
-h1 {{ margin-bottom: 0; }} h2 {{ margin-top: 2.5rem; }}
-table {{ border-collapse: collapse; margin: 1rem 0; }}
-td, th {{ padding: .2rem 1rem .2rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid #e4e4e4; }}
-code, pre {{ font: 13px/1.45 ui-monospace, monospace; overflow-wrap: anywhere; }}
-pre {{ background: #f6f6f6; padding: .8rem; white-space: pre-wrap; }}
-img {{ max-width: 100%; }}
-.verdict {{ color: #fff; border-radius: .3rem; padding: .1rem .5rem; font-size: .85em; }}
-.small {{ color: #666; font-size: .9em; }}
-</style></head><body>
-<h1>{title}</h1>
-{body}
-</body></html>
-"""
 
 
 def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
     """Write the page of a session, with its bench file as it was and as it is. Raises InputError where it cannot be written."""
     bench = Path(session.bench)
+    beats = None if session.beat is None else beat_line(session.beat)
+    overview = [(Markup(f"<a href='#{each.name}'>{each.name}</a>"), _badge(each), each.line) for each in session.steps]
     body = [
-        f'<p class="small">hilstar {_text(session.hilstar)}; images: {_text(session.seen_by)}</p>',
-        _overview(session.steps),
-        *(f"<p>{_text(line)}</p>" for line in [None if session.beat is None else beat_line(session.beat)] if line),
+        f'<p class="small">hilstar {escaped(session.hilstar)}; images: {escaped(session.seen_by)}</p>',
+        table_of(overview),
+        *([f"<p>{escaped(beats)}</p>"] if beats else []),
         *(part for record in session.steps for part in _step(folder, record)),
         "<h2>The bench file</h2>",
-        f"<p>{_text(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",
-        f"<pre>{_text(_difference(before, bench))}</pre>",
+        f"<p>{escaped(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",
+        f"<pre>{escaped(_difference(before, bench))}</pre>",
     ]
     path = folder / PAGE_FILE
-    write_whole(path, PAGE.format(title=f"First light of {_text(bench.name)}", body="\n".join(body)).encode(errors="replace"))
+    write_whole(path, page_of(f"First light of {bench.name}", body))
     return path
 
 
-def _overview(steps: Iterable[StepRecord]) -> str:
-    rows = [
-        f"<tr><td><a href='#{record.name}'>{record.name}</a></td><td>{_badge(record)}</td><td>{_text(record.line)}</td></tr>"
-        for record in steps
-    ]
-    return f"<table>{''.join(rows)}</table>"
-
-
-def _badge(record: StepRecord) -> str:
-    return f'<span class="verdict" style="background:{COLOURS[record.verdict]}">{record.verdict}</span>'
+def _badge(record: StepRecord) -> Markup:
+    return Markup(f'<span class="verdict" style="background:{COLOURS[record.verdict]}">{record.verdict}</span>')
 
 
 def _step(folder: Path, record: StepRecord) -> Iterator[str]:
     yield f'<h2 id="{record.name}">{record.name} {_badge(record)}</h2>'
-    yield f'<p>{_text(record.line)}</p><p class="small">{_text(record.ended)}, {record.seconds:.1f} s</p>'
+    yield f'<p>{escaped(record.line)}</p><p class="small">{escaped(record.ended)}, {record.seconds:.1f} s</p>'
     if record.changes:
-        yield f"<p>In the bench file: {'; '.join(f'<code>{_text(change.line)}</code>' for change in record.changes)}</p>"
+        yield f"<p>In the bench file: {'; '.join(f'<code>{escaped(change.line)}</code>' for change in record.changes)}</p>"
     yield from (_picture(folder / name) for name in record.pictures)
     if record.figures:
-        yield _table((name, _figure(value)) for name, value in record.figures.items())
+        yield table_of(record.figures.items(), digits=6)
     if record.files:
         listed = list(record.files.items())[:MAX_FILES_LISTED]
         more = len(record.files) - len(listed)
-        yield _table((name, f"<code>{digest}</code>") for name, digest in listed)
+        yield table_of((name, Markup(f"<code>{digest}</code>")) for name, digest in listed)
         yield f'<p class="small">and {more} files more, in session.json</p>' if more else ""
-
-
-def _table(rows: Iterable[tuple[str, str]]) -> str:
-    return f"<table>{''.join(f'<tr><td>{_text(name)}</td><td>{value}</td></tr>' for name, value in rows)}</table>"
-
-
-def _figure(value: Figure) -> str:
-    return _text(f"{value:.6g}" if isinstance(value, float) else value)
 
 
 def _picture(path: Path) -> str:
     try:
-        data = base64.b64encode(read_bytes(path, "", MAX_PICTURE_BYTES)).decode()
+        return picture_of(read_bytes(path, "", MAX_PICTURE_BYTES), "png", path.stem)
     except InputError as error:
-        return f"<p>{_text(error)}</p>"
-    return f'<p><img alt="{_text(path.stem)}" src="data:image/png;base64,{data}"></p>'
+        return f"<p>{escaped(error)}</p>"
 
 
 def _difference(before: Path, after: Path) -> str:
@@ -245,7 +212,3 @@ def _difference(before: Path, after: Path) -> str:
     old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, after))
     lines = list(difflib.unified_diff(old, new, "before", "now", lineterm=""))
     return "\n".join(lines) or "nothing was changed"
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value))

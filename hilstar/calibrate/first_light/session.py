@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import fcntl
 import hashlib
 import math
 import os
@@ -36,9 +35,9 @@ from hilstar.calibrate.first_light.records import (
 )
 from hilstar.calibrate.first_light.stars import scale, verify
 from hilstar.calibrate.first_light.uniformity import uniformity
-from hilstar.calibrate.latency import LatencySummary, checked_delay_ms, draw_latency, pair, summarise
+from hilstar.calibrate.latency import checked_delay_ms, draw_latency, pair, summarise
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
-from hilstar.files import clear_parts, open_lock, write_whole
+from hilstar.files import clear_parts, lock_alone, write_whole
 from hilstar.run.doctor import examine
 from hilstar.run.sync import BeatSummary, beat_of
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
@@ -61,12 +60,12 @@ def latency(context: StepContext) -> StepOutcome:
     found = summarise(paired, context.file.config)
     picture = context.session / "latency.png"
     draw_latency(picture, paired, found)
-    delay_ms = checked_delay_ms(0.0 if -AGREE_MS < found.panel_delay_ms < 0 else found.panel_delay_ms)
-    error_ms = ERROR_OF_MEDIAN * found.jitter_ms / math.sqrt(found.edges)
+    delay_ms = checked_delay_ms(0.0 if -AGREE_MS < found["panel_delay_ms"] < 0 else found["panel_delay_ms"])
+    error_ms = ERROR_OF_MEDIAN * found["jitter_ms"] / math.sqrt(found["edges"])
     figures = _figures(context, found, delay_ms, error_ms)
     line = (
         f"panel_delay_ms {delay_ms:g} +- {error_ms:.3f}, the bench file has {monitor.panel_delay_ms:g}; a swap is light at the"
-        f" square after {found.latency_ms.p50:.2f} ms, jitter {found.jitter_ms:.3f}, {found.edges} edges"
+        f" square after {found['latency_ms']['p50']:.2f} ms, jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
     )
     if abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms):
         return StepOutcome("done", line, figures, (picture,), (picture,))
@@ -74,19 +73,19 @@ def latency(context: StepContext) -> StepOutcome:
     return StepOutcome("done", line, figures, (picture,), (picture,), (change,))
 
 
-def _figures(context: StepContext, found: LatencySummary, delay_ms: float, error_ms: float) -> dict[str, Figure]:
+def _figures(context: StepContext, found: dict[str, Any], delay_ms: float, error_ms: float) -> dict[str, Figure]:
     figures: dict[str, Figure] = {
         "panel_delay_ms": delay_ms,
         "error_ms": error_ms,
         "in_bench_file_ms": context.file.config.monitor.panel_delay_ms,
-        "swap_to_light_p50_ms": found.latency_ms.p50,
-        "swap_to_light_p99_ms": found.latency_ms.p99,
-        "swap_to_square_ms": found.swap_to_square_ms,
-        "jitter_ms": found.jitter_ms,
-        "edges": found.edges,
-        "edges_without_a_frame": found.unmatched,
+        "swap_to_light_p50_ms": found["latency_ms"]["p50"],
+        "swap_to_light_p99_ms": found["latency_ms"]["p99"],
+        "swap_to_square_ms": found["swap_to_square_ms"],
+        "jitter_ms": found["jitter_ms"],
+        "edges": found["edges"],
+        "edges_without_a_frame": found["unmatched"],
     }
-    figures |= {name: value for name, value in (("rise_ms", found.rise_ms), ("fall_ms", found.fall_ms)) if value is not None}
+    figures |= {name: found[name] for name in ("rise_ms", "fall_ms") if found[name] is not None}
     if context.truth is not None:
         figures["truth_panel_delay_ms"] = context.truth.config.monitor.panel_delay_ms
     return figures
@@ -397,12 +396,8 @@ def _is_same(path: Path, digest: str) -> bool:
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
     """Lock a directory against a second session (InputError); a kill releases the lock."""
-    lock = open_lock(folder / LOCK_FILE)
+    lock = lock_alone(folder / LOCK_FILE, "another first-light session works there; wait for its end")
     try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(f"{folder}: another first-light session works there; wait for its end") from error
         yield
     finally:
         os.close(lock)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,7 @@ from scipy.spatial import cKDTree
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
-from hilstar.bench.cameras import bench_camera, tracker_camera
+from hilstar.bench.cameras import bench_camera, display_psf, tracker_camera
 from hilstar.bench.config import Verify
 from hilstar.bench.frame import Bench, Frame
 from hilstar.calibrate.first_light.context import MAX_FILL, DarkSubtracted, StepContext
@@ -28,9 +29,8 @@ from hilstar.monitor.calibration import BUILT_IN
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import Levels
 from hilstar.rotation import to_matrix
-from hilstar.scene.psf import peak_share
 from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars, noisiest_background
-from hilstar.twin.verify.summary import VerifySummary, summarise
+from hilstar.twin.verify.summary import summarise
 from hilstar.twin.verify.summary import verify as run_twin
 from hilstar.units import ARCSEC_PER_RAD, ERROR_OF_MEDIAN, MAG_PER_RELATIVE, magnitude
 
@@ -166,20 +166,16 @@ def see_stars(context: StepContext) -> StarsSeen:
 
 def _levels(bench: Bench, frame: Frame) -> tuple[Levels, ...]:
     """The levels of a frame, or with `temporal` of all frames of an exposure."""
-    if not bench.quantiser.over_frames:
+    exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)
+    if len(exposed) == 1:
         return (frame.levels,)
-    return tuple(Levels(bench.draw(frame.q_icrs_to_cam, k).levels.copy()) for k in range(bench.config.exposure_frames))
+    return tuple(Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in exposed)
 
 
 def _together(fields: list[StarsSeen], dark: Path) -> StarsSeen:
+    arrays = [field.name for field in dataclasses.fields(StarsSeen) if field.name not in {"lost", "images"}]
     return StarsSeen(
-        place_px=np.concatenate([each.place_px for each in fields]),
-        residual_px=np.concatenate([each.residual_px for each in fields]),
-        dn=np.concatenate([each.dn for each in fields]),
-        e_per_s=np.concatenate([each.e_per_s for each in fields]),
-        noise_mag=np.concatenate([each.noise_mag for each in fields]),
-        screen=np.concatenate([each.screen for each in fields]),
-        codes_mag=np.concatenate([each.codes_mag for each in fields]),
+        **{name: np.concatenate([getattr(each, name) for each in fields]) for name in arrays},
         lost=sum(each.lost for each in fields),
         images=(dark, *(path for each in fields for path in each.images)),
     )
@@ -278,13 +274,14 @@ def _spot_sigma_px(context: StepContext) -> tuple[float, float]:
     """The sigma of a star in the tracker's image: its own and the sprite's, (x, y)."""
     geometry = context.geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    sprite = context.file.config.render.sprite_sigma_px
-    x, y = (math.hypot(a, ratio * b) for a, b in zip(context.file.config.tracker.psf_sigma_px, sprite, strict=True))
+    sprite = display_psf(context.file.config.render).width_px
+    x, y = (math.hypot(a, ratio * b) for a, b in zip(context.tracker_psf.width_px, sprite, strict=True))
     return x, y
 
 
 VERIFY_FIELDS, VERIFY_SEED = 3, 0
 LOST_SHARE = 0.1
+LIMITS = ("flux_mag", "centroid_px", "lost_share", "black_e_per_s_px")  # of [verify], also before a truth
 GRID = 21  # places along each side of the screen at which a truth is compared
 
 
@@ -308,7 +305,7 @@ def verify(context: StepContext) -> StepOutcome:
         line += f"; the light of {int(seen.sure.sum())} can be read, too few to judge it"
     reasons += _star_reasons(context, figures)
     twin = summarise(run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED)))
-    reasons += [f"the twin: {reason}" for reason in twin.reasons]
+    reasons += [f"the twin: {reason}" for reason in twin["reasons"]]
     figures |= _twin_figures(twin)
     if context.truth is not None:
         figures |= _against_truth(context)
@@ -316,10 +313,9 @@ def verify(context: StepContext) -> StepOutcome:
             f"; against the truth, places are {figures['truth_rms_arcsec']:.2f} arcsec rms off, and stars of the twin"
             f" {figures['twin_flux_p95_mag']:.3f} mag at 95 %"
         )
-    files = (*pictures, *seen.images)
-    if reasons:
-        return StepOutcome("failed", f"{line}: {'; '.join(reasons)}", figures, files, tuple(pictures))
-    return StepOutcome("done", line, figures, files, tuple(pictures))
+    line += f": {'; '.join(reasons)}" if reasons else ""
+    verdict: Verdict = "failed" if reasons else "done"
+    return StepOutcome(verdict, line, figures, (*pictures, *seen.images), tuple(pictures))
 
 
 def _twin_file(context: StepContext) -> BenchFile:
@@ -331,15 +327,9 @@ def _twin_file(context: StepContext) -> BenchFile:
     with open_bench(truth) as bench:
         white = bench.flux_at_white_e_per_s
     named = monitor.calibration in BUILT_IN
-    limits = file.config.verify
-    known = Verify(
-        flux_mag=limits.flux_mag,
-        centroid_px=limits.centroid_px,
-        lost_share=limits.lost_share,
-        black_e_per_s_px=limits.black_e_per_s_px,
-        true_calibration=monitor.calibration if named else str(folder / monitor.calibration),
-        true_flux_at_white_e_per_s=white,
-    )
+    calibration = monitor.calibration if named else str(folder / monitor.calibration)
+    limits = {name: getattr(file.config.verify, name) for name in LIMITS}
+    known = Verify(**limits, true_calibration=calibration, true_flux_at_white_e_per_s=white)
     if collimator.geometry is not None:
         known = replace(known, true_geometry=str(folder / collimator.geometry))
     else:
@@ -352,13 +342,13 @@ def _twin_file(context: StepContext) -> BenchFile:
     return dataclasses.replace(file, config=replace(file.config, verify=known))
 
 
-def _twin_figures(twin: VerifySummary) -> dict[str, Figure]:
+def _twin_figures(twin: dict[str, Any]) -> dict[str, Figure]:
     """The twin's figures."""
-    spreads = {"flux": (twin.flux_error_mag, "mag"), "centroid": (twin.centroid_error_px, "px")}
+    spreads = {"flux": (twin["flux_error_mag"], "mag"), "centroid": (twin["centroid_error_px"], "px")}
     return {
-        "twin_passed": str(twin.passed).lower(),
-        "twin_stars": twin.stars,
-        "twin_zero_point_mag": "not known" if twin.zero_point_mag is None else twin.zero_point_mag,
+        "twin_passed": str(twin["passed"]).lower(),
+        "twin_stars": twin["stars"],
+        "twin_zero_point_mag": "not known" if twin["zero_point_mag"] is None else twin["zero_point_mag"],
         **{f"twin_{name}_p95_{unit}": spread.p95 or 0.0 for name, (spread, unit) in spreads.items()},
     }
 
@@ -448,7 +438,7 @@ def scale(context: StepContext) -> StepOutcome:
     """Find what white is worth by stars, and set it in the bench file. Raises InputError."""
     seen = see_stars(context)
     white = _white_e_per_s(context.file)
-    used = seen.sure & (seen.e_per_s * peak_share(context.file.config.render.sprite_sigma_px) <= white)
+    used = seen.sure & (seen.e_per_s * display_psf(context.file.config.render).peak_share <= white)
     if used.sum() < MIN_STARS:
         raise InputError(
             f"the light of {used.sum()} stars can be read and {MIN_STARS} are needed; the others of {len(used)} saturate the"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from hilstar.calibrate.first_light.context import HOT_FILL, StepContext
 from hilstar.calibrate.first_light.geometry import DOT_PX, sharp_dots
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.calibrate.first_light.photometry import calibration_of, calibration_source
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome
+from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, Verdict
 from hilstar.charts import chart
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import load_calibration, weights_of_grid, with_uniformity
@@ -93,14 +92,14 @@ def uniformity(context: StepContext) -> StepOutcome:
     else:
         source, path = calibration_source(context.file), context.session / FILE
         files += with_uniformity(source, context.file.config.monitor.bits, path, None if found.is_even else found.grid)
-        changes = _named(context, path)
+        changes = context.names("monitor", "calibration", path)
         line += "; what the tracker's own lens darkens is part of it"
-    if found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG):
+    noisy = found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG)
+    if noisy:
         why = "dust, a panel uneven from pixel to pixel, or light that is not steady; look at the images"
-        return StepOutcome(
-            "failed", f"{line}: that is far above their noise: {why}", figures, tuple(files), (picture,), changes
-        )
-    return StepOutcome("done", line, figures, tuple(files), (picture,), changes)
+        line = f"{line}: that is far above their noise: {why}"
+    verdict: Verdict = "failed" if noisy else "done"
+    return StepOutcome(verdict, line, figures, tuple(files), (picture,), changes)
 
 
 def _said(found: UniformityMap, assumed: bool) -> str:
@@ -115,11 +114,6 @@ def _mag(found: UniformityMap, dots: DotLight) -> tuple[FloatArray, FloatArray]:
     """How much fainter each used dot is than the brightest place, and than the map, magnitudes."""
     light, mapped = (dots.light / np.median(dots.light))[found.used], found.at_dots[found.used]
     return np.asarray(magnitude(light / mapped.max())), np.asarray(magnitude(light / mapped))
-
-
-def _named(context: StepContext, path: Path) -> tuple[KeyChange, ...]:
-    name, before = os.path.relpath(path, context.file.folder), context.file.config.monitor.calibration
-    return () if before == name else (KeyChange(table="monitor", key="calibration", before=before, after=name),)
 
 
 def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap) -> dict[str, Figure]:
@@ -147,7 +141,7 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     """Measure dots on lattices over the whole screen; their light, and the images. Raises InputError for too few whole dots."""
     geometry, code = context.real_geometry(), int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    psf_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.file.config.tracker.psf_sigma_px)))
+    psf_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.tracker_psf.width_px)))
     sigma_px = math.hypot(psf_px, DOT_PX * ratio / math.sqrt(12))
     apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
     period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(context.resolution_px) / MAX_DOTS / 2) * 2)

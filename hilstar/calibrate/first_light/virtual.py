@@ -12,14 +12,14 @@ from msgspec.structs import replace
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench, orientation_of
-from hilstar.bench.cameras import tracker_camera
+from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.calibrate.first_light.image_sources import KIND, CodeImage, DiodeRecording, Pattern, off_screen, on_screen
 from hilstar.calibrate.latency import Edges, edges_of, swap_to_square_ms
 from hilstar.errors import InputError
 from hilstar.files import written
 from hilstar.monitor.calibration import BUILT_IN, primary_lights
 from hilstar.run.screen.gate import Timing
-from hilstar.run.screen.photodiode import marker_light
+from hilstar.run.screen.screen import marker_light
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.simulator import background_e
@@ -44,7 +44,7 @@ class VirtualBench:
             self._panel, camera = real.panel, real.camera
         tracker = config.tracker
         self.geometry = BenchGeometry(camera, tracker_camera(tracker, truth.folder))
-        self._optics = TwinOptics(self.geometry, tracker.psf_sigma_px)
+        self._optics = TwinOptics(self.geometry, tracker_psf(tracker, truth.folder))
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self._glow_e_per_s: FloatArray = self._optics.glow_e_per_s(self._panel)
         self._sky_e_per_s: FloatArray = background_e(config, truth.folder) / tracker.exposure_s

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from hilstar.calibrate.geometric.fit import (
     best_of,
     candidates,
     directions_in_cam,
-    final_fit,
     fit,
     noise_of_repeats,
     residuals_px,
@@ -73,6 +72,11 @@ class Calibrated:
     uncertainty: Uncertainty
     centroids: int
     tracker_known: bool
+
+    @property
+    def recognised(self) -> int:
+        """Dots that were recognised."""
+        return len(np.unique(self.data.dot))
 
     @property
     def lost(self) -> int:
@@ -144,7 +148,7 @@ def calibrate_geometry(
         raise InputError(f"{found} dots were recognised and {MIN_DOTS} are needed; show more --dots or more --frames")
     models = candidates(problem, data, tracker_names)
     chosen = best_of(models)
-    final = bounded_to_field(problem, final_fit(problem, chosen, data))
+    final = bounded_to_field(problem, fit(problem, chosen.model, chosen.field_degree, data))
     calibrated = Calibrated(
         plan, problem, data, final, models, chosen, uncertainty_of(problem, final, data), len(seen), tracker_known
     )
@@ -250,98 +254,39 @@ WIDE_INCH = 5.6  # width of a panel
 ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the screen's width
 
 
-@dataclass(frozen=True, slots=True)
-class DotCounts:
-    """Dots in the plan, and those recognised."""
-
-    planned: int
-    recognised: int
-
-
-@dataclass(frozen=True, slots=True)
-class CentroidCounts:
-    """Centroids given and matched, lit dots in the tracker's field without one, and centroids that are no dot."""
-
-    given: int
-    matched: int
-    lost: int
-    false: int
-
-
-@dataclass(frozen=True, slots=True)
-class HeldOutDots:
-    """The error of dots held out of the fit, arcsec, and the rms that the noise of their centroids alone makes."""
-
-    rms_arcsec: float
-    max_arcsec: float
-    noise_arcsec: float
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceError:
-    """One sigma of a star's place over the screen."""
-
-    rms_arcsec: float
-    max_arcsec: float
-
-
-@dataclass(frozen=True, slots=True)
-class ModelError:
-    """A model, and its error on dots held out of its fit."""
-
-    name: str
-    rms_arcsec: float
-    max_arcsec: float
-
-
-@dataclass(frozen=True, slots=True)
-class FittedParameter:
+class FittedParameter(NamedTuple):
     """A parameter's value and one sigma, in the unit of its name."""
 
     value: float
     sigma: float
 
 
-@dataclass(frozen=True, slots=True)
-class GeometricSummary:
-    """What was fitted and written; `tracker` is "held" or "fitted", its own lens."""
-
-    model: str
-    poses: int
-    dots: DotCounts
-    centroids: CentroidCounts
-    noise_px: float
-    noise_arcsec: float
-    held_out: HeldOutDots
-    error: PlaceError
-    models: tuple[ModelError, ...]
-    parameters: dict[str, FittedParameter]
-    tracker: str
-    notes: tuple[str, ...]
-    written: tuple[str, ...]
-
-
-def summary_of(found: Calibrated, written: tuple[str, ...]) -> GeometricSummary:
-    """The figures of a calibration; their names are the keys of --json."""
-    chosen = found.chosen
-    return GeometricSummary(
-        model=chosen.name,
-        poses=len(found.problem.q_poses),
-        dots=DotCounts(len(found.plan), len(np.unique(found.data.dot))),
-        centroids=CentroidCounts(found.centroids, len(found.data), found.lost, found.false),
-        noise_px=found.problem.noise_px,
-        noise_arcsec=found.noise_arcsec,
-        held_out=HeldOutDots(chosen.rms_arcsec, chosen.max_arcsec, found.held_out_noise_arcsec),
-        error=PlaceError(found.uncertainty.rms_arcsec, found.uncertainty.max_arcsec),
-        models=tuple(ModelError(model.name, model.rms_arcsec, model.max_arcsec) for model in found.models),
-        parameters=parameters_of(found),
-        tracker="held" if found.tracker_known else "fitted",
-        notes=_notes(found),
-        written=written,
-    )
+def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
+    """The figures of a calibration, by the keys of --json; `tracker` is "held" or "fitted", its own lens."""
+    chosen, error = found.chosen, found.uncertainty
+    return {
+        "model": chosen.name,
+        "poses": len(found.problem.q_poses),
+        "dots": {"planned": len(found.plan), "recognised": found.recognised},
+        "centroids": {"given": found.centroids, "matched": len(found.data), "lost": found.lost, "false": found.false},
+        "noise_px": found.problem.noise_px,
+        "noise_arcsec": found.noise_arcsec,
+        "held_out": {**_both(chosen), "noise_arcsec": found.held_out_noise_arcsec},
+        "error": _both(error),
+        "models": [{"name": model.name, **_both(model)} for model in found.models],
+        "parameters": {name: each._asdict() for name, each in parameters_of(found).items()},
+        "tracker": "held" if found.tracker_known else "fitted",
+        "notes": notes_for_a_person(found),
+        "written": written,
+    }
 
 
-def _notes(found: Calibrated) -> tuple[str, ...]:
+def _both(error: Candidate | Uncertainty) -> dict[str, float]:
+    return {"rms_arcsec": error.rms_arcsec, "max_arcsec": error.max_arcsec}
+
+
+def notes_for_a_person(found: Calibrated) -> tuple[str, ...]:
+    """What the figures alone do not say."""
     if len(found.problem.q_poses) == 1:
         notes: tuple[str, ...] = (ONE_POSE if found.problem.nominal.tracker.lens is None else COLLIMATOR_ALONE,)
     else:
@@ -398,32 +343,29 @@ def notes_of(found: Calibrated) -> Notes:
     return Notes(sigma, error, MadeTable(by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses)))
 
 
-def write_calibrated(path: Path, found: Calibrated, plot: Path | None) -> GeometricSummary:
-    """Write the geometry file, and its chart where one is wanted. Raises InputError where one cannot be written."""
+def write_calibrated(path: Path, found: Calibrated, plot: Path | None) -> list[str]:
+    """Write the geometry file, and its chart where one is wanted; their names. Raises InputError where that cannot be done."""
     geometry = found.fit.geometry
     write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, notes_of(found))
     if plot is not None:
         draw_geometry(plot, found)
-    return summary_of(found, tuple(str(each) for each in (path, plot) if each is not None))
+    return [str(each) for each in (path, plot) if each is not None]
 
 
-def lines_of(summary: GeometricSummary) -> list[str]:
+def lines_of(found: Calibrated) -> list[str]:
     """The calibration as lines of text."""
-    held, dots, centroids, error = summary.held_out, summary.dots, summary.centroids, summary.error
+    chosen, error, noise = found.chosen, found.uncertainty, found.held_out_noise_arcsec
     rows = [
-        ("dots", f"{dots.recognised} of {dots.planned} recognised in {summary.poses} pose(s)"),
-        ("centroids", f"{centroids.matched} matched, {centroids.lost} lost, {centroids.false} false"),
-        ("centroid noise", f"{summary.noise_px:.4f} px, {summary.noise_arcsec:.2f} arcsec"),
-    ]
-    for model in summary.models:
-        rows.append((model.name, f"{model.rms_arcsec:.3f} / {model.max_arcsec:.3f} arcsec (rms / max of held-out dots)"))
-    rows += [
-        ("chosen", summary.model),
-        ("held-out dots", f"{held.rms_arcsec:.3f} arcsec rms, {held.max_arcsec:.3f} max; noise: {held.noise_arcsec:.3f}"),
+        ("dots", f"{found.recognised} of {len(found.plan)} recognised in {len(found.problem.q_poses)} pose(s)"),
+        ("centroids", f"{len(found.data)} matched, {found.lost} lost, {found.false} false"),
+        ("centroid noise", f"{found.problem.noise_px:.4f} px, {found.noise_arcsec:.2f} arcsec"),
+        *((m.name, f"{m.rms_arcsec:.3f} / {m.max_arcsec:.3f} arcsec (rms / max of held-out dots)") for m in found.models),
+        ("chosen", chosen.name),
+        ("held-out dots", f"{chosen.rms_arcsec:.3f} arcsec rms, {chosen.max_arcsec:.3f} max; noise: {noise:.3f}"),
         ("a star's place", f"known to {error.rms_arcsec:.3f} arcsec rms, {error.max_arcsec:.3f} max (1 sigma)"),
     ]
     width = max(len(name) for name, _ in rows) + 2
-    return [f"{name:{width}}{text}" for name, text in rows] + list(summary.notes)
+    return [f"{name:{width}}{text}" for name, text in rows] + list(notes_for_a_person(found))
 
 
 def draw_geometry(path: Path, found: Calibrated) -> None:

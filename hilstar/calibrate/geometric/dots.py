@@ -6,7 +6,6 @@ as the number of dots allows.
 
 from __future__ import annotations
 
-import csv
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +16,9 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.config import Monitor
+from hilstar.charts import write_csv
+from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError
-from hilstar.files import as_text, whole_file
-from hilstar.reading import open_lines
 
 LIT_SHARE = 0.4  # share of the frames that a dot is lit in
 MIN_LIT, MAX_LIT = 3, 10  # frames that a dot is lit in
@@ -111,12 +110,9 @@ def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: 
 
 def write_plan(path: Path, plan: DotPlan) -> None:
     """Write plan.csv, a row for each lit dot of each frame."""
-    with whole_file(path) as whole, as_text(whole) as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(PLAN_COLUMNS)
-        for frame in range(plan.frames):
-            for dot in np.flatnonzero(plan.lit[:, frame]):
-                writer.writerow((frame, int(dot), int(plan.x_px[dot]), int(plan.y_px[dot])))
+    places = np.stack([plan.x_px, plan.y_px], axis=1).astype(int).tolist()
+    lit = ((frame, dot) for frame in range(plan.frames) for dot in np.flatnonzero(plan.lit[:, frame]).tolist())
+    write_csv(path, PLAN_COLUMNS, ((frame, dot, *places[dot]) for frame, dot in lit))
 
 
 class _PlanRow(NamedTuple):
@@ -129,20 +125,15 @@ class _PlanRow(NamedTuple):
 def read_plan(path: Path) -> DotPlan:
     """Read plan.csv. Raises InputError with the line that is wrong."""
     rows: list[_PlanRow] = []
-    with open_lines(path, PLAN_ADVICE, MAX_PLAN_BYTES) as lines:
-        reader = csv.reader(lines)
-        header = tuple(name.strip() for name in next(reader, []))
-        if header != PLAN_COLUMNS:
-            raise InputError(f"{path}:1: the header must be {','.join(PLAN_COLUMNS)}; {PLAN_ADVICE}")
-        for row in reader:
-            try:
-                frame, dot, x_px, y_px = int(row[0]), int(row[1]), float(row[2]), float(row[3])
-                if len(row) != len(PLAN_COLUMNS) or min(frame, dot) < 0 or max(frame, dot) > 10**6:
-                    raise ValueError
-            except (ValueError, IndexError) as error:
-                wanted = "whole numbers frame and dot, and x_px and y_px are wanted"
-                raise InputError(f"{path}:{reader.line_num}: {','.join(row)[:80]!r}; {wanted}") from error
-            rows.append(_PlanRow(frame, dot, x_px, y_px))
+    for line, cells in read_rows(path, PLAN_COLUMNS, PLAN_ADVICE, MAX_PLAN_BYTES, ()):
+        try:
+            row = _PlanRow(int(cells[0]), int(cells[1]), float(cells[2]), float(cells[3]))
+            if min(row.frame, row.dot) < 0 or max(row.frame, row.dot) > 10**6:
+                raise ValueError
+        except ValueError as error:
+            wanted = "whole numbers frame and dot, and x_px and y_px are wanted"
+            raise InputError(f"{path}:{line}: {','.join(cells)[:80]!r}; {wanted}") from error
+        rows.append(row)
     if not rows:
         raise InputError(f"{path}: has no dot; {PLAN_ADVICE}")
     return _plan_of(path, rows)
@@ -175,7 +166,8 @@ def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowe
     from hilstar.bench.build import orientation_of
     from hilstar.calibrate.plan import stays_until_key
     from hilstar.monitor.window.window import Window, WindowSettings
-    from hilstar.render.presenter import Presenter, ScreenView, level_texture, window_context
+    from hilstar.render.backend import ScreenView
+    from hilstar.render.presenter import Presenter, level_texture, window_context
 
     orientation = orientation_of(monitor)
     screen_px = orientation.screen_px(monitor.resolution_px)

@@ -377,11 +377,6 @@ def best_of(found: list[Candidate]) -> Candidate:
     return best
 
 
-def final_fit(problem: Problem, chosen: Candidate, data: MatchedDots) -> Fit:
-    """The chosen model on all of the data."""
-    return fit(problem, chosen.model, chosen.field_degree, data)
-
-
 MAP_PLACES = (17, 11)
 
 

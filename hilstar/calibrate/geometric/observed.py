@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 import warnings
@@ -15,14 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError
-from hilstar.reading import open_lines, read_bytes
+from hilstar.reading import read_bytes
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 MAX_OBSERVED_BYTES = 100_000_000
 MAX_ROWS = 1_000_000
 NEEDED = ("frame", "x_px", "y_px")
-KNOWN = (*NEEDED, "flux", "sigma_px", "pose")
 ADVICE = "write a CSV with the columns frame,x_px,y_px and, where known, flux, sigma_px and pose"
 
 
@@ -50,34 +49,25 @@ class Observed:
 def read_observed(path: Path) -> Observed:
     """Read a table of centroids. Raises InputError with the line that is wrong."""
     rows: list[tuple[float, ...]] = []
-    with open_lines(path, ADVICE, MAX_OBSERVED_BYTES) as lines:
-        reader = csv.reader(lines)
-        header = [name.strip() for name in next(reader, [])]
-        missing = [name for name in NEEDED if name not in header]
-        if missing:
-            raise InputError(f"{path}:1: column {missing[0]} is missing; {ADVICE}")
-        places = {name: header.index(name) for name in KNOWN if name in header}
-        for row in reader:
-            if row and not row[0].startswith("#"):
-                rows.append(_row(path, reader.line_num, row, places))
-            if len(rows) > MAX_ROWS:
-                raise InputError(f"{path}: more than {MAX_ROWS} centroids; write fewer frames")
+    for line, cells in read_rows(path, NEEDED, ADVICE, MAX_OBSERVED_BYTES, ("sigma_px", "pose")):
+        rows.append(_row(path, line, cells))
+        if len(rows) > MAX_ROWS:
+            raise InputError(f"{path}: more than {MAX_ROWS} centroids; write fewer frames")
     if not rows:
         raise InputError(f"{path}: has no centroid; {ADVICE}")
     frame, x_px, y_px, sigma_px, pose = np.array(rows).T
     return Observed(frame.astype(np.intp), pose.astype(np.intp), x_px, y_px, sigma_px)
 
 
-def _row(path: Path, line: int, row: list[str], places: dict[str, int]) -> tuple[float, ...]:
+def _row(path: Path, line: int, cells: list[str]) -> tuple[float, ...]:
     try:
-        cells = {name: row[place].strip() for name, place in places.items()}
-        frame, pose = int(cells["frame"]), int(cells.get("pose") or 0)
-        x_px, y_px, sigma_px = float(cells["x_px"]), float(cells["y_px"]), float(cells.get("sigma_px") or 1.0)
+        frame, x_px, y_px = int(cells[0]), float(cells[1]), float(cells[2])
+        sigma_px, pose = float(cells[3] or 1.0), int(cells[4] or 0)
         if not (all(map(math.isfinite, (x_px, y_px))) and 0 < sigma_px < math.inf and 0 <= frame < 10**6 and 0 <= pose < 1000):
             raise ValueError
-    except (ValueError, IndexError) as error:
+    except ValueError as error:
         wanted = "a frame from 0, finite x_px and y_px, sigma_px above 0 and a pose from 0 are wanted"
-        raise InputError(f"{path}:{line}: {','.join(row)[:80]!r}; {wanted}") from error
+        raise InputError(f"{path}:{line}: {','.join(cells)[:80]!r}; {wanted}") from error
     return frame, x_px, y_px, sigma_px, pose
 
 
@@ -130,15 +120,15 @@ def _numbers_of(path: Path) -> tuple[int, int]:
     return int(found[1]), int(pose[1]) if pose else 0
 
 
-def read_image(path: Path, resolution_px: tuple[int, int]) -> FloatArray:
-    """A grey image (h, w) as float64, first row at the top. Raises InputError."""
+def read_image(path: Path, resolution_px: tuple[int, int] | None = None) -> FloatArray:
+    """A grey image (h, w) as float64, first row at the top, of this (width, height) if any. Raises InputError."""
     data = read_bytes(path, IMAGE_ADVICE, MAX_IMAGE_BYTES)
     # A grabbing script may write FITS under any name.
     is_fits = path.suffix.lower() in FITS_ENDINGS or data.startswith(FITS_MAGIC)
     image = _fits(path, data) if is_fits else _picture(path, data)
     if image.ndim != 2:
         raise InputError(f"{path}: is no grey image of one plane; {IMAGE_ADVICE}")
-    if (image.shape[1], image.shape[0]) != resolution_px:
+    if resolution_px is not None and (image.shape[1], image.shape[0]) != resolution_px:
         sizes = (
             f"is {image.shape[1]} x {image.shape[0]} px, and [tracker] resolution_px is {resolution_px[0]} x {resolution_px[1]}"
         )

@@ -29,7 +29,6 @@ from hilstar.console.messages import Order, OrderAnswer, RunState, Setup
 from hilstar.console.protocol import CONTROLS, SUBPROTOCOL, TOKEN_PROTOCOL, OrderBody, PageText, SkyMap
 from hilstar.console.server.connections import OpenPage, OpenPages
 from hilstar.console.server.reader import RunReader
-from hilstar.units import NS_PER_S
 
 LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}  # no name server says where they are
 HEADERS = {
@@ -68,11 +67,6 @@ class Guard:
             f"{name}{port}" for name in setup.names if ":" not in name for port in ("", ":443", ":80", f":{setup.port}")
         }
         self._any_address, self._port, self._token = setup.any_address, setup.port, setup.token
-
-    @property
-    def has_token(self) -> bool:
-        """Whether a token is required."""
-        return bool(self._token)
 
     def check_host(self, host: str) -> None:
         """Raises Refused (421) for a name that is not the page's."""
@@ -130,15 +124,18 @@ def headers_of(host: str) -> dict[str, str]:
     return HEADERS | {"Content-Security-Policy": POLICY.format(sockets=sockets)}
 
 
-CONTENT_TYPE = CONTENT_TYPE_LATEST
-
-
 class RunCollector(Collector):
     """Makes a run's metrics on request."""
 
     def __init__(self, reader: RunReader) -> None:
         self._reader = reader
         self.clients = 0
+        self._registry = CollectorRegistry()
+        self._registry.register(self)
+
+    def text(self) -> bytes:
+        """The answer of `GET /metrics`."""
+        return bytes(generate_latest(self._registry))  # type: ignore[no-untyped-call]
 
     def collect(self) -> Iterator[Metric]:
         """The metrics with their current values."""
@@ -147,39 +144,39 @@ class RunCollector(Collector):
         yield InfoMetricFamily("hilstar_run", "What runs.", value=info)
         yield _gauge("hilstar_healthy", "1 while the sky is right, as GET /health has it.", float(self._reader.health.ok))
         yield _gauge("hilstar_health_since_timestamp_seconds", "Since when that is so.", self._reader.health.since_s)
-        yield _counter("hilstar_frames", "Frames shown.", seen.frames)
-        yield _counter("hilstar_frames_missed", "Refresh periods without a frame of their own.", seen.missed)
-        yield _counter("hilstar_frames_stale", "Frames shown with a stale attitude.", seen.stale_frames)
-        yield _counter("hilstar_frames_given_up", "Frames given up because their moment had passed.", seen.given_up)
-        yield _counter("hilstar_packets_received", "Attitude packets received.", seen.received)
+        yield _counter("hilstar_frames", "Frames shown.", seen.counts.frames)
+        yield _counter("hilstar_frames_missed", "Refresh periods without a frame of their own.", seen.counts.missed)
+        yield _counter("hilstar_frames_stale", "Frames shown with a stale attitude.", seen.counts.stale)
+        yield _counter("hilstar_frames_given_up", "Frames given up because their moment had passed.", seen.counts.given_up)
+        yield _counter("hilstar_packets_received", "Attitude packets received.", seen.counts.received)
         refused = CounterMetricFamily("hilstar_packets_refused", "Attitude packets refused.", labels=["reason"])
-        for reason, count in seen.refused.items():
+        for reason, count in seen.counts.refused.items():
             refused.add_metric([reason], count)
         yield refused
         yield from self._of_attitude(seen)
         yield from self._of_rest(seen)
 
     def _of_attitude(self, seen: RunState) -> Iterator[Metric]:
-        yield _gauge("hilstar_attitude_missing", "1 until an attitude has come.", float(seen.missing))
-        yield _gauge("hilstar_attitude_stale", "1 while the attitude is stale.", float(seen.stale))
+        yield _gauge("hilstar_attitude_missing", "1 until an attitude has come.", float(seen.frame.missing))
+        yield _gauge("hilstar_attitude_stale", "1 while the attitude is stale.", float(seen.frame.stale))
         if seen.attitude is not None:
             yield _gauge(
-                "hilstar_attitude_age_seconds", "Age of the attitude of the newest frame.", seen.attitude.age_ns / NS_PER_S
+                "hilstar_attitude_age_seconds", "Age of the attitude of the newest frame.", seen.attitude.age_ms * 1e-3
             )
         clock = seen.clock
         if clock is None:
             return
         for name, words, value, scale in (
             ("offset_seconds", "Host time minus the sender's.", clock.offset_ms, 1e-3),
-            ("uncertainty_seconds", "Of the offset.", clock.uncertainty_ms, 1e-3),
+            ("uncertainty_seconds", "Of the offset.", clock.sigma_ms, 1e-3),
             ("drift_ratio", "How much faster the sender's clock runs.", clock.drift_ppm, 1e-6),
         ):
             if value is not None:
                 yield _gauge(f"hilstar_clock_{name}", words, value * scale)
 
     def _of_rest(self, seen: RunState) -> Iterator[Metric]:
-        yield _gauge("hilstar_stars", "Stars in the newest frame.", seen.stars)
-        yield _gauge("hilstar_stars_clipped", "Those brighter than the monitor's white.", len(seen.clipped))
+        yield _gauge("hilstar_stars", "Stars in the newest frame.", seen.frame.stars)
+        yield _gauge("hilstar_stars_clipped", "Those brighter than the monitor's white.", len(seen.frame.clipped))
         yield _gauge("hilstar_display_lost", "1 where the display has gone.", float(bool(seen.display_lost)))
         yield _gauge("hilstar_operator_override", "1 while an operator changes the sky.", float(bool(seen.operator_text)))
         if seen.ledger is not None:
@@ -205,19 +202,6 @@ def _counter(name: str, words: str, value: float) -> CounterMetricFamily:
     return CounterMetricFamily(name, words, value=value)
 
 
-class Metrics:
-    """The registry of a run's metrics."""
-
-    def __init__(self, reader: RunReader) -> None:
-        self.collector = RunCollector(reader)
-        self._registry = CollectorRegistry()
-        self._registry.register(self.collector)
-
-    def text(self) -> bytes:
-        """The answer of `GET /metrics`."""
-        return bytes(generate_latest(self._registry))  # type: ignore[no-untyped-call]
-
-
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_BODY_BYTES = 4_000
@@ -235,7 +219,7 @@ class Page:
 
     def __init__(self, setup: Setup, reader: RunReader, pages: OpenPages, sky: SkyMap | None, give: Give) -> None:
         self.setup, self.reader, self.pages, self.give = setup, reader, pages, give
-        self.guard, self.metrics = Guard(setup), Metrics(reader)
+        self.guard, self.metrics = Guard(setup), RunCollector(reader)
         self._sky = b"{}" if sky is None else msgspec.json.encode(sky)
         self._files = {path.name: path.read_bytes() for path in PAGE_FOLDER.iterdir() if path.suffix in TYPES}
 
@@ -268,8 +252,8 @@ class Page:
         return Response(msgspec.json.encode(found), 200 if found.ok else 503, media_type="application/json")
 
     async def _metrics(self, _: Request) -> Response:
-        self.metrics.collector.clients = len(self.pages)
-        return Response(self.metrics.text(), headers={"Content-Type": CONTENT_TYPE})
+        self.metrics.clients = len(self.pages)
+        return Response(self.metrics.text(), headers={"Content-Type": CONTENT_TYPE_LATEST})
 
     async def _state(self, _: Request) -> Response:
         return Response(PageText(hello=self.setup.hello, state=self.reader.state()).json(), media_type="application/json")

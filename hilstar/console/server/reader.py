@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,21 +22,17 @@ from hilstar.console.protocol import (
     KEPT_EVENTS,
     ChartPoint,
     EventLine,
-    NewestFrame,
     Pacing,
     PageState,
     PageText,
     PictureFormat,
     RunCounts,
-    ShownAttitude,
-    ShownClock,
     SkyHealth,
     StarMark,
     Truth,
 )
 from hilstar.console.shared_memory import PICTURE_HEAD_BYTES, SPRITE, SharedMemory
 from hilstar.monitor.response import Levels
-from hilstar.rotation import to_radec_roll_deg
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 
@@ -86,10 +81,10 @@ def _of_display(seen: RunState, now_ns: int, refresh_hz: float) -> Iterator[str]
 def _of_attitude(seen: RunState, now_ns: int, lately: RecentFrames, pace: Pace) -> Iterator[str]:
     if not seen.alive_ns:
         return
-    if seen.missing:
+    if seen.frame.missing:
         yield "no attitude has come yet"
-    elif seen.stale:
-        age = "" if seen.attitude is None else f": {_s(seen.attitude.age_ns)} old"
+    elif seen.frame.stale:
+        age = "" if seen.attitude is None else f": {_s(round(seen.attitude.age_ms * NS_PER_MS))} old"
         yield f"the attitude is stale{age}"
     elif pace == "asked" and lately.swap_ns and now_ns - lately.swap_ns > UNASKED_NS:
         yield f"the simulator has asked for no frame for {_s(now_ns - lately.swap_ns)}"
@@ -140,13 +135,6 @@ PACING_EACH_S = 1.0
 MIN_INTERVALS = 10
 
 
-class _Received(NamedTuple):
-    host_ns: int
-    packets: int
-    frames: int
-    missed: int
-
-
 class RunReader:
     """A run for its page. `look` brings it up to date."""
 
@@ -159,7 +147,7 @@ class RunReader:
         self._frame_at = self._event_at = 0
         self._last: FrameNumbers | None = None
         self._intervals_ms: deque[tuple[int, float]] = deque()
-        self._received: deque[_Received] = deque()  # over the last second
+        self._received: deque[tuple[int, RunCounts]] = deque()  # over the last second
         self._begun_ns = time.monotonic_ns()
         self.pacing: Pacing | None = None
         self._pacing_ns = 0
@@ -216,16 +204,16 @@ class RunReader:
         seen = self.seen
         if seen is None:
             return None
-        self._received.append(_Received(now_ns, seen.received, seen.frames, seen.missed))
-        while len(self._received) > 1 and now_ns - self._received[0].host_ns > NS_PER_S:
+        self._received.append((now_ns, seen.counts))
+        while len(self._received) > 1 and now_ns - self._received[0][0] > NS_PER_S:
             self._received.popleft()
-        first, passed_ns = self._received[0], now_ns - self._received[0].host_ns
-        return round((seen.received - first.packets) / passed_ns * NS_PER_S, 2) if passed_ns else None
+        first_ns, first = self._received[0]
+        return round((seen.counts.received - first.received) / (now_ns - first_ns) * NS_PER_S, 2) if now_ns > first_ns else None
 
     def _missed_share(self) -> float:
         if len(self._received) < 2:
             return 0.0
-        first, last = self._received[0], self._received[-1]
+        (_, first), (_, last) = self._received[0], self._received[-1]
         shown, lost = last.frames - first.frames, last.missed - first.missed
         return lost / (shown + lost) if shown + lost else 0.0
 
@@ -245,59 +233,19 @@ class RunReader:
     def state(self) -> PageState:
         """The state of the run, as the page shows it."""
         seen = RunState(host_ns=0) if self.seen is None else self.seen
-        clock = seen.clock
         return PageState(
             utc=utc_text(time.time()),
             health=self.health_now(),
-            attitude=_attitude(seen),
+            attitude=seen.attitude,
             source=self.setup.source,
-            clock=None
-            if clock is None
-            else ShownClock(
-                offset_ms=clock.offset_ms,
-                sigma_ms=clock.uncertainty_ms,
-                drift_ppm=clock.drift_ppm,
-                synchronised=clock.mode in {"exchange", "shared"},
-                mode=clock.mode,
-            ),
-            counts=RunCounts(
-                frames=seen.frames,
-                missed=seen.missed,
-                stale=seen.stale_frames,
-                given_up=seen.given_up,
-                received=seen.received,
-                accepted=seen.received - sum(seen.refused.values()),
-                refused=seen.refused,
-            ),
+            clock=seen.clock,
+            counts=seen.counts,
             pacing=self.pacing,
-            frame=NewestFrame(
-                number=seen.frame,
-                missing=seen.missing,
-                stale=seen.stale,
-                blank=seen.blank,
-                stars=seen.stars,
-                clipped=seen.clipped,
-            ),
+            frame=seen.frame,
             operator=seen.operator,
             faults=seen.faults,
             ledger=seen.ledger,
         )
-
-
-def _attitude(seen: RunState) -> ShownAttitude | None:
-    attitude = seen.attitude
-    if attitude is None:
-        return None
-    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(np.array(attitude.q))
-    rate = attitude.rate_rad_s
-    return ShownAttitude(
-        q=attitude.q,
-        ra_deg=ra_deg,
-        dec_deg=dec_deg,
-        roll_deg=roll_deg,
-        rate_deg_s=None if rate is None else np.degrees(rate).tolist(),
-        age_ms=attitude.age_ns / NS_PER_MS,
-    )
 
 
 LEVEL = 1  # zlib's fastest: a night sky is nearly all zeros
@@ -360,7 +308,7 @@ def _message(head: PictureHead, levels: Levels) -> bytes:
 def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) -> list[StarMark]:
     """Where the stars of a picture were drawn, the brightest first."""
     stars, x_px, y_px = _one_each(sprites)
-    clipped = set() if seen is None else set(seen.clipped)
+    clipped = set() if seen is None else set(seen.frame.clipped)
     marks = []
     for k in np.argsort(scene.v_mag[stars], kind="stable")[:MAX_STARS].tolist():
         star, v_mag = int(stars[k]), float(scene.v_mag[stars[k]])

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
-from hilstar.run.record.ledger_reader import NO_FRAMES, frame_records
+from hilstar.run.record.ledger_records import NO_FRAMES, frame_records
 from hilstar.units import NS_PER_S
 
 # Two frames further apart than MAX_GAP_S and USUAL_INTERVALS median intervals do not say what was shown between them.

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, NamedTuple, Self
+from typing import Literal, Self
 
 import msgspec
 
@@ -41,6 +41,7 @@ from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_write, printable
 from hilstar.files import NewFile
 from hilstar.notices import Notice, Notices
+from hilstar.process.closing import Closing
 from hilstar.process.interrupts import caught, stop_on_signal
 from hilstar.run.record.ledger_records import (
     COUNT_TOPIC,
@@ -138,14 +139,6 @@ class Allowance:
         return True
 
 
-class FloodCount(NamedTuple):
-    """How many messages of a kind were only counted, and why."""
-
-    kind: Counted
-    reason: str
-    number: int
-
-
 class FloodFilter:
     """In a flood, passes the first messages of each kind and reason and counts the others."""
 
@@ -174,11 +167,11 @@ class FloodFilter:
         with self._lock:
             self._counts[kind, reason] += number
 
-    def counted(self) -> list[FloodCount]:
-        """The counts since the last call."""
+    def counted(self) -> Counter[tuple[Counted, str]]:
+        """The counts since the last call, by kind and reason."""
         with self._lock:
             counts, self._counts = self._counts, Counter()
-        return [FloodCount(kind, reason, number) for (kind, reason), number in counts.items()]
+        return counts
 
 
 class ProcessProbe:
@@ -232,7 +225,7 @@ class SplitLimits:
 NO_SPLIT = SplitLimits()
 
 
-class Ledger:
+class Ledger(Closing):
     """Writes a run's MCAP file. Raises InputError if it cannot be created."""
 
     def __init__(
@@ -366,7 +359,7 @@ class Ledger:
         dropped, self._queue.dropped = self._queue.dropped, type(self._queue.dropped)()
         for kind, number in dropped.items():
             self._lose(kind, number)
-        for kind, reason, number in self._filter.counted():
+        for (kind, reason), number in self._filter.counted().items():
             self._counted += 0 if reason == NO_ROOM or kind == "pulse" else number
             record = CountRecord(host_ns=now_ns, kind=kind, reason=reason, count=number)
             self._add("count", now_ns, msgspec.json.encode(record))
@@ -503,12 +496,6 @@ class Ledger:
         if self._part:
             told["files"] = self._part + 1
         return told
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 def _free_path(path: Path) -> Path:

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -14,23 +14,21 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.notices import MAX_DETAIL_CHARACTERS
-from hilstar.run.record.ledger_reader import (
+from hilstar.run.record.ledger_records import (
     MAX_REASON_CHARACTERS,
     MAX_REASONS,
     NO_FRAMES,
-    PacketTally,
-    config_of,
-    read_head,
-    run_records,
-)
-from hilstar.run.record.ledger_records import (
     PULSES,
     CountRecord,
     EventRecord,
     FrameRecord,
     PacketForm,
+    PacketTally,
     ProcessRecord,
     RunRecord,
+    config_of,
+    read_head,
+    run_records,
 )
 from hilstar.running_statistics import Percentiles, RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -211,7 +209,16 @@ class Keyframes:
         return sorted(found.values(), key=lambda each: each[0].swap_ns)
 
 
-METRICS = ("interval", "late", "draw", "age", "prediction", "packet")  # ms
+# Times of a frame, ms, and the keys that a report has them under.
+METRICS = {
+    **{"interval": "interval_ms", "late": "swap_late_ms", "draw": "draw_to_swap_ms", "age": "attitude_age_ms"},
+    **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
+}
+HEAD = ("bench_sha256", "calibration", "calibration_sha256", "gl_renderer", "gl_version", "render_path")
+COUNTED = (
+    *("frames", "duration_s", "stale_frames", "right_frames", "blank_frames", "operator_frames", "hidden_frames"),
+    *("capped_frames", "events", "pulses", "memory_growth_mb"),
+)
 # The columns of the spans: METRICS, then these.
 COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
 ACCEPTED, REFUSED = range(2)
@@ -226,13 +233,13 @@ class RunFigures:
     events: dict[str, int] = field(default_factory=dict)
     pulses: dict[str, int] = field(default_factory=dict)  # by PULSES; {} where none was due
     frames: int = 0
-    stale: int = 0
-    blank: int = 0
+    stale_frames: int = 0
+    blank_frames: int = 0
     late: int = 0  # stale, with an attitude
-    capped: int = 0
-    operator: int = 0
-    hidden: int = 0
-    right: int = 0  # frames with none of these faults
+    capped_frames: int = 0
+    operator_frames: int = 0
+    hidden_frames: int = 0
+    right_frames: int = 0  # with none of these faults
     most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
     last: FrameRecord | None = None
     first_swap_ns: int = 0
@@ -297,13 +304,13 @@ class RunFigures:
             self.first_swap_ns = frame.swap_ns
         self.last = frame
         self.frames += 1
-        self.stale += frame.stale
-        self.blank += frame.q is None
+        self.stale_frames += frame.stale
+        self.blank_frames += frame.q is None
         self.late += frame.stale and frame.q is not None
-        self.capped += frame.capped > 0
-        self.operator += bool(frame.operator)
-        self.hidden += bool(frame.hidden)
-        self.right += not (frame.stale or frame.q is None or frame.operator or frame.hidden)
+        self.capped_frames += frame.capped > 0
+        self.operator_frames += bool(frame.operator)
+        self.hidden_frames += bool(frame.hidden)
+        self.right_frames += not (frame.stale or frame.q is None or frame.operator or frame.hidden)
         for name in self.most:
             self.most[name] = max(self.most[name], getattr(frame, name))
         values = _times_ms(frame, before)
@@ -407,40 +414,18 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
 
 def summarise(run: RunFigures) -> RunReport:
     """The figures of a run, from those of its frames."""
-    config, last, spreads = config_of(run.head), run.last, run.spreads
+    config, last = config_of(run.head), run.last
     refresh_hz = None if config is None else config.monitor.refresh_hz
-    age_ms = spreads["age"].percentiles()
+    times = {key: run.spreads[name].percentiles() for name, key in METRICS.items()}
+    found: dict[str, Any] = {name: getattr(run, name) for name in COUNTED} | {name: run.head.get(name) for name in HEAD}
     return RunReport(
-        frames=run.frames,
-        duration_s=run.duration_s,
+        **(found | times | run.most),
         missed_frames=0 if last is None else last.missed,
-        stale_frames=run.stale,
-        right_frames=run.right,
-        blank_frames=run.blank,
-        operator_frames=run.operator,
-        hidden_frames=run.hidden,
-        capped_frames=run.capped,
         timestamp_source="" if last is None else last.timestamp_source,
         refresh_hz=refresh_hz,
-        pacing_jitter_ms=spreads["interval"].deviation,
-        interval_ms=spreads["interval"].percentiles(),
-        swap_late_ms=spreads["late"].percentiles(),
-        draw_to_swap_ms=spreads["draw"].percentiles(),
-        attitude_age_ms=age_ms,
-        attitude_age_frames=None if refresh_hz is None else age_ms.times(refresh_hz / 1e3),
-        prediction_ms=spreads["prediction"].percentiles(),
-        packet_to_swap_ms=spreads["packet"].percentiles(),
+        pacing_jitter_ms=run.spreads["interval"].deviation,
+        attitude_age_frames=None if refresh_hz is None else times["attitude_age_ms"].times(refresh_hz / 1e3),
         packets=run.packets.counts,
-        events=run.events,
-        pulses=run.pulses,
-        **run.most,
-        memory_growth_mb=run.memory_growth_mb,
-        bench_sha256=run.head.get("bench_sha256"),
-        calibration=run.head.get("calibration"),
-        calibration_sha256=run.head.get("calibration_sha256"),
-        gl_renderer=run.head.get("gl_renderer"),
-        gl_version=run.head.get("gl_version"),
-        render_path=run.head.get("render_path"),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,10 +10,9 @@ from typing import Any
 from hilstar.bench.frame import Drawn
 from hilstar.monitor.window.watch import presented_as
 from hilstar.notices import Notices
-from hilstar.process.scheduling import steady_loop
-from hilstar.run.host_clock import HOST_CLOCK, HostClock
-from hilstar.run.operator import GAMMA, Overrides, SwitchRequests
-from hilstar.run.pacer import Moment, Presented
+from hilstar.process.scheduling import HOST_CLOCK, HostClock, steady_loop
+from hilstar.run.operator import GAMMA, Operator, SwitchRequests
+from hilstar.run.pacer import Moment, Pacer, Presented
 from hilstar.run.screen.screen import Screen
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -22,7 +20,7 @@ CHANGED = "another program changed the display's gamma ramp: codes make other li
 log = logging.getLogger(__name__)
 
 
-class DisplayPacer:
+class DisplayPacer(Pacer):
     """Paces by a screen and shows frames on it; `stop` is set when its window closes."""
 
     moves_stars = True
@@ -30,9 +28,8 @@ class DisplayPacer:
     def __init__(
         self, screen: Screen, notices: Notices, clock: HostClock = HOST_CLOCK, requests: SwitchRequests | None = None
     ) -> None:
-        self.clock = clock
-        self.stop = threading.Event()
-        self.operator = Overrides(screen.aids, notices, lambda: screen.window.hidden, requests)
+        operator = Operator(screen.aids, notices, lambda: screen.window.hidden, requests)
+        super().__init__(screen.clock.period_ns, clock, operator)
         self.scheduling = "normal"
         self._screen = screen
         self._notices = notices

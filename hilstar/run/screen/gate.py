@@ -1,23 +1,26 @@
-"""The start-up gate: a display's swaps are timed, and one whose timing cannot be trusted is refused."""
+"""A bench on its display, past the start-up gate: swaps are timed, and a display whose timing cannot be trusted is refused."""
 
 from __future__ import annotations
 
 import logging
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.build import orientation_of
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import open_bench, orientation_of
 from hilstar.bench.config import Monitor
 from hilstar.errors import MachineError
 from hilstar.monitor.window.output_settings import findings
-from hilstar.monitor.window.window import Window
-from hilstar.run.host_clock import HOST_CLOCK, HostClock
-from hilstar.run.screen.screen import Screen
-from hilstar.run.screen.swap_clock import DrawBudget
+from hilstar.monitor.window.window import Window, WindowSettings
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.render.driver import sleep_in_waits
+from hilstar.render.presenter import window_context
+from hilstar.run.screen.screen import DrawBudget, Screen
 from hilstar.units import NS_PER_MS
 
 GATE_FRAMES = 120
@@ -57,6 +60,25 @@ class Timing:
     variable: bool = False
 
 
+@contextmanager
+def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Screen]:
+    """The bench of a file on its display, past the gate. Raises InputError or MachineError."""
+    monitor = file.config.monitor
+    display = None if windowed else monitor.display
+    size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
+    sleep_in_waits()
+    settings = WindowSettings(size_px, monitor.bits, display, monitor.refresh_hz)
+    with Window(settings) as window, open_bench(file, window_context()) as bench:
+        wanted, draws = file.config.render.gpu, bench.renderer.gl_renderer
+        if isinstance(wanted, str) and wanted.lower() not in draws.lower():
+            log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)
+        screen = Screen(window, bench)
+        bench.warm_up()
+        pass_gate(screen, force)
+        bench.output.update({} if screen.output is None else screen.output.fields())
+        yield screen
+
+
 def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Timing:
     """Time GATE_FRAMES swaps and refuse (MachineError) a display that is not as the bench file has it; its timing.
 
@@ -80,7 +102,7 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
     if window.gone is not None:
         raise MachineError(window.gone)
     screen.output = window.output
-    changed = screen.changed_codes()
+    changed = screen.bench.renderer.changed_codes()
     if changed:
         changed += "; switch dithering, colour transforms and antialiasing off in the display's driver"
     told = () if screen.output is None else tuple(findings(screen.output, monitor.bits, monitor.pixel_pitch_um))

@@ -1,25 +1,128 @@
-"""The monitor's window: frames on it, and its operator's keys."""
+"""The monitor's window: frames on it, when it swaps, the square that a photodiode watches, and its operator's keys."""
 
 from __future__ import annotations
 
 import logging
+import math
 import time
-from typing import cast
+from collections import deque
 
 from hilstar.bench.build import orientation_of
 from hilstar.bench.frame import Bench
 from hilstar.monitor.window.output_settings import OutputState
 from hilstar.monitor.window.window import Window
-from hilstar.render.presenter import Presenter, ScreenView, changed_codes
-from hilstar.render.renderer import Renderer
+from hilstar.render.backend import ScreenView
 from hilstar.run.operator import Aids
-from hilstar.run.screen.photodiode import marker_light
-from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 HELP = "keys: q quit, b blank, space pause, c crosshair, g grid, t next test patch, h this line"
 KEYS = {"b": "blank", "c": "crosshair", "g": "grid", "t": "patch", "space": "pause"}
+CODE_BITS = 7  # of the photodiode square: any so many frames in a row are known by their light
 log = logging.getLogger(__name__)
+
+
+def maximal_sequence() -> tuple[int, ...]:
+    """The 127 bits of the shift register x^7 + x^6 + 1: any 7 in a row come once (Golomb, Shift Register Sequences, 1967)."""
+    state, bits = 1, []
+    for _ in range(2**CODE_BITS - 1):
+        bits.append(state & 1)
+        state = state >> 1 | ((state ^ state >> 1) & 1) << CODE_BITS - 1
+    return tuple(bits)
+
+
+CODE = maximal_sequence()
+
+
+def marker_light(number: int, kind: str) -> int:
+    """The square of a frame, 0 or 1: light in every other frame (`toggle`), or the bit of CODE at the frame's number.
+
+    `toggle` gives a latency modulo two frames, `code` modulo 127 frames.
+    """
+    return number % 2 if kind == "toggle" else CODE[number % len(CODE)]
+
+
+class SwapClock:
+    """The grid of moments at which a screen swaps: a phase and a period, fitted to measured time stamps.
+
+    A second-order loop (Gardner, Phaselock Techniques, 2005): each swap pulls the phase by PHASE_SHARE of its error and the
+    period by PERIOD_SHARE of it, damping 0.79; a swap that came whole periods late advances the phase by that many. With
+    `paced_by_screen` false the grid is this program's own, and stamps do not move it.
+    """
+
+    PHASE_SHARE = 0.1
+    PERIOD_SHARE = 0.004
+
+    def __init__(self, first_ns: int, period_ns: float, paced_by_screen: bool) -> None:
+        self.period_ns = period_ns
+        self.paced_by_screen = paced_by_screen
+        self._phase_ns = float(first_ns)
+
+    def update(self, swap_ns: int) -> None:
+        """Add the time of a swap."""
+        if not self.paced_by_screen:
+            return
+        steps = round((swap_ns - self._phase_ns) / self.period_ns)
+        if steps < 1:  # a swap that did not wait says nothing of the grid
+            return
+        error_ns = swap_ns - self._phase_ns - steps * self.period_ns
+        self._phase_ns += steps * self.period_ns + self.PHASE_SHARE * error_ns
+        self.period_ns += self.PERIOD_SHARE * error_ns / steps
+
+    def next_after(self, host_ns: float) -> int:
+        """The first moment of the grid at or after `host_ns`."""
+        steps = math.ceil((host_ns - self._phase_ns) / self.period_ns)
+        return round(self._phase_ns + steps * self.period_ns)
+
+
+class DrawBudget:
+    """How long before its swap a frame is begun: as late as recent frames allow, so that its attitude is fresh."""
+
+    FRAMES = 120
+    SLOW = 3  # the third slowest counts: two outliers in two seconds are late rather than all others early
+    GUARD_NS = 1.0 * NS_PER_MS
+    MORE = 1.25  # factor on the time that a driver was seen to need
+
+    def __init__(self, period_ns: float, guard_ns: float = GUARD_NS) -> None:
+        self._period_ns = period_ns
+        self._costs_ns: deque[int] = deque(maxlen=self.FRAMES)
+        self._late_leads_ns: deque[float] = deque(maxlen=self.SLOW)
+        self._frames = 0
+        self.guard_ns = guard_ns
+
+    def add(self, cost_ns: int) -> None:
+        """Add how long a frame took until it could be swapped."""
+        self._costs_ns.append(cost_ns)
+
+    def add_flip(self, lead_ns: float, late_ns: float) -> bool:
+        """Add a flip that was `late_ns` after its moment, of a frame that was ready `lead_ns` before it.
+
+        True where the guard is raised: the third in FRAMES frames that was ready in time and a refresh late.
+        """
+        self._frames += 1
+        if self._frames >= self.FRAMES:
+            self._frames = 0
+            self._late_leads_ns.clear()
+        if late_ns < self._period_ns / 2 or not 0 < lead_ns < self._period_ns / 2:
+            return False
+        self._late_leads_ns.append(lead_ns)
+        if len(self._late_leads_ns) < self.SLOW:
+            return False
+        before_ns = self.guard_ns
+        self.guard_ns = min(max(before_ns, self.MORE * sorted(self._late_leads_ns)[1]), self._period_ns / 2)
+        self._late_leads_ns.clear()
+        return self.guard_ns > before_ns
+
+    @property
+    def min_ns(self) -> float:
+        """The shortest of the last frames: with less time left than that, a swap cannot be reached."""
+        return min(self._costs_ns, default=0)
+
+    @property
+    def ns(self) -> float:
+        """The time that all but two of the last frames took, and a guard; at most a period, and a whole period at first."""
+        if len(self._costs_ns) < self.FRAMES // 4:
+            return self._period_ns
+        return min(sorted(self._costs_ns)[-self.SLOW] + self.guard_ns, self._period_ns)
 
 
 class Screen:
@@ -47,9 +150,8 @@ class Screen:
             cross_px=bench.camera.boresight_px,
             triples=bench.calibration.response.rgb,
         )
-        self._renderer = cast(Renderer, bench.renderer)  # a window's bench has the window's context
-        self._presenter = Presenter(self._renderer.codes_texture, view)
-        self._renderer.tables.append(self._presenter.table)
+        self._backend = bench.renderer
+        self._backend.show_on(view)
 
     def keep_time(self, period_ms: float, by_screen: bool, swap_ns: int) -> None:
         """Predict swaps from the one at `swap_ns`, by the screen's own period where the screen keeps time."""
@@ -74,17 +176,13 @@ class Screen:
         """Where the times of swaps come from, and who paces them."""
         return self.window.timestamp_source + ("" if self.clock.paced_by_screen else ", software pacing")
 
-    def changed_codes(self) -> str:
-        """Which codes the driver draws otherwise than they are; "" for none."""
-        return changed_codes(self._renderer.context, self.window.size_px, self.bench.config.monitor.bits)
-
     def present(self, number: int) -> int | None:
         """Draw the bench's last frame on the back buffer; the photodiode square's light in frame `number`, None without one."""
         monitor = self.bench.config.monitor
         white = 2**monitor.bits - 1
         side_px = monitor.photodiode_px
         marker = marker_light(number, monitor.photodiode) if side_px else None
-        self._presenter.present(self.aids.overlay, round(self.aids.patch_share * white), (side_px, white * (marker or 0)))
+        self._backend.present(self.aids.overlay, round(self.aids.patch_share * white), (side_px, white * (marker or 0)))
         return marker
 
     def swap(self, timed: bool = True) -> int:
@@ -92,7 +190,7 @@ class Screen:
 
         One that is not `timed` does not move the clock.
         """
-        swap_ns = self.window.swap(self._presenter.wait)
+        swap_ns = self.window.swap(self._backend.take_back_buffer)
         if timed:
             self.clock.update(swap_ns)
         self.window.look_at_events()

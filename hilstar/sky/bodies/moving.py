@@ -91,11 +91,16 @@ class Sight:
 
 @dataclass(frozen=True, slots=True)
 class BodyLight:
-    """Bodies by name, their colours (n,) and their electron rates at V = 0 (n,)."""
+    """Bodies by name, their B-V (n,) and their electron rates at V = 0 (n,).
+
+    `colours` (n, channels) and those of `sunlight` (channels,) are shares of electrons, as in `Stars`.
+    """
 
     names: tuple[str, ...]
     bv_mag: FloatArray
     v0_e_per_s: FloatArray
+    colours: FloatArray | None = None
+    sunlight: FloatArray | None = None
 
 
 NOTHING = BodyLight((), np.empty(0), np.empty(0))
@@ -143,8 +148,8 @@ class MovingSky:
         """
         if self.satellites is not None:
             colour = np.full(len(self.satellites), SUN_BV_MAG)
-            stars = with_bodies(stars, self.satellites.names, colour, found=False)
-        both = with_bodies(stars, self.names, self._bodies.bv_mag)
+            stars = with_bodies(stars, self.satellites.names, colour, found=False, colours=self._bodies.sunlight)
+        both = with_bodies(stars, self.names, self._bodies.bv_mag, colours=self._bodies.colours)
         self.seen(both)
         return both
 

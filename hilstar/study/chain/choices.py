@@ -11,14 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
+from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import assembled, bench_stars
@@ -26,11 +25,12 @@ from hilstar.bench.config import AttitudeSettings, BenchConfig, RenderSettings, 
 from hilstar.bench.config.sky import SpacecraftSettings
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
-from hilstar.monitor.quantise import Quantisation
-from hilstar.rotation import multiply, normalise, propagate, rate_between_rad_s
+from hilstar.monitor.quantisers import Quantisation
+from hilstar.process.closing import Closing
+from hilstar.rotation import normalise, propagate
 from hilstar.scene.frame_motion import Scan
 from hilstar.sky.stars import split_by_rate
-from hilstar.study.predictors import JITTER, RATE_STEP_NS
+from hilstar.study.predictors import rate_of, shaken
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 # `held`: the newest sample's attitude. `rate`: carried on by the sample's rate. `two samples`: by the last two, from a sender
@@ -74,20 +74,11 @@ class Movement:
         if not self.turns:
             return self.q_icrs_to_cam
         t_s = t_ns / NS_PER_S
-        q = propagate(self.q_icrs_to_cam, math.radians(self.rate_deg_s) * AXIS, t_s)
-        for axis in range(3):
-            angle = sum(math.radians(arcsec / 3600) * math.sin(2 * math.pi * hz * t_s + 2 * axis * hz) for arcsec, hz in JITTER)
-            turn = np.zeros(4)
-            turn[0], turn[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
-            q = multiply(turn, q)
-        return q
+        return shaken(propagate(self.q_icrs_to_cam, math.radians(self.rate_deg_s) * AXIS, t_s), t_s)
 
     def rate_rad_s(self, t_ns: int) -> FloatArray:
         """The true rate (3,) of cam in icrs, cam components, jitter included."""
-        if not self.turns:
-            return np.zeros(3)
-        before, after = self.at(t_ns - RATE_STEP_NS), self.at(t_ns + RATE_STEP_NS)
-        return rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S)
+        return rate_of(self.at, t_ns) if self.turns else np.zeros(3)
 
     def samples(self, until_ns: int) -> list[AttitudeSample]:
         """The newest KEPT samples at time `until_ns`."""
@@ -110,14 +101,6 @@ def filled_timeline(samples: list[AttitudeSample], prediction: Prediction, setti
     for sample in samples:
         timeline.add(replace(sample, rate_cam_rad_s=None) if prediction == "two samples" else sample)
     return timeline
-
-
-def attitude_at(timeline: Timeline, t_ns: int) -> Attitude:
-    """The attitude at a moment, of a timeline that has samples."""
-    attitude = timeline.at(t_ns)
-    if attitude is None:
-        raise AssertionError("the timeline has samples")
-    return attitude
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +255,7 @@ class Marks:
     as_filed: Combination
 
 
-class Parts:
+class Parts(Closing):
     """The benches of a bench file's combinations, without bodies. Free them with `close`.
 
     Raises InputError for a bench file that cannot be studied, MachineError without OpenGL.
@@ -358,9 +341,3 @@ class Parts:
         """Free the GL contexts."""
         for bench in self._benches.values():
             bench.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

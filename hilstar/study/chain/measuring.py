@@ -30,13 +30,13 @@ from hilstar.study.chain.choices import (
     Movement,
     PanelExposure,
     Parts,
-    attitude_at,
     combinations,
     exposure,
     filled_timeline,
     lead_ns,
 )
 from hilstar.study.chain.tracker import MeasuredStars, Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off
+from hilstar.study.predictors import attitude_at
 from hilstar.study.sweep import Spent, spent
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
 
@@ -155,19 +155,19 @@ QUICK = Rounds(exposures=1, time_s=0.5)
 class Error:
     """The error of a combination's stars, rms: each star on its own, arcsec and mag, and all of them as one attitude."""
 
-    arcsec: float
-    mag: float
-    attitude_arcsec: float
-    roll_arcsec: float
     stars: int
     lost: int
+    error_arcsec: float
+    error_mag: float
+    attitude_arcsec: float
+    roll_arcsec: float
 
 
 @dataclass(frozen=True, slots=True)
 class Times:
     """A frame's median time, quartile range and one sigma of the median, ms; its processor time; how many were timed."""
 
-    median_ms: float
+    time_ms: float
     iqr_ms: float
     noise_ms: float
     cpu_ms: float
@@ -261,7 +261,8 @@ class SceneMeasurement:
             turns.append(attitude_off_arcsec(shown, judge.sky))
         arcsec, mag = pooled(found)
         cross, roll = (rms_of_known(column) for column in zip(*turns, strict=True))
-        return Error(arcsec, mag, cross, roll, self.star_count, sum(int(one.lost.sum()) for one in found))
+        lost = sum(int(one.lost.sum()) for one in found)
+        return Error(self.star_count, lost, *map(rounded, (arcsec, mag, cross, roll)))
 
 
 def rms_of_known(values: Sequence[float]) -> float:
@@ -279,7 +280,7 @@ def pooled(found: Sequence[Off]) -> tuple[float, float]:
 def sprite_px(chain: DrawingChain) -> str:
     """The sides of a chain's sprites, px."""
     sides = [side.side_px for side in chain.bench.renderer.target.sides]
-    low, high = min(sides, default=chain.bench.renderer.footprint_px), max(sides, default=chain.bench.renderer.footprint_px)
+    low, high = min(sides, default=chain.bench.psf.footprint_px), max(sides, default=chain.bench.psf.footprint_px)
     return f"{low}" if low == high else f"{low} to {high}"
 
 
@@ -311,7 +312,10 @@ def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[l
 def _times(taken: FloatArray) -> Times:
     low, middle, high = np.percentile(taken[:, 0], (25, 50, 75))
     noise = ERROR_OF_MEDIAN * (high - low) / SIGMAS_IN_IQR / math.sqrt(len(taken))
-    return Times(float(middle), float(high - low), float(noise), float(np.median(taken[:, 1])), len(taken))
+    time_ms, iqr_ms, noise_ms, cpu_ms = (
+        round(float(ms), MS_PLACES) for ms in (middle, high - low, noise, np.median(taken[:, 1]))
+    )
+    return Times(time_ms, iqr_ms, noise_ms, cpu_ms, len(taken))
 
 
 def rounded(value: float) -> float:
@@ -372,7 +376,6 @@ def _lights(scene: SceneMeasurement, combination: Combination, number: int) -> I
 
 def _sprites(bench: Bench, stars: Stars, turn: CameraTurn, along_paths: bool) -> Sprites:
     """Whole sprites of stars in a frame, along their paths or as points."""
-    footprint_px, sigma_px = bench.renderer.footprint_px, bench.config.render.sprite_sigma_px
     if along_paths:
-        return swept_sprites(stars, turn, bench.scan, bench.camera, footprint_px, sigma_px)
-    return make_sprites(stars, bench.camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam), bench.camera, footprint_px)
+        return swept_sprites(stars, turn, bench.scan, bench.camera, bench.psf)
+    return make_sprites(stars, bench.camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam), bench.camera, bench.psf.footprint_px)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +33,6 @@ from hilstar.files import make_directory
 from hilstar.study.chain.choices import QUANTISATIONS, Parts, five_scenes, shortened_line
 from hilstar.study.chain.measuring import (
     AUTO,
-    MS_PLACES,
     QUICK,
     RSS,
     WHOLE,
@@ -160,42 +159,20 @@ def beyond_noise(own: CombinationRow, other: CombinationRow) -> bool:
     return own.time_ms - other.time_ms > noise_ms or not noise_ms
 
 
-def write_tables(
-    directory: Path, rows: Sequence[CombinationRow], budgets: Sequence[ErrorPart], stages: Sequence[StageTime]
-) -> None:
-    """Write `chain.csv`, `chain_budget.csv` and `chain_time.csv`. Raises InputError."""
-    for name, records in (("chain", rows), ("chain_budget", budgets), ("chain_time", stages)):
-        write_records(directory / f"{name}.csv", records)
-
-
 def _row(scene: SceneMeasurement, one: CombinationOutcome) -> CombinationRow:
-    own, marks, error, times = one.combination, scene.marks, one.error, one.times
+    own, marks = one.combination, scene.marks
     marked = [name for name, at in ((DEFAULT, marks.default), (AUTO, marks.auto)) if own == at]
     return CombinationRow(
         scene=scene.scene.name,
         rate_deg_s=scene.scene.rate_deg_s,
         exposure_s=rounded(scene.judges[0].seen.length_s),
         bits=scene.parts.own.config.monitor.bits,
-        bit_stealing=said(own.bit_stealing),
-        faintest_v_mag=own.faintest_v_mag,
-        sprite=own.sprite,
         sprite_px=one.sprite_px,
-        smear=own.smear,
-        prediction=own.prediction,
-        quantisation=own.quantisation,
-        stars=error.stars,
-        lost=error.lost,
-        error_arcsec=rounded(error.arcsec),
-        error_mag=rounded(error.mag),
-        attitude_arcsec=rounded(error.attitude_arcsec),
-        roll_arcsec=rounded(error.roll_arcsec),
-        time_ms=round(times.median_ms, MS_PLACES),
-        iqr_ms=round(times.iqr_ms, MS_PLACES),
-        noise_ms=round(times.noise_ms, MS_PLACES),
-        cpu_ms=round(times.cpu_ms, MS_PLACES),
-        frames=times.frames,
         chosen=" ".join(marked),
         as_filed=said(own == marks.as_filed),
+        **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
+        **asdict(one.error),
+        **asdict(one.times),
     )
 
 
@@ -451,7 +428,8 @@ def run(
     busy = is_busy(others_cores)
     lines = [*(scene_line(*scene, busy) for scene in judged), *lines]
     make_directory(directory)
-    write_tables(directory, rows, budget, stages)
+    for name, records in (("chain", rows), ("chain_budget", budget), ("chain_time", stages)):
+        write_records(directory / f"{name}.csv", records)
     notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([busy_line(others_cores)] if busy else [])]
     draw(directory / "chain", rows, headline(rows, busy), "; ".join(notes))
     draw_budget(directory / "chain_budget", rows, budget, stages)

@@ -15,13 +15,13 @@ import numpy as np
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame import Bench
+from hilstar.render.reference import add_stars
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.psf import peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.study.chain.choices import PACKET_HZ, Lit, Movement, PanelExposure, lead_ns
 from hilstar.twin.optics import BenchGeometry, TwinOptics
-from hilstar.twin.verify.star_finder import MATCH_PX, Matched, StarFinder, crowded, seen_sigma_px, shared, star_finder
+from hilstar.twin.verify.star_finder import MATCH_PX, Matched, StarFinder, crowded, seen_psf, shared, star_finder
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
 
 # Gauss-Legendre over the exposure: 1.02 nodes to a sigma of path and three more are right to 1e-6 of a star in every pixel
@@ -48,7 +48,7 @@ def instants(bench: Bench, movement: Movement, seen: PanelExposure) -> Instants:
     if not movement.turns:
         return Instants((seen.middle_ns(),), np.ones(1))
     path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
-    sigmas = path_rad * bench.camera.scales_px_rad()[1] / min(bench.config.render.sprite_sigma_px)
+    sigmas = path_rad * bench.camera.scales_px_rad()[1] / min(bench.psf.width_px)
     nodes, weights = np.polynomial.legendre.leggauss(max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3))
     t_s = seen.begin_s + seen.length_s * (nodes + 1) / 2
     return Instants(tuple(round(t * NS_PER_S) for t in t_s), weights / 2)
@@ -57,42 +57,24 @@ def instants(bench: Bench, movement: Movement, seen: PanelExposure) -> Instants:
 def points(bench: Bench, q_icrs_to_cam: FloatArray) -> Sprites:
     """All of the bench's stars as whole sprites at an attitude."""
     icrs_to_image = bench.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-    return make_sprites(bench.stars, icrs_to_image, bench.camera, bench.renderer.footprint_px)
+    return make_sprites(bench.stars, icrs_to_image, bench.camera, bench.psf.footprint_px)
 
 
 def sky_light(bench: Bench, movement: Movement, at: Instants) -> FloatArray:
     """The sky's own mean light (H, W) over the exposure, electrons per second."""
     total = np.zeros(bench.camera.resolution_px[::-1])
     for t_ns, share in zip(at.t_ns, at.share, strict=True):
-        add_light(total, points(bench, movement.at(t_ns)), bench.config.render.sprite_sigma_px, float(share))
+        sprites = points(bench, movement.at(t_ns))
+        add_stars(total, sprites, bench.psf, sprites.footprint_px, share=float(share))
     return total
 
 
 def linear_light(bench: Bench, sprites: Sprites) -> Lit:
     """The pixels that a frame's sprites light, and the light of each before any quantisation."""
     image = np.zeros(bench.camera.resolution_px[::-1])
-    add_light(image, sprites, bench.config.render.sprite_sigma_px)
+    add_stars(image, sprites, bench.psf, sprites.footprint_px)
     place = np.flatnonzero(image)
     return place, image.ravel()[place]
-
-
-def add_light(image: FloatArray, sprites: Sprites, sigma_px: tuple[float, float], share: float = 1.0) -> None:
-    """Add the light of sprites to an image (H, W): `render.reference.linear_image`, all sprites at once."""
-    height, width = image.shape
-    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
-    flat = image.reshape(-1)
-    for begin in range(0, len(sprites), SPRITES_AT_ONCE):
-        part = slice(begin, begin + SPRITES_AT_ONCE)
-        columns = sprites.data["pixel"][part, 0, None] + steps
-        rows = sprites.data["pixel"][part, 1, None] + steps
-        across = pixel_shares(columns - sprites.x_px[part, None], sigma_px[0])
-        down = pixel_shares(rows - sprites.y_px[part, None], sigma_px[1])
-        across *= (columns >= 0) & (columns < width)
-        down *= (rows >= 0) & (rows < height)
-        light = share * sprites.data["electrons_per_s"][part].astype(np.float64)
-        parts = (light[:, None, None] * down[:, :, None] * across[:, None, :]).ravel()
-        places = np.clip(rows, 0, height - 1)[:, :, None] * width + np.clip(columns, 0, width - 1)[:, None, :]
-        np.add.at(flat, places.ravel(), parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,10 +107,10 @@ class StudyTracker:
         tracker = bench.config.tracker
         self.camera: Camera = tracker_camera(tracker, bench.file.folder)
         self.geometry = BenchGeometry(bench.camera, self.camera)
-        self.optics = TwinOptics(self.geometry, tracker.psf_sigma_px)
+        self.optics = TwinOptics(self.geometry, bench.tracker_psf)
         scale = bench.camera.focal_length_px / self.camera.focal_length_px
         self.finder: StarFinder = star_finder(bench, scale)
-        self.sigma_px = seen_sigma_px(bench.config, scale)
+        self.psf = seen_psf(bench, scale)
         self.monitor_px_per_px = scale
         self.arcsec_per_px = ARCSEC_PER_RAD / self.camera.scales_px_rad()[1]
 
@@ -184,14 +166,14 @@ class StarJudge:
         bench = self.tracker.bench
         rates = bench.stars.electrons_per_s[star]
         white = bench.flux_at_white_e_per_s * bench.darkest
-        clips = rates * peak_share(bench.config.render.sprite_sigma_px) > white
+        clips = rates * bench.psf.peak_share > white
         return np.asarray((rates >= bench.calibration.response.half_step * white) & ~clips)
 
     def _choose_points(self, sky_e: FloatArray) -> None:
         tracker, radius_px = self.tracker, self.tracker.finder.settings.radius_px
         match = tracker.finder.match(sky_e, self._x_px, self._y_px)
         wanted = self._wanted & (match.index >= 0) & ~shared(match.index)
-        wanted &= ~crowded(self._x_px, self._y_px, self._e, radius_px, tracker.sigma_px)
+        wanted &= ~crowded(self._x_px, self._y_px, self._e, radius_px, tracker.psf)
         self.judged = np.flatnonzero(wanted)
 
     def _measured(self, match: Matched, which: IntArray) -> MeasuredStars:
@@ -211,7 +193,7 @@ class StarJudge:
     @property
     def _reach_px(self) -> int:
         """Distance from a path within which its star's light is summed."""
-        return math.ceil(REACH_SIGMAS * max(self.tracker.sigma_px)) + 1
+        return math.ceil(REACH_SIGMAS * max(self.tracker.psf.width_px)) + 1
 
     def _choose_paths(self, sky_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> None:
         """Choose the stars whose paths (k, n), extended for a late attitude, receive hardly any light from other stars."""
@@ -273,7 +255,7 @@ class StarJudge:
         width, height = tracker.camera.resolution_px
         inside = (x_px >= margin_px) & (x_px < width - 1 - margin_px) & (y_px >= margin_px) & (y_px < height - 1 - margin_px)
         seen_x, seen_y = (part.reshape(x_px.shape) for part in tracker.geometry.to_monitor(x_px.ravel(), y_px.ravel()))
-        reach = tracker.bench.renderer.footprint_px / 2 + margin_px * tracker.monitor_px_per_px
+        reach = tracker.bench.psf.footprint_px / 2 + margin_px * tracker.monitor_px_per_px
         width, height = tracker.bench.camera.resolution_px
         inside &= (seen_x >= reach) & (seen_x < width - 1 - reach)
         return np.asarray(inside & (seen_y >= reach) & (seen_y < height - 1 - reach))

@@ -33,7 +33,7 @@ from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.render.variants import StagedRenderer
 from hilstar.rotation import from_radec_roll_deg, to_matrix
-from hilstar.scene.psf import SQRT2
+from hilstar.scene.psf import SQRT2, GaussianPsf
 from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, pack_sprites
 from hilstar.sky.stars import Stars, cell_grid
 from hilstar.study.settings import Table, Value, bench_text
@@ -129,7 +129,7 @@ def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
 
 def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generator) -> FloatArray:
     """ICRS unit vectors, even over a cap around the view, of which `wanted` are in view."""
-    camera, footprint_px = bench.camera, bench.renderer.footprint_px
+    camera, footprint_px = bench.camera, bench.psf.footprint_px
     cos_cap = np.cos(min(SKY_BEYOND * camera.field_radius_rad(footprint_px), np.pi))
     tries = 4 * wanted
     while True:
@@ -300,7 +300,7 @@ class CellMeasurement:
         self.sprites = bench.sprites(self.q)
         self.icrs_to_image = bench.camera.cam_to_image @ to_matrix(self.q)
         self.staged = StagedRenderer(bench.renderer.target)
-        self.linear = Renderer(Target(bench.camera.resolution_px, self.sigma_px))
+        self.linear = Renderer(Target(bench.camera.resolution_px, GaussianPsf(self.sigma_px)))
         self.stage_ms: dict[str, list[float]] = {}
 
     def measure(self, methods: list[OtherMethod], rounds: int, budget_s: float) -> None:
@@ -373,7 +373,9 @@ class CellMeasurement:
     def _python(self) -> None:
         """All of a frame that is not OpenGL."""
         white, size_px = self.bench.flux_at_white_e_per_s, self.bench.camera.resolution_px
-        clipped_sprites(self.bench.sprites(self.q), self.sigma_px, white, size_px, self.bench.uniformity, self.bench.darkest)
+        clipped_sprites(
+            self.bench.sprites(self.q), GaussianPsf(self.sigma_px), white, size_px, self.bench.uniformity, self.bench.darkest
+        )
 
     def __enter__(self) -> CellMeasurement:
         return self

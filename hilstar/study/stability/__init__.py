@@ -1,8 +1,16 @@
-"""Where methods fail, and what hilstar does there: each case compares two methods by one measure."""
+"""Where methods fail, and what hilstar does there: each case compares two methods by one measure.
+
+Cases that draw are measured by `hilstar study stability` where it runs (`image.py`). Mathematics is the same on every machine:
+tests/authority measures those cases with every commit, and the tables beside this file have their figures.
+"""
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
+from pathlib import Path
+
+COLUMNS = ("case", "verdict", "failing method", "its failure", "what happens", "why", "error", "its error", "tolerance")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,3 +40,18 @@ class FailureCase:
     def right(self) -> bool:
         """True where hilstar's error is within the tolerance; NaN is not."""
         return self.figures.error <= self.figures.tolerance
+
+    def row(self) -> tuple[str | float, ...]:
+        """The values of COLUMNS."""
+        numbers = self.figures.error, self.figures.fault, self.figures.tolerance
+        verdict = "right" if self.right else "WRONG"
+        return self.case, verdict, self.method, self.fails, self.happens, self.why, *map(float, numbers)
+
+
+def recorded(name: str) -> list[FailureCase]:
+    """The recorded cases of one of the tables beside this file."""
+    with Path(__file__).with_name(f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return [
+            FailureCase(case, method, fails, happens, why, Figures(*map(float, numbers)))
+            for case, _, method, fails, happens, why, *numbers in list(csv.reader(file))[1:]
+        ]

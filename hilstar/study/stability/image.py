@@ -1,27 +1,37 @@
-"""Where methods fail between sprites and codes: narrow and wide stars, edges, crowds, flux range, uneven and coarse panels."""
+"""Where methods fail between sprites and codes: narrow and wide stars, edges, crowds, popping, uneven and coarse panels.
+
+Each case draws, so that its figures are those of the machine that runs it. Popping is one star's light from frame to frame
+while the camera turns slowly.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from scipy.special import erf, ndtr
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
-from hilstar.monitor.quantise import Panel, Quantisation, shown_light
+from hilstar.monitor.geometry import monitor_camera
+from hilstar.monitor.quantise import Panel, shown_light
+from hilstar.monitor.quantisers import Quantisation
 from hilstar.monitor.response import Levels, Response, srgb_response
 from hilstar.render.backend import Target
 from hilstar.render.context import create_context
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer
-from hilstar.scene.psf import MAX_CUT, SQRT2, cut_share, footprint_px, peak_share, pixel_shares
-from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
+from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
+from hilstar.scene.psf import MAX_CUT, SQRT2, GaussianPsf, pixel_shares
+from hilstar.scene.sprites import Sprites, join_sprites, make_sprites, pack_sprites
+from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
+from hilstar.sky.stars import make_stars, unit_vectors_icrs
+from hilstar.study.codes import AIMS
 from hilstar.study.stability import FailureCase, Figures
-from hilstar.units import flux_ratio
+from hilstar.units import flux_ratio, magnitude
 
 IMAGE_PX = (512, 512)
 SIGMA_PX = 0.85
@@ -37,6 +47,11 @@ NOTHING = 0.0
 CROWD, CROWD_PX, CORNER_PX = 100_000, (1024, 1024), 128
 # Ten stars on a pixel are added in float32: half of 1.2e-7 each time, on top of each star's own error.
 CROWD_ERROR = FLUX_ERROR + 10 * 6e-8
+# Popping: the demo's lens and pitch (configs/demo.toml), and a star that moves by PATH_PX in STEPS frames.
+FOCAL_LENGTH_MM, PITCH_UM, ALIGNED = 350.0, 57.65, np.array([1.0, 0.0, 0.0, 0.0])
+STEPS, PATH_PX, MOVING_PX = 1000, (3.0, 1.7), (32, 32)
+RIPPLE = 1e-4  # mag, a two-hundredth of the finest aim for codes: what ripples more is the monitor's doing
+CODES_MAG_UNDER_WHITE, CODES_BITS = 6.0, 8
 POINT_SAMPLED = "the Gaussian's value at the middle of each pixel"
 
 # splat.frag's, from the highest power of x^2 down.
@@ -68,13 +83,13 @@ Groups = tuple[slice, slice]
 
 def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
     """A linear image, whose stars are round."""
-    return Target(size_px, (sigma_px, sigma_px))
+    return Target(size_px, GaussianPsf((sigma_px, sigma_px)))
 
 
 def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0) -> Sprites:
     """A star of a target's sigma."""
     place = np.array([x_px]), np.array([y_px]), np.array([electrons_per_s])
-    return pack_sprites(*place, np.zeros(1, dtype=np.intp), on.resolution_px, footprint_px(on.sigma_px))
+    return pack_sprites(*place, np.zeros(1, dtype=np.intp), on.resolution_px, on.psf.footprint_px)
 
 
 @contextmanager
@@ -91,7 +106,7 @@ def by_renderer(on: Target) -> Iterator[Draw]:
 
 def _outer(on: Target, sprites: Sprites, shares: Callable[[FloatArray, float], FloatArray]) -> FloatArray:
     """One star's image from its shares along each axis, by a pixel's offset from it and sigma, px."""
-    places = zip((sprites.x_px[0], sprites.y_px[0]), on.resolution_px, on.sigma_px, strict=True)
+    places = zip((sprites.x_px[0], sprites.y_px[0]), on.resolution_px, on.psf.width_px, strict=True)
     along_x, along_y = (shares(np.arange(size) - at, sigma_px) for at, size, sigma_px in places)
     return np.asarray(float(sprites.data["electrons_per_s"][0]) * np.outer(along_y, along_x))
 
@@ -124,14 +139,8 @@ def _difference(erf_of: Callable[[FloatArray], FloatArray], offset_px: FloatArra
 def erf_float32(value: FloatArray) -> FloatArray:
     """erf by splat.frag's rational polynomial, every step in float32; same shape."""
     x = np.clip(value, -4, 4).astype(np.float32)
-    return np.asarray(x * _horner(x * x, ERF_NUMERATOR) / _horner(x * x, ERF_DENOMINATOR))
-
-
-def _horner(s: Float32Array, terms: tuple[float, ...]) -> Float32Array:
-    value = np.zeros_like(s)
-    for term in terms:
-        value = value * s + np.float32(term)
-    return value
+    above, below = (np.polyval(np.array(terms, dtype=np.float32), x * x) for terms in (ERF_NUMERATOR, ERF_DENOMINATOR))
+    return np.asarray(x * above / below)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +188,7 @@ def wide_star() -> FailureCase:
     """Sigma 20 px."""
     on = target(20.0)
     sprites = one_star(256.3, 256.0, on)
-    exact = linear_image(sprites, on.resolution_px, on.sigma_px)
+    exact = linear_image(sprites, on.resolution_px, on.psf)
     with by_renderer(on) as draw:
         image = draw(sprites)
     error, fault = (float(np.abs(shown - exact).max() / exact.max()) for shown in (image, half_float(on, sprites)))
@@ -236,11 +245,11 @@ def absurd_sigmas() -> FailureCase:
     lines, silently_cut = [], NOTHING
     for sigma_px in (60.0, 1e6):
         try:
-            Renderer(Target(IMAGE_PX, (sigma_px, sigma_px))).close()
-            silently_cut = max(silently_cut, cut_share(point_px, (sigma_px, sigma_px)))
+            Renderer(Target(IMAGE_PX, GaussianPsf((sigma_px, sigma_px)))).close()
+            silently_cut = max(silently_cut, GaussianPsf((sigma_px, sigma_px)).cut_share(point_px))
         except InputError as refusal:
             lines.append(str(refusal))
-    cuts = [cut_share(point_px, (sigma_px, sigma_px)) for sigma_px in (60.0, 1e6)]
+    cuts = [GaussianPsf((sigma_px, sigma_px)).cut_share(point_px) for sigma_px in (60.0, 1e6)]
     return FailureCase(
         "sigma 60 and 1e6 px",
         f"GL's largest point, {point_px} px, whatever the sigma",
@@ -292,10 +301,12 @@ def many_stars() -> FailureCase:
     x_px, y_px = rng.uniform(10, CROWD_PX[0] - 11, (2, CROWD))
     flux = 10 ** rng.uniform(0, 4, CROWD)
     on, size = target(SIGMA_PX, CROWD_PX), (CORNER_PX, CORNER_PX)
-    sprites = pack_sprites(x_px, y_px, flux, np.arange(CROWD), CROWD_PX, footprint_px(on.sigma_px))
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(CROWD), CROWD_PX, on.psf.footprint_px)
     with by_renderer(on) as draw:
         image = draw(sprites)
-    corner = linear_image(pack_sprites(x_px, y_px, flux, np.arange(CROWD), size, sprites.footprint_px), size, (SIGMA_PX,) * 2)
+    corner = linear_image(
+        pack_sprites(x_px, y_px, flux, np.arange(CROWD), size, sprites.footprint_px), size, GaussianPsf((SIGMA_PX,) * 2)
+    )
     pixel_error = float(np.abs(image[:CORNER_PX, :CORNER_PX] - corner).max() / corner.max())
     error, fault = (float(abs(shown.sum() / flux.sum() - 1)) for shown in (image, _indexed_sum(sprites)))
     return FailureCase(
@@ -340,6 +351,74 @@ def flux_range() -> FailureCase:
     )
 
 
+def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[Sprites]:
+    """Sirius at a given flux in STEPS frames of the demo's camera, which turns until the star has moved by PATH_PX."""
+    sirius = load_catalog().brighter_than(-1.0)
+    vectors = unit_vectors_icrs(sirius, HIPPARCOS_EPOCH_JYEAR)
+    stars = make_stars(sirius, vectors, np.full(1, np.nan), np.full(1, electrons_per_s))
+    camera = monitor_camera(on.resolution_px, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
+    start = from_radec_roll_deg(float(sirius.ra_deg[0]), float(sirius.dec_deg[0]), 20.0)
+    # A turn about x moves stars up the image, one about -y to the right.
+    turn_rad = np.array([-PATH_PX[1], -PATH_PX[0], 0.0]) / camera.focal_length_px
+    for share in np.linspace(0, 1, STEPS):
+        yield make_sprites(stars, to_matrix(propagate(start, share * turn_rad, 1.0)), camera, on.psf.footprint_px)
+
+
+def moving_fluxes(draw: Draw, on: Target) -> FloatArray:
+    """Its light (steps,) in each image."""
+    return np.array([draw(sprites).sum() for sprites in moving_star(on)])
+
+
+@cache  # a case and a chart
+def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
+    """The light (steps,) that an sRGB monitor makes of it, relative to the light wanted.
+
+    It is CODES_MAG_UNDER_WHITE fainter than a star whose peak is white.
+    """
+    sigma, response = (SIGMA_PX, SIGMA_PX), srgb_response(CODES_BITS)
+    flux = flux_ratio(CODES_MAG_UNDER_WHITE) / GaussianPsf(sigma).peak_share
+    on, light = Target(MOVING_PX, GaussianPsf(sigma), response, 1.0, quantisation), []
+    with Renderer(on) as gl:
+        for sprites in moving_star(on, flux):
+            gl.draw(sprites)
+            light.append(response.light[gl.levels()].sum())
+    return np.array(light) / flux
+
+
+def ripple(fluxes: FloatArray) -> float:
+    """From the faintest to the brightest of a star's fluxes, relative to their mean."""
+    return float((fluxes.max() - fluxes.min()) / fluxes.mean())
+
+
+def popping() -> FailureCase:
+    """A star's light in the linear image while the camera turns by parts of a pixel."""
+    on = target(0.5, MOVING_PX)
+    with by_renderer(on) as draw:
+        error, fault = (ripple(moving_fluxes(by, on)) for by in (draw, partial(point_sampled, on)))
+    return FailureCase(
+        f"a star over {STEPS} sub-pixel steps, sigma 0.5 px",
+        POINT_SAMPLED,
+        f"its light varies by {100 * fault:.1f} %",
+        f"varies by {error:.1e} in the linear image",
+        "integrated over pixels, and cut where 1e-6 of the light remains",
+        Figures(error, fault, RIPPLE),
+    )
+
+
+def popping_codes() -> FailureCase:
+    """The same star's light through 8-bit codes."""
+    fluxes = [moving_code_fluxes("round"), moving_code_fluxes("exact")]
+    fault, error = (magnitude(float(f.min() / f.max())) for f in fluxes)
+    return FailureCase(
+        f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
+        'quantisation = "round"',
+        f"its light varies by {fault:.3f} mag",
+        f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
+        "round adds up the errors of its pixels; exact chooses a star's codes together",
+        Figures(error, fault, AIMS[CODES_BITS][0]),
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class CodeScene:
     """Groups of `stars` stars, each group alone in its part of the image, on a panel."""
@@ -352,13 +431,15 @@ class CodeScene:
     def wanted(self) -> FloatArray:
         """The light (h, w) that a panel of any number of levels would show."""
         even = 1.0 if self.panel.uniformity is None else self.panel.uniformity
-        return np.asarray(np.minimum(linear_image(self.sprites, (SIDE_PX, SIDE_PX), (self.sigma_px,) * 2), WHITE * even))
+        return np.asarray(
+            np.minimum(linear_image(self.sprites, (SIDE_PX, SIDE_PX), GaussianPsf((self.sigma_px,) * 2)), WHITE * even)
+        )
 
 
 def codes_of(scene: CodeScene, quantisation: Quantisation) -> Levels:
     """The codes (h, w) as hilstar draws them."""
     panel, sigma_px = scene.panel, (scene.sigma_px, scene.sigma_px)
-    on = Target((SIDE_PX, SIDE_PX), sigma_px, panel.response, WHITE, quantisation, panel.uniformity)
+    on = Target((SIDE_PX, SIDE_PX), GaussianPsf(sigma_px), panel.response, WHITE, quantisation, panel.uniformity)
     with Renderer(on) as gl:
         gl.draw(scene.sprites)
         return gl.levels().copy()
@@ -382,8 +463,8 @@ def error_steps(codes: Levels, scene: CodeScene) -> float:
 def sprites_of(x_px: FloatArray, y_px: FloatArray, under_white_mag: FloatArray, sigma_px: float) -> Sprites:
     """Stars at places (n,), so many magnitudes (n,) under the one whose peak is white."""
     sigma = (sigma_px, sigma_px)
-    light = WHITE * flux_ratio(under_white_mag) / peak_share(sigma)
-    return pack_sprites(x_px, y_px, light, np.arange(len(x_px)), (SIDE_PX, SIDE_PX), footprint_px(sigma))
+    light = WHITE * flux_ratio(under_white_mag) / GaussianPsf(sigma).peak_share
+    return pack_sprites(x_px, y_px, light, np.arange(len(x_px)), (SIDE_PX, SIDE_PX), GaussianPsf(sigma).footprint_px)
 
 
 def middles() -> tuple[FloatArray, FloatArray]:
@@ -482,7 +563,7 @@ def all_clipped() -> FailureCase:
 def _spilled(case: str, scene: CodeScene) -> FailureCase:
     """The most light that a pixel has beyond what is wanted: what is over white there, its neighbours may be given."""
     wanted = scene.wanted()
-    linear = linear_image(scene.sprites, (SIDE_PX, SIDE_PX), (scene.sigma_px,) * 2)[: 2 * TILE_PX, : 2 * TILE_PX]
+    linear = linear_image(scene.sprites, (SIDE_PX, SIDE_PX), GaussianPsf((scene.sigma_px,) * 2))[: 2 * TILE_PX, : 2 * TILE_PX]
     diffused = diffused_light(linear, scene.panel.response) - wanted[: 2 * TILE_PX, : 2 * TILE_PX]
     error, fault = float((shown_light(exact_codes(scene), scene.panel) - wanted).max()), float(diffused.max())
     return FailureCase(

@@ -8,51 +8,43 @@ from pathlib import Path
 
 import numpy as np
 
+from hilstar.arrays import FloatArray
 from hilstar.charts import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, chart, label_ends, plain_ticks, two_digits, write_csv
-from hilstar.study.stability import FailureCase, field, image, sky
-from hilstar.study.stability.field import (
-    CODES_BITS,
-    CODES_MAG_UNDER_WHITE,
-    IMAGE_PX,
-    PATH_PX,
-    STEPS,
-    moving_code_fluxes,
-    moving_fluxes,
-    sampled_error_arcsec,
-    straight_line,
-    way_error_arcsec,
-    weak_perspective_error,
-)
-from hilstar.study.stability.image import SIGMA_PX, by_renderer, narrow_errors, point_sampled, target
+from hilstar.files import write_whole
+from hilstar.study.stability import COLUMNS, FailureCase, image, recorded
 from hilstar.units import magnitude
 
-# In the order of the light's way: catalogue, geometry, image, codes, detector, attitude.
-CASES: tuple[Callable[[], FailureCase], ...] = (
-    *(sky.bluest_star, sky.reddest_star, sky.temperature_range, sky.planck_overflow, sky.source_step, sky.cool_stars),
-    sky.blind_tracker,
-    *(field.motion_at_pole, field.fields_over_wrap_and_pole, field.boresight_at_pole, field.stars_behind),
-    *(field.field_of_180_deg, field.weak_perspective),
+# In the order of the light's way, between the recorded cases of catalogue and geometry and those of detector and attitude.
+DRAWN: tuple[Callable[[], FailureCase], ...] = (
     *(image.narrow_star, image.wide_star, image.negative_wings, image.floored_wings, image.absurd_sigmas),
     *(image.star_on_pixel_edge, image.star_on_image_edge, image.many_stars, image.flux_range),
-    *(field.popping, field.popping_codes),
+    *(image.popping, image.popping_codes),
     *(image.stars_half_off, image.stars_a_pixel_apart, image.narrow_codes, image.uneven_panel, image.two_bits),
     *(image.sixteen_bits, image.clipped_neighbours, image.all_clipped, image.no_stars),
-    *(sky.billion_electrons, sky.full_well, sky.empty_field, sky.no_exposure, sky.nan_pixel),
-    *(field.two_signs, field.antipodal, field.half_turn, field.fast_turns, field.not_a_number),
 )
-COLUMNS = ("case", "verdict", "failing method", "its failure", "what happens", "why", "error", "its error", "tolerance")
 
 
-def draw_charts(directory: Path) -> None:
-    """Write each chart and its table (CSV) into `directory`."""
+def run(directory: Path) -> list[FailureCase]:
+    """Measure the cases that are drawn, and write `stability.csv` and the charts; all cases in order. Raises InputError."""
+    drawn = [measure() for measure in DRAWN]
+    cases = [*recorded("catalogue_and_geometry"), *drawn, *recorded("detector_and_attitude")]
+    write_csv(directory / "stability.csv", COLUMNS, [case.row() for case in cases])
     for draw in (narrow_sigmas, weak_perspectives, ripples, turns):
         draw(directory)
+    return cases
+
+
+def _recorded_curves(directory: Path, name: str) -> FloatArray:
+    """The columns of a recorded table, which is copied into `directory`."""
+    source = Path(__file__).with_name(f"{name}.csv")
+    write_whole(directory / source.name, source.read_bytes())
+    return np.loadtxt(source, delimiter=",", skiprows=1).T
 
 
 def narrow_sigmas(directory: Path) -> None:
     """Flux and centroid error against sigma: point sampling, and the integral over pixels."""
     sigmas_px = np.geomspace(0.1, 2.0, 27)
-    pairs = [narrow_errors(float(sigma)) for sigma in sigmas_px]
+    pairs = [image.narrow_errors(float(sigma)) for sigma in sigmas_px]
     errors = [(ours.flux, ours.centroid_px, sampled.flux, sampled.centroid_px) for ours, sampled in pairs]
     rows = np.column_stack([sigmas_px, errors]).tolist()
     columns = ("sigma_px", "flux_error", "centroid_error_px", "sampled_flux_error", "sampled_centroid_error_px")
@@ -76,11 +68,8 @@ def narrow_sigmas(directory: Path) -> None:
 
 def weak_perspectives(directory: Path) -> None:
     """What one depth for every star costs against the field angle."""
-    angle_deg = np.geomspace(0.1, 60.0, 200)
-    off_px, off_arcsec = weak_perspective_error(angle_deg)
-    rows = np.column_stack([angle_deg, off_px, off_arcsec]).tolist()
-    write_csv(directory / "weak_perspective.csv", ("field_angle_deg", "error_px", "error_arcsec"), rows)
-    at_px, at_arcsec = (float(off[0]) for off in weak_perspective_error(np.array([10.0])))
+    angle_deg, off_px, off_arcsec = _recorded_curves(directory, "weak_perspective")
+    at_px, at_arcsec = (float(np.interp(10.0, angle_deg, off)) for off in (off_px, off_arcsec))
     finding = (
         f"Weak perspective (one depth for every star) is off by {abs(at_px):.0f} px or {abs(at_arcsec):.0f} arcsec ten degrees"
         " from the axis, and by an eighth of that at five"
@@ -96,17 +85,17 @@ def weak_perspectives(directory: Path) -> None:
 
 def ripples(directory: Path) -> None:
     """One star's flux over sub-pixel steps: in the linear image, by codes, and point sampled."""
-    on, narrow = target(SIGMA_PX, IMAGE_PX), target(0.5, IMAGE_PX)
-    with by_renderer(on) as draw:
-        linear = moving_fluxes(draw, on)
+    on, narrow = image.target(image.SIGMA_PX, image.MOVING_PX), image.target(0.5, image.MOVING_PX)
+    with image.by_renderer(on) as draw:
+        linear = image.moving_fluxes(draw, on)
     curves = {
-        "point sampled, sigma 0.5 px": moving_fluxes(partial(point_sampled, narrow), narrow),
-        "codes, round": moving_code_fluxes("round"),
-        "codes, exact": moving_code_fluxes("exact"),
+        "point sampled, sigma 0.5 px": image.moving_fluxes(partial(image.point_sampled, narrow), narrow),
+        "codes, round": image.moving_code_fluxes("round"),
+        "codes, exact": image.moving_code_fluxes("exact"),
         "linear image": linear,
     }
     off_mag = {name: magnitude(light) for name, light in curves.items()}
-    step_px = np.linspace(0, PATH_PX[0], STEPS)
+    step_px = np.linspace(0, image.PATH_PX[0], image.STEPS)
     columns = "x_px", *(f"{name} [mag]" for name in off_mag)
     write_csv(directory / "popping.csv", columns, np.column_stack([step_px, *off_mag.values()]).tolist())
     spread = {name: float(np.ptp(mag)) for name, mag in off_mag.items()}
@@ -114,8 +103,8 @@ def ripples(directory: Path) -> None:
         f"Moved in sub-pixel steps a star's light varies by {spread['codes, exact']:.3f} mag with exact codes and by"
         f" {spread['codes, round']:.3f} mag with rounded ones"
     )
-    note = f"A star {CODES_MAG_UNDER_WHITE:g} mag under white, {CODES_BITS} bits, sigma {SIGMA_PX:g} px, {STEPS} steps;"
-    note += f" it moves in y by {PATH_PX[1] / PATH_PX[0]:.2f} of its way in x."
+    note = f"A star {image.CODES_MAG_UNDER_WHITE:g} mag under white, {image.CODES_BITS} bits, sigma {image.SIGMA_PX:g} px,"
+    note += f" {image.STEPS} steps; it moves in y by {image.PATH_PX[1] / image.PATH_PX[0]:.2f} of its way in x."
     with chart(directory / "popping", finding, panels=2, note=note) as (above, below):
         for (name, mag), colour in zip(off_mag.items(), (GREEN, ORANGE, BLUE, INK), strict=True):
             above.plot(step_px, mag, color=colour, label=name, lw=1.0)
@@ -127,42 +116,17 @@ def ripples(directory: Path) -> None:
 
 def turns(directory: Path) -> None:
     """Interpolation against the turn from one sample to the next."""
-    turn_deg = np.concatenate([np.linspace(5, 175, 35), [178.0, 179.9, 180.1, 182.0], np.linspace(185, 355, 35)])
-    curves = {
-        "straight line, normalised": [way_error_arcsec(straight_line, 1.0, float(t)) for t in turn_deg],
-        "SLERP (samples without rates)": [sampled_error_arcsec(float(t), False) for t in turn_deg],
-        "samples with rates": [sampled_error_arcsec(float(t), True) for t in turn_deg],
-    }
-    columns = "turn_deg", *(f"{name} [arcsec]" for name in curves)
-    write_csv(directory / "turns.csv", columns, np.column_stack([turn_deg, *curves.values()]).tolist())
-    largest = max(curves["samples with rates"])
+    turn_deg, *errors = _recorded_curves(directory, "turns")
+    curves = dict(zip(("straight line", "SLERP (without rates)", "with rates"), errors, strict=True))
+    largest = curves["with rates"].max()
     finding = (
         "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady turn is followed"
         f" within {two_digits(largest)} arcsec"
     )
     with chart(directory / "turns", finding) as (axis,):
-        for (name, errors), colour in zip(curves.items(), (PURPLE, ORANGE, BLUE), strict=True):
-            axis.plot(
-                turn_deg,
-                np.maximum(errors, 1e-12),
-                color=colour,
-                label=name.replace("samples ", "").replace(", normalised", ""),
-            )
+        for (name, error), colour in zip(curves.items(), (PURPLE, ORANGE, BLUE), strict=True):
+            axis.plot(turn_deg, np.maximum(error, 1e-12), color=colour, label=name)
         axis.set(yscale="log", xlabel="turn between samples [deg]", ylabel="largest error between samples [arcsec]")
         plain_ticks(axis.xaxis, (0, 60, 120, 180, 240, 300, 360))
         axis.axvline(180, color=MUTED, ls="--", lw=1.0)
         label_ends(axis)
-
-
-def run(directory: Path) -> list[FailureCase]:
-    """Measure every case, and write `stability.csv` and the charts; the cases, in order. Raises InputError."""
-    cases = [measure() for measure in CASES]
-    write_csv(directory / "stability.csv", COLUMNS, [_row(case) for case in cases])
-    draw_charts(directory)
-    return cases
-
-
-def _row(case: FailureCase) -> tuple[str | float, ...]:
-    verdict, figures = "right" if case.right else "WRONG", case.figures
-    numbers = figures.error, figures.fault, figures.tolerance
-    return case.case, verdict, case.method, case.fails, case.happens, case.why, *map(float, numbers)

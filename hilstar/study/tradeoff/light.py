@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -22,7 +23,7 @@ from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.camera import Camera
-from hilstar.scene.psf import MAX_CUT, footprint_px, peak_share
+from hilstar.scene.psf import MAX_CUT
 from hilstar.scene.sprites import Sprites, make_sprites, pack_sprites
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import (
@@ -45,7 +46,7 @@ from hilstar.sky.stars import Stars
 from hilstar.study.codes import AIMS, FRAME_PX, JUDGE, STARS, WAYS, Way, code_errors, response_of, star_field
 from hilstar.study.predictors import ORION
 from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
-from hilstar.study.tradeoff.places import NO_LIMIT_V_MAG, SIGMA_PX, demo_config, stars_to, turn_to_image
+from hilstar.study.tradeoff.places import NO_LIMIT_V_MAG, SPRITE_PSF, demo_config, stars_to, turn_to_image
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.units import LIGHT_M_S, flux_ratio, magnitude
@@ -268,7 +269,7 @@ def _centre_remark() -> str:
         offset_px = np.arange(-TILE_PX, TILE_PX + 1) - phase_px[:, None]
         return np.asarray((np.exp(-0.5 * (offset_px / sigma_px) ** 2) / (sigma_px * np.sqrt(2 * np.pi))).sum(axis=1))
 
-    excess = 1 / (2 * np.pi * SIGMA_PX[0] * SIGMA_PX[1] * peak_share(SIGMA_PX)) - 1
+    excess = 1 / (2 * np.pi * math.prod(SPRITE_PSF.width_px) * SPRITE_PSF.peak_share) - 1
     worst = np.abs(magnitude(flux(SMALL_SIGMA_PX, np.arange(PSF_PHASES) / PSF_PHASES) ** 2)).max()
     return (
         f"sampling at pixel centres gives a wide star the right sum and the wrong shape: its middle pixel is"
@@ -278,7 +279,7 @@ def _centre_remark() -> str:
 
 def splat_variants() -> dict[str, SplatVariant]:
     """The GPU's ways, by name; the renderer's own is the `SplatVariant()` that changes nothing."""
-    own = footprint_px(SIGMA_PX)
+    own = SPRITE_PSF.footprint_px
     variants = {f"GL polynomial, R32F, {own} px": SplatVariant()}
     variants |= {f"GL polynomial, R32F, {size} px": SplatVariant(footprint_px=size) for size in SIZES_PX if size != own}
     variants |= {f"GL polynomial, R16F, {own} px": SplatVariant(half_float=True)}
@@ -290,7 +291,7 @@ def splat_variants() -> dict[str, SplatVariant]:
 
 
 def _drawn_psf(stack: ExitStack, name: str, variant: SplatVariant) -> Trial:
-    renderer = stack.enter_context(VariantRenderer(Target(FRAME_PX, SIGMA_PX), variant))
+    renderer = stack.enter_context(VariantRenderer(Target(FRAME_PX, SPRITE_PSF), variant))
     side = PSF_PHASES * TILE_PX
 
     def image(sprites: Sprites) -> FloatArray:
@@ -303,9 +304,9 @@ def _drawn_psf(stack: ExitStack, name: str, variant: SplatVariant) -> Trial:
 
 def _exact_psf() -> Trial:
     def image(sprites: Sprites) -> FloatArray:
-        return linear_image(sprites, (PSF_PHASES * TILE_PX,) * 2, SIGMA_PX)
+        return linear_image(sprites, (PSF_PHASES * TILE_PX,) * 2, SPRITE_PSF)
 
-    work = partial(linear_image, star_field(FRAME_PX, TILE_PX), FRAME_PX, SIGMA_PX)
+    work = partial(linear_image, star_field(FRAME_PX, TILE_PX), FRAME_PX, SPRITE_PSF)
     return Trial("exact integral, erfc in float64", *_psf_errors(TILE_PX, image), work, is_exact=True)
 
 
@@ -314,9 +315,9 @@ def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[f
     side = PSF_PHASES * TILE_PX
     place = (np.arange(PSF_PHASES) + 0.5) * TILE_PX + (np.arange(PSF_PHASES) + 0.5) / PSF_PHASES - 0.5
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
-    flux, star = np.full(PSF_PHASES**2, WHITE / peak_share(SIGMA_PX)), np.arange(PSF_PHASES**2)
+    flux, star = np.full(PSF_PHASES**2, WHITE / SPRITE_PSF.peak_share), np.arange(PSF_PHASES**2)
     sprites = pack_sprites(x_px, y_px, flux, star, (side, side), size_px)
-    bright = linear_image(sprites, (side, side), SIGMA_PX, TILE_PX)
+    bright = linear_image(sprites, (side, side), SPRITE_PSF, TILE_PX)
     errors = [measure(bright * flux_ratio(mag), image(fainter(sprites, mag)).copy(), TILE_PX) for mag in (0.0, FAINTER_MAG)]
     return max(e.flux_max_mag for e in errors), max(e.centroid_max_px for e in errors)
 
@@ -348,7 +349,7 @@ def _each_remark(trials: list[Trial]) -> str:
 def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
     response, mag = response_of(bits, way), AIMS[bits][1]
     found = code_errors(bits, way, PHASES, [mag])[0]
-    renderer = stack.enter_context(Renderer(Target(FRAME_PX, SIGMA_PX, response, WHITE, way.method)))
+    renderer = stack.enter_context(Renderer(Target(FRAME_PX, SPRITE_PSF, response, WHITE, way.method)))
     field = star_field(FRAME_PX, renderer.footprint_px)
 
     numbers = count()
@@ -366,8 +367,11 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
     """How deep the catalogue goes: light of the whole sky that is lost, %, and stars drawn in the field."""
     del quick
     config, camera = demo_config(), ideal_monitor(demo_config())
-    calibration, white = bench_calibration(config, Path()), brightest_peak_e_per_s(stars_to(NO_LIMIT_V_MAG), SIGMA_PX)
-    renderer = stack.enter_context(Renderer(Target(camera.resolution_px, SIGMA_PX, calibration.response, white)))
+    calibration, white = (
+        bench_calibration(config, Path()),
+        brightest_peak_e_per_s(stars_to(NO_LIMIT_V_MAG), SPRITE_PSF),
+    )
+    renderer = stack.enter_context(Renderer(Target(camera.resolution_px, SPRITE_PSF, calibration.response, white)))
     everything = stars_to(NO_LIMIT_V_MAG).electrons_per_s.sum()
     default, turn, trials = SkySettings().faintest_v_mag, turn_to_image(ORION, camera), []
     for limit in sorted({*LIMITS_V_MAG, default, NO_LIMIT_V_MAG}):

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.build import bench_stars
-from hilstar.bench.cameras import ideal_monitor
+from hilstar.bench.cameras import display_psf, ideal_monitor, tracker_psf
 from hilstar.bench.config import BenchConfig, RenderSettings, read_config
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.phases import measure
@@ -28,7 +28,6 @@ from hilstar.resources import resource_path
 from hilstar.rotation import angle_between_rad, normalise, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
-from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites, pack_sprites
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import CELL_DEG, Stars, cell_grid, make_stars
@@ -47,7 +46,7 @@ from hilstar.study.predictors import (
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
 from hilstar.units import NS_PER_MS, NS_PER_S
 
-SIGMA_PX = RenderSettings().sprite_sigma_px
+SPRITE_PSF = display_psf(RenderSettings())
 NO_LIMIT_V_MAG = 20.0
 ATTITUDES = 60
 SEED = 1
@@ -132,7 +131,7 @@ def in_cells(stars: Stars, cell_deg: float, by_centres: bool = False) -> Stars:
 
 def _by_cells(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
     """As `make_sprites` finds them."""
-    margin_px = footprint_px(SIGMA_PX) / 2 + 1
+    margin_px = SPRITE_PSF.footprint_px / 2 + 1
     near = stars.grid.near(turn[2], camera.field_radius_rad(margin_px), camera.edges(margin_px) @ turn)
     return _project(stars, near, turn, camera), len(near)
 
@@ -142,13 +141,13 @@ def _scan(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int
 
 
 def _scan_angles(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
-    radius_rad = camera.field_radius_rad(footprint_px(SIGMA_PX) / 2 + 1)
+    radius_rad = camera.field_radius_rad(SPRITE_PSF.footprint_px / 2 + 1)
     return _project(stars, np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad)), turn, camera), len(stars)
 
 
 def _project(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> IntArray:
     x_px, y_px = camera.project(stars.vectors[near] @ turn.T)
-    return pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, footprint_px(SIGMA_PX)).star
+    return pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, SPRITE_PSF.footprint_px).star
 
 
 def projection(stack: ExitStack, quick: bool) -> Trials:
@@ -195,7 +194,7 @@ class Road:
         scale = kind(camera.focal_length_px) / z
         cx, cy = (kind(c) for c in camera.principal_point_px)
         x, y = x * scale + cx, y * scale + cy
-        star, (width, height), side = np.arange(len(vectors)), camera.resolution_px, footprint_px(SIGMA_PX)
+        star, (width, height), side = np.arange(len(vectors)), camera.resolution_px, SPRITE_PSF.footprint_px
         if self.dtype == SPRITE_DTYPE:
             sprites = pack_sprites(x, y, np.ones(len(star)), star, (width, height), side)
             return sprites.data, sprites.star
@@ -243,6 +242,7 @@ def _place_errors_px(
 
 
 TRACKER = demo_config().tracker
+TRACKER_PSF = tracker_psf(TRACKER, Path())
 CAMERA = monitor_camera(TRACKER.resolution_px, TRACKER.pixel_pitch_um, TRACKER.focal_length_mm, np.array([1.0, 0, 0, 0]))
 SIZE_PX = CAMERA.resolution_px[0]
 RATE_DEG_S = (0.7, -0.7, 5.0)
@@ -262,7 +262,7 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     across = STARS_ACROSS // 2 if quick else STARS_ACROSS
     motion = Motion(ORION, np.radians(np.array(RATE_DEG_S)), TRACKER.exposure_s)
     few, many = grid_stars(across, motion), grid_stars(STARS_ACROSS, motion)
-    renderer = stack.enter_context(VariantRenderer(Target(TRACKER.resolution_px, TRACKER.psf_sigma_px), SplatVariant()))
+    renderer = stack.enter_context(VariantRenderer(Target(TRACKER.resolution_px, TRACKER_PSF), SplatVariant()))
     exact = _image(gauss_sprites(EXACT_NODES, few, motion))
     trials = []
     for name, sprites_of in smear_methods(few, motion).items():
@@ -317,7 +317,7 @@ def path_lengths_px(stars: Stars, motion: Motion) -> FloatArray:
 
 def own_sprites(stars: Stars, motion: Motion) -> Sprites:
     """The sprites that hilstar draws (scene/exposure_motion.py)."""
-    return smeared_sprites(stars, motion, CAMERA, footprint_px(TRACKER.psf_sigma_px), TRACKER.psf_sigma_px)
+    return smeared_sprites(stars, motion, CAMERA, TRACKER_PSF)
 
 
 def gauss_sprites(count: int, stars: Stars, motion: Motion) -> Sprites:
@@ -335,7 +335,7 @@ def _chain(stars: Stars, motion: Motion, at: FloatArray, share: FloatArray) -> S
     x_px, y_px = _places_px(stars, motion, at)
     light = np.outer(share, stars.electrons_per_s)
     star = np.broadcast_to(np.arange(len(stars)), x_px.shape)
-    side = footprint_px(TRACKER.psf_sigma_px)
+    side = TRACKER_PSF.footprint_px
     return pack_sprites(x_px.ravel(), y_px.ravel(), light.ravel(), star.ravel(), CAMERA.resolution_px, side)
 
 
@@ -347,7 +347,7 @@ def _places_px(stars: Stars, motion: Motion, at: FloatArray) -> tuple[FloatArray
 
 
 def _image(sprites: Sprites) -> FloatArray:
-    return linear_image(sprites, CAMERA.resolution_px, TRACKER.psf_sigma_px, WIDE_PX)
+    return linear_image(sprites, CAMERA.resolution_px, TRACKER_PSF, WIDE_PX)
 
 
 def _draw_path(renderer: VariantRenderer, sprites_of: SpritesOf, stars: Stars, motion: Motion) -> None:

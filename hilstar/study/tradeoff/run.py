@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,45 +13,22 @@ from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, title
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.study.tradeoff.light import brightness, depth, psf, quantisation, spectrum
-from hilstar.study.tradeoff.places import SIGMA_PX, culling, prediction, projection, smear
-from hilstar.study.tradeoff.table import Figure, MethodRow, TradeoffStep, Trials, measured
+from hilstar.study.tradeoff.places import SPRITE_PSF, culling, prediction, projection, smear
+from hilstar.study.tradeoff.table import Figure, Trial, Trials, measured
 from hilstar.tracker.centroiders import FAMILY
-
-if TYPE_CHECKING:
-    pass
 
 LABEL_COLUMNS = 40  # characters along an axis as high as a panel
 # In the order of the chain.
 STEPS: tuple[Callable[[ExitStack, bool], Trials], ...] = (
-    brightness,
-    spectrum,
-    depth,
-    culling,
-    projection,
-    prediction,
-    smear,
-    psf,
-    quantisation,
+    *(brightness, spectrum, depth),
+    *(culling, projection, prediction, smear),
+    *(psf, quantisation),
 )
 # Time for the rounds of one step, s: 30 s in all with --quick, five minutes without, set-up and charts included.
 QUICK_BUDGET_S, BUDGET_S = 0.8, 25.0
 COLUMNS = (
-    "step",
-    "work",
-    "method",
-    "error",
-    "error_unit",
-    "error_is",
-    "second",
-    "second_unit",
-    "second_is",
-    "time_ms",
-    "quartile_1_ms",
-    "quartile_3_ms",
-    "default",
-    "exact",
-    "front",
-    "beaten_by",
+    *("step", "work", "method", "error", "error_unit", "error_is", "second", "second_unit", "second_is"),
+    *("time_ms", "quartile_1_ms", "quartile_3_ms", "default", "exact", "front", "beaten_by"),
 )
 # Columns of the step `quantisation` alone: what centroiders of every kind find.
 MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
@@ -66,39 +42,33 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         with ExitStack() as stack:
             steps.append(measured(plan(stack, quick), QUICK_BUDGET_S if quick else BUDGET_S))
         draw(directory / f"tradeoff_{steps[-1].name}", steps[-1], machine)
-    write_csv(directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), [cells(step, row) for step in steps for row in step.rows])
+    write_csv(
+        directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), [cells(step, row) for step in steps for row in step.trials]
+    )
     head = f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast; > hilstar's default"
     return [head, *(line for step in steps for line in table_lines(step))]
 
 
 def this_machine() -> str:
     """The machine and GL that the times hold for."""
-    with Renderer(Target((8, 8), SIGMA_PX)) as renderer:
+    with Renderer(Target((8, 8), SPRITE_PSF)) as renderer:
         return f"{renderer.gl_renderer}, {os.cpu_count()} cores"
 
 
-def cells(step: TradeoffStep, row: MethodRow) -> tuple[str | float | bool, ...]:
+def cells(step: Trials, row: Trial) -> tuple[str | float | bool, ...]:
     """A row of the CSV: COLUMNS and MORE_COLUMNS."""
-    figures = (
-        row.error,
-        step.error.unit,
-        step.error.name,
-        row.second,
-        step.second.unit,
-        step.second.name,
-        row.time_ms,
-        *row.quartiles_ms,
-    )
+    error, second = (row.error, step.error.unit, step.error.name), (row.second, step.second.unit, step.second.name)
+    marks = row.is_default, row.is_exact, row.on_front, row.beaten
     more = (row.more.get(name, "") for name in MORE_COLUMNS)
-    return step.name, step.work, row.method, *figures, row.is_default, row.is_exact, row.on_front, row.beaten, *more
+    return step.name, step.work, row.method, *error, *second, row.time_ms, *row.quartiles_ms, *marks, *more
 
 
-def table_lines(step: TradeoffStep) -> list[str]:
+def table_lines(step: Trials) -> list[str]:
     """A step's table for a person, the fastest method first."""
-    wide = max(len(row.method) for row in step.rows)
+    wide = max(len(row.method) for row in step.trials)
     columns = (f"{step.error.name} [{step.error.unit}]", f"{step.second.name} [{step.second.unit}]", "ms")
     lines = ["", f"{step.name}: {step.work}", f"   {'method':{wide}}  {'   '.join(columns)}"]
-    for row in step.rows:
+    for row in step.trials:
         marks = ("*" if row.on_front else " ") + (">" if row.is_default else " ")
         errors = "  ".join(f"{value:>{len(name)}.3g} " for value, name in zip((row.error, row.second), columns, strict=False))
         lines.append(f"{marks} {row.method:{wide}}  {errors} {row.time_ms:.3g}")
@@ -106,9 +76,9 @@ def table_lines(step: TradeoffStep) -> list[str]:
     return [*lines, *([f"   the default: {beaten}"] if beaten else []), *([f"   {step.remark}"] if step.remark else [])]
 
 
-def finding(step: TradeoffStep) -> str:
+def finding(step: Trials) -> str:
     """What a chart says in its title."""
-    own, exact = step.default, next((row for row in step.rows if row.is_exact), None)
+    own, exact = step.default, next((row for row in step.trials if row.is_exact), None)
     off = "has no error" if own.error <= step.error.floor else f"is off by {said(own.error, step.error)}"
     text = f"{'PSF' if step.name == 'psf' else step.name}: '{own.method}' {off}"
     compared = "" if exact is None else f"; '{exact.method}' takes {exact.time_ms:.3g} ms"
@@ -120,22 +90,24 @@ def said(value: float, figure: Figure) -> str:
     return two_digits(value) + ("" if figure.unit == "1" else f" {figure.unit}")
 
 
-def draw(path: Path, step: TradeoffStep, machine: str) -> None:
+def draw(path: Path, step: Trials, machine: str) -> None:
     """Draw error against time on logarithmic axes: the front as a line, the default ringed, every method named at the side."""
     floor, own = step.error.floor, step.default
-    shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.rows}
+    shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.trials}
     note = f"{capital(step.work)}. Blue: the front, which nothing else is as right and as fast as. Ring: hilstar's default."
     note += (
         f" Bars: quartiles. Dotted: {said(floor, step.error)}, no error below it. {machine}."
         if floor
         else f" Bars: quartiles. {machine}."
     )
-    height = max(4.2, 1.9 + 0.17 * len(step.rows))
+    height = max(4.2, 1.9 + 0.17 * len(step.trials))
     with chart(path, finding(step), note=note, height_inch=height) as (axes,):
-        front = [shown[row.method] for row in step.rows if row.on_front]
-        axes.step(*np.array(front).T, where="post", color=BLUE, lw=1.4)
-        for row in step.rows:
-            colour = BLUE if row.on_front else MUTED
+        front = [shown[row.method] for row in step.trials if row.on_front]
+        if len(front) > 1:
+            axes.step(*np.array(front).T, where="post", color=BLUE, lw=1.4)
+        for row in step.trials:
+            # A default that is alone on the front has the colour of its name.
+            colour = RED if row is own and len(front) == 1 else BLUE if row.on_front else MUTED
             axes.plot(row.quartiles_ms, [shown[row.method][1]] * 2, color=colour, lw=3.5, alpha=0.4, solid_capstyle="butt")
             axes.plot(*shown[row.method], "o", color=colour, ms=6, zorder=3)
         axes.plot(*shown[own.method], "o", color=RED, ms=14, mfc="none", mew=2.0, zorder=4)
@@ -146,9 +118,9 @@ def draw(path: Path, step: TradeoffStep, machine: str) -> None:
             ylabel=title_lines(f"{step.error.name} [{unit_of(step.error)}]", LABEL_COLUMNS),
         )
         axes.margins(0.06, 0.08)
-        if any(row.error < floor for row in step.rows):
+        if any(row.error < floor for row in step.trials):
             axes.axhline(floor, color=MUTED, ls=":", lw=1.2)
-        falling = sorted(step.rows, key=lambda row: (-shown[row.method][1], row.time_ms))
+        falling = sorted(step.trials, key=lambda row: (-shown[row.method][1], row.time_ms))
         colours = [RED if row is own else BLUE if row.on_front else MUTED for row in falling]
         name_at_side(axes, [(row.method, shown[row.method], colour) for row, colour in zip(falling, colours, strict=True)])
 

@@ -158,7 +158,7 @@ class FaultyFields:
         return bool(reach <= place[0] < width - reach and reach <= place[1] < height - reach)
 
     def _reach_px(self) -> int:
-        return math.ceil(WINDOW_SIGMAS * max(self._finder.sigma_px)) + 1
+        return math.ceil(WINDOW_SIGMAS * max(self._finder.psf.width_px)) + 1
 
     def _window(self, place: FloatArray) -> tuple[slice, slice]:
         reach, (x, y) = self._reach_px(), np.rint(place).astype(int).tolist()

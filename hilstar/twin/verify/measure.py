@@ -22,6 +22,7 @@ from hilstar.bench.config import BenchConfig
 from hilstar.bench.moving import wide_bodies
 from hilstar.monitor.calibration import Calibration
 from hilstar.scene.camera import Camera
+from hilstar.scene.psf import Psf
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.centroids import Centroids, estimate_background, find_stars, noisiest_background
 from hilstar.twin.optics import BenchGeometry, Mirror
@@ -261,12 +262,12 @@ class Measured:
     wide_bodies: list[str]
 
 
-def with_blends_as_one(seen: TwinField, sigma_px: tuple[float, float]) -> TwinField:
-    """The field with each star that stands within BLEND_SIGMAS of a brighter one (`sigma_px` of the tracker) added to that.
+def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
+    """The field with each star that stands within BLEND_SIGMAS of a brighter one (of `psf`, the tracker's) added to that.
 
     The brighter one keeps its name; its light, magnitude and places become those of the sum.
     """
-    owner = _owners(np.column_stack([seen.x_px, seen.y_px]) / sigma_px, seen.truth["electrons_per_s"])
+    owner = _owners(np.column_stack([seen.x_px, seen.y_px]) / psf.width_px, seen.truth["electrons_per_s"])
     own = np.arange(len(owner))
     if np.array_equal(owner, own):
         return seen
@@ -319,7 +320,7 @@ class Comparison:
         """Compare the stars of one field; the generator is for the detector's noise."""
         self.field_count += 1
         tally, stars_listed = self.tally, len(seen.truth)
-        seen = with_blends_as_one(seen, self.finder.sigma_px)
+        seen = with_blends_as_one(seen, self.finder.psf)
         tally.summed += stars_listed - len(seen.truth)
         windowed = [self.finder.find(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e)]
         each = {kind: self._placed(seen, windowed, kind) for kind in FAMILY}
@@ -359,7 +360,7 @@ class Comparison:
 
     def _glow(self) -> GlowFit:
         given = self.twin.config.verify.black_e_per_s_px
-        sigma_x, sigma_y = self.finder.sigma_px
+        sigma_x, sigma_y = self.finder.psf.width_px
         disc_px = 4 * math.pi * sigma_x * sigma_y
         return GlowFit(
             assumed_e_per_s_px=on_screen_median(self.twin.sky_optics.glow_e_per_s(self.twin.bench.panel)),
@@ -401,8 +402,8 @@ class Comparison:
 
     def _blended(self, seen: TwinField, sky: Matched) -> npt.NDArray[np.bool_]:
         flux, radius_px = seen.truth["electrons_per_s"], self.finder.settings.radius_px
-        by_disc = seen.near_disc(self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.sigma_px))
-        return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.sigma_px) | by_disc)
+        by_disc = seen.near_disc(self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.psf.width_px))
+        return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.psf) | by_disc)
 
     def _follow(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
         """Find each star where the true lens shows it, and note how far that is from where the sky has it."""
@@ -442,7 +443,7 @@ class Comparison:
         """Stars whose window is whole on the detector and whose sprite is whole on the monitor."""
         margin = self.finder.settings.radius_px + 1.5
         bench = self.twin.bench
-        reach = bench.renderer.footprint_px / 2 + margin * self.twin.monitor_px_per_px
+        reach = bench.psf.footprint_px / 2 + margin * self.twin.monitor_px_per_px
         width, height = bench.camera.resolution_px
         x, y = seen.truth["x_px"], seen.truth["y_px"]
         inside = (x >= reach) & (x < width - 1 - reach) & (y >= reach) & (y < height - 1 - reach)

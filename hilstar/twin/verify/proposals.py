@@ -15,7 +15,7 @@ import math
 import os
 import stat
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import combinations
 
 import numpy as np
@@ -25,6 +25,7 @@ from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG
 from hilstar.error_spread import ErrorSpread
 from hilstar.errors import InputError, cannot_write
 from hilstar.files import write_whole
+from hilstar.monitor.quantisers import BY_COST
 from hilstar.reading import MAX_TOML_BYTES, read_text
 from hilstar.twin.verify.summary import summarise, verify
 from hilstar.twin.verify.verdict import Verdict, p95
@@ -177,7 +178,7 @@ def _keys(verdict: Verdict) -> list[_Key]:
     measured = verdict.measured
     render = measured.config.render
     calibrations = [one for one in (measured.calibration, measured.true_calibration) if one is not None]
-    keys = [] if render.quantisation == "exact" else [_Key("render", "quantisation", ("exact",))]
+    keys = [] if render.quantisation == BY_COST[-1] else [_Key("render", "quantisation", BY_COST[-1:])]
     if not render.bit_stealing and all(one.can_steal_bits for one in calibrations):
         keys.append(_Key("render", "bit_stealing", (True,)))
     if render.flux_at_white_e_per_s is None:  # a measured scale is not changed
@@ -214,17 +215,7 @@ def _mildest(keys: tuple[_Key, ...], trials: _Trials) -> tuple[KeyProposal, ...]
 
 def _verified(verdict: Verdict) -> Verified:
     summary = summarise(verdict)
-    return Verified(
-        fields=summary.fields,
-        stars=summary.stars,
-        lost=summary.lost,
-        clipped=summary.clipped,
-        not_shown=summary.not_shown,
-        flux_error_mag=summary.flux_error_mag,
-        centroid_error_px=summary.centroid_error_px,
-        passed=summary.passed,
-        reasons=summary.reasons,
-    )
+    return Verified(**{entry.name: summary[entry.name] for entry in fields(Verified)})
 
 
 def _none_passes(verdict: Verdict, trials: _Trials) -> BenchProposal:
@@ -249,12 +240,12 @@ def _what_fails(verdict: Verdict) -> str:
     limits, monitor = verdict.measured.config.verify, verdict.measured.config.monitor
     failing = [
         row
-        for row in summarise(verdict).by_magnitude
-        if (row.flux_error_mag.p95 or 0.0) > limits.flux_mag or (row.centroid_error_px.p95 or 0.0) > limits.centroid_px
+        for row in summarise(verdict)["by_magnitude"]
+        if (row["flux_error_mag"].p95 or 0.0) > limits.flux_mag or (row["centroid_error_px"].p95 or 0.0) > limits.centroid_px
     ]
     if not failing:
         return f"at best: {verdict.reasons[0]}"
-    return f"{monitor.bits} bits cannot show stars of V {failing[0].v_from} to {failing[-1].v_to} within the limits"
+    return f"{monitor.bits} bits cannot show stars of V {failing[0]['v_from']} to {failing[-1]['v_to']} within the limits"
 
 
 def proposal_lines(file: BenchFile, proposal: BenchProposal) -> list[str]:

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
-from hilstar.scene.psf import peak_share
+from hilstar.scene.psf import GaussianPsf, Psf
 from hilstar.tracker.centroiders import Centroider, star_places
 from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground, find_stars
 from hilstar.units import magnitude
@@ -52,10 +51,10 @@ class Matched:
 
 @dataclass(frozen=True, slots=True)
 class StarFinder:
-    """A centroider for a bench's stars: their sigma (x, y) on the tracker, px, and the background for noiseless images."""
+    """A centroider for a bench's stars: their PSF on the tracker, and the background for noiseless images."""
 
     settings: CentroidSettings
-    sigma_px: tuple[float, float]
+    psf: Psf
     background: LocalBackground
     centroider: Centroider = USUAL
 
@@ -90,7 +89,7 @@ class StarFinder:
         padded = np.pad(image_e, far)
         stamps = padded[(row[:, None] + near + far - reach)[:, :, None], (column[:, None] + near + far - reach)[:, None, :]]
         middle = np.full(len(stars), reach)
-        dx_px, dy_px = star_places(stamps, kind, self.sigma_px, (middle, middle))
+        dx_px, dy_px = star_places(stamps, kind, self.psf.width_px, (middle, middle))
         x_px, y_px = found.x_px.copy(), found.y_px.copy()
         x_px[index], y_px[index] = column + dx_px, row + dy_px
         return Matched(replace(found, x_px=x_px, y_px=y_px), matched.index)
@@ -98,18 +97,18 @@ class StarFinder:
 
 def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     """The finder for a bench's stars; `monitor_px_per_px` monitor pixels are as wide as a tracker pixel."""
-    sigma_px = seen_sigma_px(bench.config, monitor_px_per_px)
-    settings = CentroidSettings(window_sigma_px=max(1.0, *sigma_px))
-    peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * peak_share(sigma_px)
+    psf = seen_psf(bench, monitor_px_per_px)
+    settings = CentroidSettings(window_sigma_px=max(1.0, *psf.width_px))
+    peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * psf.peak_share
     under = LocalBackground(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
-    return StarFinder(settings, sigma_px, under, bench.config.verify.centroider or USUAL)
+    return StarFinder(settings, psf, under, bench.config.verify.centroider or USUAL)
 
 
-def seen_sigma_px(config: BenchConfig, monitor_px_per_px: float) -> tuple[float, float]:
-    """A star's sigma on the tracker, its pixels: sprite, monitor pixel and the tracker's own PSF."""
-    sprite, psf = config.render.sprite_sigma_px, config.tracker.psf_sigma_px
-    spread = [(s**2 + 1 / 6) / monitor_px_per_px**2 for s in sprite]  # two squares: sampled, and shown
-    return math.sqrt(spread[0] + psf[0] ** 2), math.sqrt(spread[1] + psf[1] ** 2)
+def seen_psf(bench: Bench, monitor_px_per_px: float) -> Psf:
+    """The Gaussian nearest to a star on the tracker, in its pixels: sprite, monitor pixel and the tracker's own PSF."""
+    spread = [(s**2 + 1 / 6) / monitor_px_per_px**2 for s in bench.psf.width_px]  # two squares: sampled, and shown
+    x, y = (math.sqrt(a + own**2) for a, own in zip(spread, bench.tracker_psf.width_px, strict=True))
+    return GaussianPsf((x, y))
 
 
 def faintest_e_per_s(bench: Bench) -> float:
@@ -136,18 +135,16 @@ def shared(match: IntArray) -> npt.NDArray[np.bool_]:
     return np.asarray((match >= 0) & (counts[np.searchsorted(used, match)] > 1))
 
 
-def crowded(
-    x_px: FloatArray, y_px: FloatArray, flux: FloatArray, radius_px: int, sigma_px: tuple[float, float]
-) -> npt.NDArray[np.bool_]:
+def crowded(x_px: FloatArray, y_px: FloatArray, flux: FloatArray, radius_px: int, psf: Psf) -> npt.NDArray[np.bool_]:
     """True for stars (n,) into whose window any other brings more than CROWDED_SHARE of their own light."""
     from scipy.spatial import KDTree
     from scipy.special import ndtr
 
     places, half = np.nan_to_num(np.stack([x_px, y_px], axis=1), nan=-1e9), radius_px + 0.5
-    close = KDTree(places).query_pairs(math.sqrt(2) * half + WING_SIGMAS * max(sigma_px), output_type="ndarray")
+    close = KDTree(places).query_pairs(math.sqrt(2) * half + WING_SIGMAS * max(psf.width_px), output_type="ndarray")
     result = np.zeros(len(flux), dtype=np.bool_)
     for a, b in (close.T, close.T[::-1]):
         offset = places[b] - np.rint(places[a])
-        share = (ndtr((offset + half) / sigma_px) - ndtr((offset - half) / sigma_px)).prod(axis=1)
+        share = (ndtr((offset + half) / psf.width_px) - ndtr((offset - half) / psf.width_px)).prod(axis=1)
         result[a[flux[b] * share > CROWDED_SHARE * flux[a]]] = True
     return result

@@ -9,8 +9,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -28,11 +26,12 @@ from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import Response, table_response
+from hilstar.process.closing import Closing
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import BenchGeometry, TwinOptics
-from hilstar.twin.simulator import background_e
+from hilstar.twin.simulator import TrackerBackground
 
 PHASES = 4  # frames of a sequence with which an exposure may begin
 
@@ -44,20 +43,19 @@ def exposure_lights(
 
     With `temporal` that is one of the first PHASES frames of a sequence, which `frame` is the first of.
     """
-    if not bench.quantiser.over_frames:
-        return [shown_light(frame.levels, panel) for panel in panels]
-    before, count = first_frame % PHASES, max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
+    count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
+    exposed = bench.quantiser.exposure(first_frame % PHASES, count)
     lights = [np.zeros(frame.levels.shape) for _ in panels]
-    for number in range(before + count):
+    for number in range(exposed.stop):
         levels = frame.levels
         if number:
             sprites = bench.light(bench.view(frame.q_icrs_to_cam, None, frame.t_ns), faults)
             levels = bench.draw_sprites(sprites, first_frame + number).levels
-        if number >= before:
+        if number in exposed:
             for light, panel in zip(lights, panels, strict=True):
                 light += shown_light(levels, panel)
     for light in lights:
-        light /= count
+        light /= len(exposed)
     return lights
 
 
@@ -95,8 +93,9 @@ class TwinField:
     """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
 
     `shown_e` is what the monitor as it is makes, `assumed_e` what it would make if everything were as assumed (the same
-    array where nothing differs), and `sky_e` what the stars themselves make. `truth` has the rows of TRUTH_DTYPE of stars and
-    points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more than points.
+    array where nothing differs), and `sky_e` what the stars themselves make. `under_e` lies under them all. `truth` has the
+    rows of TRUTH_DTYPE of stars and points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more
+    than points.
     """
 
     shown_e: FloatArray
@@ -106,6 +105,7 @@ class TwinField:
     x_px: FloatArray
     y_px: FloatArray
     discs: tuple[tuple[FloatArray, float], ...] = ()
+    under_e: FloatArray | float = 0.0
 
     def near_disc(self, camera: Camera, margin_px: float) -> npt.NDArray[np.bool_]:
         """True for stars (n,) within `margin_px` of a disc's limb, or before it."""
@@ -117,7 +117,7 @@ class TwinField:
         return near
 
 
-class Twin:
+class Twin(Closing):
     """A bench's twin. Free it with `close`, or use it as a context manager.
 
     Raises InputError for a bench file or a true calibration that is wrong.
@@ -134,10 +134,10 @@ class Twin:
         true = true_geometry(self.bench, self.camera)
         self.true_camera = true.monitor
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
-        self.true_optics = TwinOptics(true, tracker.psf_sigma_px)
-        self.sky_optics = TwinOptics(self.assumed_geometry, tracker.psf_sigma_px)
+        self.true_optics = TwinOptics(true, self.bench.tracker_psf)
+        self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
         self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
-        self._under_stars_e = self.glow_e_per_s * tracker.exposure_s + background_e(self.config, file.folder)
+        self._background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
         """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""
@@ -149,16 +149,17 @@ class Twin:
         shown = self.true_optics.image_e_per_s(lights[0]) * exposure_s
         assumed = self.sky_optics.image_e_per_s(lights[1]) * exposure_s if self.differs else shown
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
-        discs = self.bench.discs(self.bench.view(frame.q_icrs_to_cam))
+        view = self.bench.view(frame.q_icrs_to_cam)
+        discs, under_e = self.bench.discs(view), self.glow_e_per_s * exposure_s + self._background.of_view_e(view)
         points = ~np.isin(frame.truth["name"], [disc.name for disc in discs])
         x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
         found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
-        return TwinField(shown, assumed, sky, frame.truth[points], x_px, y_px, found)
+        return TwinField(shown, assumed, sky, frame.truth[points], x_px, y_px, found, under_e)
 
     def detected_e(self, seen: TwinField, rng: np.random.Generator) -> FloatArray:
         """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted."""
-        dn = self.detector.expose(seen.shown_e + self._under_stars_e, self.config.tracker.exposure_s, rng)
-        return dn * self.config.tracker.detector.gain_e_per_dn - self._under_stars_e
+        dn = self.detector.expose(seen.shown_e + seen.under_e, self.config.tracker.exposure_s, rng)
+        return np.asarray(dn * self.config.tracker.detector.gain_e_per_dn - seen.under_e)
 
     @property
     def monitor_px_per_px(self) -> float:
@@ -169,12 +170,6 @@ class Twin:
         """Free the GL contexts."""
         for part in (self.bench, self.true_optics, self.sky_optics):
             part.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 def changed_keys(verify: Verify) -> list[str]:

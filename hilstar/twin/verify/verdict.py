@@ -9,6 +9,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.error_spread import error_spread
+from hilstar.monitor.quantisers import BY_COST
 from hilstar.twin.verify.faulty_fields import FaultSeen
 from hilstar.twin.verify.measure import GeometryFit, Measured, Star, fit_geometry
 
@@ -185,7 +186,7 @@ def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
         return []
     return [
         f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the tracker's PSF is too"
-        " narrow or too wide for its pixels, so that nothing can be said about the display"
+        " narrow or too wide for its pixels, or lies beside its chief ray, so that nothing can be said about the display"
     ]
 
 
@@ -197,7 +198,7 @@ def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
         return []
     # What is proposed has to suit the monitor as it is, too.
     calibrations = [one for one in (measured.calibration, measured.true_calibration) if one is not None]
-    ways = ['quantisation = "exact"'] if render.quantisation != "exact" else []
+    ways = [f'quantisation = "{BY_COST[-1]}"'] if render.quantisation != BY_COST[-1] else []
     ways += ["bit_stealing = true"] if not render.bit_stealing and all(c.can_steal_bits for c in calibrations) else []
     ways += ["more bits" if all(c.is_formula for c in calibrations) else "a monitor calibrated on more bits"]
     ways += ["a larger brightest_v_mag", "a smaller faintest_v_mag"]

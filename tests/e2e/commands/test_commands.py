@@ -59,7 +59,8 @@ def test_the_frame_s_files_agree_with_each_other(orion):
     folder, summary = orion
     rows = read_truth(folder / "o.csv")
     first = ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
-    assert list(rows[0]) == [*first, "variable", "range_mag", "period_d", "double", "separation_arcsec", "name"]
+    last = ["variable", "range_mag", "period_d", "double", "separation_arcsec", "name", "sigma_pos_mas", "sigma_mag"]
+    assert list(rows[0]) == [*first, *last]
     with fits.open(folder / "o.fits") as hdus:
         linear, header = hdus[0].data, hdus[0].header
         assert linear.dtype == np.dtype(">f4")

@@ -12,7 +12,7 @@ from astropy.io import fits
 from PIL import Image
 
 from hilstar.render.reference import linear_image
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import pack_sprites
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
@@ -40,8 +40,8 @@ def faulty(golden, tmp_path):
     with fits.open(golden[0]) as hdus:
         for star, less in ((alnitak, 1 - 10 ** (-0.4 * 0.05)), (gone, 1.0)):
             x, y, flux = (np.array([float(star[name])]) for name in ("x_px", "y_px", "electrons_per_s"))
-            sprite = pack_sprites(x, y, less * flux, np.zeros(1, dtype=int), (320, 240), footprint_px(SIGMA_PX))
-            hdus[0].data -= linear_image(sprite, (320, 240), SIGMA_PX).astype(np.float32)
+            sprite = pack_sprites(x, y, less * flux, np.zeros(1, dtype=int), (320, 240), GaussianPsf(SIGMA_PX).footprint_px)
+            hdus[0].data -= linear_image(sprite, (320, 240), GaussianPsf(SIGMA_PX)).astype(np.float32)
         hdus.writeto(tmp_path / "faulty.fits")
     return tmp_path / "faulty.fits"
 

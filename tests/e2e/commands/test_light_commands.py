@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import hilstar
 from hilstar.bench.frame import clipping_hip
 from hilstar.monitor.calibration import load_calibration
-from hilstar.scene.psf import peak_share, pixel_share
+from hilstar.scene.psf import GaussianPsf, pixel_share
 from hilstar.twin.budget import budget, zero_point_mag
 from tests.support.benches import ROOT, SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
@@ -38,12 +38,12 @@ def test_where_a_star_clips_and_where_it_shows_nothing_is_where_frames_say_so(be
     found = budget(bench)
     zero_mag = zero_point_mag(bench)
     white_rate, dark_rate = (10 ** (0.4 * (zero_mag - v)) for v in (found.clips_v_mag, found.nothing_v_mag))
-    assert white_rate * peak_share((0.85, 0.85)) == pytest.approx(1e8, rel=1e-12)
+    assert white_rate * GaussianPsf((0.85, 0.85)).peak_share == pytest.approx(1e8, rel=1e-12)
     half_code = 0.5 / 255 / 12.92
-    assert dark_rate * peak_share((0.85, 0.85)) == pytest.approx(1e8 * half_code, rel=1e-12)
+    assert dark_rate * GaussianPsf((0.85, 0.85)).peak_share == pytest.approx(1e8 * half_code, rel=1e-12)
     corner = 10 ** (0.4 * (zero_mag - found.clips_v_mag_at_best)) * pixel_share(0.5, 0.85) ** 2
     assert corner == pytest.approx(1e8, rel=1e-9)
-    clipped = bench.stars.hip[bench.stars.electrons_per_s * peak_share((0.85, 0.85)) > 1e8]
+    clipped = bench.stars.hip[bench.stars.electrons_per_s * GaussianPsf((0.85, 0.85)).peak_share > 1e8]
     assert sorted(found.clipped_hip) == sorted(clipped.tolist())
     assert found.range_mag == pytest.approx(-2.5 * math.log10(half_code))
     rates = bench.stars.electrons_per_s
@@ -55,7 +55,7 @@ def test_the_error_of_round_is_that_of_brute_force(bench_with):
     """Five magnitudes under white, at 16 x 16 phases, pixel by pixel in plain Python."""
     bench = bench_with('[render]\nquantisation = "round"\n')
     row = next(row for row in budget(bench).rows if row.below_white_mag == 5.0)
-    peak = peak_share((0.85, 0.85))
+    peak = GaussianPsf((0.85, 0.85)).peak_share
     total = 10 ** (-0.4 * 5) / peak
     errors = []
     for fx in (np.arange(16) + 0.5) / 16 - 0.5:
@@ -124,7 +124,7 @@ def test_white_is_the_brightest_star_wanted(bench_with):
     bench = bench_with("[render]\nbrightest_v_mag = 1.0\n")
     stars = bench.stars
     wanted = stars.electrons_per_s[stars.v_mag >= 1.0].max()
-    assert bench.flux_at_white_e_per_s == pytest.approx(wanted * peak_share((0.85, 0.85)), rel=1e-15)
+    assert bench.flux_at_white_e_per_s == pytest.approx(wanted * GaussianPsf((0.85, 0.85)).peak_share, rel=1e-15)
     assert 32349 in budget(bench).clipped_hip  # Sirius
 
 
@@ -155,7 +155,7 @@ def test_a_run_names_the_stars_that_clip_and_a_bench_without_such_stars_says_not
 def test_a_sky_of_the_brightest_stars_alone_has_a_white(bench_with):
     """Of the stars to V = 1 none is as faint as the default white."""
     bench = bench_with("[sky]\nfaintest_v_mag = 1.0\n")
-    assert bench.flux_at_white_e_per_s == bench.stars.electrons_per_s.max() * peak_share((0.85, 0.85))
+    assert bench.flux_at_white_e_per_s == bench.stars.electrons_per_s.max() * GaussianPsf((0.85, 0.85)).peak_share
     assert clipping_hip(bench) == []
 
 

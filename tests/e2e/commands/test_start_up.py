@@ -33,7 +33,7 @@ def test_a_run_imports_before_its_first_frame_what_some_frames_need():
 def test_a_run_begins_no_other_process_by_what_it_imports():
     """As the own search of glfw would, whose process says a traceback where a signal ends the start-up meanwhile."""
     program = "import sys; sys.addaudithook(lambda name, _: print(name) if name == 'subprocess.Popen' else None)\n"
-    program += "import hilstar.cli.serve, hilstar.run.screen.open_screen; print('glfw' in sys.modules)"
+    program += "import hilstar.cli.serve, hilstar.run.screen.gate; print('glfw' in sys.modules)"
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYGLFW")}
     result = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S, env=environment

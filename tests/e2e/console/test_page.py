@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.logs.mcap_log import read_messages
-from hilstar.run.record.ledger_reader import frame_records
-from hilstar.run.record.ledger_records import EventRecord
+from hilstar.run.record.ledger_records import EventRecord, frame_records
 from tests.support.commands import run_hilstar_here
 from tests.support.pages import PageAddress, children, gone, live, page_of, picture_of
 from tests.support.run_page import run_data_of

@@ -18,7 +18,7 @@ from tests.support.benches import LIVE_BENCH, attitude_table
 from tests.support.commands import HILSTAR
 from tests.support.pages import children, gone
 from tests.support.senders import free_port
-from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
+from tests.support.waiting import PATIENCE_S, wait_for
 
 pytestmark = pytest.mark.e2e
 WATCHDOG_S = 1.0
@@ -99,7 +99,6 @@ def test_a_run_is_ready_with_its_first_frame_and_alive_while_frames_go_on(system
         wait_for(lambda: process.poll() is not None)
 
 
-@best_of_three
 def test_killed_and_started_again_it_shows_frames_within_three_seconds(systemd):
     """In time of a free core: on a busy machine everything takes longer. docs/console-server.md has what the clock says."""
     with systemd.started() as process:
@@ -109,4 +108,4 @@ def test_killed_and_started_again_it_shows_frames_within_three_seconds(systemd):
     with systemd.started() as process:
         systemd.told("READY=1")
         back_s = cpu_s(process.pid) + RESTART_S
-    in_time(back_s < BACK_S, back_s)  # cores that share what they have make each second longer
+    assert back_s < BACK_S

@@ -24,7 +24,7 @@ from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import connected, packet
 from tests.support.servers import Served, bound
-from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
+from tests.support.waiting import PATIENCE_S, CoreWaits, missed_in, wait_for
 from tests.support.wire.zmtp import greeted, part
 
 # bounds.MAX_GROWTH_BYTES, and what comes within the time that a loaded machine needs to see it.
@@ -56,10 +56,9 @@ def sending(port: int, hz: float = 100.0) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("size", [1, 100_000])
-@best_of_three
 def test_a_message_that_does_not_end_costs_bounded_memory_and_the_sender_is_heard_again(tmp_path, size):
     """libzmq keeps a message until its last part; there is none."""
-    with bound(tmp_path) as served, sending(served.port):
+    with bound(tmp_path) as served, sending(served.port), CoreWaits(served.process.pid) as waited:
         served.await_line("the first attitude")
         before_mb, most_mb, sent_bytes = served.used_mb(), 0.0, 0
         blob = part(bytes(size), more=True) * max(1, 200_000 // size)
@@ -76,7 +75,7 @@ def test_a_message_that_does_not_end_costs_bounded_memory_and_the_sender_is_hear
         served.process.has_accepted(served.process.accepted() + 50)
         summary = served.summary()
     assert summary["link"]["resets"] == summary["events"]["flood"] >= 2
-    in_time(summary["frames"] > 3 * summary["missed_frames"], summary)
+    assert summary["frames"] > 3 * (summary["missed_frames"] - missed_in(waited.s)), (summary, waited.s)
     assert summary["packets"]["accepted"] > 50
 
 
@@ -92,7 +91,6 @@ def test_a_message_of_a_million_parts_is_dropped_before_it_is_a_list(tmp_path):
     assert summary["link"]["resets"] == 1
 
 
-@best_of_three
 def test_idle_connections_are_limited_and_the_sender_and_the_ledger_stay(tmp_path):
     """600 connections that say nothing, at a process that may have 512 files."""
     ledger = tmp_path / "run.mcap"
@@ -102,6 +100,7 @@ def test_idle_connections_are_limited_and_the_sender_and_the_ledger_stay(tmp_pat
         stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
         served = stack.enter_context(bound(tmp_path, "--ledger", str(ledger), files=512))
         stack.enter_context(sending(served.port))
+        waited = stack.enter_context(CoreWaits(served.process.pid))
         served.await_line("the first attitude")
         for _ in range(600):
             stack.enter_context(socket.create_connection(("127.0.0.1", served.port)))
@@ -110,12 +109,12 @@ def test_idle_connections_are_limited_and_the_sender_and_the_ledger_stay(tmp_pat
         summary = served.summary()
     link = summary["link"]
     assert link["refused"] > 300
-    assert link["rejected"] == summary["events"]["client-rejected"] > 30
+    # How many of the 64 that were let in had their handshakes timed out by the end depends on how fast the cores are.
+    assert link["rejected"] == summary["events"]["client-rejected"] > 0
     assert summary["ledger"]["failure"] is None
-    in_time("stale" not in summary["events"] or summary["stale_frames"] < summary["frames"] / 4, summary)
+    assert summary["stale_frames"] - missed_in(waited.s) < summary["frames"] / 4, (summary, waited.s)
 
 
-@best_of_three
 def test_a_flood_of_packets_leaves_the_frames_their_time_and_is_counted(tmp_path):
     flood = """
 import time, zmq
@@ -133,13 +132,13 @@ while time.monotonic() < end:
     k += 1
 """
     ledger = tmp_path / "run.mcap"
-    with bound(tmp_path, "--ledger", str(ledger)) as served:
+    with bound(tmp_path, "--ledger", str(ledger)) as served, CoreWaits(served.process.pid) as waited:
         subprocess.run([sys.executable, "-c", flood.replace("PORT", str(served.port))], check=True, timeout=PATIENCE_S)
         summary = served.summary()
     assert summary["link"]["flooded"] > 10_000
     assert 1 <= summary["events"]["flood"] <= 3
     assert 0 < summary["packets"]["received"] < MAX_BURST + MAX_PACKETS_PER_S * summary["duration_s"]
-    in_time(summary["frames"] > 5 * summary["missed_frames"], summary)
+    assert summary["frames"] > 5 * (summary["missed_frames"] - missed_in(waited.s)), (summary, waited.s)
     assert ledger.stat().st_size < 20e6
 
 

@@ -13,7 +13,7 @@ import pytest
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import packet, publisher
 from tests.support.servers import serving, summary_of
-from tests.support.waiting import PATIENCE_S, best_of_three, in_time
+from tests.support.waiting import PATIENCE_S, CoreWaits, missed_in
 
 RATES_RAD_S = (1.0, 10.0, 57.0, 200.0, 900.0)
 # A frame of the small bench takes 1 ms; one of 10 rad/s took 1500 ms and more. The margin is for busy machines.
@@ -40,20 +40,19 @@ def turned(degrees: float) -> tuple[float, ...]:
     return (math.cos(half), 0.0, math.sin(half), 0.0)
 
 
-@best_of_three
 def test_turns_of_any_rate_are_drawn_in_bounded_time_and_counted(tmp_path):
     turns = [((0.5, 0.5, -0.5, 0.5), (0.6 * r, -0.7 * r, 0.2 * r)) for r in RATES_RAD_S for _ in range(40)]
     attitude = f"max_rate_deg_s = 1e6\n{MOVING}"
-    with publisher() as (sender, port), serving(tmp_path, port, attitude=attitude) as process:
+    with publisher() as (sender, port), serving(tmp_path, port, attitude=attitude) as process, CoreWaits(process.pid) as waited:
         process.shows()
         stream(sender, turns, 100)
         process.has_received(len(turns))
         process.send_signal(signal.SIGINT)
         summary = summary_of(process)
     assert summary["packets"]["accepted"] == 40 * len(RATES_RAD_S)
-    in_time(summary["capped"] > 30, summary)
+    assert summary["capped"] + missed_in(waited.s) > 30, summary
     assert summary["events"]["capped"] == 1
-    in_time(summary["frame_ms"]["max"] < MAX_FRAME_MS, summary)
+    assert summary["frame_ms"]["max"] < MAX_FRAME_MS + 1000 * waited.s, (summary, waited.s)
 
 
 def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp_path):
@@ -71,16 +70,16 @@ def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp
 
 
 @pytest.mark.parametrize("degrees", [20.0, 90.0, 180.0])
-@best_of_three
 def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees):
     """200 Hz, at rest, `degrees` further every 0.1 s, and never a discontinuity: each frame shows one place or the other."""
-    with publisher() as (sender, port), serving(tmp_path, port, attitude=MOVING) as process:
+    with publisher() as (sender, port), serving(tmp_path, port, attitude=MOVING) as process, CoreWaits(process.pid) as waited:
         stream(sender, [(turned(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
         process.send_signal(signal.SIGTERM)
         asked_s = time.monotonic()
         summary = summary_of(process)
-    in_time(time.monotonic() - asked_s < 10, "the end")
-    in_time(summary["frame_ms"]["max"] < MAX_FRAME_MS, summary)
+        took_s = time.monotonic() - asked_s
+    assert took_s - waited.s < 10
+    assert summary["frame_ms"]["max"] < MAX_FRAME_MS + 1000 * waited.s, (summary, waited.s)
     assert summary["capped"] == 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 
@@ -12,7 +13,7 @@ import pytest
 from tests.support.benches import bench_text, still_log
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.rts_server import RtsServer
-from tests.support.waiting import best_of_three, in_time
+from tests.support.waiting import CoreWaits
 
 # pyserial's client asks every 50 ms whether the server has set its line: a pulse is two of those, and 0.4 s apart.
 EVERY, REFRESH_HZ, SECONDS = 24, 60, 1.7
@@ -40,20 +41,19 @@ def replayed(tmp_path, bench_file):
     return json.loads(done.stdout), done.stderr
 
 
-@best_of_three
 def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_path, server):
-    server.line.edges.clear()  # of an attempt before
-    summary, _ = replayed(tmp_path, bench(tmp_path, server.url, pulse_ms=20))
+    with CoreWaits(os.getpid()) as waited:
+        summary, _ = replayed(tmp_path, bench(tmp_path, server.url, pulse_ms=20))
     told, pulses = summary["sync"], server.pulses()
     assert told["port"] == server.url
     assert len(pulses) == told["pulses"] and told["pulses"] + told["skipped"] <= 1 + int(SECONDS * REFRESH_HZ) // EVERY
     assert told["lost"] == 0
-    in_time(told["pulses"] >= 3, told)
+    assert told["pulses"] >= 2, told
     assert min(down - up for up, down in pulses) >= 20e6
     # Seen from the far port, against the grid of frames: what the summary calls jitter, and the socket's own.
     rises_ms = np.array([up for up, _ in pulses]) / 1e6
     off_ms = rises_ms - rises_ms[0] - np.round((rises_ms - rises_ms[0]) / APART_MS) * APART_MS
-    in_time(np.abs(off_ms).max() < APART_MS / 4, off_ms)
+    assert np.abs(off_ms).max() < APART_MS / 4 + 1000 * waited.s, (off_ms, waited.s)
     assert told["jitter_ms"] <= told["max_delay_ms"]
     assert server.line.edges[-1][1] is False
 

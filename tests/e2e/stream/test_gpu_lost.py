@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.run.record.ledger_reader import read_run, run_records
-from hilstar.run.record.ledger_records import EventRecord
+from hilstar.run.record.ledger_records import EventRecord, run_records
 from tests.support.benches import SMALL_BENCH, still_log
 from tests.support.commands import run_hilstar_here
+from tests.support.ledgers import read_run
 from tests.support.waiting import PATIENCE_S
 from tests.support.x11.screens import xvfb
 
@@ -22,7 +22,7 @@ PLANTED = """
 import sys
 from hilstar.bench import build
 from hilstar.cli import run_command
-from hilstar.run.host_clock import HostClock
+from hilstar.process.scheduling import HostClock
 
 harm, wanted, slept_s = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 benches, looks = [], 0

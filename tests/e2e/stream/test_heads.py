@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.rotation import angle_between_rad, multiply
-from hilstar.run.record.ledger_reader import frame_records
+from hilstar.run.record.ledger_records import frame_records
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar
 from tests.support.heads import MOUNTINGS, heads_file
 from tests.support.senders import publisher, talking

@@ -17,14 +17,15 @@ from PIL import Image
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg, propagate
-from hilstar.run.record.ledger_reader import drawable_frames
+from hilstar.run.record.ledger_records import drawable_frames
+from hilstar.units import NS_PER_S
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.full_disk import limited_environment
 from tests.support.pages import page_of
 from tests.support.senders import await_subscriber, connected, packet, publisher, talking
 from tests.support.servers import bound, serving, summary_of
-from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
+from tests.support.waiting import PATIENCE_S, CoreWaits, wait_for
 
 START = from_radec_roll_deg(84, -1, 0)
 RATE = (0.0, 0.0, 0.1)
@@ -62,7 +63,6 @@ def served(tmp_path, *options: str) -> tuple[Path, dict]:
         return ledger, summary_of(process)
 
 
-@best_of_three
 def test_every_packet_and_every_frame_is_there(tmp_path):
     ledger, summary = served(tmp_path)
     assert summary["ledger"] == {"path": str(ledger), "failure": None, "unrecorded": 0}
@@ -79,7 +79,7 @@ def test_every_packet_and_every_frame_is_there(tmp_path):
     assert len(frames) == summary["frames"]
     drawn = [frame for frame in frames if frame["q"] is not None]
     assert drawn == frames[-len(drawn) :]  # from the first packet on
-    in_time(len(drawn) > 40, len(drawn))
+    assert len(drawn) > 1
     for frame in drawn:
         assert frame["draw_ns"] < frame["swap_ns"]
         assert frame["receive_ns"] < frame["draw_ns"]
@@ -126,19 +126,19 @@ def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
     assert_refused(refused, 2, "run.mcap", "--step")
 
 
-@best_of_three
 def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger)) as process:
         process.shows()
-        stream(sender, 150)
-        process.kill()
-        process.wait()
+        with CoreWaits(process.pid) as waited:
+            stream(sender, 150)
+            process.kill()
+            process.wait()
     found, frames = read_log(ledger), list(drawable_frames(ledger))
-    in_time(len(found) >= 100 and len(frames) > 50, (len(found), len(frames)))
+    assert found and frames
     # The bench's clock began 50 s before its stream, which ended at the kill: frames and packets reach to half a second of it.
-    within_ns = 50_000_000_000 + 1_500_000_000 - 600_000_000
-    in_time(found[-1].t_ns > within_ns and frames[-1].t_ns > within_ns, (found[-1].t_ns, frames[-1].t_ns))
+    within_ns = 50_000_000_000 + 1_500_000_000 - 600_000_000 - waited.s * NS_PER_S
+    assert found[-1].t_ns > within_ns and frames[-1].t_ns > within_ns, (found[-1].t_ns, frames[-1].t_ns, waited.s)
 
 
 def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):

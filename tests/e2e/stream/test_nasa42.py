@@ -21,7 +21,7 @@ from hilstar.bench.build import load
 from hilstar.errors import InputError
 from hilstar.rotation import angle_between_rad, propagate
 from hilstar.run.loop import Limit
-from hilstar.run.record.ledger_reader import frame_records
+from hilstar.run.record.ledger_records import frame_records
 from hilstar.run.serve import serve
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here

@@ -18,9 +18,9 @@ from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.bench.build import load
 from hilstar.rotation import angle_between_rad, propagate
+from hilstar.run.pacer import Shown
 from hilstar.run.record.ledger_records import EventRecord
 from hilstar.run.serve import Running
-from hilstar.run.shown import Shown
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.live_runs import serve_until
 from tests.support.pages import page_of

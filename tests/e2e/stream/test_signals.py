@@ -17,10 +17,11 @@ import pytest
 import zmq
 
 from hilstar.attitude.logs.log_file import read_log
+from hilstar.process.interrupts import GUARD_WAITS_S, THREAD_WAITS_S
 from tests.support.benches import LIVE_BENCH, attitude_table
 from tests.support.commands import has_handlers
 from tests.support.senders import free_port, packet, publisher
-from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
+from tests.support.waiting import PATIENCE_S, CoreWaits, repeating, wait_for
 
 WITHIN_S = 1.0
 # A loaded machine wakes and reaps late.
@@ -57,27 +58,29 @@ def running(command: list[str], **more) -> Iterator[subprocess.Popen]:
 
 def test_a_hang_up_ends_nothing_under_nohup(tmp_path):
     """SIGHUP stays ignored where it was on entry."""
+    ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port):
-        command = program("serve", serve_file(tmp_path, port), "--headless", "--json")
+        command = program("serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger)
         with running(["bash", "-c", 'trap "" HUP; exec "$@"', "bash", *command]) as process:
             assert process.stderr is not None and process.stderr.readline()
             process.send_signal(signal.SIGHUP)
-            for _ in range(20):
-                sender.send(packet(0, time.monotonic_ns()))
-                time.sleep(0.01)
+            wait_for(
+                lambda: sender.send(packet(0, time.monotonic_ns())) or (ledger.exists() and ledger.stat().st_size > 10_000)
+            )
             assert process.poll() is None
             code, out, err = ends(process, signal.SIGTERM)
-    assert code in {0, 4}, err
+    assert code == 0, err
     assert json.loads(out)["frames"] > 0
 
 
 def ends(process: subprocess.Popen, number: int) -> tuple[int, str, str]:
     """Exit code and what was said, after a signal; within a second, and nothing of its session is left."""
-    begin_s = time.monotonic()
-    process.send_signal(number)
-    out, err = process.communicate(timeout=PATIENCE_S)
-    took_s = time.monotonic() - begin_s
-    in_time(took_s < WITHIN_S + LATE_S, (took_s, err))
+    with CoreWaits(process.pid) as waited:
+        begin_s = time.monotonic()
+        process.send_signal(number)
+        out, err = process.communicate(timeout=PATIENCE_S)
+        took_s = time.monotonic() - begin_s
+    assert took_s - waited.s < WITHIN_S + LATE_S, (took_s, waited.s, err)
     wait_for(lambda: not of_session(process.pid))
     return process.returncode, out.decode(), err.decode()
 
@@ -100,7 +103,6 @@ def serve_file(folder: Path, port: int, more: str = "") -> Path:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@best_of_three
 def test_a_signal_ends_a_run_in_order(tmp_path, number):
     """Also where SIGINT is ignored on entry, as a shell does it for what it runs with `&`; not where SIGHUP is (nohup)."""
     ledger = tmp_path / "run.mcap"
@@ -121,15 +123,16 @@ def test_a_signal_ends_a_run_in_order(tmp_path, number):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 @pytest.mark.parametrize("before", [WITHOUT_LOCK, WITH_LOCK])
-@best_of_three
 def test_a_draw_without_end_is_ended(tmp_path, small_bench_file, number, before):
     """Once in a call that lets other threads run, and once in one that does not."""
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n60,1,0,0,0\n")
     with running(program("replay", small_bench_file, log, "--headless", before=before)) as process:
         assert process.stdout is not None and process.stdout.readline() == b"drawing\n"
-        code, _, err = ends(process, number)
-    if before == WITHOUT_LOCK:
+        with CoreWaits(process.pid) as waited:
+            code, _, err = ends(process, number)
+    held_up = waited.s > GUARD_WAITS_S - THREAD_WAITS_S and code == -signal.SIGKILL
+    if before == WITHOUT_LOCK and not held_up:
         assert code == 128 + number
         assert f"s after {signal.Signals(number).name}" in err.splitlines()[-1]
     else:
@@ -171,7 +174,7 @@ def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_
 def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
     """Python runs a handler between any two steps of the main thread, and there it may hold the lock of what it waits for."""
     before = (
-        "import os, signal\nfrom hilstar.run.host_clock import HostClock\nwait = HostClock.wait_until\n"
+        "import os, signal\nfrom hilstar.process.scheduling import HostClock\nwait = HostClock.wait_until\n"
         "def told(clock, due_ns, stop):\n    with stop._cond:\n        os.kill(os.getpid(), signal.SIGINT)\n"
         "    return wait(clock, due_ns, stop)\n"
         "HostClock.wait_until = told"
@@ -184,7 +187,6 @@ def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
     assert json.loads(out)["frames"] < 10
 
 
-@best_of_three
 def test_a_second_signal_ends_it_at_once(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n60,1,0,0,0\n")
@@ -192,11 +194,11 @@ def test_a_second_signal_ends_it_at_once(tmp_path, small_bench_file):
         assert process.stdout is not None and process.stdout.readline() == b"drawing\n"
         process.send_signal(signal.SIGTERM)
         time.sleep(0.2)
-        _, _, err = ends(process, signal.SIGTERM)
-    in_time("second signal" in err, err)  # a watcher that was held up takes two signals for one
+        with repeating(lambda: process.send_signal(signal.SIGTERM), 0.15):  # a watcher that was held up takes two for one
+            _, _, err = ends(process, signal.SIGTERM)
+    assert "second signal" in err
 
 
-@best_of_three
 def test_a_disk_that_stands_still_holds_up_neither_the_frames_nor_the_end(tmp_path):
     """The ledger's writer never returns from a write: the summary comes all the same, says it, and the exit code is 1."""
     still = "import time; from hilstar.attitude.logs import mcap_log as w; w.McapWriter.flush = lambda *a: time.sleep(100)"
@@ -231,7 +233,6 @@ def full_pipe() -> Iterator[int]:
         os.close(writing)
 
 
-@best_of_three
 def test_a_log_that_nobody_reads_holds_up_neither_the_frames_nor_the_end(tmp_path):
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port), full_pipe() as log:
@@ -245,33 +246,35 @@ def test_a_log_that_nobody_reads_holds_up_neither_the_frames_nor_the_end(tmp_pat
                             sender.send(b"refused, which is said") or (ledger.exists() and ledger.stat().st_size > size)
                         )
                     )
-                begin_s = time.monotonic()
-                process.send_signal(signal.SIGTERM)
-                out, _ = process.communicate(timeout=PATIENCE_S)
-                in_time(time.monotonic() - begin_s < WITHIN_S + LATE_S, "the end")
+                with CoreWaits(process.pid) as waited:
+                    begin_s = time.monotonic()
+                    process.send_signal(signal.SIGTERM)
+                    out, _ = process.communicate(timeout=PATIENCE_S)
+                    took_s = time.monotonic() - begin_s
+                assert took_s - waited.s < WITHIN_S + LATE_S, (took_s, waited.s)
             finally:
                 process.kill()
     assert process.returncode == NO_ATTITUDE
     assert json.loads(out)["frames"] > 10
 
 
-@best_of_three
 def test_a_summary_that_nobody_reads_does_not_hold_up_the_end(tmp_path):
     with full_pipe() as stdout:
         command = program("serve", serve_file(tmp_path, free_port()), "--headless")
         with subprocess.Popen(command, stdout=stdout, stderr=subprocess.PIPE) as process:
             try:
                 assert process.stderr is not None and process.stderr.readline()
-                begin_s = time.monotonic()
-                process.send_signal(signal.SIGTERM)
-                process.wait(timeout=PATIENCE_S)
-                in_time(time.monotonic() - begin_s < WITHIN_S + LATE_S, "the end")
+                with CoreWaits(process.pid) as waited:
+                    begin_s = time.monotonic()
+                    process.send_signal(signal.SIGTERM)
+                    process.wait(timeout=PATIENCE_S)
+                    took_s = time.monotonic() - begin_s
+                assert took_s - waited.s < WITHIN_S + LATE_S, (took_s, waited.s)
             finally:
                 process.kill()
     assert process.returncode == 128 + signal.SIGTERM
 
 
-@best_of_three
 def test_a_lockstep_message_that_is_no_request_holds_up_nothing(tmp_path):
     """A DEALER that leaves out the empty part: libzmq's poll says that something is there, and nothing ever is."""
     port = free_port()
@@ -301,7 +304,6 @@ def test_a_lockstep_message_that_is_no_request_holds_up_nothing(tmp_path):
     assert json.loads(out)["frames"] == 1
 
 
-@best_of_three
 def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
     """Over ZeroMQ to a subscriber that never reads, and over a line that is full."""
     port = free_port()
@@ -329,7 +331,6 @@ def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
         context.term()
 
 
-@best_of_three
 def test_a_pool_of_workers_ends_with_its_command(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t},1,0,0,0\n" for t in range(5000)))
@@ -358,7 +359,6 @@ def other_commands(folder: Path, bench: Path) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("name", ["send", "demo", "replay", "verify", "benchmark", "study", "lockstep"])
-@best_of_three
 def test_every_command_that_takes_its_time_ends_within_a_second(tmp_path, small_bench_file, name):
     for number, later_s in ((signal.SIGTERM, 0.0), (signal.SIGINT, 1.5)):
         with running(program(*other_commands(tmp_path, small_bench_file)[name])) as process:

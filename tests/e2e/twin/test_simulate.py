@@ -8,8 +8,9 @@ from astropy.io import fits
 from PIL import Image
 
 import hilstar
-from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.benches import ROOT, SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.psfs import coma, sampled
 
 LYRA = ROOT / "configs" / "thesis-lyra.toml"
 POINTING = ("--radec", "283.021,35.349,0")
@@ -32,7 +33,8 @@ def test_the_fits_has_dn_header_and_truth(tmp_path):
     assert header["CREATOR"] == f"hilstar {hilstar.__version__}"
     assert header["RA_PNT"] == pytest.approx(283.021, abs=1e-9)
     first = ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
-    assert list(truth.names) == [*first, "variable", "range_mag", "period_d", "double", "separation_arcsec", "name"]
+    last = ["variable", "range_mag", "period_d", "double", "separation_arcsec", "name", "sigma_pos_mas", "sigma_mag"]
+    assert list(truth.names) == [*first, *last]
     # Background and dark: 3000 e- and 203 e-/s for 5 s, at 24 e-/DN.
     assert np.median(dn) == pytest.approx((3000 + 203 * 5) / 24, abs=1.0)
     vega = truth[truth["hip"] == 91262][0]
@@ -153,3 +155,60 @@ def test_a_wrong_detector_gets_one_line(tmp_path, keys, words):
     (tmp_path / "bench.toml").write_text(SMALL_BENCH + f"[tracker.detector]\n{keys}\n")
     result = run_hilstar_here("simulate", "bench.toml", "--radec", "1,2,3", "-o", "x.fits", cwd=tmp_path)
     assert_refused(result, 2, "[tracker.detector]", words)
+
+
+def test_the_tracker_s_psf_may_be_an_image(tmp_path):
+    """A coma, whose light lies right of and below the stars' places: as bright, and the bench has another hash."""
+    fits.writeto(tmp_path / "coma.fits", sampled(coma(), 5, 7), fits.Header({"OVERSAMP": 5}))
+    detector = {"gain_e_per_dn": 0.5, "bits": 16}
+    images, hashes = [], []
+    for name, optics in (("plain", {}), ("coma", {"psf": "coma.fits"})):
+        tables = {"tracker": {"resolution_px": [128, 128]}, "tracker.detector": detector, "tracker.optics": optics}
+        (tmp_path / "bench.toml").write_text(bench_text(tables))
+        dn, header, truth = simulate(tmp_path / f"{name}-dn.fits", "--noise", "none", bench=tmp_path / "bench.toml")
+        images.append(dn - np.median(dn).astype(float))
+        hashes.append(header["BENCHSHA"])
+    on = truth[(np.abs(truth["x_px"] - 63.5) < 50) & (np.abs(truth["y_px"] - 63.5) < 50) & ~truth["clipped"]]
+    star = on[np.argmax(on["electrons_per_s"])]
+    x, y = round(star["x_px"]), round(star["y_px"])
+    at = np.arange(-9, 10)
+    light, moved = [], []
+    for image in images:
+        stamp = image[y - 9 : y + 10, x - 9 : x + 10]
+        light.append(stamp.sum())
+        moved.append([(stamp.sum(axis=0) * at).sum(), (stamp.sum(axis=1) * at).sum()] / stamp.sum())
+    assert light[1] == pytest.approx(light[0], rel=0.01)
+    # The profile's own first moment; the stamp's neighbours and the DN's rounding are in both images.
+    assert moved[1] - moved[0] == pytest.approx(0.45 * (0.28 * np.array([1.2, 0.5]) + 0.12 * np.array([3.0, 1.3])), abs=0.02)
+    assert hashes[0] != hashes[1]
+
+
+@pytest.mark.parametrize(
+    ("image", "header", "advice"),
+    [
+        (None, {}, "give a FITS file"),
+        (np.ones((3, 5, 5)), {}, "holds 3 images"),
+        (np.ones((4, 5)), {}, "odd width and height"),
+        (np.ones((5, 5)), {"OVERSAMP": 2.5}, "write a whole number, and T or F"),
+        (np.ones((5, 5)), {"PIXINT": 1}, "write a whole number, and T or F"),
+        (sampled(coma(), 5, 7) - 1e-3, {"OVERSAMP": 5}, "subtract its background"),
+        (b"SIMPLE  = nothing", {}, "not a FITS image"),
+    ],
+)
+def test_a_file_that_is_no_psf_is_one_line(tmp_path, image, header, advice):
+    path, bench = tmp_path / "psf.fits", tmp_path / "bench.toml"
+    if isinstance(image, bytes):
+        path.write_bytes(image)
+    elif image is not None:
+        fits.writeto(path, image, fits.Header(header))
+    bench.write_text(SMALL_BENCH + '[tracker.optics]\npsf = "psf.fits"\n')
+    assert_refused(run_hilstar_here("simulate", bench, *POINTING, "-o", tmp_path / "a.fits"), 2, "psf.fits", advice)
+
+
+def test_a_sigma_that_a_psf_s_file_replaces_is_said(tmp_path):
+    fits.writeto(tmp_path / "psf.fits", sampled(coma(), 5, 7), fits.Header({"OVERSAMP": 5}))
+    optics = {"tracker": {"psf_sigma_px": [0.7, 0.7], "resolution_px": [64, 64]}, "tracker.optics": {"psf": "psf.fits"}}
+    (tmp_path / "bench.toml").write_text(bench_text(optics))
+    result = run_hilstar_here("simulate", tmp_path / "bench.toml", *POINTING, "-o", tmp_path / "a.fits")
+    assert result.returncode == 0
+    assert "psf_sigma_px is not used: [tracker.optics] psf is psf.fits" in result.stderr

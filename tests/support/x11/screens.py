@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hilstar.run.record.ledger_reader import frame_records
-from hilstar.run.record.ledger_records import FrameRecord
+from hilstar.run.record.ledger_records import FrameRecord, frame_records
 from tests.support.benches import ATTITUDE
 from tests.support.commands import HILSTAR, run_hilstar_here
 from tests.support.waiting import PATIENCE_S

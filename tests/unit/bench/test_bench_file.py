@@ -11,7 +11,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import open_bench
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.ledger_reader import config_of, read_head
+from hilstar.run.record.ledger_records import config_of, read_head
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import run_hilstar_here
 

@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from hilstar.bench.build import bench_optics
 from hilstar.bench.config import read_config
 from hilstar.errors import InputError
 from tests.support.benches import ROOT, SMALL_BENCH
@@ -166,3 +167,12 @@ def test_tables_without_end_are_refused(tmp_path, text):
 def test_a_bench_file_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(InputError, match="No such file"):
         read_config(tmp_path / "none.toml")
+
+
+def test_the_fill_factor_takes_its_share_of_every_electron(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(WHOLE)
+    plain = bench_optics(read_config(path).tracker, tmp_path).quantum_efficiency
+    path.write_text(WHOLE.replace("[tracker.detector]", "[tracker.detector]\nfill_factor = 0.4"))
+    open_part = bench_optics(read_config(path).tracker, tmp_path).quantum_efficiency
+    assert (open_part.value == plain.value * 0.4).all()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +15,10 @@ from hilstar.bench.config import RenderSettings
 from hilstar.bench.effort import Light, choose_codes, choose_sides, cut_px, explain, plan_effort
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.response import srgb_response
+from hilstar.render.backend import level_cost
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.psf import footprint_px, outside_share
+from hilstar.scene.psf import GaussianPsf
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.commands import run_hilstar_here
 
@@ -46,7 +49,10 @@ def test_auto_leaves_exact_where_numpy_would_be_late():
     """Some 1000 stars in view at 60 Hz: 3 ms by shaders, 50 ms where OpenGL has none."""
     asked = settings(tolerance_mag=0.02, tolerance_px=0.04)
     bright = replace(light(8, 6.0), rates_e_per_s=np.repeat(light(8, 6.0).rates_e_per_s, 200), sky_share=0.1)
-    by_shader, by_numpy = (choose_codes(asked, replace(bright, has_compute=has_compute)) for has_compute in (True, False))
+    by_shader, by_numpy = (
+        choose_codes(asked, replace(bright, cost=partial(level_cost, context=SimpleNamespace(version_code=version))))
+        for version in (430, 330)
+    )
     assert (by_shader.method, by_numpy.method) == ("exact", "round")
     assert "in NumPy" in by_numpy.choice.error and "OpenGL 4.3" in by_numpy.choice.error
 
@@ -79,7 +85,7 @@ def test_what_the_file_asks_for_is_not_overruled():
 def test_sprites_are_as_small_as_the_tolerance_lets_them_be():
     wide = choose_sides(settings(tolerance_mag=1e-6, tolerance_px=1e-6), light(8, 6.0), "exact")
     narrow = choose_sides(settings(tolerance_mag=0.2, tolerance_px=0.2), light(8, 6.0), "exact")
-    full = footprint_px(SIGMA)
+    full = GaussianPsf(SIGMA).footprint_px
     assert (wide.sides[0].below_e_per_s, wide.sides[0].side_px) == (pytest.approx(3e38), full)
     assert narrow.sides[0].side_px < full
     assert narrow.cut_mag <= 0.05 and narrow.moved_px <= 0.05
@@ -98,14 +104,14 @@ def test_the_light_outside_a_sprite_is_no_more_than_said(size):
         middle = math.erf(0.5 / 1.2020815)
         worst = max(worst, shares[~inside].max() * middle)
         moved = max(moved, abs((shares * offsets)[inside].sum() / shares[inside].sum()))
-    assert worst <= outside_share(size, SIGMA) * (1 + 1e-6)
-    assert cut_px(size, SIGMA) == pytest.approx(math.hypot(moved, moved), rel=1e-3)
+    assert worst <= GaussianPsf(SIGMA).outside_share(size) * (1 + 1e-6)
+    assert cut_px(size, GaussianPsf(SIGMA)) == pytest.approx(math.hypot(moved, moved), rel=1e-3)
 
 
 def test_small_sprites_give_the_codes_of_whole_ones_but_where_wings_meet(bench_with):
     """What is left out lights no pixel by itself; added to another star's it may make up a step, never two."""
     bench = bench_with('[render]\neffort = "auto"\nquantisation = "round"\n')
-    assert min(side.side_px for side in bench.renderer.target.sides) < bench.renderer.footprint_px
+    assert min(side.side_px for side in bench.renderer.target.sides) < bench.psf.footprint_px
     small = bench.draw(ORION).levels.astype(int)
     whole = bench_with('[render]\nquantisation = "round"\n').draw(ORION).levels.astype(int)
     lit = (whole > 0).sum()
@@ -118,10 +124,10 @@ def test_the_linear_image_is_whole_all_the_same(bench_with):
     bench = bench_with('[render]\neffort = "auto"\ntolerance_mag = 0.5\ntolerance_px = 0.5\n')
     frame = bench.frame(ORION)
     sprites = bench.sprites(ORION, bench.stars)
-    exact = linear_image(sprites, bench.camera.resolution_px, SIGMA)
+    exact = linear_image(sprites, bench.camera.resolution_px, GaussianPsf(SIGMA))
     assert frame.linear.sum() == pytest.approx(exact.sum(), rel=FLOAT32)
     bench.draw(ORION)
-    shown = linear_image(bench.sprites(ORION), bench.camera.resolution_px, SIGMA)
+    shown = linear_image(bench.sprites(ORION), bench.camera.resolution_px, GaussianPsf(SIGMA))
     assert bench.renderer.linear().sum() == pytest.approx(shown.sum(), rel=FLOAT32)
 
 

@@ -11,7 +11,7 @@ from hilstar.bench.build import load
 from hilstar.bench.effort import explain
 from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
-from hilstar.scene.psf import peak_share
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import pack_sprites
 from hilstar.tracker.star_errors import stamp_errors
 
@@ -63,12 +63,12 @@ def drawn_errors(bench, rng):
     whole = x.ravel(), y.ravel()
     x_px, y_px = (place + rng.uniform(-0.5, 0.5, place.size) for place in whole)
     sigma_px, white = bench.config.render.sprite_sigma_px, bench.flux_at_white_e_per_s * bench.darkest
-    brightest = white / peak_share(sigma_px)
+    brightest = white / GaussianPsf(sigma_px).peak_share
     deepest = 2.5 * math.log10(brightest / bench.stars.electrons_per_s.min())
     rates = brightest * 10 ** (-0.4 * rng.choice(np.linspace(0, deepest, 5), x_px.size))
-    sprites = pack_sprites(x_px, y_px, rates, np.arange(x_px.size), SIZE, bench.renderer.footprint_px)
+    sprites = pack_sprites(x_px, y_px, rates, np.arange(x_px.size), SIZE, bench.psf.footprint_px)
     bench.renderer.draw(sprites, 0)
-    images = shown_light(bench.renderer.levels(), bench.panel), linear_image(sprites, SIZE, sigma_px)
+    images = shown_light(bench.renderer.levels(), bench.panel), linear_image(sprites, SIZE, GaussianPsf(sigma_px))
     near = np.arange(-HALF_PX, HALF_PX + 1)
     rows, columns = whole[1][:, None, None] + near[:, None], whole[0][:, None, None] + near
     shown, wanted = (image[rows, columns] for image in images)

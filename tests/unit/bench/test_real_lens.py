@@ -9,6 +9,7 @@ from scipy.special import ndtr
 from hilstar.bench.build import load
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
+from hilstar.scene.psf import GaussianPsf
 from hilstar.twin.budget import budget
 from tests.support.real_lens import SIZE, true_places_px, write_bench
 
@@ -41,7 +42,7 @@ def attitude(rng):
 
 
 def test_no_star_is_lost_and_none_is_a_ghost(bench, folder, rng):
-    reach = bench.renderer.footprint_px // 2
+    reach = bench.psf.footprint_px // 2
     for _ in range(FIELDS):
         q = attitude(rng)
         x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
@@ -171,7 +172,7 @@ def test_a_fast_star_that_cuts_a_corner_from_beyond_the_lens_to_beyond_it_is_dra
         seen = camera.cam_to_image @ to_matrix(propagate(turn.q_icrs_to_cam, rate, seconds)) @ from_star
         assert np.isnan(camera.project(seen[None])[0])
     sigma_px = bench.config.render.sprite_sigma_px
-    found = swept_sprites(bench.shown_stars, turn, Scan((0, 1), 0.0, hold_s), camera, bench.renderer.footprint_px, sigma_px)
+    found = swept_sprites(bench.shown_stars, turn, Scan((0, 1), 0.0, hold_s), camera, GaussianPsf(sigma_px))
     assert found.data["electrons_per_s"][found.star == star].sum() > 0.01 * bench.shown_stars.electrons_per_s[star]
 
 

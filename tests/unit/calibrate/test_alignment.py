@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.calibrate.alignment import align, groups_of, summary_of
+from hilstar.calibrate.alignment import align, groups_of, remarks_of
 from hilstar.calibrate.attitude_pairs import COMMANDED, Pairs
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
@@ -88,7 +88,7 @@ def test_one_attitude_determines_the_rotation_and_the_summary_says_what_it_canno
     commanded = np.repeat(commanded_of(rng, 1), 20, axis=0)
     found = align(pairs_of(commanded, turned_by(rng, commanded)), CAMERA)
     assert np.abs(np.subtract(found.rotation_arcsec, PLANTED_ARCSEC) / NOISE_ARCSEC).max() < SIGMAS / np.sqrt(20)
-    assert any("one attitude" in note for note in summary_of(found).notes)
+    assert any("one attitude" in note for note in remarks_of(found))
 
 
 def test_what_goes_with_attitude_is_told_from_noise_by_repeats(rng):
@@ -101,7 +101,7 @@ def test_what_goes_with_attitude_is_told_from_noise_by_repeats(rng):
     assert found.residual.repeat.cross == pytest.approx(5.0, rel=0.2)
     assert found.residual.unexplained.cross == pytest.approx(30.0, rel=0.35)
     assert found.residual.unexplained.roll == pytest.approx(100.0, rel=0.35)
-    assert any("a rotation does not explain" in note and "dots" in note for note in summary_of(found).notes)
+    assert any("a rotation does not explain" in note and "dots" in note for note in remarks_of(found))
     assert not found.residual.causes
     assert min(found.sigma_arcsec) > 30 / np.sqrt(40) / 1.5  # the attitudes count, not the pairs
 

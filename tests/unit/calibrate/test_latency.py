@@ -7,7 +7,7 @@ import pytest
 
 from hilstar.calibrate.latency import Edges, pair
 from hilstar.errors import InputError
-from hilstar.run.screen.photodiode import marker_light
+from hilstar.run.screen.screen import marker_light
 
 PERIOD_NS = 1e9 / 60
 

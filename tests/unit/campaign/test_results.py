@@ -51,14 +51,14 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
 def test_a_planted_budget_and_what_a_parameter_costs_are_found(table: Path) -> None:
     config = read_bench_file(write_campaign(table.parent).parent / "bench.toml").config
     found = write_results(table, config, 1)
-    assert np.all(np.abs(np.array(found.bias_arcsec) - BIAS_ARCSEC) < BIAS_LIMIT_ARCSEC)
+    assert np.all(np.abs(np.array(found["bias_arcsec"]) - BIAS_ARCSEC) < BIAS_LIMIT_ARCSEC)
     # The mean square of 1 + 2 a over a from 0 to 1.
     growth = np.sqrt(1 + COST + COST**2 / 3)
-    assert found.noise_arcsec.cross == pytest.approx(growth, rel=SHARE_OF_BIAS)
-    assert found.noise_arcsec.roll == pytest.approx(8 * growth, rel=SHARE_OF_BIAS)
-    assert found.wrong == CASES // 50 and found.availability == pytest.approx(0.98)
-    assert any("too far apart" in note for note in found.notes)  # of an all-sky plan
-    assert "a costs the most of the error across" in found.findings[0]
+    assert found["noise_arcsec"].cross == pytest.approx(growth, rel=SHARE_OF_BIAS)
+    assert found["noise_arcsec"].roll == pytest.approx(8 * growth, rel=SHARE_OF_BIAS)
+    assert found["wrong"] == CASES // 50 and found["availability"] == pytest.approx(0.98)
+    assert any("too far apart" in note for note in found["notes"])  # of an all-sky plan
+    assert "a costs the most of the error across" in found["findings"][0]
     each = {cost.parameter: cost for cost in costs(read_cases(table)) if cost.measure == "roll"}
     assert each["a"].sure and not each["b"].sure and not each["word"].sure
     assert each["a"].places[each["a"].worst] > 0.8

@@ -12,6 +12,7 @@ from tests.support.heads import heads_file
 COMMANDS = {
     "verify": ["verify", "{bench}"],
     "budget": ["budget", "{bench}"],
+    "noise": ["budget", "{bench}", "--noise"],
     "benchmark": ["benchmark", "{bench}"],
     "study": ["study", "chain", "{bench}"],
     "assess": ["assess", "{bench}", "{bench}"],
@@ -40,7 +41,7 @@ def test_a_directory_is_looked_at_before_the_work_and_made_after_the_input_is_re
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["budget", "benchmark", "study", "dots", "first-light"])
+@pytest.mark.parametrize("name", ["budget", "noise", "benchmark", "study", "dots", "first-light"])
 def test_a_file_of_heads_in_a_bench_file_s_place_is_refused_in_words(name, tmp_path):
     line = [part.format(bench=heads_file(tmp_path, 5599)) for part in COMMANDS[name]]
     assert_refused(run_hilstar_here(*line, "-o", tmp_path / "out"), 2, "heads.toml: ", "give one of its heads' files")

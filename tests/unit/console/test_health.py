@@ -5,13 +5,16 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from hilstar.console.messages import AttitudeState, LedgerState, RunState
+from hilstar.console.messages import LedgerState, RunState
+from hilstar.console.protocol import NewestFrame, ShownAttitude
 from hilstar.console.server.reader import Health, RecentFrames, reasons
 
 S = 1_000_000_000
 NOW = 1_000 * S
-ATTITUDE = AttitudeState((1.0, 0.0, 0.0, 0.0), None, 1_250_000_000)
-WELL = RunState(host_ns=NOW - S // 20, alive_ns=NOW - S // 10, missing=False, blank=False, attitude=ATTITUDE)
+ATTITUDE = ShownAttitude(q=(1.0, 0.0, 0.0, 0.0), ra_deg=90.0, dec_deg=0.0, roll_deg=0.0, rate_deg_s=None, age_ms=1250.0)
+FRAME = NewestFrame(number=1, missing=False, blank=False)
+STALE = replace(FRAME, stale=True)
+WELL = RunState(host_ns=NOW - S // 20, alive_ns=NOW - S // 10, frame=FRAME, attitude=ATTITUDE)
 LATELY = RecentFrames(NOW - S // 50)
 
 
@@ -27,11 +30,11 @@ def test_a_run_that_goes_well_has_no_reason():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"missing": True}, "no attitude has come yet"),
-        ({"stale": True}, "the attitude is stale: 1.2 s old"),
-        ({"stale": True, "attitude": replace(ATTITUDE, age_ns=3_725 * S)}, "the attitude is stale: 1 h 02 min old"),
-        ({"stale": True, "attitude": replace(ATTITUDE, age_ns=725 * S)}, "the attitude is stale: 12 min 05 s old"),
-        ({"stale": True, "attitude": None}, "the attitude is stale"),
+        ({"frame": NewestFrame()}, "no attitude has come yet"),
+        ({"frame": STALE}, "the attitude is stale: 1.2 s old"),
+        ({"frame": STALE, "attitude": replace(ATTITUDE, age_ms=3_725e3)}, "the attitude is stale: 1 h 02 min old"),
+        ({"frame": STALE, "attitude": replace(ATTITUDE, age_ms=725e3)}, "the attitude is stale: 12 min 05 s old"),
+        ({"frame": STALE, "attitude": None}, "the attitude is stale"),
         ({"alive_ns": 0}, "being prepared"),
         ({"alive_ns": NOW - S}, "the frame loop has hung for 1.0 s"),
         ({"host_ns": NOW - S, "alive_ns": NOW - S}, "silent for 1.0 s"),
@@ -67,7 +70,7 @@ def test_a_simulator_that_asks_for_nothing_is_a_reason_in_lockstep_alone():
 
 
 def test_a_session_is_as_well_as_its_steps():
-    assert found(pace="session", missing=True, stale=True) == []
+    assert found(pace="session", frame=replace(STALE, missing=True)) == []
     assert found(pace="session", failed=["focus failed: too dark"]) == ["focus failed: too dark"]
 
 

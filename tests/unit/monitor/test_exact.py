@@ -12,7 +12,7 @@ from hilstar.monitor.footprints import FootprintMap, star_losses_mag
 from hilstar.monitor.quantise import Panel, round_levels, shown_light
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.render.reference import linear_image
-from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import Sprites, pack_sprites
 from tests.support.centroiders import family_errors_px
 
@@ -32,17 +32,17 @@ FLUX_MAG = 0.01
 def sprites_at(x_px, y_px, electrons_per_s, resolution=FIELD, sigma=SIGMA) -> Sprites:
     x, y = np.atleast_1d(np.asarray(x_px, float)), np.atleast_1d(np.asarray(y_px, float))
     flux = np.broadcast_to(np.asarray(electrons_per_s, float), x.shape)
-    return pack_sprites(x, y, flux, np.arange(len(x)), resolution, footprint_px(sigma))
+    return pack_sprites(x, y, flux, np.arange(len(x)), resolution, GaussianPsf(sigma).footprint_px)
 
 
 def flux_of(mag, sigma=SIGMA):
     """Electrons per second of a star so many magnitudes under the one whose peak is white."""
-    return WHITE * 10 ** (-0.4 * np.asarray(mag)) / peak_share(sigma)
+    return WHITE * 10 ** (-0.4 * np.asarray(mag)) / GaussianPsf(sigma).peak_share
 
 
 def phases(count, mag, sigma=SIGMA):
     """count x count stars, one to a tile, at every phase; the tile's side and the resolution."""
-    tile = footprint_px(sigma) + 2
+    tile = GaussianPsf(sigma).footprint_px + 2
     place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
     x, y = np.meshgrid(place, place)
     side = count * tile
@@ -59,14 +59,14 @@ def sums(image, tile):
 
 def errors(sprites, levels, panel, sigma, tile):
     """Each star's flux error, mag, and centroid errors along x and y, px."""
-    wanted = linear_image(sprites, levels.shape[::-1], sigma)
+    wanted = linear_image(sprites, levels.shape[::-1], GaussianPsf(sigma))
     light, x, y = sums(wanted, tile)
     shown, shown_x, shown_y = sums(shown_light(levels, panel), tile)
     return -2.5 * np.log10(shown / light), shown_x / shown - x / light, shown_y / shown - y / light
 
 
 def exact(sprites, panel, resolution=FIELD, sigma=SIGMA):
-    return ExactQuantiser(panel, resolution, sigma).levels(sprites).copy()
+    return ExactQuantiser(panel, resolution, GaussianPsf(sigma)).levels(sprites).copy()
 
 
 @pytest.mark.parametrize(("bits", "aim_mag", "range_mag", "aim_px"), AIMS)
@@ -87,7 +87,7 @@ def test_rounding_alone_misses_the_aim():
     panel = Panel(srgb_response(10), WHITE)
     sprites, tile = phases(12, 8.0)
     side = 12 * tile
-    linear = linear_image(sprites, (side, side), SIGMA).astype(np.float32)
+    linear = linear_image(sprites, (side, side), GaussianPsf(SIGMA)).astype(np.float32)
     flux, x, _ = errors(sprites, round_levels(linear, panel), panel, SIGMA, tile)
     assert np.abs(flux).max() > 0.05
     assert np.abs(x).max() > 1.5 * 0.03
@@ -109,7 +109,7 @@ def test_whatever_centroider_a_tracker_has_finds_the_star_a_third_as_far_off_as_
     x, y = (axis.ravel() for axis in np.meshgrid(place, place))
     size = (count * tile, count * tile)
     sprites = sprites_at(x, y, flux_of(6.0), size)
-    wanted = linear_image(sprites, size, SIGMA)
+    wanted = linear_image(sprites, size, GaussianPsf(SIGMA))
     rounded, chosen = (
         cut(shown_light(levels, panel), tile)
         for levels in (round_levels(wanted.astype(np.float32), panel), exact(sprites, panel, size))
@@ -132,7 +132,7 @@ def test_on_equal_steps_no_light_could_be_nearer(sigma, steps):
     sprites.data["electrons_per_s"] = np.float32(steps * step)
     side = 8 * tile
     levels = exact(sprites, panel, (side, side), sigma)
-    light, _, _ = sums(linear_image(sprites, (side, side), sigma), tile)
+    light, _, _ = sums(linear_image(sprites, (side, side), GaussianPsf(sigma)), tile)
     shown, _, _ = sums(shown_light(levels, panel), tile)
     wide = min(sigma) > 1.4
     assert np.abs(shown - light).max() <= (0.5 + wide) * step * EXCESS
@@ -151,7 +151,7 @@ def test_along_a_path_the_light_is_handed_on():
     x, y = (m[:, None] + turn[:, None] * along for m, turn in zip(middle, (np.cos(angle), np.sin(angle)), strict=True))
     data = sprites_at(x.ravel(), y.ravel(), np.full(x.size, flux_of(5.0) / nodes), size)
     sprites = replace(data, star=np.repeat(np.arange(count**2), nodes), per_star=nodes)
-    wanted = linear_image(sprites, size, SIGMA)
+    wanted = linear_image(sprites, size, GaussianPsf(SIGMA))
     rounded = errors_of_tiles(round_levels(wanted.astype(np.float32), panel), wanted, panel, 40)
     chosen = errors_of_tiles(exact(sprites, panel, size), wanted, panel, 40)
     alone = errors_of_tiles(exact(data, panel, size), wanted, panel, 40)
@@ -171,7 +171,7 @@ def test_every_pixel_shows_one_of_the_two_levels_about_its_light(rng):
     response = srgb_response(10)
     panel = Panel(response, WHITE)
     sprites = sprites_at(rng.uniform(5, 150, 60), rng.uniform(5, 110, 60), flux_of(rng.uniform(0, 8, 60)))
-    light = np.minimum(linear_image(sprites, FIELD, SIGMA) / WHITE, 1)
+    light = np.minimum(linear_image(sprites, FIELD, GaussianPsf(SIGMA)) / WHITE, 1)
     levels = exact(sprites, panel)
     lower = np.searchsorted(response.light, light * (1 + 1e-6), side="right") - 1
     assert (levels >= np.searchsorted(response.light, light * (1 - 1e-6), side="right") - 1).all()
@@ -185,7 +185,7 @@ def test_no_light_is_put_where_the_star_has_none(rng):
     sprites, tile = phases(10, 7.3)
     side = 10 * tile
     levels = exact(sprites, panel, (side, side))
-    light = linear_image(sprites, (side, side), SIGMA) / WHITE
+    light = linear_image(sprites, (side, side), GaussianPsf(SIGMA)) / WHITE
     y, x = np.nonzero((levels > 0) & (light < response.threshold[0]))
     far = np.hypot(x[:, None] - sprites.x_px, y[:, None] - sprites.y_px).min(axis=1)
     assert len(far) > 100
@@ -207,7 +207,7 @@ def test_a_star_over_white_stays_white_and_its_neighbours_bring_no_more():
     panel = Panel(response, WHITE)
     sprites = sprites_at([50.2], [40.4], flux_of(-2.0))
     levels = exact(sprites, panel)
-    light = linear_image(sprites, FIELD, SIGMA) / WHITE
+    light = linear_image(sprites, FIELD, GaussianPsf(SIGMA)) / WHITE
     assert (levels[light >= 1] == 255).all()
     kept = np.minimum(light, 1)
     shown = shown_light(levels, panel) / WHITE
@@ -221,7 +221,7 @@ def test_overlapping_stars_keep_the_light_of_both():
     x, y = np.array([50.2, 52.9, 51.0, 100.0, 100.0]), np.array([40.4, 41.1, 44.0, 60.0, 60.0])
     sprites = sprites_at(x, y, flux_of(np.array([2.0, 3.0, 5.5, 6.0, 6.0])))
     levels = exact(sprites, panel)
-    wanted = linear_image(sprites, FIELD, SIGMA)
+    wanted = linear_image(sprites, FIELD, GaussianPsf(SIGMA))
     shown = shown_light(levels, panel)
     left, right = np.s_[30:55, 38:64], np.s_[50:70, 90:110]
     # Three groups and one: each within half of the smallest step, or far within where steps differ.
@@ -237,7 +237,7 @@ def test_stars_cut_by_the_edge_show_their_part_of_the_light():
     panel = Panel(response, WHITE)
     sprites = sprites_at([-0.5, 159.4, 60.2, 100.7], [50.0, 80.3, -1.0, 120.0], flux_of(np.full(4, 3.0)))
     levels = exact(sprites, panel)
-    wanted = linear_image(sprites, FIELD, SIGMA)
+    wanted = linear_image(sprites, FIELD, GaussianPsf(SIGMA))
     shown = shown_light(levels, panel)
     for box in (np.s_[40:60, :10], np.s_[70:90, 150:], np.s_[:10, 50:70], np.s_[110:, 90:112]):
         assert wanted[box].sum() > 100 * response.light[1] * WHITE
@@ -246,7 +246,7 @@ def test_stars_cut_by_the_edge_show_their_part_of_the_light():
 
 def test_nothing_remains_of_the_image_before(rng):
     panel = Panel(srgb_response(8), WHITE)
-    quantiser = ExactQuantiser(panel, FIELD, SIGMA)
+    quantiser = ExactQuantiser(panel, FIELD, GaussianPsf(SIGMA))
     many = sprites_at(rng.uniform(-5, 165, 200), rng.uniform(-5, 125, 200), flux_of(rng.uniform(-1, 6, 200)))
     few = sprites_at([30.3], [40.4], flux_of(2.0))
     alone = quantiser.levels(few).copy()
@@ -296,8 +296,8 @@ def test_what_cannot_be_shown_is_named_with_its_loss():
     step = response.light[1] * WHITE
     flux = np.array([flux_of(-2.0), flux_of(1.0), 0.4 * step, flux_of(4.0)])
     sprites = sprites_at([30.0, 60.3, 100.4, 130.0], [30.0, 60.6, 80.4, 30.0], flux)
-    footprints = FootprintMap(FIELD, SIGMA)
-    light = linear_image(sprites, FIELD, SIGMA)[:50, :50]
+    footprints = FootprintMap(FIELD, GaussianPsf(SIGMA))
+    light = linear_image(sprites, FIELD, GaussianPsf(SIGMA))[:50, :50]
     shown_mag = star_losses_mag(sprites, panel, footprints, exact(sprites, panel))
     assert shown_mag[0] == pytest.approx(-2.5 * np.log10(np.minimum(light, WHITE).sum() / light.sum()), abs=1e-3)
     assert np.abs(shown_mag[[1, 3]]).max() < 0.01
@@ -309,7 +309,7 @@ def test_a_star_within_a_brighter_one_loses_what_that_one_does():
     panel = Panel(srgb_response(8), WHITE)
     # As alpha Centauri B within A: every pixel of its own is A's.
     sprites = sprites_at([30.0, 30.02], [30.0, 30.01], np.array([flux_of(-2.0), flux_of(-0.6)]))
-    footprints = FootprintMap(FIELD, SIGMA)
+    footprints = FootprintMap(FIELD, GaussianPsf(SIGMA))
     shown_mag = star_losses_mag(sprites, panel, footprints, exact(sprites, panel))
     assert shown_mag[0] > 0.1
     assert shown_mag[1] == pytest.approx(shown_mag[0], abs=0.02)  # a fiftieth of a pixel apart

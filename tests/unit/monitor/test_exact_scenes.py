@@ -8,7 +8,7 @@ import pytest
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import round_levels
 from hilstar.monitor.response import srgb_response
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import pack_sprites
 from tests.support.exact_scenes import (
     SCENES,
@@ -29,7 +29,7 @@ FAMILY = {"sigma 0.3 px": 0.8, "sigma 0.3 px, faint": 1.7, "uneven": 0.35, "unev
 @pytest.mark.parametrize("name", SCENES)
 def test_no_scene_is_worse_than_rounded(name):
     scene = SCENES[name]()
-    levels = ExactQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px).levels(scene.sprites)
+    levels = ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(scene.sprites)
     assert levels.max() <= scene.response.white and levels.shape == (SIDE, SIDE)
     assert_no_worse(levels, name, scene)
 
@@ -37,7 +37,7 @@ def test_no_scene_is_worse_than_rounded(name):
 @pytest.mark.parametrize("name", FAMILY)
 def test_nor_by_any_centroider_but_one_that_fits_less_than_a_pixel(name):
     scene = SCENES[name]()
-    levels = ExactQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px).levels(scene.sprites)
+    levels = ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(scene.sprites)
     rounded = family_of(round_levels(scene.linear.astype(np.float32), scene.panel), scene)
     found = family_of(levels, scene)
     share = {who: found[who] / rounded[who] for who in found}
@@ -48,7 +48,7 @@ def test_nor_by_any_centroider_but_one_that_fits_less_than_a_pixel(name):
 
 def test_all_over_white_is_white_where_it_is_and_no_more_beside():
     scene = SCENES["all clipped"]()
-    levels = ExactQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px).levels(scene.sprites)
+    levels = ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px)).levels(scene.sprites)
     over = scene.linear >= WHITE
     assert over.sum() > 9 * len(scene.windows)
     assert (levels[over] == scene.response.white).all()
@@ -58,8 +58,8 @@ def test_all_over_white_is_white_where_it_is_and_no_more_beside():
 @pytest.mark.parametrize("uniformity", [None, uneven()], ids=["even", "uneven"])
 def test_no_stars_are_black_also_after_some(uniformity):
     scene = single(3, srgb_response(8), uniformity=uniformity)
-    quantiser = ExactQuantiser(scene.panel, (SIDE, SIDE), USUAL)
-    none = pack_sprites(*np.zeros((3, 0)), np.zeros(0, dtype=np.intp), (SIDE, SIDE), footprint_px(USUAL))
+    quantiser = ExactQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(USUAL))
+    none = pack_sprites(*np.zeros((3, 0)), np.zeros(0, dtype=np.intp), (SIDE, SIDE), GaussianPsf(USUAL).footprint_px)
     assert quantiser.levels(none).max() == 0
     assert quantiser.levels(scene.sprites).max() > 0
     assert quantiser.levels(none).max() == quantiser.levels(None).max() == 0

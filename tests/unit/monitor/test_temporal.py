@@ -12,7 +12,7 @@ from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import gamma_response, srgb_response, table_response
 from hilstar.monitor.temporal import MAX_CARRIED_STEPS, NONE_BEFORE, TemporalQuantiser, places_before
 from hilstar.render.reference import linear_image
-from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import pack_sprites
 from tests.support.centroiders import family_errors_px, moment
 
@@ -35,7 +35,7 @@ def linear(bits):
 
 
 def flux_of(mag):
-    return WHITE * 10 ** (-0.4 * np.asarray(mag)) / peak_share(SIGMA)
+    return WHITE * 10 ** (-0.4 * np.asarray(mag)) / GaussianPsf(SIGMA).peak_share
 
 
 def places(shift_x=0.0, shift_y=0.0):
@@ -47,7 +47,7 @@ def places(shift_x=0.0, shift_y=0.0):
 
 def stars(x, y, flux, numbers=None, size=SIZE):
     numbers = np.arange(len(x)) if numbers is None else numbers
-    return pack_sprites(x, y, np.broadcast_to(np.asarray(flux, float), x.shape), numbers, size, footprint_px(SIGMA))
+    return pack_sprites(x, y, np.broadcast_to(np.asarray(flux, float), x.shape), numbers, size, GaussianPsf(SIGMA).footprint_px)
 
 
 def tiles(image):
@@ -56,7 +56,7 @@ def tiles(image):
 
 def shown(panel, frames):
     """The light of frames of sprites, one after another, (frames, tiles, h, w)."""
-    quantiser = TemporalQuantiser(panel, SIZE, SIGMA)
+    quantiser = TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA))
     return np.stack([tiles(shown_light(quantiser.levels(sprites), panel)) for sprites in frames])
 
 
@@ -79,7 +79,7 @@ def worst(frames, wanted, every=1):
 
 
 def skies(frames):
-    return np.stack([tiles(linear_image(sprites, SIZE, SIGMA)) for sprites in frames])
+    return np.stack([tiles(linear_image(sprites, SIZE, GaussianPsf(SIGMA))) for sprites in frames])
 
 
 @pytest.mark.parametrize("name", ["srgb", "gamma2.2", "lcd-example"])
@@ -153,13 +153,13 @@ def test_a_clipped_star_is_right_again_after_it_clips(over):
     panel = Panel(srgb_response(8), WHITE)
     step = np.diff(panel.response.light).max() / panel.response.light[1]
     bright, fine = (stars(*places(), flux_of(mag)) for mag in (-over, 4.0))
-    quantiser = TemporalQuantiser(panel, SIZE, SIGMA)
+    quantiser = TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA))
     for _ in range(60):
         quantiser.levels(bright)
     assert np.abs(quantiser.left.error).max() < 4 * MAX_CARRIED_STEPS * step
     quantiser.levels(fine)
     after = np.stack([tiles(shown_light(quantiser.levels(fine), panel)) for _ in range(FRAMES)]).mean(axis=0)
-    flux = 2.5 * np.log10(after.sum((1, 2)) / tiles(linear_image(fine, SIZE, SIGMA)).sum((1, 2)))
+    flux = 2.5 * np.log10(after.sum((1, 2)) / tiles(linear_image(fine, SIZE, GaussianPsf(SIGMA))).sum((1, 2)))
     assert np.abs(flux).max() < AIM_MAG
 
 
@@ -168,7 +168,7 @@ def test_a_star_that_comes_back_begins_anew_and_the_others_go_on():
     x, y = places()
     both = stars(x[:2], y[:2], flux_of([6.0, 6.3]))
     first = replace(both, data=both.data[:1], star=both.star[:1], x_px=both.x_px[:1], y_px=both.y_px[:1])
-    gone, stays = TemporalQuantiser(panel, SIZE, SIGMA), TemporalQuantiser(panel, SIZE, SIGMA)
+    gone, stays = TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)), TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA))
     seen = [gone.levels(sprites).copy() for sprites in (both, both, first, both, both)]
     alone = [stays.levels(first).copy() for _ in range(5)]
     left, right = np.s_[:TILE, :TILE], np.s_[:TILE, TILE : 2 * TILE]
@@ -183,7 +183,7 @@ def test_a_star_is_known_by_its_number_in_whatever_order_they_come(rng):
     """Also light that a fault adds, whose numbers are negative."""
     panel = Panel(srgb_response(8), WHITE)
     sprites = stars(*places(), flux_of(6.0), np.arange(SIDE**2) - 5)
-    straight, mixed = TemporalQuantiser(panel, SIZE, SIGMA), TemporalQuantiser(panel, SIZE, SIGMA)
+    straight, mixed = TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA)), TemporalQuantiser(panel, SIZE, GaussianPsf(SIGMA))
     for _ in range(4):
         order = rng.permutation(len(sprites))
         other = replace(

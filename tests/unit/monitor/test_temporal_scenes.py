@@ -6,11 +6,12 @@ import pytest
 
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.scene.psf import GaussianPsf
 from tests.support.exact_scenes import FRAMES, SCENES, SIDE, assert_right_over_frames
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_no_scene_is_near_rounded_and_a_part_of_a_refresh_costs_nothing(name):
     scene = SCENES[name]()
-    quantiser = TemporalQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px)
+    quantiser = TemporalQuantiser(scene.panel, (SIDE, SIDE), GaussianPsf(scene.sigma_px))
     assert_right_over_frames([shown_light(quantiser.levels(scene.sprites), scene.panel) for _ in range(FRAMES)], scene)

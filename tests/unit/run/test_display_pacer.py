@@ -13,10 +13,9 @@ from hilstar.frame.view import View
 from hilstar.notices import Notices
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.operator import Aids
-from hilstar.run.pacer import Moment
+from hilstar.run.pacer import Moment, Shown
 from hilstar.run.screen.display_pacer import DisplayPacer
-from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
-from hilstar.run.shown import Shown
+from hilstar.run.screen.screen import DrawBudget, SwapClock
 from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock, WellGpu
 

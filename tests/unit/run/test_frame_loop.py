@@ -11,8 +11,7 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.config import parse_config
 from hilstar.frame.view import View
 from hilstar.run.loop import FrameLoop, Limit
-from hilstar.run.pacer import ClockPacer, Moment
-from hilstar.run.shown import Shown
+from hilstar.run.pacer import Moment, Pacer, Shown
 from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock, WellGpu
 
@@ -52,7 +51,7 @@ class Run:
         self.clock = FakeClock()
         bench = SlowBench(tmp_path, self.clock, cost, more)
         self.shown: list[Shown] = []
-        self.loop = FrameLoop(bench, self.shown.append, ClockPacer(PERIOD_NS, self.clock))
+        self.loop = FrameLoop(bench, self.shown.append, Pacer(PERIOD_NS, self.clock))
         self.lights_ns: list[int] = []
 
         def draw_slot(moment: Moment) -> Shown | None:
@@ -76,7 +75,7 @@ def test_frames_stand_on_a_grid_of_the_clock(tmp_path):
 
 def test_a_wait_that_wakes_late_shifts_no_later_frame(tmp_path):
     clock = FakeClock(wakes_late_ns=100_000)
-    pacer = ClockPacer(PERIOD_NS, clock)
+    pacer = Pacer(PERIOD_NS, clock)
     begins = []
     for moment in pacer.moments():
         clock.wait_until(moment.begin_ns, pacer.stop)
@@ -125,7 +124,7 @@ def test_slots_after_the_end_of_a_run_are_not_missed(tmp_path):
 
 def test_a_stopped_run_draws_no_other_frame(tmp_path):
     clock = FakeClock()
-    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), pacer=ClockPacer(PERIOD_NS, clock))
+    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), pacer=Pacer(PERIOD_NS, clock))
     drawn = []
 
     def draw_slot(moment: Moment) -> Shown | None:
@@ -141,7 +140,7 @@ def test_a_stopped_run_draws_no_other_frame(tmp_path):
 def test_frames_of_a_lead_in_are_not_counted(tmp_path):
     clock = FakeClock()
     shown = []
-    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), shown.append, ClockPacer(PERIOD_NS, clock))
+    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), shown.append, Pacer(PERIOD_NS, clock))
     loop.lead_in(lambda moment: loop.draw(moment.slot, 0, None, moment), lambda: len(shown) == 5)
     assert [frame.missing for frame in shown] == [True] * 5
     loop.paced(Limit(slots=7), lambda moment: loop.draw(moment.slot, 0, STILL, moment))
@@ -151,7 +150,7 @@ def test_frames_of_a_lead_in_are_not_counted(tmp_path):
 
 def test_a_stopped_lead_in_ends(tmp_path):
     clock = FakeClock()
-    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), pacer=ClockPacer(PERIOD_NS, clock))
+    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), pacer=Pacer(PERIOD_NS, clock))
     loop.stop.set()
     loop.lead_in(lambda moment: pytest.fail("it was stopped"), lambda: False)
     assert loop.tally.frames == 0
@@ -171,7 +170,7 @@ def test_without_an_attitude_a_frame_is_blank_and_says_so(tmp_path):
 
 def test_a_frame_that_has_no_moment_is_never_late(tmp_path):
     clock = FakeClock()
-    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 100 * PERIOD_NS), pacer=ClockPacer(PERIOD_NS, clock))
+    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 100 * PERIOD_NS), pacer=Pacer(PERIOD_NS, clock))
     assert loop.draw(0, 0, STILL) is not None
     assert loop.tally.given_up_frames == 0
     assert loop.notices.counts() == {"first-attitude": 1}
@@ -182,16 +181,14 @@ def test_stars_move_within_a_frame_on_a_screen_only_unless_the_bench_file_says_o
     clock = FakeClock()
     bench = SlowBench(tmp_path, clock, lambda number: 0, f'[render]\nmotion = "{motion}"\n')
     rate = np.array([0.0, 0.1, 0.0])
-    FrameLoop(bench, pacer=ClockPacer(PERIOD_NS, clock)).draw(
-        0, 0, Attitude(STILL.q_icrs_to_cam, 0, False, rate_cam_rad_s=rate)
-    )
+    FrameLoop(bench, pacer=Pacer(PERIOD_NS, clock)).draw(0, 0, Attitude(STILL.q_icrs_to_cam, 0, False, rate_cam_rad_s=rate))
     assert (bench.asked[0] is rate) == paths
 
 
 def test_a_frame_starts_when_it_is_due_or_on_a_screen_when_that_has_swapped_it(tmp_path):
     clock = FakeClock()
     bench = SlowBench(tmp_path, clock, lambda number: 0)
-    loop, started = FrameLoop(bench, pacer=ClockPacer(PERIOD_NS, clock)), []
+    loop, started = FrameLoop(bench, pacer=Pacer(PERIOD_NS, clock)), []
     loop.on_frame = lambda number, frame_ns: started.append((number, frame_ns, clock.now_ns()))
     due_ns = clock.now_ns()
     loop.draw(0, 0, STILL, Moment(0, due_ns, due_ns))
@@ -205,7 +202,7 @@ def test_a_frame_starts_when_it_is_due_or_on_a_screen_when_that_has_swapped_it(t
 
 def test_a_frame_that_is_given_up_has_no_start_on_a_screen(tmp_path):
     clock = FakeClock()
-    loop, started = FrameLoop(SlowBench(tmp_path, clock, lambda number: 1e8), pacer=ClockPacer(PERIOD_NS, clock)), []
+    loop, started = FrameLoop(SlowBench(tmp_path, clock, lambda number: 1e8), pacer=Pacer(PERIOD_NS, clock)), []
     loop.on_frame = lambda number, frame_ns: started.append(number)
     due_ns = clock.now_ns()
     assert loop.draw(0, 0, STILL, Moment(0, due_ns, due_ns, swap_ns=due_ns)) is None

@@ -14,7 +14,7 @@ from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.frame_pulse import FramePulse
 from tests.support.rts_server import KeptLine
-from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
+from tests.support.waiting import PATIENCE_S, wait_for
 
 # Between frames here; a pulse is 1 ms. On a machine whose cores are busy a thread may be given none for some of them.
 FRAME_S = 0.02
@@ -65,22 +65,21 @@ def frames(pulse, count, first=0):
 
 
 @pytest.mark.parametrize("active", ["high", "low"])
-@best_of_three
 def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_ends_at_rest(kept, active):
     high = active == "high"
     with FramePulse(Line(high), settings(active=active, pulse_ms=3.0), Notices()) as pulse:
-        frames(pulse, 12)
+        for number in range(12):
+            frames(pulse, 1, number)
+            wait_for(lambda number=number: pulse.summary().pulses == number + 1, "its pulse has ended", poll_s=0.0)
     summary = pulse.summary()
     line = kept[-1]
     levels = [level for _, level in line.edges]
     assert levels[0] is levels[-1] is (not high)
     raised = [at_ns for at_ns, level in line.edges if level is high]
     fallen = [at_ns for at_ns, level in line.edges[1:] if level is not high]
-    assert len(raised) == summary.pulses == 12 - summary.skipped
-    in_time(summary.pulses >= 6, summary)
+    assert len(raised) == summary.pulses == 12 and summary.skipped == 0
     widths_ms = sorted((down - up) / 1e6 for up, down in zip(raised, fallen, strict=True))
-    assert widths_ms[0] >= 3.0
-    in_time(widths_ms[len(widths_ms) // 2] < 3.0 + FRAME_S * 500, widths_ms)
+    assert 3.0 <= widths_ms[0] < 3.0 + FRAME_S * 500  # a busy machine makes some of them wider
     assert not line.is_open
     assert 0 <= summary.delay_ms <= summary.max_delay_ms and summary.jitter_ms >= 0 and summary.lost == 0
 
@@ -108,24 +107,24 @@ def test_of_every_third_frame(kept):
     assert summary.pulses + summary.skipped == 3
 
 
-@best_of_three
 def test_a_slow_line_keeps_no_frame_waiting_and_what_it_misses_is_counted(kept):
     line = Line()
     with FramePulse(line, settings(), Notices()) as pulse:
         line.slow_s = 0.1
-        begin_s = time.thread_time()
+        begin_s, asked_s = time.thread_time(), time.monotonic()
         costs_s = []
         for number in range(20):
             start_s = time.monotonic()
             pulse.frame(number, time.monotonic_ns())
             costs_s.append(time.monotonic() - start_s)
             time.sleep(0.01)
-        in_time(sorted(costs_s)[10] < 0.005, costs_s)  # half of a line's time is 0.05
+        # A frame that waited for the line would cost 0.1 s, each of them; a busy machine holds up some.
+        assert sorted(costs_s)[5] < 0.005, costs_s
         assert time.thread_time() - begin_s < 0.1
+        busy_s = time.monotonic() - asked_s
     summary = pulse.summary()
     assert summary.pulses + summary.skipped == 20
-    assert summary.pulses >= 1
-    in_time(summary.skipped >= 10, summary)
+    assert 1 <= summary.pulses <= 1 + busy_s / 0.2  # the line takes 0.1 s to rise and 0.1 s to fall
     assert summary.line_ms >= 100
 
 

@@ -74,22 +74,22 @@ def test_each_fault_of_a_display_is_said_with_what_to_do(monitor, changes, timin
 
 @pytest.mark.parametrize("buffers", [2, 3])
 @pytest.mark.parametrize("hz", [60, 120])
-def test_a_fixed_refresh_is_not_taken_for_a_variable_one(tmp_path, monkeypatch, buffers, hz):
-    screen, display = model_screen(tmp_path, monkeypatch, hz=hz, buffers=buffers, stamp_ns=200_000, deadline_ns=400_000)
+def test_a_fixed_refresh_is_not_taken_for_a_variable_one(tmp_path, buffers, hz):
+    screen, display = model_screen(tmp_path, hz=hz, buffers=buffers, stamp_ns=200_000, deadline_ns=400_000)
     assert not pass_gate(screen, force=False, clock=display.clock).variable
 
 
 @pytest.mark.parametrize("stamp_ns", [None, 200_000])
-def test_a_variable_refresh_is_recognised_and_refused(tmp_path, monkeypatch, stamp_ns):
-    screen, display = model_screen(tmp_path, monkeypatch, variable=True, stamp_ns=stamp_ns)
+def test_a_variable_refresh_is_recognised_and_refused(tmp_path, stamp_ns):
+    screen, display = model_screen(tmp_path, variable=True, stamp_ns=stamp_ns)
     with pytest.raises(MachineError, match=r"variable refresh.*VariableRefresh.*or add --force"):
         pass_gate(screen, force=False, clock=display.clock)
     assert pass_gate(screen, force=True, clock=display.clock).variable
 
 
-def test_a_wrong_setting_of_the_output_is_refused_and_a_doubtful_one_is_told(tmp_path, monkeypatch, caplog):
+def test_a_wrong_setting_of_the_output_is_refused_and_a_doubtful_one_is_told(tmp_path, caplog):
     output = OutputState("DP-1", (320, 240), properties={"Broadcast RGB": "Limited 16:235", "TearFree": "on"})
-    screen, display = model_screen(tmp_path, monkeypatch, output=output)
+    screen, display = model_screen(tmp_path, output=output)
     with pytest.raises(MachineError, match=r"Broadcast RGB of DP-1.*xrandr --output DP-1 --set.*or add --force"):
         pass_gate(screen, force=False, clock=display.clock)
     assert "TearFree of DP-1 is on" in caplog.text
@@ -97,23 +97,23 @@ def test_a_wrong_setting_of_the_output_is_refused_and_a_doubtful_one_is_told(tmp
     assert screen.output is output
 
 
-def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp_path, monkeypatch):
-    screen, display = model_screen(tmp_path, monkeypatch)
+def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp_path):
+    screen, display = model_screen(tmp_path)
     timing = pass_gate(screen, force=False, clock=display.clock)
     assert timing.period_ms == pytest.approx(PERIOD_MS, rel=1e-6) and timing.paced_by_screen
     periods = (screen.clock.next_after(display.clock.ns) - display.flips_ns[-1]) / display.period_ns
     assert periods == pytest.approx(round(periods), abs=1e-4)
 
 
-def test_a_fault_is_refused_and_only_logged_with_force(tmp_path, monkeypatch, caplog):
-    screen, display = model_screen(tmp_path, monkeypatch, composited=True)
+def test_a_fault_is_refused_and_only_logged_with_force(tmp_path, caplog):
+    screen, display = model_screen(tmp_path, composited=True)
     with pytest.raises(MachineError, match=r"compositing.*or add --force"):
         pass_gate(screen, force=False, clock=display.clock)
     pass_gate(screen, force=True, clock=display.clock)
     assert "shown anyway (--force)" in caplog.text
 
 
-def test_a_window_that_is_gone_is_refused_even_with_force(tmp_path, monkeypatch):
-    screen, display = model_screen(tmp_path, monkeypatch, gone="its display was unplugged")
+def test_a_window_that_is_gone_is_refused_even_with_force(tmp_path):
+    screen, display = model_screen(tmp_path, gone="its display was unplugged")
     with pytest.raises(MachineError, match="unplugged"):
         pass_gate(screen, force=True, clock=display.clock)

@@ -33,8 +33,7 @@ from hilstar.run.record.ledger import (
     ReceivedPacket,
     SplitLimits,
 )
-from hilstar.run.record.ledger_reader import drawable_frames
-from hilstar.run.record.ledger_records import FAULT_TOPIC, FaultRecord, FrameRecord
+from hilstar.run.record.ledger_records import FAULT_TOPIC, FaultRecord, FrameRecord, drawable_frames
 from hilstar.run.record.report import figures_of, summarise
 from tests.support.full_disk import files_of_at_most
 from tests.support.waiting import wait_for

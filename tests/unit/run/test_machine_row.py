@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.run.machine_row import COLUMNS, EDID_HEADER, read_edid, row, table
+from hilstar.run.doctor import COLUMNS, EDID_HEADER, read_edid, row, table
 from tests.support.commands import run_hilstar_here
 
 SERIAL, SERIAL_TEXT = 305419896, "CN0F00BAR123"

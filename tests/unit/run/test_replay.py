@@ -12,7 +12,7 @@ import pytest
 from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.bench.config import parse_config
 from hilstar.errors import InputError
-from hilstar.monitor.quantise import QUANTISERS
+from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.replay import OTHER_CODES_BY_NUMPY, DrawnBy, Wanted, plan_play

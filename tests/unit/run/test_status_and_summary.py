@@ -12,16 +12,16 @@ from hilstar.attitude.clock.timeline import Attitude, StaleGate
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire import protocol
 from hilstar.notices import Notices
-from hilstar.run.frame_status import StatusMaker
-from hilstar.run.pacer import Operator
-from hilstar.run.shown import OnScreen, Shown
+from hilstar.run.operator import OnScreen
+from hilstar.run.pacer import Shown
+from hilstar.run.serve import StatusMaker
 from hilstar.run.summary import RunTally, SwapTally
 
 FRESH = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 5_000_000, False, sequence=42)
 MS = 1_000_000
 
 
-class Keys(Operator):
+class Keys:
     """An operator, and a window, as a test sets them."""
 
     def __init__(self) -> None:

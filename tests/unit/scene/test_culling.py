@@ -10,14 +10,14 @@ import pytest
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.psf import footprint_px, peak_share, pixel_shares
+from hilstar.scene.psf import GaussianPsf, pixel_shares
 from hilstar.scene.sprites import CLIP_TOLERANCE, clipped_sprites, make_sprites, pack_sprites
 from hilstar.sky.stars import cell_grid
 from tests.support.stars import stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])
 SIGMA = (0.85, 0.85)
-FOOTPRINT = footprint_px(SIGMA)
+FOOTPRINT = GaussianPsf(SIGMA).footprint_px
 SIZE = (1920, 1080)
 STARS = 30_000
 FAST_KM_S = np.array([12_000.0, -9_000.0, 4_000.0])  # a twentieth of light: stars are seen up to 3 degrees away
@@ -73,14 +73,14 @@ def test_a_crowd_clips_where_the_light_of_all_is_over_white(count, rng):
     """Asked of every star together, without looking for neighbours."""
     size = (200, 120)
     x, y = rng.uniform(-8, 207, count), rng.uniform(-8, 127, count)
-    light = rng.uniform(0.3, 1.2, count) / peak_share(SIGMA)
+    light = rng.uniform(0.3, 1.2, count) / GaussianPsf(SIGMA).peak_share
     sprites = pack_sprites(x, y, light, np.arange(count), size, FOOTPRINT)
     column, row = np.rint(sprites.x_px), np.rint(sprites.y_px)
     shares = [pixel_shares(place - own[:, None], SIGMA[0]) for place, own in ((column, sprites.x_px), (row, sprites.y_px))]
     total = sprites.data["electrons_per_s"] @ (shares[0] * shares[1])
     on_image = (column >= 0) & (column < size[0]) & (row >= 0) & (row < size[1])
-    bright = sprites.data["electrons_per_s"] > 0.5 / peak_share(SIGMA)
+    bright = sprites.data["electrons_per_s"] > 0.5 / GaussianPsf(SIGMA).peak_share
     over = total > 1 + CLIP_TOLERANCE
     sure = np.abs(total - 1) > 1e-5  # of white: footprints cut 1e-6 of a star
-    clipped = np.isin(np.arange(len(sprites)), clipped_sprites(sprites, SIGMA, 1.0, size))
+    clipped = np.isin(np.arange(len(sprites)), clipped_sprites(sprites, GaussianPsf(SIGMA), 1.0, size))
     assert np.array_equal(clipped[sure], (over & on_image & bright)[sure])

@@ -11,7 +11,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.scene import exposure_motion as smear
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
-from hilstar.scene.psf import MAX_CUT, footprint_px
+from hilstar.scene.psf import MAX_CUT, GaussianPsf
 from hilstar.scene.sprites import join_sprites, make_sprites
 from tests.support.stars import stars_at
 
@@ -41,8 +41,8 @@ def brute_force(stars, at: Motion, steps: int) -> np.ndarray:
     for k in range(steps):
         seconds = ((k + 0.5) / steps - 0.5) * at.exposure_s
         q = propagate(at.q_icrs_to_cam, at.rate_cam_rad_s, seconds)
-        instants.append(make_sprites(stars, to_matrix(q), CAMERA, footprint_px(SIGMA)))
-    return linear_image(join_sprites(instants, footprint_px(SIGMA)), SIZE, SIGMA) / steps
+        instants.append(make_sprites(stars, to_matrix(q), CAMERA, GaussianPsf(SIGMA).footprint_px))
+    return linear_image(join_sprites(instants, GaussianPsf(SIGMA).footprint_px), SIZE, GaussianPsf(SIGMA)) / steps
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def brute_force(stars, at: Motion, steps: int) -> np.ndarray:
 def test_a_path_is_the_mean_of_its_instants(rate):
     at = motion(rate)
     stars = star_on((200.3, 90.6), at)
-    drawn = linear_image(smeared_sprites(stars, at, CAMERA, footprint_px(SIGMA), SIGMA), SIZE, SIGMA)
+    drawn = linear_image(smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA)), SIZE, GaussianPsf(SIGMA))
     steps = 4000
     exact = brute_force(stars, at, steps)
     # The mean of midpoints is itself off by (path / steps)^2 / 24 times the PSF's curvature: 1e-7 at the longest path here,
@@ -63,25 +63,25 @@ def test_a_path_is_the_mean_of_its_instants(rate):
 def test_flux_is_conserved_along_every_path():
     for rate in ((0.01, 0, 0), (0.1, 0.05, 0.3), (0, 0, 30.0)):
         at = motion(rate)
-        sprites = smeared_sprites(star_on((160.2, 120.7), at, 1e6), at, CAMERA, footprint_px(SIGMA), SIGMA)
+        sprites = smeared_sprites(star_on((160.2, 120.7), at, 1e6), at, CAMERA, GaussianPsf(SIGMA))
         # Gauss-Legendre weights and float32 fluxes: a few 1e-8.
         assert sprites.data["electrons_per_s"].sum(dtype=np.float64) == pytest.approx(1e6, rel=3e-7)
-        assert linear_image(sprites, SIZE, SIGMA).sum() == pytest.approx(1e6, rel=3e-7 + MAX_CUT)
+        assert linear_image(sprites, SIZE, GaussianPsf(SIGMA)).sum() == pytest.approx(1e6, rel=3e-7 + MAX_CUT)
 
 
 def test_a_camera_at_rest_has_one_sprite_a_star():
     at = motion((0, 0, 0))
-    sprites = smeared_sprites(star_on((160, 120), at), at, CAMERA, 10, SIGMA)
+    sprites = smeared_sprites(star_on((160, 120), at), at, CAMERA, GaussianPsf(SIGMA))
     assert len(sprites) == 1
     none = motion((5, 0, 0), exposure_s=0.0)
-    assert len(smeared_sprites(star_on((160, 120), none), none, CAMERA, 10, SIGMA)) == 1
+    assert len(smeared_sprites(star_on((160, 120), none), none, CAMERA, GaussianPsf(SIGMA))) == 1
 
 
 def test_a_star_on_the_axis_of_rotation_needs_one_sprite_and_a_far_one_more():
     at = motion((0, 0, 0.5))
     centre, corner = star_on((159.5, 119.5), at), star_on((300, 220), at)
-    assert len(smeared_sprites(centre, at, CAMERA, 10, SIGMA)) == 1
-    count = len(smeared_sprites(corner, at, CAMERA, 10, SIGMA))
+    assert len(smeared_sprites(centre, at, CAMERA, GaussianPsf(SIGMA))) == 1
+    count = len(smeared_sprites(corner, at, CAMERA, GaussianPsf(SIGMA)))
     # 0.5 deg at 172 px is 1.5 px, 2.5 of the smaller sigma: 1.02 * 2.5 + 3, rounded up by at most 15 %.
     assert 5 <= count <= 8
 
@@ -89,16 +89,16 @@ def test_a_star_on_the_axis_of_rotation_needs_one_sprite_and_a_far_one_more():
 def test_a_star_that_enters_during_the_exposure_is_drawn_in_part():
     at = motion((0, -2.0, 0))
     stars = star_on((-30.0, 100.0), at, 1.0)  # 2 deg/s is 188 px in a second: half of its path is inside
-    sprites = smeared_sprites(stars, at, CAMERA, footprint_px(SIGMA), SIGMA)
-    inside = linear_image(sprites, SIZE, SIGMA).sum()
+    sprites = smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA))
+    inside = linear_image(sprites, SIZE, GaussianPsf(SIGMA)).sum()
     path_px = CAMERA.focal_length_px * np.radians(2.0)
     assert inside == pytest.approx((path_px / 2 - 29.5) / path_px, rel=0.02)
 
 
 def test_a_whole_turn_in_one_exposure_makes_rings():
     at = motion((0, 0, 360.0))
-    sprites = smeared_sprites(star_on((159.5 + 60, 119.5), at, 1.0), at, CAMERA, footprint_px(SIGMA), SIGMA)
-    image = linear_image(sprites, SIZE, SIGMA)
+    sprites = smeared_sprites(star_on((159.5 + 60, 119.5), at, 1.0), at, CAMERA, GaussianPsf(SIGMA))
+    image = linear_image(sprites, SIZE, GaussianPsf(SIGMA))
     assert image.sum() == pytest.approx(1.0, rel=3e-7 + MAX_CUT)
     y, x = np.mgrid[0:240, 0:320]
     radius = np.hypot(x - 159.5, y - 119.5)
@@ -111,7 +111,7 @@ def test_a_whole_turn_in_one_exposure_makes_rings():
 def test_a_spin_that_sweeps_the_sky_past_the_camera_ends(rng):
     vectors = rng.normal(size=(2000, 3))
     at = motion((30.0, 20.0, 0.0))
-    sprites = smeared_sprites(stars_at(vectors, np.ones(2000)), at, CAMERA, footprint_px(SIGMA), SIGMA)
+    sprites = smeared_sprites(stars_at(vectors, np.ones(2000)), at, CAMERA, GaussianPsf(SIGMA))
     assert 0 < sprites.data["electrons_per_s"].sum() < 2000
     assert np.isfinite(sprites.x_px).all()
 
@@ -120,15 +120,15 @@ def test_a_spin_that_sweeps_the_sky_past_the_camera_ends(rng):
 def test_a_turn_too_long_to_draw_is_refused_with_what_can_be(rate):
     at = motion(rate)
     with pytest.raises(InputError, match=r"turns by .* deg is too long; at most .* deg can be drawn"):
-        smeared_sprites(star_on((160.2, 120.7), motion((0, 0, 0))), at, CAMERA, 10, SIGMA)
+        smeared_sprites(star_on((160.2, 120.7), motion((0, 0, 0))), at, CAMERA, GaussianPsf(SIGMA))
 
 
 def test_more_sprites_than_the_bound_are_made_fewer_with_their_light_kept(monkeypatch, rng):
     at = motion((10.0, 0, 0))
     stars = stars_at(rng.normal(size=(20_000, 3)), np.ones(20_000))
-    whole = smeared_sprites(stars, at, CAMERA, 10, SIGMA)
+    whole = smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA))
     monkeypatch.setattr(smear, "MAX_SPRITES", len(whole) // 2)
-    coarse = smeared_sprites(stars, at, CAMERA, 10, SIGMA)
+    coarse = smeared_sprites(stars, at, CAMERA, GaussianPsf(SIGMA))
     assert len(coarse) <= len(whole) // 2
     assert (whole.capped, coarse.capped) == (0, len(np.unique(whole.star)))
     light = [float(sprites.data["electrons_per_s"].sum(dtype=np.float64)) for sprites in (whole, coarse)]

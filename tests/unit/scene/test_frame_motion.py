@@ -11,14 +11,14 @@ from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.scene import sprites as sprites_module
 from hilstar.scene.frame_motion import EXTRA_SPRITES, CameraTurn, Orientation, Scan, swept_sprites
 from hilstar.scene.paths import MAX_NODES
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import clipped_sprites, make_sprites
 from tests.support.stars import stars_at
 
 SIZE = (320, 240)
 CAMERA = monitor_camera(SIZE, 13.0, 70.0, np.array([1.0, 0, 0, 0]))
 SIGMA = (0.85, 0.6)
-FOOTPRINT = footprint_px(SIGMA)
+FOOTPRINT = GaussianPsf(SIGMA).footprint_px
 Q = from_radec_roll_deg(84.0, -1.0, 20.0)
 FRAME_S = 1 / 60
 PIXEL_LIMIT = 1e-3  # of a star's flux: what the module's node counts promise
@@ -47,7 +47,7 @@ def place_px(stars, at: CameraTurn, seconds: float):
 
 
 def swept(stars, at, scan):
-    return swept_sprites(stars, at, scan, CAMERA, FOOTPRINT, SIGMA)
+    return swept_sprites(stars, at, scan, CAMERA, GaussianPsf(SIGMA))
 
 
 PIXELS = [(30.0, 12.0), (160.0, 120.0), (290.3, 229.5)]
@@ -72,12 +72,12 @@ def test_each_star_is_where_it_is_when_its_own_row_lights(down, axis, sign, rows
 def test_a_path_is_the_mean_of_its_instants_and_keeps_its_flux(rate):
     stars, at = stars_on([(160.3, 120.6)]), turn(rate)
     sprites = swept(stars, at, Scan(hold_s=FRAME_S))
-    drawn = linear_image(sprites, SIZE, SIGMA)
+    drawn = linear_image(sprites, SIZE, GaussianPsf(SIGMA))
     steps = 1000
     exact = np.zeros_like(drawn)
     for k in range(steps):
         q = propagate(Q, at.rate_cam_rad_s, (k + 0.5) / steps * FRAME_S)
-        exact += linear_image(make_sprites(stars, to_matrix(q), CAMERA, FOOTPRINT), SIZE, SIGMA) / steps
+        exact += linear_image(make_sprites(stars, to_matrix(q), CAMERA, FOOTPRINT), SIZE, GaussianPsf(SIGMA)) / steps
     assert np.abs(drawn - exact).max() < PIXEL_LIMIT
     assert drawn.sum() == pytest.approx(exact.sum(), rel=1e-5)
     assert sprites.star_count == 1
@@ -118,10 +118,10 @@ def test_stars_that_come_in_during_the_frame_are_drawn():
 def test_a_bright_path_is_called_clipped_by_its_light_together():
     stars, at = stars_on([(160.3, 120.6)]), turn((1.0, 0, 0))
     sprites = swept(stars, at, Scan(hold_s=FRAME_S))
-    peak = float(linear_image(sprites, SIZE, SIGMA).max())
+    peak = float(linear_image(sprites, SIZE, GaussianPsf(SIGMA)).max())
     assert sprites.per_star > 2
-    assert len(clipped_sprites(sprites, SIGMA, 0.9 * peak, SIZE)) > 0
-    assert len(clipped_sprites(sprites, SIGMA, 1.1 * peak, SIZE)) == 0
+    assert len(clipped_sprites(sprites, GaussianPsf(SIGMA), 0.9 * peak, SIZE)) > 0
+    assert len(clipped_sprites(sprites, GaussianPsf(SIGMA), 1.1 * peak, SIZE)) == 0
 
 
 def crowd(count: int, rng: np.random.Generator):

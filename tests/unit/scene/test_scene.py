@@ -10,16 +10,7 @@ import pytest
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, to_matrix
-from hilstar.scene.psf import (
-    MAX_CUT,
-    MAX_SHARE_ERROR,
-    cut_share,
-    footprint_px,
-    peak_share,
-    pixel_share,
-    pixel_shares,
-    share_polynomial,
-)
+from hilstar.scene.psf import MAX_CUT, MAX_SHARE_ERROR, GaussianPsf, pixel_share, pixel_shares, share_polynomial
 from hilstar.scene.sprites import clipped_sprites, make_sprites
 from hilstar.sky.stars import Stars
 from tests.support.stars import stars_at
@@ -37,25 +28,25 @@ def stars_on_pixels(camera, pixels: np.ndarray, electrons_per_s: np.ndarray | No
 
 @pytest.mark.parametrize("sigma", [0.2, 0.4, 0.55, 0.85, 1.0, 3.0, 20.0])
 def test_a_footprint_is_the_smallest_that_cuts_too_little_to_matter(sigma):
-    size = footprint_px((sigma, sigma))
-    assert cut_share(size, (sigma, sigma)) <= MAX_CUT < cut_share(size - 1, (sigma, sigma))
+    size = GaussianPsf((sigma, sigma)).footprint_px
+    assert GaussianPsf((sigma, sigma)).cut_share(size) <= MAX_CUT < GaussianPsf((sigma, sigma)).cut_share(size - 1)
 
 
 def test_cut_share_is_the_light_outside_the_worst_footprint():
     for size in (3, 4, 9, 10):
         inside = [sum(pixel_share(k + 0.5 - size / 2 - 0.5, s) for k in range(size)) for s in (0.9, 1.4)]
         # A sum of a few pixel shares: float64 rounding.
-        assert cut_share(size, (0.9, 1.4)) == pytest.approx(1 - inside[0] * inside[1], abs=1e-14)
+        assert GaussianPsf((0.9, 1.4)).cut_share(size) == pytest.approx(1 - inside[0] * inside[1], abs=1e-14)
 
 
 def test_the_peak_is_that_of_a_centred_star():
     x, y = (2 * NormalDist(0, sigma).cdf(0.5) - 1 for sigma in (0.85, 0.55))
-    assert peak_share((0.85, 0.55)) == pytest.approx(x * y, rel=1e-14)
+    assert GaussianPsf((0.85, 0.55)).peak_share == pytest.approx(x * y, rel=1e-14)
 
 
 def test_an_absurd_sigma_is_refused():
     with pytest.raises(InputError, match="sigma"):
-        footprint_px((1e6, 1e6))
+        assert GaussianPsf((1e6, 1e6)).footprint_px
 
 
 def test_the_boresight_falls_on_the_principal_point():
@@ -125,12 +116,12 @@ def test_an_image_turned_to_the_pole_has_polaris_where_it_belongs():
 
 def test_a_star_is_clipped_when_its_peak_is_over_white():
     camera = monitor_camera((64, 48), 10.0, 50.0, IDENTITY)
-    white = peak_share(SIGMA)
+    white = GaussianPsf(SIGMA).peak_share
     pixels = np.array([[10.0, 10.0], [30.0, 10.0], [50.0, 10.0], [50.5, 10.0]])
     flux = np.array([1.0, 1.001, 0.9, 0.9])
     stars = stars_on_pixels(camera, pixels, flux)
     sprites = make_sprites(stars, np.eye(3), camera, 10)
-    clipped = stars.hip[sprites.star[clipped_sprites(sprites, SIGMA, white, (64, 48))]]
+    clipped = stars.hip[sprites.star[clipped_sprites(sprites, GaussianPsf(SIGMA), white, (64, 48))]]
     # 0 is white itself; 1 is over it; 2 and 3 are over it together.
     assert sorted(clipped.tolist()) == [1, 2, 3]
 
@@ -138,7 +129,7 @@ def test_a_star_is_clipped_when_its_peak_is_over_white():
 @pytest.mark.parametrize("sigma", [0.5, 0.55, 0.7, 0.85, 1.3, 3.0, 20.0])
 def test_a_share_s_polynomial_is_that_close_everywhere(sigma):
     """At places between those of the fit, in the float32 of a shader."""
-    reach = footprint_px((sigma, sigma)) / 2 + 0.5
+    reach = GaussianPsf((sigma, sigma)).footprint_px / 2 + 0.5
     offset = np.linspace(0, reach, 3001)
     power = np.zeros(len(offset), dtype=np.float32)
     for term in share_polynomial(sigma, reach)[::-1]:

@@ -13,6 +13,7 @@ from hilstar.scene import frame_motion
 from hilstar.scene.camera import Lens, ResidualField, bounded
 from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
 from hilstar.scene.paths import LIMIT_PX, LIMIT_SHARE, Paths, ShortPaths, points_within
+from hilstar.scene.psf import GaussianPsf
 from tests.support.stars import stars_at
 
 SIZE = (1920, 1080)
@@ -112,10 +113,10 @@ def test_a_frame_of_short_paths_is_a_frame_of_exact_ones(camera, rate_deg_s, rng
     image = np.column_stack([u, v, np.ones(3000)])
     stars = stars_at(image @ (camera.cam_to_image @ to_matrix(q)), np.ones(3000))
     scan = Scan((0, 1), FRAME_S, FRAME_S)
-    short = swept_sprites(stars, turn, scan, camera, FOOTPRINT, SIGMA)
+    short = swept_sprites(stars, turn, scan, camera, GaussianPsf(SIGMA))
     monkeypatch.setattr(frame_motion, "points_within", lambda camera, half_turn_rad: None)
     monkeypatch.setattr(type(camera), "in_view", lambda self, seen, margin_px, reach_rad: np.arange(len(seen)))
-    exact = swept_sprites(stars, turn, scan, camera, FOOTPRINT, SIGMA)
+    exact = swept_sprites(stars, turn, scan, camera, GaussianPsf(SIGMA))
     places = [_means(sprites) for sprites in (short, exact)]
     (light, *of_short), (true, *of_exact) = places
     assert np.abs(light - true).max() < 0.02  # a path that ends at the border may have a node more or less there

@@ -7,7 +7,7 @@ import pytest
 
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.psf import footprint_px, pixel_shares
+from hilstar.scene.psf import GaussianPsf, pixel_shares
 from hilstar.scene.sprites import Sprites
 from hilstar.scene.trails import Brush, Lit, Trails, TrailView, trails, with_trails
 from hilstar.sky.bodies.passes import Cone
@@ -16,7 +16,7 @@ from tests.support.stars import sprites_at
 
 SIGMA_PX = (0.7, 0.9)
 SIZE_PX = (160, 120)
-BRUSH = Brush(footprint_px(SIGMA_PX), SIGMA_PX, 2000)
+BRUSH = Brush(GaussianPsf(SIGMA_PX), 2000)
 CAMERA = Camera(SIZE_PX, 3000.0, (79.5, 59.5), np.eye(3))
 MOMENTS = 400
 # Measured 4e-4 of a satellite's light; 1e-3 is what stars' paths may be off.
@@ -154,7 +154,7 @@ def test_streaks_follow_the_stars_of_an_image():
     sky, t_ns = lit_moment(LIST)
     q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
     found = streak(sky, t_ns, q, np.zeros(3), 0.5)
-    stars = sprites_at(np.array([[5.0, 6.0], [7.0, 8.0]]), np.array([1.0, 2.0]), BRUSH.footprint_px)
+    stars = sprites_at(np.array([[5.0, 6.0], [7.0, 8.0]]), np.array([1.0, 2.0]), BRUSH.psf.footprint_px)
     both = with_trails(stars, found, 100)
     assert both.star.tolist() == [0, 1] + [100] * len(found.sprites)
     assert both.per_star == len(found.sprites) > 1
@@ -166,6 +166,6 @@ def test_beyond_what_an_image_may_cost_streaks_are_coarser_and_counted():
     q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
     seen = sky.passing(Cone(to_matrix(q)[2], 0.5, 1.0), t_ns)
     lit, view = Lit(np.array([-1.0]), 2.0), TrailView(CAMERA, to_matrix(q), np.zeros(3))
-    fine, coarse = (trails(seen, view, lit, Brush(BRUSH.footprint_px, SIGMA_PX, most)) for most in (2000, 5))
+    fine, coarse = (trails(seen, view, lit, Brush(BRUSH.psf, most)) for most in (2000, 5))
     assert (len(coarse.sprites), coarse.sprites.capped, fine.sprites.capped) == (5, 1, 0)
     assert image_of(coarse.sprites).sum() == pytest.approx(image_of(fine.sprites).sum(), rel=0.02)

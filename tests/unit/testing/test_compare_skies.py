@@ -13,12 +13,12 @@ from hilstar.errors import InputError
 from hilstar.frame.truth import TRUTH_DTYPE
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import pack_sprites
 from hilstar.testing import MAX_LINES, assert_same_sky, compare
 from hilstar.testing.report import ChartPanel
 from hilstar.testing.sky_comparison import CENTROID_PX, FLUX_MAG
-from hilstar.testing.star_fit import star_sigma_px
+from hilstar.testing.star_fit import star_psf
 from tests.support.benches import SMALL_BENCH
 
 ORION = from_radec_roll_deg(84.057, -1.2, 0.0)
@@ -98,7 +98,7 @@ def test_another_driver_s_rounding_passes(benches, sky, ra_dec):
     """GL's float32 against the oracle's float64: the belt, Sirius, the Pleiades, the Milky Way with 680 stars in 320 x 240."""
     bench = benches[sky]
     field = Field(bench, from_radec_roll_deg(*ra_dec, 0.0))
-    oracle = linear_image(field.sprites, bench.camera.resolution_px, bench.config.render.sprite_sigma_px)
+    oracle = linear_image(field.sprites, bench.camera.resolution_px, bench.psf)
     for one, other in ((field.golden, oracle), (oracle, field.golden), (field.golden.linear, oracle)):
         stars = assert_same_sky(one, other).stars
         assert np.mean([abs(star.flux_error_mag) < DRIVER_MAG for star in stars]) > DRIVER_SHARE
@@ -226,8 +226,8 @@ def test_of_another_sky_twenty_stars_are_told_and_the_rest_counted(field):
 
 def grid(x_px, y_px, flux, sigma_px=(0.85, 0.85), size_px=(160, 120)):
     x_px, y_px, flux = (np.asarray(values, dtype=float) for values in (x_px, y_px, flux))
-    sprites = pack_sprites(x_px, y_px, flux, np.arange(len(flux)), size_px, footprint_px(sigma_px))
-    return linear_image(sprites, size_px, sigma_px).astype(np.float32)
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(len(flux)), size_px, GaussianPsf(sigma_px).footprint_px)
+    return linear_image(sprites, size_px, GaussianPsf(sigma_px)).astype(np.float32)
 
 
 @pytest.mark.parametrize("apart_px", [2.6, 4.0])
@@ -290,7 +290,7 @@ def test_the_sigma_is_that_of_the_stars(sigma_px, rng):
     """To what the light of neighbours a footprint away, 1e-6 of theirs, may do where one is 1000 times brighter."""
     x, y = (60 + 130 * axis.ravel() + rng.uniform(-5, 5, 9) for axis in np.mgrid[:3, :3])
     image = grid(x, y, 10 ** rng.uniform(3, 6, 9), sigma_px, (400, 400))
-    assert star_sigma_px(image.astype(float)) == pytest.approx(sigma_px, rel=1e-3)
+    assert star_psf(image.astype(float)).sigma_px == pytest.approx(sigma_px, rel=1e-3)
 
 
 def test_files_arrays_and_frames_are_one_sky(field, tmp_path):

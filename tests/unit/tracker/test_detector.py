@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from hilstar.errors import InputError
 from hilstar.tracker.detector import RAY_DEPTH_UM, RAY_E_PER_UM, Detector, bloom, cosmic_rays_e, false_stars_e
-from hilstar.tracker.settings import MAX_E, DetectorSettings, ccd47_20_dark
+from hilstar.tracker.settings import MAX_E, DetectorSettings, e2v_dark, silicon_gap_ev
 
 SIZE_PX = (160, 128)
 SHAPE = (128, 160)
@@ -101,6 +101,29 @@ def test_the_full_well_clips_before_read_noise_and_adc():
     assert image.std() == pytest.approx(noise_e, rel=SIGMA_ERROR)
 
 
+def test_noise_by_source_is_what_frames_of_that_source_alone_scatter_by():
+    bench = DetectorSettings(gain_e_per_dn=0.5, offset_dn=500.0, bits=16)
+    rounding_e2 = 0.5**2 / 12
+    sources = {
+        "shot_e2": ({}, 900.0),
+        "dark_e2": ({"dark_e_per_s": 300.0, "temperature_k": 298.0}, 0.0),
+        "read_e2": ({"read_noise_e": 12.0}, 0.0),
+        "prnu_e2": ({"prnu": 0.2}, 5000.0),
+        "dsnu_e2": ({"dark_e_per_s": 900.0, "dsnu_e_per_s": 90.0, "fixed_pattern": "cmos", "column_noise_e": 80.0}, 0.0),
+        "dsnu_e2 of offsets": ({"dsnu_e": 30.0}, 0.0),
+        "reset_e2": ({"sense_capacitance_ff": 2.0, "temperature_k": 250.0}, 0.0),
+        "quantisation_e2": ({"quantisation_noise": True}, 0.0),
+    }
+    for name, (keys, light_e) in sources.items():
+        settings = replace(bench, **keys)
+        noise = settings.noise(light_e, 2.0)
+        assert getattr(noise, name.split()[0]) > 0.7 * noise.total_e2, name
+        variance_e2 = Detector(settings, (1280, 128)).expose(np.full((128, 1280), light_e), 2.0, generator()).var() * 0.25
+        # 1280 columns give the variance of a column to 4 %; it is at most half of one of these.
+        assert variance_e2 == pytest.approx(noise.total_e2, rel=SIGMAS * 0.02), name
+    assert bench.noise(0.0, 0.0).total_e2 == pytest.approx(rounding_e2)
+
+
 @pytest.mark.parametrize("bits", [1, 8, 12, 16])
 def test_the_adc_clips_at_its_largest_code_and_at_zero(bits):
     settings = DetectorSettings(gain_e_per_dn=0.1, full_well_e=1e6, bits=bits, read_noise_e=3.0)
@@ -181,12 +204,13 @@ def test_quantisation_noise_is_roundings_unless_the_thesis_gaussian_is_asked_for
 
 
 def test_dark_is_the_datasheets_at_the_reference_and_falls_with_the_cold():
-    for law in ("arrhenius", "ccd47-20"):
+    for law in ("arrhenius", "diffusion-depletion", "ccd47-20", "e2v-nimo"):
         assert DetectorSettings(dark_law=law).dark_factor == 1.0
         factors = [DetectorSettings(dark_law=law, temperature_k=t).dark_factor for t in (240.0, 260.0, 280.0, 300.0)]
         assert factors == sorted(factors)
     # The datasheet's own figure at 293 K must be the 1 that it is relative to; its coefficients have 3 digits.
-    assert ccd47_20_dark(293.0) == pytest.approx(1.0, abs=0.005)
+    assert e2v_dark("ccd47-20", 293.0) == pytest.approx(1.0, abs=0.005)
+    assert e2v_dark("e2v-nimo", 293.0) == pytest.approx(1.0, abs=0.005)
 
 
 def test_arrhenius_doubles_over_the_textbook_interval():
@@ -200,9 +224,97 @@ def test_arrhenius_doubles_over_the_textbook_interval():
 def test_temperature_acts_on_dark_frames():
     settings = DetectorSettings(gain_e_per_dn=1.0, bits=16, dark_e_per_s=203.0, dark_law="ccd47-20", temperature_k=273.0)
     image = Detector(settings, SIZE_PX).expose(flat(0.0), 10.0, generator())
-    expected_e = 2030.0 * ccd47_20_dark(273.0) / ccd47_20_dark(293.0)
+    expected_e = 2030.0 * e2v_dark("ccd47-20", 273.0) / e2v_dark("ccd47-20", 293.0)
     assert expected_e < 0.2 * 2030.0
     assert image.mean() == pytest.approx(expected_e, abs=SIGMAS * math.sqrt(expected_e / PIXELS))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_diffusion_and_depletion_follow_the_thesis_equation(share):
+    # Eq. 4.12 by itself, both terms scaled to their share of the current at 293 K.
+    def terms(kelvin: float) -> np.ndarray:
+        gap_kt = (1.17 - 4.73e-4 * kelvin**2 / (kelvin + 636)) / (8.617333262e-5 * kelvin)
+        return np.array([kelvin**3 * math.exp(-gap_kt), kelvin**1.5 * math.exp(-gap_kt / 2)])
+
+    for kelvin in (230.0, 263.0, 293.0, 313.0):
+        wanted = float(np.array([1 - share, share]) @ (terms(kelvin) / terms(293.0)))
+        settings = DetectorSettings(dark_law="diffusion-depletion", dark_depletion_share=share, temperature_k=kelvin)
+        assert settings.dark_factor == pytest.approx(wanted, rel=1e-12)
+
+
+def test_the_gap_is_silicons_or_the_one_that_is_written():
+    assert silicon_gap_ev(300.0) == pytest.approx(1.1245, abs=5e-5)  # Sze
+    fixed = DetectorSettings(dark_law="diffusion-depletion", dark_gap_ev=1.2, temperature_k=273.0)
+    cold = (273 / 293) ** 1.5 * math.exp(0.6 / 8.617333262e-5 * (1 / 293 - 1 / 273))
+    assert fixed.dark_factor == pytest.approx(cold, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("law", "quantile"),
+    [
+        ("normal", lambda share: stats.norm.ppf(share, 200.0, 60.0)),
+        ("gamma", lambda share: stats.gamma.ppf(share, (200 / 60) ** 2, scale=60.0**2 / 200)),
+        (
+            "log-normal",
+            lambda share: stats.lognorm.ppf(share, (s := math.sqrt(math.log1p(0.09))), scale=200 * math.exp(-s * s / 2)),
+        ),
+    ],
+)
+def test_dark_currents_lie_as_their_law_says_about_one_mean_and_sigma(law, quantile):
+    settings = DetectorSettings(dark_e_per_s=200.0, dsnu_e_per_s=60.0, dark_distribution=law)
+    dark = Detector(settings, (512, 512)).dark_map_e_per_s
+    assert dark.mean() == pytest.approx(200.0, abs=SIGMAS * 60 / 512)
+    assert dark.std() == pytest.approx(60.0, rel=0.02)
+    for share in (0.01, 0.5, 0.99, 0.999):
+        # A quantile's error is sqrt(p (1 - p) / n) over the density there; here as a share.
+        error = SIGMAS * math.sqrt(share * (1 - share)) / 512
+        assert (dark < quantile(share)).mean() == pytest.approx(share, abs=error)
+
+
+def test_offsets_of_pixels_stay_whatever_the_exposure_and_the_rows():
+    settings = DetectorSettings(gain_e_per_dn=0.1, offset_dn=2000.0, bits=16, dsnu_e=20.0)
+    image = Detector(settings, (256, 1024)).expose(np.zeros((1024, 256)), 0.0, generator()) * 0.1 - 200.0
+    np.testing.assert_allclose(image, Detector(settings, (256, 1024)).offset_map_e, atol=0.051)
+    assert image.std() == pytest.approx(20.0, rel=0.02)
+
+
+def test_hot_pixels_have_a_temperature_law_of_their_own():
+    cold, warm = (
+        DetectorSettings(hot_pixel_fraction=1.0, hot_pixel_activation_ev=0.3, dark_e_per_s=100.0, temperature_k=kelvin)
+        for kelvin in (263.0, 293.0)
+    )
+    extra = [Detector(one, SIZE_PX).dark_map_e_per_s.astype(float) - 100.0 * one.dark_factor for one in (cold, warm)]
+    factor = math.exp(0.3 / 8.617333262e-5 * (1 / 293 - 1 / 263))
+    assert extra[0].mean() / extra[1].mean() == pytest.approx(factor, rel=1e-4)  # maps are float32
+    assert cold.dark_factor < 0.5 * factor
+
+
+def test_a_columns_dark_current_is_its_own_and_grows_with_the_exposure():
+    settings = DetectorSettings(dark_e_per_s=500.0, fixed_pattern="cmos", column_dark_e_per_s=50.0, temperature_k=300.0)
+    dark = Detector(settings, (2000, 8)).dark_map_e_per_s
+    assert (dark == dark[0]).all()
+    assert dark[0].std() == pytest.approx(50.0 * settings.dark_factor, rel=SIGMAS / math.sqrt(2 * 2000))
+
+
+def test_read_noise_follows_the_readout_frequency():
+    white = DetectorSettings(read_noise_e=8.0, readout_hz=4e6)
+    assert white.read_noise_now_e == pytest.approx(16.0)  # four times the band
+    assert replace(white, readout_hz=1e6).read_noise_now_e == pytest.approx(8.0)
+    corner = replace(white, read_noise_corner_hz=1e6)
+    assert replace(corner, readout_hz=1.0).read_noise_now_e == pytest.approx(8.0 / math.sqrt(2), rel=1e-5)  # 1/f alone
+    table = DetectorSettings(read_noise_table=((1e4, 2.0), (1e6, 8.0)), readout_hz=1e5)
+    assert table.read_noise_now_e == pytest.approx(4.0)
+    image = Detector(replace(table, gain_e_per_dn=0.1, offset_dn=500.0, bits=16), SIZE_PX).expose(flat(0.0), 0.0, generator())
+    assert image.std() * 0.1 == pytest.approx(4.0, rel=SIGMA_ERROR)
+
+
+def test_reset_noise_is_k_t_c():
+    # 10 fF at 293 K: sqrt(1.380649e-23 * 293 * 1e-14) C = 6.36e-18 C = 39.7 e-.
+    settings = DetectorSettings(sense_capacitance_ff=10.0, gain_e_per_dn=1.0, offset_dn=500.0, read_noise_e=30.0)
+    assert settings.reset_noise_e == pytest.approx(39.70, abs=0.005)
+    image = Detector(settings, SIZE_PX).expose(flat(0.0), 0.0, generator())
+    assert image.std() == pytest.approx(math.hypot(39.7, 30.0), rel=SIGMA_ERROR)
+    assert settings.noise(0.0, 1.0).reset_e2 == pytest.approx(39.70**2, rel=1e-3)
 
 
 def test_dead_pixels_give_the_offset_and_hot_ones_their_share():
@@ -336,9 +448,14 @@ def test_more_rays_than_a_frame_can_hold_are_refused():
         ({"hot_pixel_fraction": 1.5}, "hot_pixel_fraction"),
         ({"temperature_k": -20.0}, "temperature_k"),
         ({"fixed_pattern": "emccd"}, '"ccd" or "cmos"'),
-        ({"dark_law": "doubling"}, '"arrhenius" or "ccd47-20"'),
+        ({"dark_law": "doubling"}, '"arrhenius" or "diffusion-depletion" or "ccd47-20"'),
         ({"dark_law": "ccd47-20", "temperature_k": 320.0}, "230 to 300 K"),
         ({"column_noise_e": 5.0}, 'fixed_pattern = "cmos"'),
+        ({"column_dark_e_per_s": 5.0}, 'fixed_pattern = "cmos"'),
+        ({"dark_distribution": "gamma", "dsnu_e_per_s": 5.0}, "write dark_e_per_s above 0"),
+        ({"fill_factor": 0.0}, "fill_factor"),
+        ({"readout_hz": 1e3, "read_noise_table": ((1e4, 3.0), (1e6, 9.0))}, "within read_noise_table.*10000 to 1e\\+06"),
+        ({"readout_hz": 2e5, "read_noise_table": ((1e6, 3.0), (1e4, 9.0))}, "whose frequencies rise"),
     ],
 )
 def test_a_sensor_that_cannot_be_is_refused(wrong, words):

@@ -7,11 +7,11 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from hilstar.monitor.balance import Balance, Seen
-from hilstar.monitor.phases import MARGIN_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by, tiles_of
+from hilstar.monitor.phases import MARGIN_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import srgb_response
 from hilstar.render.reference import linear_image
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import GaussianPsf
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import GOLDEN, Judge, stamp_errors
 from tests.support import centroiders as outside
@@ -27,10 +27,20 @@ FIT_PX = 0.02  # a tenth of a pixel aside widens a star, which a fit of fixed wi
 
 
 def codes(method, mag, seen, sigma_px=SIGMA):
-    sprites, tile = phase_grid(COUNT, sigma_px)
-    wanted = phase_image(sprites, sigma_px) * 10 ** (-0.4 * mag)
+    sprites, tile = phase_grid(COUNT, GaussianPsf(sigma_px))
+    wanted = phase_image(sprites, GaussianPsf(sigma_px)) * 10 ** (-0.4 * mag)
     panel = Panel(srgb_response(8), WHITE)
-    return wanted, shown_by(method, 1, panel, wanted.astype(np.float32), fainter(sprites, mag), Balance(sigma_px, seen)), tile
+    return (
+        wanted,
+        shown_by(method, 1, panel, wanted.astype(np.float32), fainter(sprites, mag), Balance(GaussianPsf(sigma_px), seen)),
+        tile,
+    )
+
+
+def tiles_of(image, tile):
+    """The tiles of a square image, (tiles, tile, tile), row by row."""
+    count = len(image) // tile
+    return image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3).reshape(-1, tile, tile)
 
 
 def along(stars, axis, star_px, seen):
@@ -58,7 +68,8 @@ def looked_at(image, tile, seen):
 @pytest.mark.parametrize("seen", [Seen(0.62, 1.0), Seen(0.4, 0.55), Seen(1.1, 2.3)])
 def test_errors_are_those_of_fine_samples_and_other_centroiders(method, seen):
     wanted, shown, tile = codes(method, 5.0, seen)
-    found = Judge(wanted, line_places(phase_grid(COUNT, SIGMA)[0]), SIGMA, seen.blur_px, seen.pixel_px).errors(shown)
+    places = line_places(phase_grid(COUNT, GaussianPsf(SIGMA))[0])
+    found = Judge(wanted, places, SIGMA, seen.blur_px, seen.pixel_px).errors(shown)
     sky, lit = (looked_at(image, tile, seen) for image in (wanted, shown))
     sigma = np.sqrt(SIGMA[0] ** 2 + 1 / 6 + seen.blur_px**2) / seen.pixel_px
     ways = {
@@ -81,7 +92,8 @@ def test_errors_are_those_of_fine_samples_and_other_centroiders(method, seen):
 def test_a_grid_s_stars_and_the_same_as_squares_are_as_far_off(seen):
     """They meet the tracker's pixels at other phases: what differs is an S-curve's, a fifth of the error; a moment has none."""
     wanted, shown, tile = codes("round", 5.0, seen)
-    grid = Judge(wanted, line_places(phase_grid(COUNT, SIGMA)[0]), SIGMA, seen.blur_px, seen.pixel_px).errors(shown)
+    places = line_places(phase_grid(COUNT, GaussianPsf(SIGMA))[0])
+    grid = Judge(wanted, places, SIGMA, seen.blur_px, seen.pixel_px).errors(shown)
     pad = ((0, 0), (8, 9), (8, 9))
     squares = (np.pad(tiles_of(image, tile), pad) for image in (shown, wanted))
     alone = stamp_errors(*squares, SIGMA, seen.blur_px, seen.pixel_px)
@@ -95,8 +107,8 @@ def test_a_grid_s_stars_and_the_same_as_squares_are_as_far_off(seen):
 @pytest.mark.parametrize("seen", [Seen(0.62, 1.0), Seen(0.3, 0.2), Seen(2.5, 5.0), Seen(0.0, 1.0)])
 def test_a_star_a_tenth_of_a_pixel_aside_is_found_there_and_a_dark_one_nowhere(seen):
     """A tenth of each star's light is a pixel aside."""
-    sprites, _ = phase_grid(COUNT, SIGMA)
-    wanted = phase_image(sprites, SIGMA)
+    sprites, _ = phase_grid(COUNT, GaussianPsf(SIGMA))
+    wanted = phase_image(sprites, GaussianPsf(SIGMA))
     moved = wanted + 0.1 * (np.roll(wanted, 1, axis=1) - wanted)
     judge = Judge(wanted, line_places(sprites), SIGMA, seen.blur_px, seen.pixel_px)
     found = judge.errors(0.5 * moved, 0.5)
@@ -112,7 +124,7 @@ def test_a_star_a_tenth_of_a_pixel_aside_is_found_there_and_a_dark_one_nowhere(s
 
 def test_the_grid_s_image_is_the_oracle_s():
     for sigma_px in (SIGMA, (0.4, 1.9)):
-        sprites, tile = phase_grid(COUNT, sigma_px)
-        assert tile == footprint_px(sigma_px) + MARGIN_PX
-        oracle = linear_image(sprites, (COUNT * tile, COUNT * tile), sigma_px)
-        assert phase_image(sprites, sigma_px) == pytest.approx(oracle, abs=1e-14)
+        sprites, tile = phase_grid(COUNT, GaussianPsf(sigma_px))
+        assert tile == GaussianPsf(sigma_px).footprint_px + MARGIN_PX
+        oracle = linear_image(sprites, (COUNT * tile, COUNT * tile), GaussianPsf(sigma_px))
+        assert phase_image(sprites, GaussianPsf(sigma_px)) == pytest.approx(oracle, abs=1e-14)

@@ -30,7 +30,7 @@ def twin(tmp_path_factory):
 
 def pairs_of(twin: Twin, parted: float = 1.0) -> TwinField:
     """A field of pairs, each separation with each ratio of light, on a grid of the tracker."""
-    sigma_px = max(Comparison(twin).finder.sigma_px)
+    sigma_px = max(Comparison(twin).finder.psf.width_px)
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(110, 290, len(SEPARATIONS)), np.linspace(110, 290, len(RATIOS))))
     separation = np.tile(SEPARATIONS, len(RATIOS)) * sigma_px * parted
     ratio = np.repeat(RATIOS, len(SEPARATIONS))
@@ -48,7 +48,7 @@ def test_pairs_are_measured_as_one_star_at_the_centre_of_their_light(twin):
     comparison.add(seen, np.random.default_rng(0))
     tally, count = comparison.tally, len(SEPARATIONS) * len(RATIOS)
     assert (len(tally.stars), len(tally.lost), tally.blended, tally.summed) == (count, 0, 0, count)
-    sigma_px = max(comparison.finder.sigma_px)
+    sigma_px = max(comparison.finder.psf.width_px)
     assert max(star.floor_px for star in tally.stars) < CENTRE_SIGMAS * sigma_px
     assert max(abs(star.floor_mag) for star in tally.stars) < FLUX_MAG
     assert max(np.hypot(star.dx_px, star.dy_px) for star in tally.stars) < SHOWN_PX
@@ -59,12 +59,12 @@ def test_pairs_that_the_tracker_parts_stay_two(twin):
     seen, comparison = pairs_of(twin, 20.0), Comparison(twin)
     comparison.add(seen, np.random.default_rng(0))
     assert comparison.tally.summed == 0
-    assert with_blends_as_one(seen, comparison.finder.sigma_px) is seen
+    assert with_blends_as_one(seen, comparison.finder.psf) is seen
 
 
 def test_the_sum_has_the_light_the_magnitude_and_the_centre_of_both(twin):
     seen = pairs_of(twin)
-    summed = with_blends_as_one(seen, Comparison(twin).finder.sigma_px)
+    summed = with_blends_as_one(seen, Comparison(twin).finder.psf)
     count = len(SEPARATIONS) * len(RATIOS)
     assert (len(seen.truth), len(summed.truth)) == (2 * count, count)
     assert summed.truth["electrons_per_s"].sum() == pytest.approx(seen.truth["electrons_per_s"].sum())
@@ -79,12 +79,12 @@ def test_the_sum_has_the_light_the_magnitude_and_the_centre_of_both(twin):
 
 def test_a_chain_of_stars_is_not_one_blend(twin):
     """Each stands within reach of the next: only neighbours of a brighter one are added to it."""
-    seen, sigma_px = pairs_of(twin), Comparison(twin).finder.sigma_px
+    seen, psf = pairs_of(twin), Comparison(twin).finder.psf
     n = len(seen.truth)
-    x_px, y_px = 100 + 0.9 * BLEND_SIGMAS * sigma_px[0] * np.arange(n), np.full(n, 100.0)
+    x_px, y_px = 100 + 0.9 * BLEND_SIGMAS * psf.width_px[0] * np.arange(n), np.full(n, 100.0)
     y_px[-1] = np.nan
     seen.truth["electrons_per_s"] = np.arange(n, 0, -1)
     chain = TwinField(seen.shown_e, seen.assumed_e, seen.sky_e, seen.truth, x_px, y_px)
-    summed = with_blends_as_one(chain, sigma_px)
+    summed = with_blends_as_one(chain, psf)
     assert len(summed.truth) == n // 2 + 1
     assert np.isnan(summed.y_px).sum() == 1

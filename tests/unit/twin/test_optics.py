@@ -14,8 +14,10 @@ from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, table_response
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Lens, bounded
+from hilstar.scene.psf import GaussianPsf, SampledPsf
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.verify.measure import on_screen_median
+from tests.support.psfs import gaussian, sampled
 
 TRACKER_PX = (60, 50)
 PSF_PX = (0.55, 0.6)
@@ -67,12 +69,23 @@ def matrix_of(geometry: BenchGeometry) -> np.ndarray:
 def test_the_monitor_s_light_is_an_independent_sum_of_squares_through_both_lenses(geometry, rng):
     light = np.zeros((48, 64))
     light[14:34, 20:44] = rng.uniform(0, 1e6, (20, 24)) * (rng.random((20, 24)) < 0.1)
-    with TwinOptics(geometry, PSF_PX) as optics:
+    with TwinOptics(geometry, GaussianPsf(PSF_PX)) as optics:
         image = optics.image_e_per_s(light)
     wanted = oracle(geometry, light)
     assert wanted.sum() == pytest.approx(light.sum(), rel=1e-9)
     assert image.sum() == pytest.approx(light.sum(), rel=CUT)
     assert np.abs(image - wanted).max() < NINE_FOR_A_SQUARE * wanted.max()
+
+
+def test_a_psf_of_samples_shows_the_monitor_as_its_gaussian_does(geometry, rng):
+    light = np.zeros((48, 64))
+    light[14:34, 20:44] = rng.uniform(0, 1e6, (20, 24)) * (rng.random((20, 24)) < 0.1)
+    images = []
+    for psf in (GaussianPsf(PSF_PX), SampledPsf(sampled(gaussian(*PSF_PX), 5, 5), 5)):
+        with TwinOptics(geometry, psf) as optics:
+            images.append(optics.image_e_per_s(light))
+    assert images[1].sum() == pytest.approx(light.sum(), rel=1e-6)
+    assert np.abs(images[1] - images[0]).max() < 2e-4 * images[0].max()  # the table's step
 
 
 def test_a_monitor_pixel_is_seen_where_its_direction_is_whatever_the_lenses_do(geometry, rng):
@@ -103,7 +116,7 @@ def test_a_mirror_is_about_the_middle_of_the_screen_and_its_own_inverse(geometry
 def test_the_glow_of_a_small_screen_is_not_diluted_by_the_detector_around_it(geometry):
     small = replace(geometry, monitor=monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0])))
     black = table_response(8, gamma_response(8).light, black=1e-3)
-    with TwinOptics(small, PSF_PX) as optics:
+    with TwinOptics(small, GaussianPsf(PSF_PX)) as optics:
         glow = optics.glow_e_per_s(Panel(black, 1e6))
     scale = (57.65e-3 / 120) / (13e-3 / 25)
     assert np.median(glow) == 0
@@ -119,7 +132,7 @@ def test_a_glow_beyond_a_lens_is_nothing_and_never_nan(geometry):
     small = monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
     bent = replace(geometry, monitor=bounded(replace(small, lens=Lens(radial=(0.3, 0.0, 0.0))), 0.0))
     black = table_response(8, gamma_response(8).light, black=1e-3)
-    with TwinOptics(bent, PSF_PX) as optics:
+    with TwinOptics(bent, GaussianPsf(PSF_PX)) as optics:
         glow = optics.glow_e_per_s(Panel(black, 1e6))
     assert np.isfinite(glow).all()
     assert (glow > 0).sum() > 100

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -37,7 +37,7 @@ def bench_file(directory: Path, verify_lines: str = "", **changes: object) -> Pa
 
 def verified(path: Path, fields: int, rng: np.random.Generator) -> tuple[Verdict, dict]:
     verdict = verify(read_bench_file(path), fields, rng)
-    return verdict, asdict(summarise(verdict))
+    return verdict, msgspec.to_builtins(summarise(verdict))
 
 
 def test_levels_of_another_monitor_s_primaries_stand_where_the_assumed_ones_do():

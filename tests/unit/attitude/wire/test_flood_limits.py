@@ -10,12 +10,14 @@ from dataclasses import replace
 
 import pytest
 
-from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S, OVER_S, FloodGate, LinkCounts, RawMessage
+from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S, OVER_NS, PAUSE_S, FloodGate, LinkCounts, RawMessage
 from hilstar.attitude.wire.packet import AttitudeSample, StreamDecoder, declares_discontinuity, decode, encode, framed
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.sender import SerialSender
+from hilstar.units import NS_PER_S
+from tests.support.fake_clock import FakeClock
 from tests.support.waiting import PATIENCE_S
 from tests.support.wire.samples import sample
 
@@ -27,21 +29,22 @@ def plain(_: object) -> bool:
 
 
 def test_a_burst_passes_and_a_flood_does_not():
-    now_s = 100.0
-    counts, notices = LinkCounts(), Notices()
-    gate = FloodGate(counts, notices, lambda: now_s)
+    clock, counts, notices = FakeClock(), LinkCounts(), Notices()
+    gate = FloodGate(counts, notices, clock)
     burst = list(range(MAX_BURST))
     assert gate.newest(burst, plain) == burst
     admitted = 0
     for _ in range(20):
-        now_s += 0.002
+        clock.work(0.002 * NS_PER_S)
         taken = gate.newest(burst, plain)
         assert taken == burst[MAX_BURST - len(taken) :]
         admitted += len(taken)
-    assert admitted == pytest.approx(20 * 0.002 * MAX_PACKETS_PER_S, abs=1)
+    rested_s = sum(clock.slept_s)
+    assert rested_s == pytest.approx(20 * PAUSE_S)
+    assert admitted == pytest.approx((20 * 0.002 + 19 * PAUSE_S) * MAX_PACKETS_PER_S, abs=1)
     assert counts.flooded == 20 * MAX_BURST - admitted
     assert notices.counts() == {"flood": 1}
-    now_s += OVER_S
+    clock.work(OVER_NS)
     assert gate.newest(burst, plain) == burst
 
 
@@ -53,12 +56,13 @@ class Line(SerialLink):
     """A line on which every frame was read by itself, all of them before anybody looked."""
 
     def __init__(self, samples: list[AttitudeSample], damaged: set[int] = frozenset()) -> None:
+        self.clock = FakeClock()
         self._master, self._slave = os.openpty()
         frames = [framed(encode(each)) for each in samples]
         for k in damaged:
             frames[k] = frames[k][:20] + bytes([frames[k][20] % 255 + 1]) + frames[k][21:]
         self._chunks = [RawMessage(k, [data], k) for k, data in enumerate([b"\0", *frames])]
-        super().__init__(os.ttyname(self._slave), 921_600)
+        super().__init__(os.ttyname(self._slave), 921_600, clock=self.clock)
 
     def _read(self, device, timeout_ms: int) -> list[RawMessage]:
         chunks, self._chunks = self._chunks, []
@@ -70,18 +74,16 @@ class Line(SerialLink):
         os.close(self._slave)
 
 
-def test_of_a_line_that_brings_more_the_newest_are_taken_in_one_go(monkeypatch):
+def test_of_a_line_that_brings_more_the_newest_are_taken_in_one_go():
     """Frame by frame each one that was too many cost a pause of 5 ms, and the oldest were taken: ages of seconds, no end."""
-    pauses: list[float] = []
-    monkeypatch.setattr("hilstar.attitude.wire.links.time.sleep", pauses.append)
     with Line(flooded_messages(set())) as line:
         taken = [arrival.event.sequence for arrival in line.receive(0)]
         assert taken == list(range(2 * MAX_BURST, 3 * MAX_BURST))
         assert line.link_counts.flooded == 2 * MAX_BURST
-        assert len(pauses) == 1
+        assert line.clock.slept_s == [PAUSE_S]
 
 
-def test_a_jump_that_is_passed_over_still_separates_what_is_before_it_from_what_is_after(monkeypatch):
+def test_a_jump_that_is_passed_over_still_separates_what_is_before_it_from_what_is_after():
     """Of two that declare one and were passed over the newest whole one is taken, on every road."""
     jumped = {500, 1500, 1800}
     samples = flooded_messages(jumped)
@@ -112,15 +114,16 @@ def test_a_line_of_short_junk_is_read_at_a_bounded_rate_and_a_good_frame_after_i
     master, slave = os.openpty()
     tty.setraw(slave)
     os.set_blocking(master, False)
-    with SerialLink(os.ttyname(slave), 921_600) as link:
-        begin_s, events, sent = time.monotonic(), 0, 0
-        while time.monotonic() - begin_s < 0.5 or link.link_counts.flooded <= 1000:
-            assert time.monotonic() - begin_s < PATIENCE_S
+    clock = FakeClock()
+    with SerialLink(os.ttyname(slave), 921_600, clock=clock) as link:
+        begin_ns, events, sent = clock.now_ns(), 0, 0
+        while clock.now_ns() - begin_ns < NS_PER_S // 2 or link.link_counts.flooded <= 1000:
             with contextlib.suppress(BlockingIOError):
                 sent += os.write(master, b"\x55\0" * 2000)
             events += len(link.receive(1))
+            clock.work(NS_PER_S // 1000)
         assert sent > 2 * events
-        assert events < MAX_BURST + MAX_PACKETS_PER_S * (time.monotonic() - begin_s)
+        assert events < MAX_BURST + MAX_PACKETS_PER_S * (clock.now_ns() - begin_ns) / NS_PER_S
         while link.receive(20):
             pass
         os.write(master, FRAME)

@@ -11,7 +11,7 @@ from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.faults import RunFaults, read_recording
 from hilstar.run.record.ledger import Ledger, LedgerSwitch
-from hilstar.run.record.ledger_reader import fault_records, frame_records
+from hilstar.run.record.ledger_records import fault_records, frame_records
 from hilstar.run.replay import Wanted, plan_play, replay
 from hilstar.run.serve import Outlet
 from tests.support.benches import ATTITUDE, bench_text

@@ -1,0 +1,279 @@
+"""A sensor's `[tracker.detector]` from an EMVA 1288 data sheet, or from a user's own flats and darks by photon transfer.
+
+Photon transfer (Janesick 2007; EMVA 1288, release 4.0): two frames of one exposure give the noise by their difference and the
+fixed pattern by their covariance. Shot noise makes the variance K times the signal, with K in DN/e-.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from hilstar import charts
+from hilstar.arrays import FloatArray
+from hilstar.calibrate.geometric.observed import read_image
+from hilstar.csv_tables import finite_numbers, read_rows
+from hilstar.errors import InputError, shortened
+from hilstar.files import write_whole
+from hilstar.reading import read_text
+from hilstar.tracker.settings import BOLTZMANN_EV_PER_K, DetectorSettings
+
+MAX_EMVA_BYTES = 1_000_000
+EMVA_ADVICE = "write rows quantity,value,unit, such as K,0.25,DN/e- and eta@530nm,62,%"
+ICE_K = 273.15
+MAX_EXPOSURE_S = 1e6
+ROUNDING_DN2 = 1 / 12
+LINEAR_SHARE = 0.7  # of saturation: the standard's range for the slope of variance over signal
+
+
+class Quantity(NamedTuple):
+    """A quantity of the standard: its names, the key that it gives, and what turns each unit into the key's."""
+
+    names: tuple[str, ...]
+    key: str
+    units: dict[str, Callable[[float], float]]
+
+
+def _same(value: float) -> float:
+    return value
+
+
+QUANTITIES = (
+    Quantity(("k", "overall system gain"), "gain_e_per_dn", {"dn/e-": lambda value: 1 / value}),
+    Quantity(("1/k", "inverse of overall system gain"), "gain_e_per_dn", {"e-/dn": _same}),
+    Quantity(("sigma_d", "temporal dark noise"), "read_noise_e", {"e-": _same}),
+    Quantity(("mu_e.sat", "saturation capacity"), "full_well_e", {"e-": _same}),
+    Quantity(("dsnu1288", "dsnu"), "dsnu_e", {"e-": _same}),
+    Quantity(("prnu1288", "prnu"), "prnu", {"%": lambda value: value / 100, "1": _same}),
+    Quantity(("mu_i", "mu_i.mean", "dark current"), "dark_e_per_s", {"e-/s": _same}),
+    Quantity(("mu_y.dark", "dark signal"), "offset_dn", {"dn": _same}),
+    Quantity(("bits", "bit depth"), "bits", {"bit": round}),
+    Quantity(("temperature",), "temperature_k", {"k": _same, "degc": lambda value: value + ICE_K}),
+    Quantity(("t_d", "doubling temperature"), "doubling_k", {"k": _same, "degc": _same}),
+    Quantity(("eta", "quantum efficiency"), "eta", {"%": lambda value: value / 100, "1": _same}),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFile:
+    """A sensor's keys with one-sigma errors where measured, quantum efficiency (nm, share), and what is to be said.
+
+    `transfer` (2, n) is the signal above dark and its variance less dark's, DN and DN^2; `dark` (2, m) seconds and mean DN.
+    """
+
+    keys: dict[str, Any]
+    sigmas: dict[str, float]
+    efficiency: tuple[tuple[float, float], ...] = ()
+    notes: tuple[str, ...] = ()
+    transfer: FloatArray | None = None
+    dark: FloatArray | None = None
+
+    @property
+    def lines(self) -> list[str]:
+        """A line for each key: `key = value`, and `+- sigma` where it was measured."""
+        return [
+            f"{key} = {value:.6g}" + (f" +- {self.sigmas[key]:.2g}" if key in self.sigmas else "")
+            for key, value in self.keys.items()
+        ]
+
+    @property
+    def settings(self) -> DetectorSettings:
+        """The detector. Raises InputError for a value that no sensor has."""
+        return DetectorSettings(**self.keys)
+
+
+def import_emva(path: Path) -> SensorFile:
+    """The sensor of a table `quantity,value,unit` (CSV, or JSON: a list of objects). Raises InputError."""
+    keys: dict[str, Any] = {}
+    efficiency: list[tuple[float, float]] = []
+    unused: list[str] = []
+    for place, name, value, unit in _emva_rows(path):
+        plain, _, wavelength = name.lower().partition("@")
+        found = next((one for one in QUANTITIES if plain.strip() in one.names), None)
+        if found is None:
+            unused.append(name)
+            continue
+        convert = found.units.get(unit.lower().replace(" ", ""))
+        if convert is None or (found.key == "gain_e_per_dn" and not value > 0):
+            raise InputError(f"{place}: {name} = {value:g} {unit}; write it above 0 in {' or '.join(found.units)}")
+        if found.key != "eta":
+            keys[found.key] = convert(value)
+        elif not re.fullmatch(r"\s*\d+(\.\d+)?\s*nm\s*", wavelength):
+            raise InputError(f"{place}: {name}; write its wavelength, such as eta@530nm")
+        else:
+            efficiency.append((float(wavelength.replace("nm", "")), convert(value)))
+    if "gain_e_per_dn" not in keys:
+        raise InputError(f"{path}: has no K; {EMVA_ADVICE}")
+    if "temperature_k" in keys:
+        keys["dark_reference_temperature_k"] = keys["temperature_k"]
+    if (doubling_k := keys.pop("doubling_k", 0.0)) > 0:
+        kelvin = keys.get("temperature_k", DetectorSettings().temperature_k)
+        keys["dark_activation_ev"] = math.log(2) * BOLTZMANN_EV_PER_K * kelvin * (kelvin + doubling_k) / doubling_k
+    notes = (f"not used: {', '.join(map(shortened, unused))}",) if unused else ()
+    return SensorFile(keys, {}, tuple(sorted(efficiency)), notes)
+
+
+def _emva_rows(path: Path) -> Iterator[tuple[str, str, float, str]]:
+    """Place, quantity, value and unit of each row."""
+    columns = ("quantity", "value", "unit")
+    if path.suffix.lower() == ".json":
+        try:
+            table = msgspec.json.decode(read_text(path, EMVA_ADVICE, MAX_EMVA_BYTES), type=list[dict[str, str | float]])
+        except msgspec.MsgspecError as error:
+            raise InputError(f"{path}: {shortened(str(error))}; write a list of objects with quantity, value, unit") from error
+        rows = [(number, [str(row.get(name, "")) for name in columns]) for number, row in enumerate(table, start=1)]
+    else:
+        rows = [(line, cells[:3]) for line, cells in read_rows(path, columns, EMVA_ADVICE, MAX_EMVA_BYTES)]
+    for line, (name, value, unit) in rows:
+        yield f"{path}:{line}", name, finite_numbers(path, line, ("value",), [value], EMVA_ADVICE)[0], unit
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Pairs of frames by mean, (n,) each: temporal and spatial (fixed-pattern) variance, and exposure, NaN if not known."""
+
+    mean_dn: FloatArray
+    temporal_dn2: FloatArray
+    spatial_dn2: FloatArray
+    exposure_s: FloatArray
+    largest_dn: float
+    shape: tuple[int, ...]
+
+    def line(self, name: str, power: int, error: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """A column over the exposure to a power, where exposures differ: slope and value at 0, and their one-sigma errors."""
+        weight = math.sqrt(math.prod(self.shape)) / np.maximum(error, 1e-9)
+        place = np.nan_to_num(self.exposure_s) ** power
+        values, covariance = np.polyfit(place, getattr(self, name), int(self.timed), w=weight, cov="unscaled")
+        return values, np.sqrt(np.diag(covariance))
+
+    @property
+    def timed(self) -> bool:
+        """Whether there are two exposures or more."""
+        return bool(np.ptp(self.exposure_s) > 0)
+
+    @property
+    def pattern_error_dn2(self) -> FloatArray:
+        """One sigma of a spatial variance, as a pixel of two frames tells it."""
+        return np.hypot(self.temporal_dn2 + self.spatial_dn2, self.spatial_dn2)
+
+
+def read_levels(paths: Sequence[Path], what: str) -> Levels:
+    """Levels of frames that come in pairs: two of one light and exposure after each other. Raises InputError."""
+    if not paths or len(paths) % 2:
+        raise InputError(f"{what}: {len(paths)} frames; give two of each exposure, one after the other")
+    rows, largest_dn, shape = [], 0.0, read_image(paths[0]).shape
+    for first, second in zip(paths[::2], paths[1::2], strict=True):
+        a, b = read_image(first), read_image(second)
+        seconds, again = _exposure_s(first), _exposure_s(second)
+        if not (a.shape == b.shape == shape and (seconds == again or (math.isnan(seconds) and math.isnan(again)))):
+            raise InputError(f"{second}: its size or EXPTIME is not that of {first}; give two frames of each exposure")
+        pattern = float(np.mean((a - a.mean()) * (b - b.mean())))
+        if not math.isfinite(pattern):
+            raise InputError(f"{second}: it or {first} has pixels that are no finite number; give raw frames")
+        rows.append(((a.mean() + b.mean()) / 2, float((a - b).var()) / 2, pattern, seconds))
+        largest_dn = max(largest_dn, float(a.max()), float(b.max()))
+    mean, temporal, spatial, exposure_s = np.array(sorted(rows)).T
+    return Levels(mean, temporal, spatial, exposure_s, largest_dn, shape)
+
+
+def _exposure_s(path: Path) -> float:
+    """EXPTIME of a FITS file; NaN where there is none."""
+    from astropy.io import fits
+
+    try:
+        exposure_s = float(fits.getheader(path)["EXPTIME"])
+    except (OSError, KeyError, TypeError, ValueError):
+        return math.nan
+    return exposure_s if 0 <= exposure_s <= MAX_EXPOSURE_S else math.nan
+
+
+def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
+    """A sensor from pairs of flats and darks. Raises InputError where they cannot tell its gain.
+
+    Errors are those of a finite number of pixels. Light that is not even over the sensor counts as PRNU.
+    """
+    light, dark = read_levels(flats, "FLATS"), read_levels(darks, "--darks")
+    if light.shape != dark.shape:
+        raise InputError("--darks: not of the flats' size; give frames of one sensor")
+    pixels, flat_s = math.prod(dark.shape), np.nan_to_num(light.exposure_s)
+    noise_dn = np.sqrt(dark.temporal_dn2 / 2 + np.maximum(dark.spatial_dn2, 0.0))
+    mean, mean_error = dark.line("mean_dn", 1, noise_dn)
+    temporal, temporal_error = dark.line("temporal_dn2", 1, math.sqrt(2) * dark.temporal_dn2)
+    spatial, spatial_error = dark.line("spatial_dn2", 2, dark.pattern_error_dn2)
+    signal, variance = light.mean_dn - np.polyval(mean, flat_s), light.temporal_dn2 - np.polyval(temporal, flat_s)
+    top = int(light.temporal_dn2.argmax())
+    usable = np.flatnonzero((signal > 0) & (light.temporal_dn2 > 0) & (signal <= LINEAR_SHARE * signal[top]))
+    weight = pixels / 2 * (signal[usable] / light.temporal_dn2[usable]) ** 2
+    k_dn_per_e = float((variance[usable] / signal[usable]) @ weight / weight.sum()) if len(usable) else 0.0
+    if not k_dn_per_e > 0:
+        raise InputError("FLATS: no noise that grows with light; give raw frames of one sensor from dark to saturation")
+    k_error = float(weight.sum()) ** -0.5 / k_dn_per_e
+    half = int(usable[np.abs(signal[usable] - signal[top] / 2).argmin()])
+    keys: dict[str, Any] = {"gain_e_per_dn": 1 / k_dn_per_e, "offset_dn": float(mean[-1])}
+    sigmas = {"gain_e_per_dn": k_error / k_dn_per_e, "offset_dn": float(mean_error[-1])}
+
+    def add(key: str, value: float, error: float, unit: float = k_dn_per_e, unit_error: float = k_error) -> None:
+        keys[key], sigmas[key] = max(float(value), 0.0) / unit, math.hypot(error, max(value, 0.0) * unit_error) / unit
+
+    def add_root(key: str, square: float, error: float, unit: float = k_dn_per_e, unit_error: float = k_error) -> None:
+        root = math.sqrt(max(square, 0.0))
+        add(key, root, error / (2 * root) if square > error else math.sqrt(error), unit, unit_error)
+
+    add_root("read_noise_e", temporal[-1] - ROUNDING_DN2, temporal_error[-1])
+    add_root("dsnu_e", spatial[-1], spatial_error[-1])
+    pattern_dn2 = light.spatial_dn2[half] - np.polyval(spatial, flat_s[half] ** 2)
+    add_root("prnu", pattern_dn2, light.pattern_error_dn2[half] / math.sqrt(pixels), signal[half], 0.0)
+    notes = [f"{len(signal)} levels of light, {len(dark.mean_dn)} of dark, {pixels} px; light that is not even counts as PRNU"]
+    if dark.timed:
+        add("dark_e_per_s", mean[0], mean_error[0])
+        add_root("dsnu_e_per_s", spatial[0], spatial_error[0])
+    else:
+        notes.append("no dark current: the darks have no two exposures (EXPTIME)")
+    if top < len(signal) - 1:
+        add("full_well_e", signal[top], np.ptp(signal[top - 1 : top + 2]) / 2)
+    else:
+        notes.append("full_well_e is not known: the brightest flats do not saturate")
+    keys["bits"] = max(1, math.ceil(math.log2(light.largest_dn + 1)))
+    notes.append(f"bits holds the largest DN seen, {light.largest_dn:g}")
+    points = np.array([signal, variance]), np.array([np.nan_to_num(dark.exposure_s), dark.mean_dn])
+    return SensorFile(keys, sigmas, (), tuple(notes), *points)
+
+
+def write_sensor(output: Path, sensor: SensorFile, source: str) -> list[Path]:
+    """Write the TOML file, a curve of quantum efficiency beside it, and the charts. Gives the files. Raises InputError."""
+    settings = sensor.settings
+    curve, chart = output.with_name(f"{output.stem}_qe.csv"), output.with_name(f"{output.stem}_curves")
+    lines, many = [f"# {source}", *(f"# {note}" for note in sensor.notes)], len(sensor.efficiency) > 1
+    if sensor.efficiency:
+        lines += ["[tracker]", f"quantum_efficiency = {json.dumps(curve.name) if many else f'{sensor.efficiency[0][1]:.6g}'}"]
+    if many:
+        charts.write_csv(curve, ("wavelength_nm", "value"), sensor.efficiency)
+    lines += ["[tracker.detector]", *(f"{line.replace(' +- ', '  # +- ')}" for line in sensor.lines)]
+    write_whole(output, "\n".join(lines) + "\n")
+    draw_curves(chart, settings, sensor)
+    return [output, *([curve] if many else []), *(chart.with_suffix(end) for end in charts.ENDINGS)]
+
+
+def draw_curves(path: Path, settings: DetectorSettings, sensor: SensorFile) -> None:
+    """Variance over signal, and dark signal over exposure, as the standard plots them: the file's lines, measured points."""
+    gain, measured = settings.gain_e_per_dn, sensor.transfer is not None and sensor.dark is not None
+    finding = f"{gain:.3g} e- a DN, {settings.read_noise_e:.3g} e- of read noise, full at {settings.full_well_e:.0f} e-"
+    signal_dn = np.array([0.0, settings.full_well_e / gain if sensor.transfer is None else sensor.transfer[0].max()])
+    seconds = np.array([0.0, 1.0 if sensor.dark is None else max(float(sensor.dark[0].max()), 1e-3)])
+    with charts.chart(path, finding, 1, 2, share_x=False) as (transfer, dark):
+        transfer.plot(signal_dn, signal_dn / gain, label="shot noise")
+        dark.plot(seconds, settings.offset_dn + settings.dark_e_per_s * seconds / gain, label="mean dark")
+        for axes, points in ((transfer, sensor.transfer), (dark, sensor.dark)):
+            if measured and points is not None:
+                axes.plot(*points, "o", color=charts.ORANGE, label="measured")
+            axes.legend()
+        transfer.set(xlabel="signal above dark, DN", ylabel="variance above dark, DN²")
+        dark.set(xlabel="exposure, s", ylabel="dark signal, DN")

@@ -1,0 +1,264 @@
+"""hilstar calibrate: a bench's geometry by dots or attitudes, its monitor by patches, its scale by stars."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilstar.cli.options import MAX_SEED, BenchFile, Json, Overwrite, check_files, parse_numbers, parse_reading
+from hilstar.cli.running import Windowed
+from hilstar.console.terminal import print_json, say
+from hilstar.errors import InputError
+from hilstar.files import CSV, PNG, TOML, check_directory, check_ending, make_directory
+
+MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
+RESOLUTION_FORM = "--resolution W,H in pixels, such as 1920,1080"
+
+
+def dots(
+    bench_file: BenchFile,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")],
+    frames: Annotated[int, typer.Option(help="Number of frames.", min=1, max=1000)] = 20,
+    dots_per_frame: Annotated[int, typer.Option("--dots", help="About how many dots are lit in each.", min=1, max=5000)] = 60,
+    show: Annotated[
+        bool, typer.Option("--show", help="Show the frames on the display: space for the next, q to quit.")
+    ] = False,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="With --show: time for each frame, without keys.", min=0)
+    ] = None,
+    windowed: Windowed = False,
+    seed: Annotated[int, typer.Option(help="Seed of the dots' codes.", min=0, max=MAX_SEED)] = 0,
+    as_json: Json = False,
+) -> None:
+    """Make frames of dots for `calibrate geometric`: each dot blinks its own code."""
+    import numpy as np
+
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.frame_files import write_codes_png
+    from hilstar.calibrate.geometric.dots import dot_image, plan_dots, show_dots, write_plan
+
+    check_directory("-o", output)
+    file = read_bench_file(bench_file)
+    monitor = file.config.monitor
+    plan = plan_dots(monitor.resolution_px, frames, dots_per_frame, np.random.default_rng(seed))
+    check_files([], [output / "plan.csv"], file)
+    make_directory(output)
+    write_plan(output / "plan.csv", plan)
+    for frame in range(plan.frames):
+        image = dot_image(plan, frame, monitor.resolution_px, 2**monitor.bits - 1)
+        write_codes_png(output / f"frame_{frame:03}.png", image, monitor.bits)
+    shown = None
+    if show:
+        shown = show_dots(plan, monitor, seconds, windowed=windowed)
+        say(f"{shown} of {plan.frames} frames shown")
+    if as_json:
+        print_json({"frames": plan.frames, "dots": len(plan), "lit": int(plan.lit.sum()), "seed": seed, "written": str(output)})
+    else:
+        typer.echo(f"{len(plan)} dots in {plan.frames} frames, {plan.lit.sum() / plan.frames:.0f} lit in each, in {output}")
+
+
+def geometric(
+    bench_file: BenchFile,
+    observed: Annotated[
+        list[Path], typer.Argument(metavar="OBSERVED...", help="A CSV of centroids (frame,x_px,y_px), or the tracker's images.")
+    ],
+    plan: Annotated[Path, typer.Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")],
+    tracker_is_ideal: Annotated[
+        bool, typer.Option("--tracker-is-ideal", help="Take the tracker's lens as ideal; the file then holds both lenses.")
+    ] = False,
+    dark: Annotated[Path | None, typer.Option(metavar="FILE", help="A dark frame, taken from each image.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The error over the screen, and the residuals.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker saw."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.calibrate.geometric.calibration import calibrate_files, lines_of, summary_of, write_calibrated
+
+    check_ending("-o", output, TOML)
+    check_ending("--plot", plot, PNG)
+    file = read_bench_file(bench_file)
+    check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
+    found = calibrate_files(file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal)
+    written = write_calibrated(output, found, plot)
+    _report(output, as_json, lambda: summary_of(found, written), lambda: lines_of(found))
+
+
+def _report(output: Path, as_json: bool, figures: Callable[[], dict[str, Any]], lines: Callable[[], list[str]]) -> None:
+    """Print what was found, as JSON or as lines, and where the geometry file is named."""
+    if as_json:
+        print_json(figures())
+        return
+    typer.echo("\n".join(lines()))
+    typer.echo(f"in the bench file, under [collimator]: geometry = {str(output.name)!r}")
+
+
+def alignment(
+    bench_file: BenchFile,
+    pairs: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PAIRS.csv",
+            help="Commanded and reported q_icrs_to_cam, scalar first: qw,qx,qy,qz,tw,tx,ty,tz[,valid]. With --ledger, the"
+            " tracker's telemetry: t_s,qw,qx,qy,qz[,valid].",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")],
+    ledger: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN.mcap",
+            help="The ledger of the run that the telemetry is of: t_s is the middle of an exposure in seconds of the ledger's"
+            " light_ns, the sender's clock.",
+        ),
+    ] = None,
+    offset_s: Annotated[
+        float | None, typer.Option("--offset-s", help="With --ledger: seconds to add to the telemetry's t_s; 0 by default.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Find how the tracker stands before the screen from the attitudes that it reports, for one that gives nothing else."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.calibrate.alignment import align_files, lines_of, summary_of, write_alignment
+
+    check_ending("-o", output, TOML)
+    if offset_s is not None and ledger is None:
+        raise InputError("--offset-s: pairs have no times; give it with --ledger RUN.mcap and the tracker's telemetry")
+    if offset_s is not None and not abs(offset_s) < MAX_OFFSET_S:
+        raise InputError(f"--offset-s {offset_s}: write seconds, less than {MAX_OFFSET_S:g} either way")
+    file = read_bench_file(bench_file)
+    check_files([pairs, ledger], [output], file)
+    found = align_files(file, pairs, ledger, offset_s or 0.0)
+    write_alignment(output, found, file)
+    _report(output, as_json, lambda: summary_of(found) | {"written": [str(output)]}, lambda: lines_of(found))
+
+
+def plan(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="PLAN.csv", help="The plan, to be filled in.")],
+    bits: Annotated[int, typer.Option(help="Bits per code.", min=1, max=16)] = 8,
+    levels: Annotated[int, typer.Option(help="Levels from black to white; half of white is added.", min=2)] = 32,
+    repeats: Annotated[int, typer.Option(help="Repeats of each level; 3 are enough for a plain power law.", min=1)] = 6,
+    channels: Annotated[str, typer.Option(help="Channels to measure, of w, r, g, b.")] = "w",
+    seed: Annotated[int, typer.Option(help="Seed of the order.", min=0, max=MAX_SEED)] = 0,
+    headless: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the patches to this directory as PNG.")] = None,
+    resolution: Annotated[str, typer.Option(metavar="W,H", help="Size of the pictures.")] = "1920,1080",
+    show: Annotated[bool, typer.Option("--show", help="Show the patches on a display: space for the next, q to quit.")] = False,
+    display: Annotated[str, typer.Option(metavar="INDEX|NAME", help="With --show: the display.")] = "0",
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="With --show: time for each patch, without keys.", min=0)
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+) -> None:
+    """Plan which codes to measure, in which order, and make their patches."""
+    import numpy as np
+
+    from hilstar.calibrate.plan import PlanSettings, is_filled_in, plan_patches, show_patches, write_patches, write_plan
+
+    check_ending("-o", output, CSV)
+    check_directory("--headless", headless)
+    check_files([], [], None, output if is_filled_in(output) else None, overwrite)
+    width, height = (round(value) for value in parse_numbers(resolution, 2, "--resolution", RESOLUTION_FORM))
+    if not (1 <= width <= 32768 and 1 <= height <= 32768):
+        raise InputError(f"--resolution {resolution}: write {RESOLUTION_FORM}")
+    settings = PlanSettings(bits, levels, repeats, channels)
+    planned = plan_patches(settings, np.random.default_rng(seed))
+    write_plan(output, planned)
+    written = [str(output)]
+    if headless is not None:
+        write_patches(headless, planned, (width, height), bits)
+        written.append(str(headless))
+    codes = len({patch.code for patch in planned})
+    if as_json:
+        print_json({"bits": bits, "patches": len(planned), "codes": codes, "seed": seed, "written": written})
+    else:
+        typer.echo(f"{len(planned)} patches of {codes} codes in {', '.join(written)}")
+        typer.echo("fill in the column value, and give the file to hilstar calibrate photometric")
+    if show:
+        shown = show_patches(planned, bits, int(display) if display.isdecimal() else display, seconds)
+        say(f"{shown} of {len(planned)} patches shown")
+    elif headless is None:
+        say("add --show for the patches on a display (space for the next one), or --headless DIR for pictures of them")
+
+
+def photometric(
+    measured: Annotated[Path, typer.Argument(metavar="MEASURED.csv", help="code,channel,value; see configs/CALIBRATION.md.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="MONITOR.toml", help="The calibration file.")],
+    bits: Annotated[int | None, typer.Option(help="Bits per code; by default from the codes measured.", min=1, max=16)] = None,
+    who: Annotated[str, typer.Option(help="Who made the measurements.")] = "",
+    when: Annotated[str, typer.Option(help="Date of the measurements; today by default.")] = "",
+    instrument: Annotated[str, typer.Option(help="Instrument used.")] = "",
+    unit: Annotated[str, typer.Option(help="Unit of the values, such as cd/m2 or DN.")] = "",
+    plot: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The response and its residuals.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Fit the monitor's response to measured patches."""
+    from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
+
+    check_ending("-o", output, TOML)
+    check_ending("--plot", plot, PNG)
+    check_files([measured], [output, output.with_suffix(".csv"), plot])
+    found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits)
+    if plot is not None:
+        draw_calibration(measured, plot, bits)
+        found["written"].append(str(plot))
+    if as_json:
+        print_json(found)
+        return
+    black, held = found["black_level"]["relative"], found["holdout"]
+    contrast = f"1 : {1 / black:.0f}" if black > 0 else "unknown: no light at code 0"
+    drift = "not known" if found["drift_percent"] is None else f"{found['drift_percent']:+.2f} %"
+    typer.echo(f"{'measured':20}{found['codes']} codes above black, {found['bits']} bits; drift {drift}")
+    typer.echo(f"{'black level':20}{black:.3e} of white, contrast {contrast}")
+    typer.echo(f"{'noise':20}{100 * found['noise_relative']:.2f} % of a reading")
+    typer.echo(
+        f"{'held-out levels':20}{held['rms_percent']:.2f} / {held['p95_percent']:.2f} / {held['max_percent']:.2f} %"
+        f" (rms / 95 % / max), {held['max_mag']:.4f} mag maximum"
+    )
+    typer.echo(f"{'written':20}{', '.join(found['written'])}")
+    typer.echo(f"{'in the bench file':20}[monitor] calibration = {json.dumps(output.name)}")
+
+
+def scale(
+    bench_file: BenchFile,
+    reading: Annotated[list[str], typer.Option(metavar="HIP,DN", help="A star, and the sum of its DN above the background.")],
+    exposure: Annotated[
+        float | None, typer.Option(metavar="S", help="The tracker's exposure; by default the bench file's.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="OUT.toml", help="A copy of the bench file with the key set.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Scale the light by the tracker: what one pixel at white is worth, from its readings of stars shown."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.build import open_bench
+    from hilstar.calibrate.scale import UNSURE_MAG, scale_by_tracker, with_flux_at_white
+
+    check_ending("-o", output, TOML)
+    file = read_bench_file(bench_file)
+    check_files([], [output], file)
+    with open_bench(file) as bench:
+        exposure_s = bench.config.tracker.exposure_s if exposure is None else exposure
+        found = scale_by_tracker(bench, [parse_reading(text) for text in reading], exposure_s)
+    if found.scatter_mag > UNSURE_MAG:
+        say(f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation, and the response")
+    if output is not None:
+        with_flux_at_white(file, found.flux_at_white_e_per_s, output)
+    summary: dict[str, Any] = {
+        "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
+        "assumed_e_per_s": found.assumed_e_per_s,
+        "readings": len(reading),
+        "scatter_mag": found.scatter_mag,
+        "exposure_s": exposure_s,
+        "written": None if output is None else str(output),
+    }
+    if as_json:
+        print_json(summary)
+        return
+    typer.echo(f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag; under [render]:")
+    typer.echo(f"flux_at_white_e_per_s = {found.flux_at_white_e_per_s!r}")

@@ -1,1 +1,0 @@
-"""Commands that calibrate a bench."""

@@ -1,0 +1,51 @@
+"""hilstar catalogue: the stars of a bench as its tracker sees them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilstar.cli.options import BenchFile, Json
+from hilstar.console.terminal import print_json
+
+
+def catalogue(
+    bench_file: BenchFile,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="STARS.csv|fits|parquet|vot", help="The table; its ending says what it is."),
+    ],
+    to: Annotated[
+        float | None, typer.Option("--to", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40)
+    ] = None,
+    epoch: Annotated[
+        float | None,
+        typer.Option(
+            "--epoch", metavar="JYEAR", help="Julian year of the places; the bench's by default.", min=-10_000, max=10_000
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the stars as the tracker sees them: places with errors, types, electrons per second, instrument magnitudes."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.catalogue import ENDINGS, bench_catalogue, write_catalogue
+    from hilstar.errors import InputError, shortened
+    from hilstar.files import check_outputs
+
+    if output.suffix.lower() not in ENDINGS:
+        raise InputError(f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}")
+    check_outputs([bench_file], [output])
+    file = read_bench_file(bench_file)
+    found = bench_catalogue(file, to, epoch)
+    write_catalogue(output, found)
+    told = {"file": str(output), "stars": len(found), "epoch_jyear": found.epoch_jyear, "zero_points_mag": found.zero_points}
+    if as_json:
+        print_json(told)
+        return
+    vega, ab = found.zero_points["vega"], found.zero_points["ab"]
+    typer.echo(
+        f"{len(found)} stars at J{found.epoch_jyear:g}; an electron per second is {vega:.4f} mag (Vega), {ab:.4f} mag (AB);"
+        f" wrote {output}"
+    )

@@ -1,0 +1,58 @@
+"""hilstar sensor: a tracker's sensor from its EMVA 1288 data sheet, or from its own frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hilstar.cli.options import Json, check_files
+from hilstar.console.terminal import print_json
+from hilstar.files import TOML, check_ending
+
+if TYPE_CHECKING:
+    from hilstar.calibrate.sensor import SensorFile
+
+Output = Annotated[Path, typer.Option("-o", "--output", metavar="SENSOR.toml", help="The tables for a bench file.")]
+
+
+def import_(
+    data: Annotated[Path, typer.Argument(metavar="EMVA.csv|json", help="Rows of quantity, value and unit.")],
+    output: Output,
+    as_json: Json = False,
+) -> None:
+    """Make a bench file's [tracker.detector] and quantum efficiency of an EMVA 1288 data sheet, and its curves."""
+    from hilstar.calibrate.sensor import import_emva
+
+    check_ending("-o", output, TOML)
+    check_files([data], [output])
+    _tell(output, import_emva(data), f"By hilstar sensor import from {data.name}", as_json)
+
+
+def measure(
+    flats: Annotated[list[Path], typer.Argument(metavar="FLATS...", help="FITS or PNG, two of each light after each other.")],
+    darks: Annotated[
+        list[Path], typer.Option("--darks", metavar="DARKS...", help="Frames without light, two of each exposure (EXPTIME).")
+    ],
+    output: Output,
+    as_json: Json = False,
+) -> None:
+    """Measure gain, noise, full well and fixed pattern of a sensor by photon transfer, and write [tracker.detector]."""
+    from hilstar.calibrate.sensor import measure_sensor
+
+    check_ending("-o", output, TOML)
+    check_files([*flats, *darks], [output])
+    _tell(output, measure_sensor(flats, darks), "By hilstar sensor measure; errors are one sigma", as_json)
+
+
+def _tell(output: Path, sensor: SensorFile, source: str, as_json: bool) -> None:
+    from hilstar.calibrate.sensor import write_sensor
+
+    files = write_sensor(output, sensor, source)
+    if as_json:
+        print_json(
+            {"keys": sensor.keys, "sigmas": sensor.sigmas, "notes": sensor.notes, "written": [str(file) for file in files]}
+        )
+        return
+    typer.echo("\n".join([*sensor.lines, *sensor.notes, f"wrote {', '.join(str(file) for file in files)}"]))

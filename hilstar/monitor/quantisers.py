@@ -1,0 +1,19 @@
+"""Every quantisation by the name that the bench file gives it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from hilstar.monitor.exact import ExactQuantiser
+from hilstar.monitor.quantise import DitherQuantiser, Quantiser, RoundQuantiser
+from hilstar.monitor.temporal import TemporalQuantiser
+
+Quantisation = Literal["round", "dither", "temporal", "exact"]
+
+QUANTISERS: dict[Quantisation, type[Quantiser]] = {
+    "round": RoundQuantiser,
+    "dither": DitherQuantiser,
+    "exact": ExactQuantiser,
+    "temporal": TemporalQuantiser,
+}
+BY_COST: tuple[Quantisation, ...] = ("round", "exact")  # what `auto` chooses among, from the cheapest to the most accurate

@@ -1,0 +1,232 @@
+"""A map of light that stands on the sky: read from FITS, kept as tangent images whose unit is stars of V = 0 per steradian.
+
+Each WCS image of a file becomes a tangent (gnomonic) image of its own resolution. One that is wider than MAX_HALF_DEG from its
+middle, or a HEALPix map, becomes the six faces of a cube. Between pixels all are bilinear.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.errors import InputError, MachineError, cannot_read
+from hilstar.reading import read_bytes
+from hilstar.sky.electrons import VEGA_V0_W_M2_M
+
+MAP_ADVICE = "give a FITS image with a WCS, or a HEALPix map in FITS"
+UNIT_ADVICE = "write BUNIT (of a HEALPix column TUNITn) as astropy does, such as mag/arcsec2, MJy/sr or W/(m2 um sr)"
+MAX_FILE_BYTES = 1_000_000_000
+V_NM = 545.0  # effective wavelength of V, for which VEGA_V0_W_M2_M is given (Bessell 1998)
+MAX_HALF_DEG = 40.0  # a tangent image's pixels are 1.7 times as long at its edge
+MAX_SIDE_PX, MAX_CUBE_PX, MAX_NSIDE = 4096, 2048, 1024  # finer maps are binned
+MIN_SIGMA = 0.2  # in its pixels: a narrower Gaussian changes nothing between them
+EDGE_PX = 2  # around a face of the cube: between pixels there is always a neighbour
+
+
+# The light (n,) in unit directions (n, 3), ICRS.
+Sampled = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TangentImage:
+    """A square image on a tangent plane, stars of V = 0 per steradian; `axes` (3, 3) are its x, y and normal, ICRS.
+
+    The direction (u, v, 1) in its axes is at `px_per_tangent` (u, v) from the middle. Nothing of it lies beyond
+    `max_tangent`, which is 1 for a face of a cube.
+    """
+
+    image: Float32Array
+    axes: FloatArray
+    px_per_tangent: float
+    max_tangent: float = math.inf
+
+    def places_px(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Columns and rows of directions (..., 3), ICRS; NaN behind the plane."""
+        x, y, z = np.moveaxis(directions @ self.axes.T, -1, 0)
+        scale = self.px_per_tangent / np.where(z > 0, z, np.nan)
+        middle = (self.image.shape[0] - 1) / 2
+        return x * scale + middle, y * scale + middle
+
+    def seen_by(self, px_rad: float, sigma_px: float) -> TangentImage:
+        """The same for a camera whose finest pixels have `px_rad`: with pixels nearly as large, and spread by a Gaussian."""
+        from scipy.ndimage import gaussian_filter
+
+        whole = self._binned(int(px_rad * self.px_per_tangent))
+        sigma = sigma_px * px_rad * whole.px_per_tangent
+        if sigma < MIN_SIGMA:
+            return whole
+        is_of_cube = math.isfinite(self.max_tangent)
+        padded = whole.image if is_of_cube else np.pad(whole.image, math.ceil(4 * sigma))
+        return replace(whole, image=gaussian_filter(padded, sigma, mode="nearest" if is_of_cube else "constant"))
+
+    def _binned(self, count: int) -> TangentImage:
+        if count < 2:
+            return self
+        half = -self.image.shape[0] % (2 * count) // 2  # sides are even: the middle stays
+        return TangentImage(
+            block_means(np.pad(self.image, half), count), self.axes, self.px_per_tangent / count, self.max_tangent
+        )
+
+
+def block_means(image: Any, count: int) -> Any:
+    """The means of blocks of `count` by `count` pixels, dark beyond the last row and column."""
+    rows, columns = (-(-size // count) for size in image.shape)
+    padded = np.pad(image, [(0, n * count - size) for n, size in zip((rows, columns), image.shape, strict=True)])
+    return padded.reshape(rows, count, columns, count).mean(axis=(1, 3))
+
+
+def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
+    """The map in a FITS file. Raises InputError, and MachineError where a HEALPix map needs its library."""
+    from astropy.io import fits
+
+    raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # astropy's about keywords of older standards; what matters is refused
+            units = fits.open(io.BytesIO(raw), memmap=False)
+            table = next((unit for unit in units if unit.header.get("PIXTYPE") == "HEALPIX"), None)
+            images = [unit for unit in units if unit.is_image and unit.data is not None]
+            if table is not None:
+                return _of_healpix(path, table)
+            if images:
+                return tuple(face for image in images for face in _of_image(path, image))
+    except (InputError, MachineError):
+        raise
+    except Exception as error:  # each library raises its own for a damaged file
+        raise cannot_read(path, f"{type(error).__name__}: {error}", MAP_ADVICE) from error
+    raise InputError(f"{path}: has neither an image nor a HEALPix table; {MAP_ADVICE}")
+
+
+def brightness(path: Path, values: Any, unit_name: str | None) -> FloatArray:
+    """Values in any unit of surface brightness as stars of V = 0 per steradian; what is negative or not finite is dark.
+
+    Magnitudes are V. Other units are spectral densities at V_NM: of energy or photons, per wavelength or frequency.
+    """
+    from astropy import units as u
+
+    try:
+        unit = u.Unit(unit_name or "")
+        if "mag" in str(unit):
+            square = (u.mag / unit).to(u.sr)
+            found = 10 ** (-0.4 * np.asarray(values, dtype=np.float64)) / square
+        else:
+            scale = (1 * unit).to(u.W / u.m**3 / u.sr, u.spectral_density(V_NM * u.nm)).value
+            found = np.asarray(values, dtype=np.float64) * (scale / VEGA_V0_W_M2_M)
+    except (ValueError, TypeError) as error:
+        said = "no unit" if not unit_name else f"unit {unit_name!r}, which is no surface brightness"
+        raise InputError(f"{path}: {said}; {UNIT_ADVICE}") from error
+    return np.asarray(np.maximum(np.nan_to_num(found, nan=0.0, posinf=0.0), 0.0))
+
+
+def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
+    from astropy.wcs import WCS
+    from astropy.wcs.utils import proj_plane_pixel_scales, wcs_to_celestial_frame
+    from scipy.ndimage import map_coordinates
+
+    wcs = WCS(hdu.header)
+    if hdu.data.ndim != 2 or not wcs.has_celestial:
+        raise InputError(f"{path}: an image of shape {hdu.data.shape} without a place on the sky; {MAP_ADVICE}")
+    light = brightness(path, hdu.data, hdu.header.get("BUNIT"))
+    frame = wcs_to_celestial_frame(wcs)
+    px_rad = math.radians(float(np.min(proj_plane_pixel_scales(wcs))))
+    count = max(math.ceil(max(light.shape) / MAX_SIDE_PX), 1)
+    light, wcs, px_rad = block_means(light, count), wcs[::count, ::count], px_rad * count
+    rows, columns = light.shape
+
+    to_frame = _turned(frame)
+
+    def sampled(directions: FloatArray) -> FloatArray:
+        x, y, z = (directions @ to_frame.T).T
+        place = wcs.world_to_pixel_values(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1.0, 1.0))))[::-1]
+        return np.asarray(map_coordinates(light, np.nan_to_num(place, nan=-9.0), order=1, mode="grid-constant"))
+
+    x, y = np.meshgrid(np.linspace(-0.5, columns - 0.5, 33), np.linspace(-0.5, rows - 0.5, 33))
+    world = np.radians(wcs.pixel_to_world_values(x.ravel(), y.ravel()))
+    lon, lat = world[:, np.isfinite(world).all(axis=0)]
+    seen = to_frame.T @ np.stack([np.cos(lon) * np.cos(lat), np.sin(lon) * np.cos(lat), np.sin(lat)])
+    middle = seen.mean(axis=1)
+    middle /= np.linalg.norm(middle) or 1.0
+    reach = math.acos(np.clip(float((middle @ seen).min()), -1.0, 1.0))
+    if reach > math.radians(MAX_HALF_DEG) or world.shape[1] != seen.shape[1]:
+        return _cube(sampled, math.ceil(2 / px_rad))
+    axes = _axes_about(middle)
+    half = math.tan(reach + px_rad)
+    side = 2 * math.ceil(half / px_rad)
+    return (_face(sampled, axes, side, side / (2 * half)),)
+
+
+def _of_healpix(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
+    try:
+        from astropy_healpix import HEALPix
+    except ImportError as error:
+        raise MachineError(f"{path}: a HEALPix map; pip install 'hilstar[healpix]'") from error
+    from astropy import units as u
+    from astropy.coordinates import SkyCoord
+
+    header = hdu.header
+    frames = {"G": "galactic", "C": "icrs", "Q": "icrs", "E": "barycentricmeanecliptic"}
+    system = str(header.get("COORDSYS", "")).strip().upper()[:1]
+    if system not in frames:
+        raise InputError(f"{path}: COORDSYS = {header.get('COORDSYS')!r}; write G (galactic), C (ICRS) or E (ecliptic)")
+    light = brightness(path, np.ravel(hdu.data.field(0)), header.get("TUNIT1"))
+    grid = HEALPix(int(header["NSIDE"]), str(header["ORDERING"]).strip().lower())
+    if header.get("INDXSCHM", "IMPLICIT").strip() != "IMPLICIT" or len(light) != grid.npix:
+        raise InputError(f"{path}: {len(light)} pixels of {grid.npix}; give a map of the whole sky")
+    if grid.nside > MAX_NSIDE:
+        nested = light if grid.order == "nested" else light[grid.nested_to_ring(np.arange(grid.npix))]
+        grid = HEALPix(MAX_NSIDE, "nested")
+        light = nested.reshape(grid.npix, -1).mean(axis=1)
+
+    to_frame = _turned(SkyCoord(0, 0, unit="deg", frame=frames[system]).frame)
+
+    def sampled(directions: FloatArray) -> FloatArray:
+        x, y, z = (directions @ to_frame.T).T
+        # Its interpolation divides by zero at longitudes below 0.
+        lon, lat = np.arctan2(y, x) % (2 * np.pi) * u.rad, np.arcsin(np.clip(z, -1.0, 1.0)) * u.rad
+        return np.asarray(grid.interpolate_bilinear_lonlat(lon, lat, light))
+
+    return _cube(sampled, math.ceil(2 / grid.pixel_resolution.to_value("rad")))
+
+
+def _turned(frame: Any) -> FloatArray:
+    """The rotation (3, 3) from ICRS to a frame of Astropy: its axes differ by a turn alone."""
+    from astropy.coordinates import SkyCoord
+
+    axes = SkyCoord(np.eye(3), representation_type="cartesian", frame="icrs").transform_to(frame)
+    return np.asarray(axes.cartesian.xyz.value)
+
+
+def _axes_about(normal: FloatArray) -> FloatArray:
+    """Axes (3, 3) of a tangent plane: any x and y across its normal."""
+    x = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(normal, x), normal])
+
+
+def _cube(sampled: Sampled, side: int) -> tuple[TangentImage, ...]:
+    """The six faces, `side` pixels wide and somewhat more; those without light are left out."""
+    px_per_tangent = min(side, MAX_CUBE_PX) / 2
+    normals = np.concatenate([np.eye(3), -np.eye(3)])
+    full = 2 * (math.ceil(px_per_tangent) + EDGE_PX)
+    faces = [_face(sampled, _axes_about(normal), full, px_per_tangent, 1.0) for normal in normals]
+    return tuple(face for face in faces if face.image.any())
+
+
+def _face(sampled: Sampled, axes: FloatArray, side: int, px_per_tangent: float, max_tangent: float = math.inf) -> TangentImage:
+    """A square tangent image, row block by row block."""
+    at = (np.arange(side) - (side - 1) / 2) / px_per_tangent
+    image = np.empty((side, side), dtype=np.float32)
+    for first in range(0, side, 256):
+        v, u = np.meshgrid(at[first : first + 256], at, indexing="ij")
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ axes
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        image[first : first + 256] = sampled(rays).reshape(u.shape)
+    return TangentImage(image, axes, px_per_tangent, max_tangent)

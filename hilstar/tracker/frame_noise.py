@@ -1,0 +1,201 @@
+"""The random part of a frame, from random words by arithmetic alone: normal pairs, and Poisson counts by inversion.
+
+A frame is drawn in blocks of rows, each from a stream of its own: the frame's key and the block's number seed it. So one
+seed gives one frame on any number of threads. A pixel takes one word of 64 bits. It becomes two independent normal numbers
+(Box and Muller 1958): the first makes the electrons, the second the read noise.
+
+Electrons are the smallest count whose cumulative probability reaches that of the normal number. Below EXACT_BELOW_E
+that is exact (to float32's rounding of the number): a table or an expansion gives the count, and where either leaves a doubt,
+scipy's distribution decides. From there on the expansion alone decides (Giles, ACM TOMS 42 (2016) 5, eq. 8: of Cornish and
+Fisher's kind, with the 1/3 of a discrete law): its errors are in `tests/unit/tracker/test_frame_noise.py`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import Float32Array
+
+Word64Array = npt.NDArray[np.int64]
+
+PART_PX = 1 << 15  # the arrays of a part stay in a core's cache
+PARTS_IN_BLOCK = 2
+
+EXACT_BELOW_E = 64.0
+TABLE_BELOW_E = 8.0
+ROWS_PER_E, COLUMNS, COLUMNS_PER_SIGMA = 64, 2048, 150.0  # 2048 / 150 sigmas hold every number
+MARGIN_COLUMNS = 0.1  # float32 places a number this well
+UNSURE = 64  # a table's flag: this count or the next one
+ONE_STEP_SIGMAS = 3.0  # within it, a doubt is between two counts
+# Above this mean, the number of a step is straight between rows to 1.7e-3 sigmas.
+STRAIGHT_ABOVE_E, STEP_NUMBER_ERROR = 0.1, 2e-3
+# The expansion's error, e-, is at most ERROR_PER_BEND2 times the square of its last term ("bend"), plus
+# ERROR_E_TIMES_MEAN / mean; with the next term, FINER_ERROR_PER_BEND3 times its cube, plus FINER_ERROR_E / mean^1.5.
+ERROR_PER_BEND2, ERROR_E_TIMES_MEAN = 3.0, 0.03
+FINER_ERROR_PER_BEND3, FINER_ERROR_E = 7.5, 0.03
+
+
+def normal_pairs(words: Word64Array) -> tuple[Float32Array, Float32Array]:
+    """Two independent standard normal numbers from each random word: two arrays of its shape, up to 6.77 sigmas."""
+    halves = words.view(np.uint32).reshape(2, *words.shape)
+    radius = halves[0].astype(np.float32)
+    radius += np.float32(0.5)
+    radius *= np.float32(2.0**-32)
+    np.log(radius, out=radius)
+    radius *= np.float32(-2.0)
+    np.sqrt(radius, out=radius)
+    angle = halves[1].view(np.int32).astype(np.float32)
+    angle *= np.float32(2.0**-31 * np.pi)
+    sine = np.sin(angle)
+    np.cos(angle, out=angle)
+    sine *= radius
+    angle *= radius
+    return angle, sine
+
+
+def poisson(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
+    """Poisson counts of `mean_e` at the quantiles of standard normal numbers; all of one shape."""
+    small = np.flatnonzero(mean_e < TABLE_BELOW_E)
+    if len(small) == mean_e.size:
+        return _by_table(mean_e, normal)
+    if not len(small):
+        return _by_expansion(mean_e, normal)
+    counts = _by_expansion(np.maximum(mean_e, np.float32(TABLE_BELOW_E)), normal)
+    counts.ravel()[small] = _by_table(mean_e.ravel()[small], normal.ravel()[small])
+    return counts
+
+
+def _by_table(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
+    table = _count_table()
+    place = mean_e * np.float32(ROWS_PER_E)
+    np.floor(place, out=place)
+    place *= np.float32(COLUMNS)
+    place += normal * np.float32(COLUMNS_PER_SIGMA)
+    place += np.float32(COLUMNS / 2)
+    found = table.cells.take(place.astype(np.intp))
+    counts = (found & (UNSURE - 1)).astype(np.float32)
+    doubts = np.flatnonzero(found >= UNSURE)
+    numbers, rows = normal.ravel()[doubts], mean_e.ravel()[doubts] * ROWS_PER_E
+    step = rows.astype(np.intp) * UNSURE + counts.ravel()[doubts].astype(np.intp)
+    low, high = table.step_number.take(step), table.step_number.take(step + UNSURE)
+    above = numbers - (low + (rows - np.floor(rows)) * (high - low))
+    sure = (np.abs(above) > STEP_NUMBER_ERROR) & (rows > STRAIGHT_ABOVE_E * ROWS_PER_E) & (np.abs(numbers) < ONE_STEP_SIGMAS)
+    counts.ravel()[doubts] += (above > 0) & sure
+    _decide(counts, mean_e, normal, doubts[~sure])
+    return counts
+
+
+def _by_expansion(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
+    root = np.sqrt(mean_e)
+    square = normal * normal
+    bend = square + np.float32(2.0)
+    bend *= normal
+    bend /= root
+    bend *= np.float32(1 / 72)
+    quantile = root
+    quantile *= normal
+    quantile += mean_e
+    square *= np.float32(1 / 6)
+    quantile += square
+    quantile -= bend
+    smallest_e = float(mean_e.min(initial=np.inf))
+    if smallest_e >= EXACT_BELOW_E:
+        quantile += np.float32(1 / 3)
+        return np.floor(quantile, out=quantile)
+    quantile += np.float32(1 / 3 - 0.5)
+    counts = np.rint(quantile)
+    quantile -= counts  # near +-1/2, it may be either of two counts
+    np.abs(quantile, out=quantile)
+    bend *= bend
+    bend *= np.float32(ERROR_PER_BEND2)
+    quantile += bend
+    doubts = np.flatnonzero(quantile > 0.5 - ERROR_E_TIMES_MEAN / smallest_e)
+    means, numbers = mean_e.ravel()[doubts].astype(np.float64), normal.ravel()[doubts].astype(np.float64)
+    square, root = numbers**2, np.sqrt(means)
+    bends = numbers * (2 + square) / (72 * root)
+    finer = means + numbers * root + square / 6 - bends + 1 / 3 + (square * (7 / 810 + square / 270) - 8 / 405) / means
+    counts.ravel()[doubts] = np.floor(finer)
+    near = np.abs(finer - np.rint(finer)) < FINER_ERROR_PER_BEND3 * np.abs(bends) ** 3 + FINER_ERROR_E / root**3
+    counts.ravel()[doubts[near]] = np.rint(finer[near]) - 1
+    _decide(counts, mean_e, normal, doubts[near])
+    return counts
+
+
+def _decide(counts: Float32Array, mean_e: Float32Array, normal: Float32Array, doubts: npt.NDArray[np.intp]) -> None:
+    """Raise the counts of the pixels `doubts`, lower bounds so far, to where the cumulative probability is reached."""
+    from scipy.special import ndtr, pdtr
+
+    numbers = normal.ravel()[doubts]
+    means, counted = mean_e.ravel()[doubts].astype(np.float64), np.maximum(counts.ravel()[doubts], 0.0).astype(np.float64)
+    low = pdtr(counted, means) < ndtr(numbers.astype(np.float64))
+    counted += low
+    climbing = np.flatnonzero(low & (np.abs(numbers) > ONE_STEP_SIGMAS))
+    while len(climbing):
+        short = pdtr(counted[climbing], means[climbing]) < ndtr(numbers[climbing].astype(np.float64))
+        climbing = climbing[short]
+        counted[climbing] += 1
+    counts.ravel()[doubts] = counted
+
+
+class CountTable(NamedTuple):
+    """Counts by mean and normal number.
+
+    `cells` (rows * COLUMNS,) holds the smallest count of a cell, with UNSURE where there are more; `step_number`
+    ((rows + 1) * UNSURE,) the number above which a count gives way to the next, at the means between rows.
+    """
+
+    cells: npt.NDArray[np.uint8]
+    step_number: Float32Array
+
+
+@cache
+def _count_table() -> CountTable:
+    from scipy.special import ndtri, pdtr
+
+    mean_e = np.arange(int(TABLE_BELOW_E) * ROWS_PER_E + 1) / ROWS_PER_E
+    number = ndtri(pdtr(np.arange(UNSURE), mean_e[:, None])).clip(-6.8, 6.8)
+    edge = number * COLUMNS_PER_SIGMA + COLUMNS / 2
+
+    def counts(margin: float) -> npt.NDArray[np.intp]:
+        steps = np.zeros((len(mean_e), COLUMNS), dtype=np.intp)
+        np.add.at(steps, (np.arange(len(mean_e))[:, None], np.ceil(edge + margin).astype(np.intp)), number < 6.8)
+        return steps.cumsum(axis=1)
+
+    smallest = counts(MARGIN_COLUMNS)[:-1]
+    largest = counts(-1 - MARGIN_COLUMNS)[1:]
+    cells = np.where(largest > smallest, smallest | UNSURE, smallest)
+    return CountTable(cells.astype(np.uint8).ravel(), number.astype(np.float32).ravel())
+
+
+def draw_blocks(shape: tuple[int, int], rng: np.random.Generator, draw: Callable[[slice, Word64Array], None]) -> None:
+    """Call `draw` for the rows of each part of an image (height, width) with random words, (rows, width), on every core.
+
+    One seed gives each part the same words on any number of threads. `OMP_NUM_THREADS` bounds them.
+    """
+    height, width = shape
+    rows = max(1, PART_PX // width)
+    key = int(rng.integers(2**63))
+
+    def draw_block(first: int) -> None:
+        stream = np.random.Generator(np.random.SFC64(np.random.SeedSequence((key, first))))
+        for top in range(first, min(first + PARTS_IN_BLOCK * rows, height), rows):
+            part = slice(top, min(top + rows, height))
+            words = stream.integers(-(2**63), 2**63, size=(part.stop - top) * width, dtype=np.int64)
+            draw(part, words.reshape(-1, width))
+
+    blocks = range(0, height, PARTS_IN_BLOCK * rows)
+    asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
+    threads = min(len(blocks), int(asked) if asked.isdecimal() and int(asked) else len(os.sched_getaffinity(0)))
+    if threads == 1:
+        for first in blocks:
+            draw_block(first)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(draw_block, blocks))

@@ -1,0 +1,365 @@
+"""The noise of a tracker's stars by source, and the limits that it sets: detection, place, flux and attitude.
+
+Fisher's information of place, flux and background is the sum over pixels of slope times slope over variance, with the noise of
+`DetectorSettings.noise` (thesis table 4.1, eq. 4.13, 4.14). Its inverse is the Cramer-Rao bound, which no unbiased centroider
+beats (Winick 1986, JOSA A 3, 1809; of a whole star sensor Fialho and Mortari 2019, Sensors 19, 5355). A star's noise is that
+of its flux under the weights share / variance, which no other weights beat: its sources add up to n_TOT, and PSF photometry
+reaches it. Pixels that clip tell nothing. Fixed patterns count as noise: all this holds over places on the detector.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import structs
+from scipy.special import ndtr
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_stars, star_rates
+from hilstar.bench.cameras import tracker_camera, tracker_psf
+from hilstar.charts import BLUE, ORANGE, chart, label_ends, two_digits, write_csv
+from hilstar.errors import InputError
+from hilstar.frame.truth import truth_table
+from hilstar.frame.view import STILL, View
+from hilstar.rotation import normalise, to_matrix
+from hilstar.scene.camera import Camera
+from hilstar.scene.psf import Psf
+from hilstar.sky.stars import Stars
+from hilstar.tracker.centroiders import FAMILY, Centroider, star_places
+from hilstar.tracker.centroids import CentroidSettings
+from hilstar.tracker.detector import Detector
+from hilstar.tracker.settings import DetectorSettings
+from hilstar.twin.budget import SOLAR_BV, STEP_MAG, USUAL
+from hilstar.twin.simulator import TrackerBackground, full_e
+from hilstar.units import ARCSEC_PER_RAD, flux_ratio
+
+PHASES = 6  # along a side of a pixel
+SLOPE_STEP_PX = 1e-3
+CHUNK = 64  # stars at once
+UNSEEN = 0.01  # the probability of detection at which the table of magnitudes ends
+MAX_ROWS, BETWEEN = 80, 5  # rows, and steps from one to the next by which stars are interpolated
+NO_INFORMATION = NO_NOISE_E2 = 1e-12  # of a star whose pixels all clip, of a pixel without light
+TRIALS, MIN_FOUND = 20, 40  # simulated stars of a magnitude along a side of an image; found ones that give an error
+SKY_FIELDS = 100
+LIMIT_STEP_MAG = 0.25
+TURN_RAD = 1e-6
+NO_PLACE_PX = 1e3  # of a star whose light never leaves one pixel, or is all clipped
+MIN_STARS = 2  # for an attitude
+SOURCES = ("shot", "background", "dark", "read", "reset", "quantisation", "prnu", "dsnu")
+WHO = ("limit", *FAMILY)
+NEA_COLUMNS = [f"{kind}_{way}_arcsec" for kind in WHO for way in ("across", "about")]
+
+# Stars in noise, electrons of a whole star, rms over the places within a pixel. `detection` is the probability that the
+# threshold finds it. `bound_px` is the Cramer-Rao bound of place along an axis (rms of x and y), flux unknown; `bound_flux_e`
+# that of flux, place unknown, `bound_flux_sky_e` background unknown too. `effective_px` is how many pixels' read noise a star
+# has, `clipped_px` how many pixels are left out because they clip.
+NOISE_DTYPE = np.dtype(
+    [(f"{source}_e", "f8") for source in SOURCES]
+    + [(name, "f8") for name in ("total_e", "snr", "detection", "bound_px", "bound_x_px", "bound_y_px")]
+    + [(name, "f8") for name in ("bound_flux_e", "bound_flux_sky_e", "star_e", "effective_px", "clipped_px")]
+)
+Table = npt.NDArray[np.void]
+
+
+class NoisyStar:
+    """A tracker's star at a grid of places within a pixel: its shares of light, their slopes, and the detector's noise."""
+
+    def __init__(self, psf: Psf, detector: DetectorSettings, exposure_s: float, phases: int = PHASES) -> None:
+        self.psf, self.detector, self.exposure_s = psf, detector, exposure_s
+        self.side_px = max(psf.footprint_px | 1, 7)
+        phase = (np.arange(phases) + 0.5) / phases - 0.5
+        y_px, x_px = (grid.ravel() for grid in np.meshgrid(phase, phase))
+        step, count = SLOPE_STEP_PX, phases**2
+        self.shares = self.stamps(x_px, y_px).reshape(count, -1)
+        by_x, by_y = (
+            (self.stamps(x_px + dx, y_px + dy) - self.stamps(x_px - dx, y_px - dy)).reshape(count, -1) / (2 * step)
+            for dx, dy in ((step, 0.0), (0.0, step))
+        )
+        slopes = np.stack([by_x, by_y, self.shares, np.ones_like(by_x)])  # by x, y, flux, background; of one electron
+        self._pairs = np.einsum("ifp,jfp->fpij", slopes, slopes).reshape(count, -1, 16)
+
+    def stamps(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """Shares (n, side, side) of stars so far (n,) from the middle of their square."""
+        at = np.arange(self.side_px) - self.side_px // 2
+        return np.asarray(self.psf.shares((at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None]))
+
+    def noise(self, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings) -> Table:
+        """Rows of NOISE_DTYPE of stars of `star_e` (n,) electrons before `background_e` (n,) in a pixel, in one exposure."""
+        found = np.empty(len(star_e), NOISE_DTYPE)
+        for at in range(0, len(star_e), CHUNK):
+            part = slice(at, at + CHUNK)
+            self._fill(found[part], star_e[part, None, None], background_e[part, None, None], finder)
+        return found
+
+    def fisher(self, weight: FloatArray, star_e: FloatArray) -> FloatArray:
+        """Information (n, phases, 4, 4) of x, y [px], flux and background [e-], of stars (n, 1, 1) by 1 / pixels' variance."""
+        unit = (weight.transpose(1, 0, 2) @ self._pairs).transpose(1, 0, 2).reshape(*weight.shape[:2], 4, 4)
+        scale = np.concatenate([star_e, star_e, np.ones_like(star_e), np.ones_like(star_e)], axis=-1)
+        return np.asarray(unit * scale.transpose(0, 2, 1)[:, None] * scale[:, None])
+
+    def _fill(self, found: Table, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings) -> None:
+        shares, light_e = self.shares, star_e * self.shares + background_e
+        noise, sky = (self.detector.noise(one, self.exposure_s) for one in (light_e, background_e))
+        unclipped = light_e + noise.dark_e2 <= full_e(self.detector)
+        weight = unclipped / noise.total_e2
+        by_flux = weight * shares
+        by_flux /= np.maximum((by_flux * shares).sum(axis=-1, keepdims=True), NO_INFORMATION)
+        squared = by_flux**2
+        effective_px = squared.sum(axis=-1, keepdims=True)
+        even = (background_e, sky.dark_e2, sky.read_e2, sky.reset_e2, sky.quantisation_e2)
+        shot, prnu = ((squared * e2).sum(axis=-1, keepdims=True) for e2 in (star_e * shares, noise.prnu_e2))
+        variances = (shot, *(effective_px * e2 for e2 in even), prnu, effective_px * sky.dsnu_e2)
+        for source, e2 in zip(SOURCES, variances, strict=True):
+            found[f"{source}_e"] = np.sqrt(e2.mean(axis=(1, 2)))
+        found["total_e"] = np.sqrt(np.sum([found[f"{source}_e"] ** 2 for source in SOURCES], axis=0))
+        # Where one pixel is left, it cannot tell place from flux: a bound is then large, and not an error.
+        information = self.fisher(weight, star_e) * (1 + NO_INFORMATION * np.eye(4)) + NO_INFORMATION * np.eye(4)
+        known, free = (
+            np.sqrt(np.linalg.inv(information[..., :size, :size]).diagonal(axis1=-2, axis2=-1).mean(axis=1)) for size in (3, 4)
+        )
+        for name, one in zip(("x_px", "y_px", "flux_e", "flux_sky_e"), (*known.T, free[:, 2]), strict=True):
+            found[f"bound_{name}"] = one
+        found["bound_px"] = np.sqrt((found["bound_x_px"] ** 2 + found["bound_y_px"] ** 2) / 2)
+        found["effective_px"] = effective_px.mean(axis=(1, 2))
+        found[~unclipped.any(axis=-1).all(axis=-1)] = np.nan  # somewhere within a pixel nothing is left of them
+        found["star_e"], found["clipped_px"] = star_e[:, 0, 0], (~unclipped).sum(axis=-1).mean(axis=-1)
+        found["snr"] = found["star_e"] / found["total_e"]
+        # The first code over the threshold begins half a step below it, and rounding is no noise of its own.
+        step_e = self.detector.gain_e_per_dn
+        level_dn = (background_e + sky.dark_e2) / step_e + self.detector.offset_dn
+        first_dn = np.floor(level_dn + finder.threshold_sigma * np.sqrt(sky.total_e2) / step_e) + 0.5
+        sigma_e = np.sqrt(np.maximum(noise.total_e2 - step_e**2 / 12, NO_NOISE_E2))
+        above = ndtr((star_e * shares - (first_dn - level_dn) * step_e) / sigma_e)
+        found["detection"] = found_share(above, finder.minimum_pixels)
+
+
+def found_share(above: FloatArray, minimum_pixels: int) -> FloatArray:
+    """The probability (n,) that at least so many pixels of a star are above the threshold, mean over its phases.
+
+    `above` (n, phases, pixels) are those of each pixel, whose noise is independent of the others'.
+    """
+    fewer = np.zeros((minimum_pixels, *above.shape[:2]))  # the probabilities of 0, 1, ... pixels so far
+    fewer[0] = 1.0
+    for pixel in np.moveaxis(above, -1, 0):
+        fewer[1:] = fewer[1:] * (1 - pixel) + fewer[:-1] * pixel
+        fewer[0] *= 1 - pixel
+    return np.asarray(1 - fewer.sum(axis=0).mean(axis=-1))
+
+
+def measured_px(star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSettings, rng: np.random.Generator) -> FloatArray:
+    """The rms error along an axis, px, that each kind of FAMILY has with simulated stars that the threshold finds; NaN for few.
+
+    TRIALS^2 stars at random places within a pixel, through the detector with all its noise but hot and dead pixels. What all
+    are off by in common is no error.
+    """
+    side, shape = star.side_px, (TRIALS * star.side_px,) * 2
+    plain = {"hot_pixel_fraction": 0.0, "dead_pixel_fraction": 0.0, "false_stars": 0, "cosmic_rays_per_cm2_s": 0.0}
+    device = Detector(structs.replace(star.detector, blooming=False, **plain), shape)
+    place_px = rng.uniform(-0.5, 0.5, (2, TRIALS**2))
+    tiles = star_e * star.stamps(*place_px) + sky_e
+    dn = device.expose(tiles.reshape(TRIALS, TRIALS, side, side).swapaxes(1, 2).reshape(shape), star.exposure_s, rng)
+    noise = star.detector.noise(sky_e, star.exposure_s)
+    seen_e = (dn - star.detector.offset_dn) * star.detector.gain_e_per_dn - sky_e - noise.dark_e2
+    stamps = seen_e.reshape(TRIALS, side, TRIALS, side).swapaxes(1, 2).reshape(-1, side, side)
+    above = stamps > finder.threshold_sigma * math.sqrt(noise.total_e2)
+    found = above.sum(axis=(1, 2)) >= finder.minimum_pixels
+    if found.sum() < MIN_FOUND:
+        return np.full(len(FAMILY), np.nan)
+    off = [np.stack(star_places(stamps[found], kind, star.psf.width_px)) - place_px[:, found] for kind in FAMILY]
+    return np.asarray(np.sqrt(np.var(off, axis=2).mean(axis=1)))  # an offset of all, as by coma, is the calibration's
+
+
+def field_stars(stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray) -> Table:
+    """Rows of TRUTH_DTYPE of the stars on a detector, brightest first."""
+    to_image = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+    near = stars.near(to_image[2], camera.field_radius_rad(0.0))
+    x_px, y_px = camera.project(stars.directions(near) @ to_image.T)
+    inside = camera.contains_px(x_px, y_px)
+    truth = truth_table(stars, near[inside], x_px[inside], y_px[inside])
+    return truth[np.argsort(truth["v_mag"], kind="stable")]
+
+
+def turns_of(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """What turns about cam's x, y and z do to places (n,): (n, 2, 3), px/rad."""
+    rays, turns = normalise(camera.rays(x_px, y_px)), np.empty((len(x_px), 2, 3))
+    for k, axis in enumerate(np.eye(3)):
+        moved = TURN_RAD * np.cross(axis, rays)
+        there, back = (np.stack(camera.project((rays + way * moved) @ camera.cam_to_image.T)) for way in (1, -1))
+        turns[:, :, k] = ((there - back) / (2 * TURN_RAD)).T
+    return turns
+
+
+def nea_arcsec(turns: FloatArray, sigma_px: FloatArray, detection: FloatArray) -> FloatArray:
+    """NEA across (rms of both axes) and about the boresight (2, n) by the first 1, 2, ... n stars; infinite for too few.
+
+    `turns` are as by `turns_of`, `sigma_px` (2, n) errors of places along x and y (NaN: not used), `detection` (n,) the
+    share of exposures that has them.
+    """
+    weight = np.where(sigma_px < NO_PLACE_PX, detection / np.square(sigma_px), 0.0).T
+    information = np.einsum("na,nai,naj->nij", weight, turns, turns).cumsum(axis=0)
+    usable = weight.all(axis=1).cumsum() >= MIN_STARS
+    # Two stars in one place leave the turn about them open: it comes out as large, and not as an error.
+    information += NO_INFORMATION * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    found = np.full((2, len(usable)), np.inf)
+    x, y, z = np.linalg.inv(information[usable]).diagonal(axis1=1, axis2=2).T
+    found[:, usable] = ARCSEC_PER_RAD * np.sqrt([(x + y) / 2, z])
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseBudget:
+    """The noise of a tracker's stars and its limits; the fields are the keys of the JSON object of `hilstar budget --noise`.
+
+    `rows`, `stars` and `nea` are those of noise.csv, stars.csv and nea.csv, the last of one field or medians of several.
+    `nea_arcsec` has its last row by who finds the stars: NEA across and about the boresight in one exposure.
+    """
+
+    threshold_sigma: float
+    minimum_pixels: int
+    background_e_per_px: float
+    centroider: Centroider
+    fields: int
+    rows: list[dict[str, Any]]
+    stars: list[dict[str, Any]] | None
+    nea: list[dict[str, Any]]
+    nea_arcsec: dict[str, dict[str, float]]
+
+
+def noise_budget(
+    file: BenchFile, q_icrs_to_cam: FloatArray | None, finder: CentroidSettings, rng: np.random.Generator
+) -> NoiseBudget:
+    """The noise of a bench's tracker at rest and its limits, in one field or, without an attitude, all over the sky.
+
+    Magnitudes are those of stars of the Sun's colour; simulated stars and fields come from `rng`. Raises InputError.
+    """
+    config, tracker = file.config, file.config.tracker
+    camera, stars = tracker_camera(tracker, file.folder), bench_stars(config, file.folder)
+    star = NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s)
+    background = TrackerBackground(config, file.folder, camera)
+    sights, levels_e = [], []
+    for q in rng.standard_normal((SKY_FIELDS, 4)) if q_icrs_to_cam is None else q_icrs_to_cam[None]:
+        try:
+            sky_e = background.of_view_e(View.exposure(normalise(q), STILL, tracker.exposure_s))
+        except InputError:  # too near the Sun: nobody looks there
+            if q_icrs_to_cam is not None:
+                raise
+            continue
+        levels_e.append(float(sky_e.mean()))
+        sights.append(field_stars(stars, camera, normalise(q)))
+    middle_e = float(np.median(levels_e))
+    brightest = float((stars.v_mag if q_icrs_to_cam is None or not len(sights[0]) else sights[0]["v_mag"]).min())
+    zero_e = float(star_rates(config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]) * tracker.exposure_s
+    v_mag: FloatArray = math.floor(brightest / STEP_MAG) * STEP_MAG + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
+    noise = star.noise(zero_e * flux_ratio(v_mag), np.full(len(v_mag), middle_e), finder)
+    shown = slice(0, int((noise["detection"][::BETWEEN] >= UNSEEN).sum()) * BETWEEN + 1, BETWEEN)
+    measured = np.array([measured_px(star, one, middle_e, finder, rng) for one in noise["star_e"][shown].tolist()]).T
+    reached = {f"{kind}_px": one for kind, one in zip(FAMILY, measured, strict=True)}
+    listed = None
+    curves: list[FloatArray] = []  # NEA of each field by who finds its stars: (WHO, 2, n)
+    for field in sights:
+        star_e = field["electrons_per_s"] * tracker.exposure_s
+        bounds = between(noise, star_e)
+        if q_icrs_to_cam is not None:
+            pixels = np.ceil(np.stack([field["y_px"], field["x_px"]]) - 0.5).astype(np.intp)
+            own = star.noise(star_e, sky_e[tuple(pixels)], finder)
+            bounds = np.stack([own["bound_x_px"], own["bound_y_px"], own["detection"]])
+            listed = _rows({name: field[name] for name in ("hip", "name", "x_px", "y_px", "v_mag")}, own, {})
+        turns = turns_of(camera, field["x_px"], field["y_px"])
+        others = [np.stack([np.interp(-np.log(star_e), -np.log(noise["star_e"][shown]), one)] * 2) for one in measured]
+        curves.append(np.stack([nea_arcsec(turns, one, bounds[2]) for one in [bounds[:2], *others]]))
+    faintest = min(config.sky.faintest_v_mag, math.ceil(stars.v_mag.max() / LIMIT_STEP_MAG) * LIMIT_STEP_MAG)
+    nea = _nea_rows(sights, curves, faintest)
+    return NoiseBudget(
+        threshold_sigma=finder.threshold_sigma,
+        minimum_pixels=finder.minimum_pixels,
+        background_e_per_px=middle_e,
+        centroider=config.verify.centroider or USUAL,
+        fields=len(sights),
+        rows=_rows({"v_mag": v_mag[shown]}, noise[shown], reached),
+        stars=listed,
+        nea=nea,
+        nea_arcsec={kind: {way: nea[-1][f"{kind}_{way}_arcsec"] for way in ("across", "about")} for kind in WHO},
+    )
+
+
+def between(noise: Table, star_e: FloatArray) -> FloatArray:
+    """Bounds of x and y [px] and the probability of detection of other stars (n,), (3, n), between those of a table."""
+    grid, at = -np.log(noise["star_e"]), -np.log(star_e)
+    bounds = [np.exp(np.interp(at, grid, np.log(noise[name]))) for name in ("bound_x_px", "bound_y_px")]
+    return np.stack([*bounds, np.interp(at, grid, noise["detection"])])
+
+
+def _rows(before: dict[str, Any], noise: Table, after: dict[str, Any]) -> list[dict[str, Any]]:
+    columns = before | {name: noise[name] for name in NOISE_DTYPE.names or ()} | after
+    return [dict(zip(columns, row, strict=True)) for row in zip(*(one.tolist() for one in columns.values()), strict=True)]
+
+
+def _nea_rows(sights: list[Table], curves: list[FloatArray], faintest_v_mag: float) -> list[dict[str, Any]]:
+    """Medians over fields by the faintest star used, from the first limit at which half of the fields have an attitude."""
+    first = min(one["v_mag"].min(initial=faintest_v_mag) for one in sights)
+    limits = np.arange(math.ceil(first / LIMIT_STEP_MAG) * LIMIT_STEP_MAG, faintest_v_mag, LIMIT_STEP_MAG)
+    none, rows = np.full((len(WHO), 2), np.inf), []
+    for limit in [*limits.tolist(), faintest_v_mag]:
+        counts = [int(np.searchsorted(field["v_mag"], limit, side="right")) for field in sights]
+        median = np.median([curve[..., n - 1] if n else none for curve, n in zip(curves, counts, strict=True)], axis=0)
+        row = {"v_mag": limit, "stars": float(np.median(counts))}
+        rows.append(row | dict(zip(NEA_COLUMNS, median.ravel().tolist(), strict=True)))
+    seen = [math.isfinite(row["limit_about_arcsec"]) for row in rows]
+    return rows[seen.index(True) if any(seen) else -1 :]
+
+
+def write_noise(directory: Path, found: NoiseBudget) -> None:
+    """noise.csv, nea.csv and their charts, and stars.csv of a field. Raises InputError where one cannot be written."""
+    for name, rows in (("noise", found.rows), ("nea", found.nea), ("stars", found.stars)):
+        if rows:
+            texts = [["" if isinstance(v, float) and not math.isfinite(v) else v for v in row.values()] for row in rows]
+            write_csv(directory / f"{name}.csv", list(rows[0]), texts)
+    if math.isfinite(found.nea_arcsec["limit"]["about"]):
+        _draw(directory / "nea", found)
+
+
+def _draw(path: Path, found: NoiseBudget) -> None:
+    last, own = found.nea_arcsec, found.centroider
+    limit, reached = (" and ".join(map(two_digits, last[kind].values())) for kind in ("limit", own))
+    finding = f"Stars to V = {found.nea[-1]['v_mag']:g} allow {limit} arcsec across and about the boresight;"
+    finding += f" {own} reaches {reached}"
+    where = "the field" if found.fields == 1 else f"{found.fields} fields all over the sky, median"
+    note = f"One exposure at rest, with all noise; {where}. Lines: Cramer-Rao bound; dashes: simulated {own}."
+    with chart(path, finding, 1, 2, note=note, share_x=False, share_y=True) as panels:
+        for axes, key, label in zip(panels, ("v_mag", "stars"), ("faintest V [mag]", "stars"), strict=True):
+            rows = list({row[key]: row for row in found.nea}.values())  # the last one of a number of stars
+            for way, colour in (("about", ORANGE), ("across", BLUE)):
+                for kind, style in ((own, "--"), ("limit", "-")):
+                    values = [row[f"{kind}_{way}_arcsec"] for row in rows]
+                    name = f"{way}, {kind}" if key == "stars" else "_"
+                    axes.semilogy([row[key] for row in rows], values, style, color=colour, label=name)
+            axes.set_xlabel(label)
+        panels[0].set_ylabel("NEA [arcsec]")
+        panels[1].set_xscale("log")
+        label_ends(panels[1])
+
+
+def noise_lines(found: NoiseBudget) -> Iterator[str]:
+    """The budget for a person."""
+    own = found.centroider
+    threshold = f"{found.minimum_pixels} px above {found.threshold_sigma:g} sigma"
+    yield f"{'found':22}{threshold} of a background of {found.background_e_per_px:.4g} e- in a pixel"
+    for kind, nea in found.nea_arcsec.items():
+        told = f"{nea['across']:.3g} arcsec across, {nea['about']:.3g} about the boresight"
+        told = told if math.isfinite(nea["about"]) else f"none: fewer than {MIN_STARS} stars with a place"
+        yield f"{'NEA, ' + kind:22}{told}"
+    yield ""
+    yield f"{'V':>6}{'star e-':>12}{'noise e-':>11}{'SNR':>8}{'detection':>11}{'bound px':>10}{own + ' px':>12}"
+    for row in found.rows:
+        reached = row[f"{own}_px"]
+        yield (
+            f"{row['v_mag']:6.1f}{row['star_e']:12.4g}{row['total_e']:11.4g}{row['snr']:8.1f}{row['detection']:11.4f}"
+            f"{row['bound_px']:10.4g}{'-' if math.isnan(reached) else f'{reached:.4f}':>12}"
+        )

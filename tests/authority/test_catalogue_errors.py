@@ -1,0 +1,93 @@
+"""Errors of place and motion carried to an epoch, against finite differences of ERFA's starpm; a bench's zero points."""
+
+from __future__ import annotations
+
+import erfa
+import numpy as np
+import pytest
+
+from hilstar.sky.catalog import load_catalog
+from hilstar.sky.electrons import Optics, Photometry
+from hilstar.sky.facts import MOTION, facts_of, motion_at
+from hilstar.sky.spectrum import Curve, constant_curve, load_curve
+from hilstar.sky.synthetic import ab_electrons_per_s, colours, vega_electrons_per_s
+from hilstar.units import flux_ratio
+
+EPOCHS_JYEAR = (1950.0, 2000.0, 2026.0)
+STARS = 300
+MAS = np.pi / (180 * 3600 * 1000)
+# starpm also delays light (v/c of the transverse speed: under 1e-3 for the fastest); differences of 1 arcsec round to 1e-6.
+SIGMA_LIMIT = 1e-3
+STEPS = (1000 * MAS, 1000 * MAS, 10 * MAS, 10 * MAS)
+# CALSPEC's Vega behind a CCD47-20, at V = 0: tests/authority/test_pickles.py.
+CALSPEC_VEGA_E_PER_S, BINNED_LIMIT = 2.5016e7, 3e-4
+# Sun: IAU 2015 zero point and nominal luminosity, V = -26.76 (Torres 2010). G2V of the library is within 0.05 mag of its BC.
+SUN_BC_MAG, BC_LIMIT_MAG = -0.072, 0.05
+
+
+def star_pm(start, years, parallax_arcsec):
+    """ra, dec, pm_ra (with cos dec) and pm_dec, radians, by ERFA."""
+    ra, dec, pm_ra, pm_dec = start
+    jd = 2448349.0625  # J1991.25
+    found = erfa.starpm(ra, dec, pm_ra / np.cos(dec), pm_dec, parallax_arcsec, 0.0, jd, 0.0, jd, years * 365.25)
+    return np.array([found[0], found[1], found[2] * np.cos(found[1]), found[3]])
+
+
+@pytest.mark.parametrize("epoch_jyear", EPOCHS_JYEAR)
+def test_errors_are_those_of_erfa(epoch_jyear):
+    catalog = load_catalog()
+    # Every 389th star, and the fastest and the most northern ones.
+    fast = np.argsort(-np.hypot(catalog.pm_ra_cosdec_mas_yr, catalog.pm_dec_mas_yr))[:5]
+    rows = np.union1d(np.arange(0, len(catalog), 389)[: STARS - 10], np.append(fast, np.argsort(-np.abs(catalog.dec_deg))[:5]))
+    stars = catalog.taken(rows)
+    facts = facts_of(stars.hip)
+    ours = motion_at(stars, facts, epoch_jyear).covariance
+    for k in range(len(stars)):
+        start = np.array([np.radians(stars.ra_deg[k]), np.radians(stars.dec_deg[k]), 0.0, 0.0])
+        start[2:] = stars.pm_ra_cosdec_mas_yr[k] * MAS, stars.pm_dec_mas_yr[k] * MAS
+        parallax = max(stars.parallax_mas[k], 0.1) / 1000
+        years = epoch_jyear - 1991.25
+        jacobian = np.empty((4, 4))
+        for j, step in enumerate(STEPS):
+            pair = []
+            for sign in (1, -1):
+                moved = start.copy()
+                moved[j] += sign * step / (np.cos(start[1]) if j == 0 else 1)
+                pair.append(star_pm(moved, years, parallax))
+            change = pair[0] - pair[1]
+            change[0] = (change[0] + np.pi) % (2 * np.pi) - np.pi
+            jacobian[:, j] = change / (2 * step)
+        jacobian[0] *= np.cos(star_pm(start, years, parallax)[1])
+        sigma = [facts[f"sigma_{name}_mas" + ("_yr" if name.startswith("pm") else "")][k] for name in MOTION]
+        correlation = np.eye(4)
+        for i in range(4):
+            for j in range(i + 1, 4):
+                correlation[i, j] = correlation[j, i] = facts[f"{MOTION[i]}_{MOTION[j]}_correlation"][k]
+        theirs = jacobian @ (np.outer(sigma, sigma) * correlation) @ jacobian.T
+        assert np.sqrt(np.diag(ours[k])) == pytest.approx(np.sqrt(np.diag(theirs)), rel=SIGMA_LIMIT), stars.hip[k]
+
+
+def test_errors_of_1991_are_the_catalogue_s():
+    """HIP 1's row of CDS I/239: 1.32, 0.74, 1.36 and 0.81, correlation 0.32; a star that it does not have has none."""
+    catalog = load_catalog()
+    one = catalog.taken(np.flatnonzero(catalog.hip == 1))
+    covariance = motion_at(one, facts_of(one.hip), 1991.25).covariance[0]
+    assert np.sqrt(np.diag(covariance)) == pytest.approx([1.32, 0.74, 1.36, 0.81])
+    assert covariance[0, 1] / (1.32 * 0.74) == pytest.approx(0.32)
+    missing = facts_of(np.array([0, 999_999], dtype=np.int32))
+    assert np.isnan(missing["sigma_ra_mas"]).all()
+    assert missing["spectral_type"].tolist() == [b"", b""]
+
+
+def test_vega_and_ab_are_zero_points():
+    optics = Optics(30.0, load_curve("ccd47-20", "qe"), load_curve("n-bk7-10mm", "transmission"))
+    vega = vega_electrons_per_s(optics, Photometry())
+    assert vega == pytest.approx(CALSPEC_VEGA_E_PER_S * flux_ratio(0.03), rel=BINNED_LIMIT)
+    # AB 0 from 400 to 800 nm, by hand: area F_nu / h ln(800 / 400).
+    flat = Optics(20.0, Curve(np.array([400.0, 800.0]), np.ones(2)), constant_curve(1.0))
+    assert ab_electrons_per_s(flat) == pytest.approx(np.pi * 0.01**2 * 3.631e-23 / 6.62607015e-34 * np.log(2), rel=1e-9)
+
+
+def test_the_sun_s_bolometric_correction():
+    colour = colours("pickles", "ballesteros2012", Photometry())["bolometric"]
+    assert colour(np.array([0.653]), np.array([0.702]), None)[0] == pytest.approx(SUN_BC_MAG, abs=BC_LIMIT_MAG)

@@ -1,0 +1,87 @@
+"""hilstar catalogue: its columns, formats and refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from tests.support.benches import bench_text
+from tests.support.commands import run_hilstar_here
+
+pytestmark = pytest.mark.e2e
+# design: names that other programs read.
+NAMES = {
+    "hip",
+    "v_mag",
+    "spectral_type",
+    "r_mag",
+    "dec_deg",
+    "g_mag",
+    "sigma_ra_mas",
+    "instrument_mag_ab",
+    "b_v_mag",
+    "v_i_mag",
+    "sigma_dec_mas",
+    "sigma_v_mag",
+    "pm_ra_mas_yr",
+    "pm_dec_mas_yr",
+    "instrument_mag_vega",
+    "electrons_per_s",
+    "u_mag",
+    "ra_deg",
+    "temperature_k",
+    "b_mag",
+    "parallax_mas",
+    "i_mag",
+}
+
+
+@pytest.fixture
+def bench(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"collimator": {"focal_length_mm": 350}}))
+    return path
+
+
+def test_every_format_has_the_same_stars(bench, tmp_path):
+    from astropy.io import fits
+    from astropy.table import Table
+
+    for ending in ("csv", "fits", "vot", "parquet"):
+        done = run_hilstar_here("catalogue", bench, "-o", tmp_path / f"s.{ending}", "--to", "2", "--epoch", "2030", "--json")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert json.loads(done.stdout)["epoch_jyear"] == 2030
+    with (tmp_path / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert set(rows[0]) >= NAMES
+    assert all(float(row["v_mag"]) <= 2 for row in rows)
+    vega = next(row for row in rows if row["hip"] == "91262")
+    assert (vega["spectral_type"], vega["luminosity_class"], len(vega["ra_deg"].split(".")[1])) == ("A0Vvar", "V", 9)
+    assert float(vega["instrument_mag_vega"]) == pytest.approx(0.03, abs=0.03)  # by its colours: CALSPEC_LIMIT of test_pickles
+    assert float(vega["absolute_mag"]) == pytest.approx(0.03 + 5 + 5 * np.log10(0.12893), abs=1e-4)
+    with fits.open(tmp_path / "s.fits") as hdus:
+        table, header = hdus[1].data, hdus[1].header
+        assert [str(n) for n in table["hip"]] == [row["hip"] for row in rows]
+        place = table.names.index("ra_deg") + 1
+        assert (header[f"TUNIT{place}"], header[f"TUCD{place}"]) == ("deg", "pos.eq.ra;meta.main")
+    assert len(Table.read(tmp_path / "s.vot")) == len(rows)
+    assert pyarrow.parquet.read_table(tmp_path / "s.parquet").column_names == list(rows[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("-o", "s.txt"), "ends in .csv, .fits, .parquet, .vot"),
+        (("-o", "s.csv", "--to", "-5"), "no star of the catalogue is brighter than V = -5"),
+    ],
+)
+def test_bad_input_is_one_line(bench, tmp_path, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    done = run_hilstar_here("catalogue", bench, *arguments)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1

@@ -1,0 +1,32 @@
+"""A whole ledger in memory: for runs as short as a test's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hilstar.run.record.ledger_records import FrameRecord, PacketTally, ProcessRecord, read_head, run_records
+
+
+@dataclass(slots=True)
+class Run:
+    """The head of a ledger, its frames, the process's state, and packets by "accepted" or why refused."""
+
+    head: dict[str, str]
+    frames: list[FrameRecord] = field(default_factory=list)
+    process: list[ProcessRecord] = field(default_factory=list)
+    packets: dict[str, int] = field(default_factory=dict)
+
+
+def read_run(path: Path) -> Run:
+    """Read a ledger, which has frames."""
+    run, tally = Run(read_head(path)), PacketTally()
+    for record in run_records(path):
+        tally.add(record)
+        if isinstance(record, FrameRecord):
+            run.frames.append(record)
+        elif isinstance(record, ProcessRecord):
+            run.process.append(record)
+    assert run.frames
+    run.packets = tally.counts
+    return run

@@ -19,7 +19,7 @@ UNSURE_MAG = 0.05  # readings that disagree by more are wrong for another reason
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class StarReading:
     """A star shown, and the sum of its DN above background."""
 
     hip: int
@@ -40,7 +40,7 @@ class MeasuredScale:
         return float(np.std(magnitude(self.ratios), ddof=1)) if len(self.ratios) > 1 else 0.0
 
 
-def scale_by_tracker(bench: Bench, readings: list[Reading], exposure_s: float) -> MeasuredScale:
+def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: float) -> MeasuredScale:
     """The light of white from the median ratio of measured to wanted light.
 
     Raises InputError for a star that the bench does not have, that clips, or that is too faint to be shown.

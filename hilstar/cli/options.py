@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench import bench_file
     from hilstar.bench.config import BenchConfig
-    from hilstar.calibrate.scale import Reading
+    from hilstar.calibrate.scale import StarReading
     from hilstar.run.record.ledger import SplitLimits
 
 BenchFile = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")]
@@ -276,13 +276,13 @@ def parse_memory(text: str) -> int:
     return round(float(match[1]) * SPLIT_UNITS[match[2]])
 
 
-def parse_reading(text: str) -> Reading:
+def parse_reading(text: str) -> StarReading:
     """A reading from "HIP,DN". Raises InputError."""
-    from hilstar.calibrate.scale import Reading
+    from hilstar.calibrate.scale import StarReading
 
     parts = text.split(",")
     try:
-        reading = Reading(int(parts[0]), float(parts[1]))
+        reading = StarReading(int(parts[0]), float(parts[1]))
     except (ValueError, IndexError) as error:
         raise InputError(f"--reading {text}: {READING_FORM}") from error
     if len(parts) != 2 or not 0 < reading.dn < math.inf:

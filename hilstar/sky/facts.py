@@ -82,7 +82,7 @@ def errors_of(catalog: Catalog) -> dict[str, npt.NDArray[Any]]:
     return facts | {name: np.where(own, facts[name], np.nan) for name in errors}
 
 
-class Motion(NamedTuple):
+class PropagatedPlaces(NamedTuple):
     """Places and proper motions at an epoch, (n,), and the covariance (n, 4, 4) of MOTION's parameters, mas and mas a year.
 
     Places are degrees, ICRS; right ascensions' errors and motions carry the cos(dec).
@@ -95,7 +95,7 @@ class Motion(NamedTuple):
     covariance: FloatArray
 
 
-def motion_at(catalog: Catalog, facts: dict[str, npt.NDArray[Any]], epoch_jyear: float) -> Motion:
+def motion_at(catalog: Catalog, facts: dict[str, npt.NDArray[Any]], epoch_jyear: float) -> PropagatedPlaces:
     """The stars' places, motions and their errors at `epoch_jyear`; radial velocity zero (ESA SP-1200 vol. 1, 1.5.5).
 
     The Jacobian is that of the straight line in space itself, by complex steps. NaN errors where none are known.
@@ -122,7 +122,7 @@ def motion_at(catalog: Catalog, facts: dict[str, npt.NDArray[Any]], epoch_jyear:
         jacobian[:, 2, k], jacobian[:, 3, k] = d_ra, d_dec
     covariance = jacobian @ _covariance(facts) @ jacobian.transpose(0, 2, 1)
     ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, flat))
-    return Motion(ra_deg, dec_deg, pm_ra.real / RAD_PER_MAS, pm_dec.real / RAD_PER_MAS, covariance)
+    return PropagatedPlaces(ra_deg, dec_deg, pm_ra.real / RAD_PER_MAS, pm_dec.real / RAD_PER_MAS, covariance)
 
 
 def _moved(start: npt.NDArray[np.complex128], years: FloatArray) -> tuple[npt.NDArray[np.complex128], ...]:

@@ -27,7 +27,7 @@ GAUSSIAN = "gaussian"
 DEFAULT_PSF_SIGMA_PX = (0.55, 0.55)
 
 
-class Optics(Table, frozen=True):
+class TrackerOptics(Table, frozen=True):
     """How the tracker's lens spreads a star over the detector.
 
     The file's first image has odd sides, x right and y down, its first row on top, and the chief ray in its middle, where it
@@ -131,7 +131,7 @@ class Tracker(Table, frozen=True):
             extra={"default": "the body's axes, with a notice"},
         ),
     ] = None
-    optics: Annotated[Optics, Meta(description="See below.")] = msgspec.field(default_factory=Optics)
+    optics: Annotated[TrackerOptics, Meta(description="See below.")] = msgspec.field(default_factory=TrackerOptics)
     detector: Annotated[DetectorSettings, Meta(description="See below.")] = msgspec.field(default_factory=DetectorSettings)
 
     @property

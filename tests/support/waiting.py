@@ -99,7 +99,10 @@ class CoreWaits:
 
     def _look(self, processes: set[int]) -> None:
         for process in processes:
-            for task in Path(f"/proc/{process}/task").glob("*"):
+            tasks: list[Path] = []
+            with contextlib.suppress(OSError):  # it has ended
+                tasks = list(Path(f"/proc/{process}/task").glob("*"))
+            for task in tasks:
                 with contextlib.suppress(OSError, IndexError):  # it has ended
                     waited_ns = int((task / "schedstat").read_text().split()[1])
                     self._first.setdefault(str(task), waited_ns)

@@ -99,7 +99,7 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     ] = 0.0
     dark_distribution: Annotated[
         Literal["normal", "gamma", "log-normal"],
-        Meta(description="How pixels' dark currents lie about their mean, with that sigma; `normal` is cut at 0."),
+        Meta(description='Law of pixels\' dark currents about their mean: `"normal"`, cut at 0, `"gamma"`, `"log-normal"`.'),
     ] = "normal"
     prnu: Annotated[Share, Meta(description="Relative sigma of the gain map (PRNU), which is fixed for a device.")] = 0.0
     device_seed: Annotated[

@@ -56,7 +56,7 @@ class Field:
         size_px = self.bench.camera.resolution_px
         sprites = pack_sprites(self.x_px, self.y_px, self.flux, self.sprites.star, size_px, self.sprites.footprint_px)
         self.bench.renderer.draw(sprites)
-        return replace(self.golden, linear=self.bench.renderer.linear().copy())
+        return replace(self.golden, light=self.bench.renderer.linear()[np.newaxis].copy())
 
     def bad(self):
         return compare(self.frame(), self.golden).bad

@@ -22,7 +22,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.notices import Notices
-from hilstar.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.rotation import conjugate, multiply, rotate, to_rotation_vector
 from hilstar.units import NS_PER_S
 
 WrongRates = Literal["use-quaternions", "warn", "off"]
@@ -145,7 +145,7 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
         return None
     at_s, turned, summed, as_icrs = (
         np.vstack((np.zeros(part.shape[1]), np.cumsum(part[whole], axis=0)))
-        for part in (step_s, turn_rad, mean * step_s, _turned_by(q[1:], mean) * step_s)
+        for part in (step_s, turn_rad, mean * step_s, rotate(q[1:], mean) * step_s)
     )
     weight = at_s[:, 0] - at_s.mean()
     spread_s2 = float(weight @ weight)
@@ -154,12 +154,6 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
     turn_sigma = math.sqrt(float((scatter**2).sum()) / (3 * (count - 1)) / spread_s2)
     rate_sigma = WALK * math.sqrt(float((np.diff(rate, axis=0)[whole] ** 2).sum()) / (6 * count) / count)
     return Stretch(turn, weight @ summed / spread_s2, weight @ as_icrs / spread_s2, turn_sigma, rate_sigma)
-
-
-def _turned_by(q: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (n, 3) turned by quaternions (n, 4)."""
-    pure = np.concatenate([np.zeros((len(vectors), 1)), vectors], axis=1)
-    return np.asarray(multiply(multiply(q, pure), conjugate(q))[:, 1:])
 
 
 def cause_of(stretches: Sequence[Stretch]) -> Cause | None:

@@ -33,7 +33,7 @@ from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns
 from hilstar.attitude.logs.entries import LogEntry, Stated
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
-from hilstar.rotation import conjugate, from_matrix, multiply, normalise
+from hilstar.rotation import frame_turns, from_matrix, multiply, normalise, rotate
 from hilstar.units import NS_PER_S
 
 IntArray = npt.NDArray[np.int64]
@@ -89,15 +89,15 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
     ut1_days = (utc_ns % (24 * HOUR_NS)) / (24 * HOUR_NS) + (ut1_tai_s + tai_utc_s[before]) / 86400.0
     era = erfa.era00(MJD_ZERO_JD + UNIX_MJD + utc_ns // (24 * HOUR_NS), ut1_days)
     node, tilt = np.arctan2(y, x), np.arcsin(np.hypot(x, y))
-    to_cirs = _chain(_turn(3, node), _turn(2, tilt), _turn(3, -node - s))
-    return _chain(to_cirs, _turn(3, era), _turn(2, -pole_x), _turn(1, -pole_y))
+    to_cirs = _chain(frame_turns(2, node), frame_turns(1, tilt), frame_turns(2, -node - s))
+    return _chain(to_cirs, frame_turns(2, era), frame_turns(1, -pole_x), frame_turns(0, -pole_y))
 
 
 def q_icrs_to_ned(utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
     """The rotations (n, 4) from ICRS to north, east, down at UTCs (n,) and geodetic places (n,) or ()."""
     zeros = np.zeros(len(utc_ns))
-    to_meridian = _turn(3, zeros + np.radians(longitude_deg))
-    return _chain(q_icrs_to_itrs(utc_ns), to_meridian, _turn(2, zeros - np.radians(latitude_deg) - np.pi / 2))
+    to_meridian = frame_turns(2, zeros + np.radians(longitude_deg))
+    return _chain(q_icrs_to_itrs(utc_ns), to_meridian, frame_turns(1, zeros - np.radians(latitude_deg) - np.pi / 2))
 
 
 def q_icrs_to_enu(utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
@@ -152,13 +152,6 @@ def tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)  # a year after the last known leap second
         return np.asarray(erfa.dat(year, month, day, 0.0))
-
-
-def _turn(axis: int, angle_rad: FloatArray) -> FloatArray:
-    """Quaternions (n, 4) of frames turned about their axis 1, 2 or 3 (R1, R2, R3 of the IERS Conventions)."""
-    q = np.zeros((len(angle_rad), 4))
-    q[:, 0], q[:, axis] = np.cos(angle_rad / 2), -np.sin(angle_rad / 2)
-    return q
 
 
 def _chain(*turns: FloatArray) -> FloatArray:
@@ -295,12 +288,9 @@ def _from_icrs(samples: list[AttitudeSample], reference: Reference, gyro: bool) 
         return []
     q_ref_to_body = np.array([sample.q_icrs_to_cam for sample in samples])
     q = multiply(q_ref_to_body, reference.q_icrs_to_reference(sample.t_ns for sample in samples))
-    own = np.array([0.0, *reference.earth_rate_rad_s])
-    earths = multiply(multiply(q_ref_to_body, own), conjugate(q_ref_to_body))[:, 1:]
+    earths = rotate(q_ref_to_body, np.tile(reference.earth_rate_rad_s, (len(samples), 1)))
     turned = []
     for sample, attitude, earth_rate in zip(samples, q, earths, strict=True):
-        rate = sample.rate_cam_rad_s
-        turned.append(
-            replace(sample, q_icrs_to_cam=attitude, rate_cam_rad_s=rate if rate is None or gyro else rate + earth_rate)
-        )
+        rate = sample.rate_cam_rad_s if sample.rate_cam_rad_s is None or gyro else sample.rate_cam_rad_s + earth_rate
+        turned.append(replace(sample, q_icrs_to_cam=attitude, rate_cam_rad_s=rate))
     return turned

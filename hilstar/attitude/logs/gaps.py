@@ -75,20 +75,19 @@ def log_joins(samples: Sequence[AttitudeSample]) -> LogJoins:
     broken = np.array([sample.discontinuity for sample in samples[1:]])
     held = gap & ~fits & ~broken
     misfit = known & ~fits & ~broken & ~gap
+    cause = ""
+    if misfit.any():  # what is probably wrong with the rates from the first one on that does not fit
+        first = int(misfit.argmax())
+        found = cause_in([sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None])
+        cause = "" if found is None else found.text
     return LogJoins(
         frozenset(t_ns[:-1][fits & ~broken].tolist()),
         frozenset(t_ns[:-1][held].tolist()),
         usual_s,
         float(seconds[held].max(initial=0.0)),
         int(misfit.sum()),
-        _cause(samples, int(misfit.argmax())) if misfit.any() else "",
+        cause,
     )
-
-
-def _cause(samples: Sequence[AttitudeSample], first: int) -> str:
-    """What is probably wrong with the rates from the first one on that does not fit; "" where they do not say."""
-    found = cause_in([sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None])
-    return "" if found is None else found.text
 
 
 def _fits(

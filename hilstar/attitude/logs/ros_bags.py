@@ -30,6 +30,7 @@ from hilstar.attitude.logs.mcap_log import ROS_ENCODINGS, records_of, unpacked
 from hilstar.errors import InputError, shortened
 from hilstar.files import temporary_folder
 from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, open_regular, read_text, refuse_kind, size_text
+from hilstar.units import NS_PER_S
 
 BAG_ADVICE = "give a bag of ROS 1 (.bag) or ROS 2 (.db3, .mcap, or the bag's directory)"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -124,21 +125,18 @@ class Db3File:
             if self._tables(database, "message_definitions"):
                 rows = database.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
                 texts = {name: text for name, encoding, text in rows.fetchmany(MAX_TOPICS) if encoding == "ros2msg"}
-            found = []
-            rows = database.execute("SELECT name, type, serialization_format FROM topics ORDER BY id")
-            for name, kind, serialised in rows.fetchmany(MAX_TOPICS):
-                if serialised == "cdr":
-                    found.append(BagTopic(str(name), type_name(str(kind)), "cdr", str(texts.get(kind, ""))))
+            rows = database.execute("SELECT name, type FROM topics WHERE serialization_format = 'cdr' ORDER BY id")
+            found = [
+                BagTopic(str(name), type_name(str(kind)), "cdr", str(texts.get(kind, "")))
+                for name, kind in rows.fetchmany(MAX_TOPICS)
+            ]
             return list(dict.fromkeys(found))
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
         """The messages of a topic, in the order of recording."""
         with self._open() as database:
-            ids = [
-                number
-                for number, name, kind in database.execute("SELECT id, name, type FROM topics").fetchmany(MAX_TOPICS)
-                if (name, type_name(str(kind))) == (topic.name, topic.type)
-            ]
+            topics = database.execute("SELECT id, name, type FROM topics").fetchmany(MAX_TOPICS)
+            ids = [number for number, name, kind in topics if (name, type_name(str(kind))) == (topic.name, topic.type)]
             marks = ",".join("?" * len(ids))
             rows = database.execute(f"SELECT timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id", ids)
             for receive_ns, data in rows:
@@ -156,10 +154,9 @@ class Db3File:
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
+        place = f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1"
         try:
-            with contextlib.closing(
-                sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1", uri=True)
-            ) as database:
+            with contextlib.closing(sqlite3.connect(place, uri=True)) as database:
                 database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
                 database.execute("PRAGMA trusted_schema = off")
                 if self._tables(database, "topics", "messages") != 2:
@@ -183,20 +180,13 @@ class McapBag:
 
     def topics(self) -> list[BagTopic]:
         """The channels whose messages are ROS's."""
-        return list(dict.fromkeys(topic for _, topic in self._channels()))
+        return list(dict.fromkeys(found for found in self._records() if isinstance(found, BagTopic)))
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
         """The messages of a topic, in the order of the file."""
-        wanted: set[int] = set()
-        schemas: dict[int, Schema] = {}
-        for record in records_of(self._path):
-            if isinstance(record, McapMessage):
-                if record.channel_id in wanted:
-                    yield Message(record.log_time, self._unpacked(record.data))
-            elif isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel) and _topic(record, schemas.get(record.schema_id)) == topic:
-                wanted.add(record.id)
+        for found in self._records(topic):
+            if isinstance(found, Message):
+                yield found
 
     def told(self) -> list[tuple[str, str]]:
         """That the recorder was killed before the file's end was written."""
@@ -206,26 +196,25 @@ class McapBag:
                 return []
         return [("log-cut", f"{self._path} was not closed by its recorder; all chunks that are whole are read")]
 
-    def _channels(self) -> Iterator[tuple[int, BagTopic]]:
+    def _records(self, wanted: BagTopic | None = None) -> Iterator[BagTopic | Message]:
+        """Every topic, and each message of the wanted one."""
+        channels: dict[int, BagTopic] = {}
         schemas: dict[int, Schema] = {}
         for record in records_of(self._path):
-            if isinstance(record, Schema):
+            if isinstance(record, McapMessage):
+                if wanted is not None and channels.get(record.channel_id) == wanted:
+                    try:
+                        yield Message(record.log_time, message_bytes(record.data))
+                    except (ValueError, zstandard.ZstdError) as error:
+                        raise damaged(self._path, error) from error
+            elif isinstance(record, Schema):
                 schemas[record.id] = record
-            elif isinstance(record, Channel) and (topic := _topic(record, schemas.get(record.schema_id))) is not None:
-                yield record.id, topic
-
-    def _unpacked(self, data: bytes) -> bytes:
-        try:
-            return message_bytes(data)
-        except (ValueError, zstandard.ZstdError) as error:
-            raise damaged(self._path, error) from error
-
-
-def _topic(channel: Channel, schema: Schema | None) -> BagTopic | None:
-    if schema is None or channel.message_encoding not in ROS_ENCODINGS:
-        return None
-    text = schema.data.decode(errors="replace") if schema.encoding in {"ros2msg", "ros1msg"} else ""
-    return BagTopic(channel.topic, type_name(schema.name), "ros1" if channel.message_encoding == "ros1" else "cdr", text)
+            elif isinstance(record, Channel) and record.message_encoding in ROS_ENCODINGS and record.schema_id in schemas:
+                schema = schemas[record.schema_id]
+                text = schema.data.decode(errors="replace") if schema.encoding in {"ros2msg", "ros1msg"} else ""
+                encoding: Encoding = "ros1" if record.message_encoding == "ros1" else "cdr"
+                channels[record.id] = BagTopic(record.topic, type_name(schema.name), encoding, text)
+                yield channels[record.id]
 
 
 class CutError(Exception):
@@ -242,10 +231,7 @@ class BagFile:
 
     def topics(self) -> list[BagTopic]:
         """The connections of the index; without one, those of all chunks."""
-        with open_regular(self._path, BAG_ADVICE) as file:
-            self._check_version(file)
-            index = self._index_at(file)
-        for start in (index, len(VERSION)):
+        for start in (self._index_at(), len(VERSION)):
             if start and not self._topics:  # an index that names nothing is not where the bag says
                 for _ in self._records(start):
                     pass
@@ -263,25 +249,20 @@ class BagFile:
             return []
         return [("log-cut", f"{self._path} ends within a record at byte {self._cut_at}; all that is whole before it is read")]
 
-    def _check_version(self, file: IO[bytes]) -> None:
-        line = file.readline(len(VERSION))
-        if line != VERSION:
-            raise InputError(f"{self._path}: a ROS 1 bag of another version than 2.0; convert it with rosbag's own tools")
-
-    def _index_at(self, file: IO[bytes]) -> int:
+    def _index_at(self) -> int:
         """Where the index begins, 0 where the bag has none."""
-        try:
-            record = _record(file, MAX_CHUNK_BYTES)
-            if record is None:
+        with open_regular(self._path, BAG_ADVICE) as file:
+            if file.readline(len(VERSION)) != VERSION:
+                raise InputError(f"{self._path}: a ROS 1 bag of another version than 2.0; convert it with rosbag's own tools")
+            try:
+                fields, _ = _record(file) or ({b"index_pos": bytes(_u64.size)}, b"")
+                if fields.get(b"encryptor"):
+                    raise InputError(f"{self._path}: an encrypted bag; decrypt it with rosbag's own tools")
+                at: int = _u64.unpack(fields[b"index_pos"])[0]
+            except FAULTS as error:
+                raise damaged(self._path, error) from error
+            except CutError:
                 return 0
-            fields = record[0]
-            if fields.get(b"encryptor"):
-                raise InputError(f"{self._path}: an encrypted bag; decrypt it with rosbag's own tools")
-            at: int = _u64.unpack(fields[b"index_pos"])[0]
-        except FAULTS as error:
-            raise damaged(self._path, error) from error
-        except CutError:
-            return 0
         return at if at < self._path.stat().st_size else 0
 
     def _records(self, start: int) -> Iterator[tuple[int, Message]]:
@@ -290,7 +271,7 @@ class BagFile:
             room = FREE_BYTES + MAX_INFLATION * self._path.stat().st_size
             file.seek(start)
             try:
-                while (record := _record(file, MAX_CHUNK_BYTES)) is not None:
+                while (record := _record(file)) is not None:
                     fields, data = record
                     if _operation(fields) == CHUNK:
                         chunk = chunk_bytes(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
@@ -307,11 +288,11 @@ class BagFile:
 
     def _inside(self, chunk: IO[bytes]) -> Iterator[tuple[int, Message]]:
         try:
-            while (record := _record(chunk, MAX_CHUNK_BYTES)) is not None:
+            while (record := _record(chunk)) is not None:
                 fields, data = record
                 if _operation(fields) == MESSAGE:
                     seconds, ns = _time.unpack(fields[b"time"])
-                    yield _u32.unpack(fields[b"conn"])[0], Message(seconds * 10**9 + ns, data)
+                    yield _u32.unpack(fields[b"conn"])[0], Message(seconds * NS_PER_S + ns, data)
                 elif _operation(fields) == CONNECTION:
                     self._connect(fields, data)
         except CutError as error:
@@ -323,13 +304,13 @@ class BagFile:
         self._topics[_u32.unpack(fields[b"conn"])[0]] = BagTopic(name, kind, "ros1", more[b"message_definition"].decode())
 
 
-def _record(file: IO[bytes], limit: int) -> tuple[Fields, bytes] | None:
+def _record(file: IO[bytes]) -> tuple[Fields, bytes] | None:
     """The next record, None at the end. Raises CutError where the file ends within it, ValueError for one over the limits."""
     head = file.read(_u32.size)
     if not head:
         return None
     fields = _fields(_part(file, head, MAX_HEADER_BYTES))
-    return fields, _part(file, file.read(_u32.size), limit)
+    return fields, _part(file, file.read(_u32.size), MAX_CHUNK_BYTES)
 
 
 def _part(file: IO[bytes], length: bytes, limit: int) -> bytes:

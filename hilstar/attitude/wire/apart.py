@@ -59,7 +59,7 @@ class RawLink(Protocol):
         """Close this process's end of it."""
 
 
-OpenStream = Callable[[Notices], RawLink]
+OpenStream = Callable[..., RawLink]  # its only argument: notices
 
 
 class ReadOrder(NamedTuple):

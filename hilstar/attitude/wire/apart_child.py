@@ -135,7 +135,7 @@ class Reading:
         self._empty_ns = clock.now_ns()
         self.link: RawLink | None = None
         if order.stream is not None:
-            self.link = order.stream(self._notices)
+            self.link = order.stream(notices=self._notices)
             self._notices.link_counts = self.link.link_counts
         elif file is not None:
             self._empty_ns = 0  # bytes that already wait may have come at any time

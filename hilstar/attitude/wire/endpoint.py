@@ -63,7 +63,10 @@ class Endpoint:
 def parse_endpoint(text: str) -> Endpoint:
     """The endpoint of a text. Raises InputError for any form except those listed in this module's docstring."""
     if text.startswith("ipc://"):
-        return _parse_ipc(text)
+        name = text.removeprefix("ipc://")
+        if not name.startswith("/") or not name.isprintable() or len(os.fsencode(name)) > MAX_PATH_BYTES:
+            raise InputError(f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}")
+        return Endpoint(text, loopback=True, path=Path(name))
     match = TCP.fullmatch(text)
     port = match[2] if match else ""
     if match is None or (port != "*" and int(port) > 65_535):
@@ -92,13 +95,6 @@ def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
     if mapped is not None:
         raise InputError(f"{shortened(text)}: an IPv4-mapped IPv6 address; write tcp://{mapped}:PORT")
     return f"[{address}]" if bracketed else str(address), address.is_loopback, address.is_unspecified
-
-
-def _parse_ipc(text: str) -> Endpoint:
-    name = text.removeprefix("ipc://")
-    if not name.startswith("/") or not name.isprintable() or len(os.fsencode(name)) > MAX_PATH_BYTES:
-        raise InputError(f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}")
-    return Endpoint(text, loopback=True, path=Path(name))
 
 
 def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
@@ -163,7 +159,13 @@ class AllowedSenders:
     """The addresses and networks whose datagrams are read: this machine alone where none are given."""
 
     def __init__(self, texts: Iterable[str] = ()) -> None:
-        self.listed = tuple(_network(text) for text in texts)
+        networks: list[Network] = []
+        for text in texts:
+            try:
+                networks.append(ipaddress.ip_network(text.strip("[]")))
+            except ValueError as error:
+                raise InputError(f'allow = ["{shortened(text)}"]: {error}; {ALLOW_FORM}') from error
+        self.listed = tuple(networks)
         self._known: dict[str, bool] = {}  # a flood asks for each of its datagrams
 
     def __bool__(self) -> bool:
@@ -234,10 +236,3 @@ def _port(text: str, word: str) -> int:
     if not re.fullmatch(r"\d{1,5}", text) or int(text) > 65_535:
         raise InputError(f"{word}: not a port; write a number from 1 to 65535, such as port = {DEFAULT_PORT}")
     return int(text)
-
-
-def _network(text: str) -> Network:
-    try:
-        return ipaddress.ip_network(text.strip("[]"))
-    except ValueError as error:
-        raise InputError(f'allow = ["{shortened(text)}"]: {error}; {ALLOW_FORM}') from error

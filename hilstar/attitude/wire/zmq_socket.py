@@ -160,17 +160,13 @@ class Doorkeeper:
         elif event == zmq.EVENT_DISCONNECTED:
             self._leave(value)
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED and not self._bound:
-            self._arrive()
+            self._counts.connections += 1
+            if self._counts.connections > 1:
+                self._notices.tell("back", "reconnected to the sender")
+            else:
+                self._notices.mention("connected", "connected to the sender")
         elif event in FAILED:
             self._failure = FAILED[zmq.Event(event)]
-
-    def _arrive(self) -> None:
-        """A connecting socket's peer has answered, for the first time or again."""
-        self._counts.connections += 1
-        if self._counts.connections > 1:
-            self._notices.tell("back", "reconnected to the sender")
-        else:
-            self._notices.mention("connected", "connected to the sender")
 
     def _leave(self, file: int) -> None:
         self.lost = True
@@ -183,10 +179,8 @@ class Doorkeeper:
             self._notices.tell("client-rejected", f"a connection from {who or 'an unknown peer'} was rejected: {failure}")
         elif failure:
             self._counts.rejected += 1
-            self._notices.tell(
-                "link-rejected",
-                "the other side rejected us: check its allowed_clients, and our curve_server_key",
-            )
+            advice = "check its allowed_clients, and our curve_server_key"
+            self._notices.tell("link-rejected", f"the other side rejected us: {advice}")
         elif not self._bound:
             self._counts.lost += 1
             self._notices.tell("lost", "lost the connection to the sender; waiting for it")
@@ -204,13 +198,10 @@ class Doorkeeper:
             self._counts.refused += 1
             self._shut.add(file)
             with _connection(file) as connection:
-                if connection is not None and self._is_ours(connection):
-                    connection.shutdown(socket.SHUT_RDWR)
-
-    def _is_ours(self, connection: socket.socket) -> bool:
-        """Whether the descriptor is still a connection of this socket; it may have been reused for another file."""
-        name = connection.getsockname()
-        return bool((name[1] if isinstance(name, tuple) else name) == self.place)
+                if connection is not None:
+                    name = connection.getsockname()  # the descriptor may have been reused for another file
+                    if (name[1] if isinstance(name, tuple) else name) == self.place:
+                        connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Stop watching; before its socket is closed."""
@@ -286,25 +277,21 @@ class ZmqSocket(Closing):
         self._poller = zmq.Poller()
         try:
             if allowed is not None:
-                self._authenticate(allowed)
+                from zmq.auth.thread import ThreadAuthenticator  # brings asyncio
+
+                self._authenticator = ThreadAuthenticator(self._context)
+                self._authenticator.start()
+                self._authenticator.configure_curve_callback("*", allowed)
             if bind:
                 self._open(0.0)
         except InputError:
             self.close()
             raise
 
-    def _authenticate(self, allowed: AllowList) -> None:
-        from zmq.auth.thread import ThreadAuthenticator  # brings asyncio
-
-        self._authenticator = ThreadAuthenticator(self._context)
-        self._authenticator.start()
-        self._authenticator.configure_curve_callback("*", allowed)
-
     def _open(self, patience_s: float = REBIND_S) -> zmq.Socket[bytes]:
         """The socket, opened. Raises InputError where it cannot be bound within `patience_s`."""
         made: zmq.Socket[bytes] = self._context.socket(self._kind)
         self._configure(made)
-        self._secure(made)
         self._socket = made
         self._keeper = Doorkeeper(made, bound=self._bind, counts=self.link_counts, notices=self._notices, clock=self._clock)
         self._poller = zmq.Poller()
@@ -348,15 +335,12 @@ class ZmqSocket(Closing):
         made.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
         made.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
         made.setsockopt(zmq.RECONNECT_IVL_MAX, MAX_RECONNECT_MS)
-
-    def _secure(self, made: zmq.Socket[bytes]) -> None:
-        if self._pair is None:
-            return
-        made.curve_publickey, made.curve_secretkey = self._pair
-        if self._server_key is None:
-            made.curve_server = True
-        else:
-            made.curve_serverkey = self._server_key
+        if self._pair is not None:
+            made.curve_publickey, made.curve_secretkey = self._pair
+            if self._server_key is None:
+                made.curve_server = True
+            else:
+                made.curve_serverkey = self._server_key
 
     def _ready(self) -> zmq.Socket[bytes]:
         """The socket, open."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -64,11 +64,19 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """What may be wrong with rates: `mended` are those of a stretch without it, `scale` what their noise is multiplied by."""
+    """What may be wrong with rates: `mends` (3, 3) makes them right, and `scale` is what that multiplies their noise by.
+
+    They are taken to have ICRS components where `in_icrs`, else the camera's.
+    """
 
     text: str
-    mended: Callable[[Stretch], FloatArray]
+    mends: FloatArray
     scale: float = 1.0
+    in_icrs: bool = False
+
+    def mended(self, stretch: Stretch) -> FloatArray:
+        """The mean rate (3,) of a stretch without it."""
+        return np.asarray(self.mends @ (stretch.rate_as_icrs if self.in_icrs else stretch.rate))
 
 
 # What a rate of 1 rad/s is in units that senders confuse with it.
@@ -81,31 +89,21 @@ UNITS = {
     "revolutions/s": 1 / math.tau,
     "rad/s times pi/180": math.radians(1.0),
 }
+DEGREES = (("", 1.0), (" and in deg/s", UNITS["deg/s"]))
+SAME = np.eye(3)
 OTHER_FRAME = "they are of another frame than the camera's, such as the body's"
 OTHER_AXES = f"their axes are in another order or have the wrong sign, or {OTHER_FRAME}"
 GROSS = "no unit, sign or order of axes explains them"
 
 
-def _scaled(by: float) -> Callable[[Stretch], FloatArray]:
-    return lambda stretch: stretch.rate / by
-
-
-def _turned(matrix: FloatArray) -> Callable[[Stretch], FloatArray]:
-    return lambda stretch: matrix @ stretch.rate
-
-
-def _in_icrs(by: float) -> Callable[[Stretch], FloatArray]:
-    return lambda stretch: stretch.rate_as_icrs / by
-
-
 def _causes() -> Iterator[Cause]:
     """Those without a choice of axes, the simplest first."""
     for unit, size in UNITS.items():
-        yield Cause(f"they are in {unit}; send rad/s", _scaled(size), 1 / size)
-    for unit, size in (("", 1.0), (" and in deg/s", UNITS["deg/s"])):
-        yield Cause(f"they have the wrong sign{unit}; send the turn of the camera in the sky, rad/s", _scaled(-size), 1 / size)
+        yield Cause(f"they are in {unit}; send rad/s", SAME / size, 1 / size)
+    for unit, size in DEGREES:
+        yield Cause(f"they have the wrong sign{unit}; send the turn of the camera in the sky, rad/s", -SAME / size, 1 / size)
     for unit, size in (("", 1.0), (", in deg/s", UNITS["deg/s"])):
-        yield Cause(f"they have ICRS components{unit}; send the camera's, rad/s", _in_icrs(size), 1 / size)
+        yield Cause(f"they have ICRS components{unit}; send the camera's, rad/s", SAME / size, 1 / size, in_icrs=True)
 
 
 def _permutations() -> Iterator[Cause]:
@@ -118,9 +116,8 @@ def _permutations() -> Iterator[Cause]:
             matrix[range(3), order] = signs
             sent = ", ".join(("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3))
             what = "some of their axes have the wrong sign" if order == (0, 1, 2) else "their axes are in another order"
-            for unit, size in (("", 1.0), (" and in deg/s", UNITS["deg/s"])):
-                text = f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)"
-                yield Cause(text, _turned(matrix / size), 1 / size)
+            for unit, size in DEGREES:
+                yield Cause(f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)", matrix / size, 1 / size)
 
 
 CAUSES, PERMUTATIONS = tuple(_causes()), tuple(_permutations())
@@ -158,12 +155,12 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
 
 def cause_of(stretches: Sequence[Stretch]) -> Cause | None:
     """What is wrong with the rates of these stretches, all but one in MORE_STRETCHES of them; None where they may be right."""
-    allowed = len(stretches) // MORE_STRETCHES
-    if sum(not (stretch.turns and _is_off(stretch)) for stretch in stretches) > allowed:
+    off = [s.turns and _error(s, s.rate) > max(MIN_OFF_RAD_S, _limit(s, OFF_SHARE, OFF_SIGMA)) for s in stretches]
+    if off.count(False) > len(stretches) // MORE_STRETCHES:
         return None
     if not any(stretch.rate.any() for stretch in stretches):
         coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(np.linalg.norm(s.turn) for s in stretches)
-        return Cause("they are zero; leave them out", _scaled(1.0)) if coherent else None
+        return Cause("they are zero; leave them out", SAME) if coherent else None
     return _definite(stretches) or _indefinite(stretches)
 
 
@@ -181,9 +178,9 @@ def _definite(stretches: Sequence[Stretch]) -> Cause | None:
         if _explains(stretches, cause, FIT_SHARE):
             return cause
     found = [cause for cause in PERMUTATIONS if _explains(stretches, cause, AXES_SHARE)]
-    sharp = all(FIT_SIGMA * math.hypot(s.turn_sigma, s.rate_sigma) < FIT_SHARE * _faster(s) for s in stretches)
     if not found:
         return None
+    sharp = all(FIT_SIGMA * math.hypot(s.turn_sigma, s.rate_sigma) < FIT_SHARE * _faster(s) for s in stretches)
     return found[0] if sharp and len(found) == 1 else replace(found[0], text=OTHER_AXES)
 
 
@@ -191,13 +188,15 @@ def _indefinite(stretches: Sequence[Stretch]) -> Cause | None:
     """A rotation that explains the rates, or that nothing does though they are far off: of MORE_STRETCHES alone."""
     if len(stretches) < MORE_STRETCHES:
         return None
-    rotation = _best_rotation(stretches)
+    # The rotation that turns rates best into turns (Kabsch 1976).
+    u, _, vt = np.linalg.svd(sum(np.outer(stretch.turn, stretch.rate) for stretch in stretches))
+    rotation = np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
     for unit, size in (("", 1.0), (", and in deg/s", UNITS["deg/s"])):
-        turned = Cause(OTHER_FRAME + unit, _turned(rotation / size), 1 / size)
+        turned = Cause(OTHER_FRAME + unit, rotation / size, 1 / size)
         if _explains(stretches, turned, AXES_SHARE):
             return turned
     gross = [_error(s, s.rate) > max(MIN_GROSS_RAD_S, GROSS_SHARE * _faster(s)) for s in stretches]
-    return Cause(GROSS, _scaled(1.0)) if all(gross) else None
+    return Cause(GROSS, SAME) if all(gross) else None
 
 
 def cause_in(samples: Sequence[AttitudeSample]) -> Cause | None:
@@ -214,10 +213,6 @@ def fits(stretch: Stretch) -> bool:
     return stretch.turns and _error(stretch, stretch.rate) <= _limit(stretch, FIT_SHARE, FIT_SIGMA)
 
 
-def _is_off(stretch: Stretch) -> bool:
-    return _error(stretch, stretch.rate) > max(MIN_OFF_RAD_S, _limit(stretch, OFF_SHARE, OFF_SIGMA))
-
-
 def _error(stretch: Stretch, rate: FloatArray) -> float:
     return float(np.linalg.norm(stretch.turn - rate))
 
@@ -232,37 +227,26 @@ def _limit(stretch: Stretch, share: float, sigma: float, scale: float = 1.0) -> 
     return max(share * size, sigma * math.hypot(stretch.turn_sigma, scale * stretch.rate_sigma))
 
 
-def _best_rotation(stretches: Sequence[Stretch]) -> FloatArray:
-    """The rotation (3, 3) that turns rates best into turns (Kabsch 1976)."""
-    u, _, vt = np.linalg.svd(sum(np.outer(stretch.turn, stretch.rate) for stretch in stretches))
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
-
-
 class _Length:
     """The newest stretches of one length."""
 
     def __init__(self, length_s: float) -> None:
         self._length_ns = round(length_s * NS_PER_S)
-        self._samples: list[AttitudeSample] = []
+        self.samples: list[AttitudeSample] = []
         self.stretches: deque[Stretch] = deque(maxlen=MORE_STRETCHES)
 
     def add(self, sample: AttitudeSample) -> bool:
         """Take the next packet; True where it completes a stretch."""
-        samples = self._samples
+        samples = self.samples
         samples.append(sample)
         if len(samples) <= MIN_INTERVALS or sample.t_ns - samples[0].t_ns < self._length_ns:
             return False
         stretch = stretch_of(samples)
-        self._samples = [sample]
+        self.samples = [sample]
         if stretch is None:
             return False
         self.stretches.append(stretch)
         return True
-
-    def restart(self) -> None:
-        """Forget everything."""
-        self._samples.clear()
-        self.stretches.clear()
 
     def newest(self, count: int) -> list[Stretch]:
         """So many of the newest stretches; [] while there are fewer."""
@@ -349,4 +333,5 @@ class RateCheck:
 
     def _restart(self) -> None:
         for length in self._lengths:
-            length.restart()
+            length.samples.clear()
+            length.stretches.clear()

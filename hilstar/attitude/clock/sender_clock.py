@@ -57,11 +57,6 @@ class OffsetLine:
         return self.offset_ns + self.drift * (host_ns - self.host_ns)
 
 
-def plausible_drift(slope: float) -> float:
-    """The slope itself, or 0 where it is steeper than any clock drifts."""
-    return slope if abs(slope) <= MAX_DRIFT else 0.0
-
-
 class Slot(NamedTuple):
     """The message with the smallest offset within SLOT_NS."""
 
@@ -141,36 +136,33 @@ class OneWayFilter:
         drift = 0.0 if -x[0] < MIN_DRIFT_SPAN_NS else supporting_slope(x, y)
         above = y - drift * x
         level = float(above.min())
-        self.line = OffsetLine(newest.host_ns, newest.offset_ns + level, drift, _spread_ns(above - level))
-
-
-def _spread_ns(above: FloatArray) -> float:
-    """How far the line may lie below the truth: a slot's smallest offset is never below it.
-
-    The last slots count one by one and are extrapolated, so that the bound also holds for a clock that was set by less than a
-    jump, and for one whose drift is not known yet.
-    """
-    if len(above) < RECENT_SLOTS:
-        return math.inf
-    last = above[-RECENT_SLOTS:]
-    rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)  # the line is used for two more slots
-    return float(max(np.median(above), last.max(), last[-1] + rise))
+        above -= level
+        # The line may lie below the truth by as much as a slot's smallest offset is above it. The last slots count one by one
+        # and are carried on to the two for which the line is used: a clock may be set by less than a jump, or drift unknown.
+        uncertainty_ns, last = math.inf, above[-RECENT_SLOTS:]
+        if len(last) == RECENT_SLOTS:
+            rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)
+            uncertainty_ns = float(max(np.median(above), last.max(), last[-1] + rise))
+        self.line = OffsetLine(newest.host_ns, newest.offset_ns + level, drift, uncertainty_ns)
 
 
 def supporting_slope(x: FloatArray, y: FloatArray) -> float:
-    """The slope of the line under all points with the smallest sum of distances: the lower hull's edge at their mean x."""
+    """The slope of the line under all points with the smallest sum of distances: the lower hull's edge at their mean x.
+
+    0 where it is steeper than any clock drifts.
+    """
     hull: list[int] = []
-    for i in range(len(x)):
-        while len(hull) > 1 and _turns_down(x, y, hull[-2], hull[-1], i):
+    for c in range(len(x)):
+        while len(hull) > 1:
+            a, b = hull[-2:]
+            if (y[b] - y[a]) * (x[c] - x[a]) < (y[c] - y[a]) * (x[b] - x[a]):
+                break
             hull.pop()
-        hull.append(i)
+        hull.append(c)
     right = int(np.searchsorted(x[hull], x.mean()))
     a, b = hull[max(right - 1, 0)], hull[max(right, 1)]
-    return plausible_drift(float((y[b] - y[a]) / (x[b] - x[a])))
-
-
-def _turns_down(x: FloatArray, y: FloatArray, a: int, b: int, c: int) -> bool:
-    return bool((y[b] - y[a]) * (x[c] - x[a]) >= (y[c] - y[a]) * (x[b] - x[a]))
+    slope = float((y[b] - y[a]) / (x[b] - x[a]))
+    return slope if abs(slope) <= MAX_DRIFT else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +215,10 @@ class ExchangeFilter:
         """Take one exchange; the line's offsets are less `base_ns`."""
         new = _MeasuredExchange((exchange.t1_ns + exchange.t4_ns) // 2, exchange.offset_ns(base_ns), exchange.delay_ns)
         self.count += 1
-        if self._contradicts(new):
-            self.restart()
+        if self.line is not None:
+            bound_ns = new.delay_ns / 2 + self.line.uncertainty_ns + MAX_DRIFT * (new.host_ns - self.line.host_ns)
+            if abs(new.offset_ns - self.line.at(new.host_ns)) > bound_ns:  # no drift explains it: the clock was set
+                self._measured.clear()
         self._measured.append(new)
         while new.host_ns - self._measured[0].host_ns > WINDOW_NS:
             self._measured.popleft()
@@ -238,7 +232,8 @@ class ExchangeFilter:
         y = np.array([each.offset_ns - new.offset_ns for each in quick], dtype=np.float64)
         drift = 0.0
         if np.ptp(x) >= MIN_DRIFT_SPAN_NS:
-            drift = plausible_drift(float(np.polyfit(x, y, 1)[0]))
+            drift = float(np.polyfit(x, y, 1)[0])
+            drift = drift if abs(drift) <= MAX_DRIFT else 0.0
         level = float(np.mean(y - drift * x))
         # The truth lies within half the delay of each exchange's own offset, however the delay divides between the two ways.
         bounds = np.abs(y - drift * x - level) + 0.5 * np.array([each.delay_ns for each in quick])
@@ -247,24 +242,11 @@ class ExchangeFilter:
             uncertainty_ns += abs(float(y[-1] - y[-2]))  # it may go on like that
         return OffsetLine(new.host_ns, new.offset_ns + level, drift, uncertainty_ns)
 
-    def _contradicts(self, new: _MeasuredExchange) -> bool:
-        """True where no drift explains the new exchange: the clock was set, by however little."""
-        line = self.line
-        if line is None:
-            return False
-        drifted_ns = MAX_DRIFT * (new.host_ns - line.host_ns)
-        return abs(new.offset_ns - line.at(new.host_ns)) > new.delay_ns / 2 + line.uncertainty_ns + drifted_ns
-
     def current_line(self, host_ns: int) -> OffsetLine | None:
         """The line while enough exchanges are recent, else None."""
         if len(self._measured) < MIN_EXCHANGES or host_ns - self._measured[-1].host_ns > EXCHANGE_LIFE_NS:
             return None
         return self.line
-
-    def restart(self) -> None:
-        """Forget every exchange."""
-        self._measured.clear()
-        self.line = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,13 +265,6 @@ class ClockSummary:
     jumps: int = 0
 
 
-class _Used(NamedTuple):
-    """The offset that the last frame used."""
-
-    host_ns: int
-    offset_ns: float
-
-
 class SenderClock:
     """The sender's time at any host time. One thread may observe while another asks. A `shared` one is the host's own."""
 
@@ -301,7 +276,7 @@ class SenderClock:
         self._line = OffsetLine(0, 0.0, uncertainty_ns=0.0) if shared else None  # one attribute: read whole by other threads
         self._mode: ClockMode = "shared" if shared else "none"
         self._first_ns: int | None = None
-        self._used: _Used | None = None
+        self._used: tuple[int, float] | None = None  # host time and offset of the last frame
 
     def observe(self, t_ns: int, host_ns: int) -> None:
         """Take one message: its time on the sender's clock and its arrival."""
@@ -350,11 +325,12 @@ class SenderClock:
             return host_ns
         offset_ns = line.at(host_ns)
         if self._used is not None and first_ns is not None and host_ns - first_ns > SETTLING_NS:
-            change_ns = offset_ns - self._used.offset_ns
+            used_host_ns, used_ns = self._used
+            change_ns = offset_ns - used_ns
             if abs(change_ns) < MAX_SLEWED_NS:
-                max_ns = SLEW * (host_ns - self._used.host_ns)
-                offset_ns = self._used.offset_ns + min(max(change_ns, -max_ns), max_ns)
-        self._used = _Used(host_ns, offset_ns)
+                max_ns = SLEW * (host_ns - used_host_ns)
+                offset_ns = used_ns + min(max(change_ns, -max_ns), max_ns)
+        self._used = host_ns, offset_ns
         return host_ns - base_ns - round(offset_ns)
 
     def latency_ns(self, t_ns: int, host_ns: int) -> float | None:
@@ -382,7 +358,7 @@ class SenderClock:
         line = self._line
         if line is None or self._base_ns is None:
             return ClockSummary(self._mode)
-        behind_ns = 0.0 if self._used is None else abs(line.at(self._used.host_ns) - self._used.offset_ns)
+        behind_ns = 0.0 if self._used is None else abs(line.at(self._used[0]) - self._used[1])
         uncertainty_ns = line.uncertainty_ns
         if self._mode == "one-way":
             uncertainty_ns = max(uncertainty_ns, self._one_way.all_above_ns) + LOCAL_DELAY_NS

@@ -184,7 +184,7 @@ class Timeline:
 
     def __init__(self, policy: Policy, capacity: int = LIVE_CAPACITY, joins: Joins | None = None) -> None:
         self._policy = policy
-        self._join = self._join_live if joins is None else joins
+        self._joins = joins
         self._capacity = capacity
         self._t_ns: list[int] = []
         self._samples: list[AttitudeSample] = []
@@ -277,7 +277,8 @@ class Timeline:
         bend, bend_after = (self._acceleration_rad_s2(near, k) for k in (place, place + 1))
         from_before = propagate(before.q_icrs_to_cam, rate + 0.5 * forward * bend, forward)
         from_after = propagate(after.q_icrs_to_cam, rate_after + 0.5 * backward * bend_after, backward)
-        share = smootherstep(age_ns / gap_ns)
+        u = age_ns / gap_ns
+        share = u * u * u * (10.0 + u * (6.0 * u - 15.0))  # first and second derivatives 0 at both ends (Perlin 2002)
         turning = (1 - share) * (rate + forward * bend) + share * (rate_after + backward * bend_after)
         return slerp(from_before, from_after, share), turning
 
@@ -290,13 +291,14 @@ class Timeline:
             raise AssertionError("a sample of a blend has a rate and a neighbour")
         return (rate_later - rate) / ((near[later].t_ns - near[earlier].t_ns) / NS_PER_S)
 
-    def _join_live(self, before: AttitudeSample, after: AttitudeSample) -> Join:
+    def _joined(self, before: AttitudeSample, after: AttitudeSample) -> Join:
+        if self._jumped(before, after):
+            return "hold"
+        if self._joins is not None:
+            return self._joins(before, after)
         # Rates say little about a long silence: propagated across it from both sides they overshoot; SLERP cannot.
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
         return "blend" if known and after.t_ns - before.t_ns <= self._policy.stale_after_ns else "slerp"
-
-    def _joined(self, before: AttitudeSample, after: AttitudeSample) -> Join:
-        return "hold" if self._jumped(before, after) else self._join(before, after)
 
     def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
         """True where the attitude jumps: the sample says so, or the turn would exceed the maximum rate."""
@@ -347,11 +349,6 @@ class Timeline:
 
 def _held(sample: AttitudeSample, age_ns: int, stale: bool) -> Attitude:
     return Attitude(sample.q_icrs_to_cam, age_ns, stale, sample.sequence)
-
-
-def smootherstep(u: float) -> float:
-    """From 0 to 1 with first and second derivatives zero at both ends (Perlin 2002)."""
-    return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
 class StaleGate:

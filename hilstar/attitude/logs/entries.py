@@ -9,6 +9,7 @@ Recorders write messages as they arrive, which is not always the order of their 
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,7 +77,8 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
     waiting: list[tuple[int, int, LogEntry]] = []
     newest_ns, late, latest_ns, repeats = None, 0, 0, 0
     last: AttitudeSample | None = None
-    for number, entry in enumerate(_with_end(entries)):
+    ended: Iterator[LogEntry | None] = itertools.chain(entries, (None,))
+    for number, entry in enumerate(ended):
         if entry is not None:
             if not isinstance(entry.event, AttitudeSample):
                 yield entry
@@ -99,11 +101,6 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
         told.append(("log-order", f"{late} attitudes came out of order, by up to {latest_ns / NS_PER_S:.3g} s, and are sorted"))
     if repeats:
         told.append(("log-repeats", f"{repeats} attitudes are exact repeats of the one before, and are dropped"))
-
-
-def _with_end(entries: Iterable[LogEntry]) -> Iterator[LogEntry | None]:
-    yield from entries
-    yield None
 
 
 def _repeats(last: AttitudeSample, sample: AttitudeSample) -> bool:

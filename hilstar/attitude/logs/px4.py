@@ -323,8 +323,8 @@ def place_at(
             if found is not None:
                 times, latitudes_deg, longitudes_deg = found
                 longitudes_deg = np.unwrap(longitudes_deg, period=360.0)
-                own = (np.interp(t_us, times, each) for each in (latitudes_deg, longitudes_deg))
-                return (*own, f"at the place of {name}")
+                latitude, longitude = (np.interp(t_us, times, each) for each in (latitudes_deg, longitudes_deg))
+                return latitude, longitude, f"at the place of {name}"
     raise InputError(f"{path}: has no position; give the place with --place LAT,LON,HEIGHT")
 
 
@@ -388,7 +388,9 @@ def read_ulog(path: Path, stated: Stated) -> LogReading:
         )
     told = sieved.told
     series, q = _ready(path, series, q, told)
-    turning = Turning(*boot_utc(path, stated, topics, told), *place_at(path, stated, topics, series.t_us, suffix))
+    boot_utc_ns, utc_words = boot_utc(path, stated, topics, told)
+    latitude_deg, longitude_deg, place_words = place_at(path, stated, topics, series.t_us, suffix)
+    turning = Turning(boot_utc_ns, utc_words, latitude_deg, longitude_deg, place_words)
     rates = _rates(series, topics, suffix)
     first_ns, last_ns = (int(t_us) * 1000 + turning.boot_utc_ns for t_us in (series.t_us.min(), series.t_us.max()))
     beyond = earth.beyond_table(first_ns, last_ns)

@@ -112,18 +112,15 @@ class ForwardedNotices(Notices):
         if grown != LinkCounts():
             self._wire.put(Record(self._order, counts=grown))
 
-    def tell(self, kind: str, detail: str, who: str = "") -> None:
-        """Forward a lasting notice."""
-        self._forward(Record(self._order, notice=(kind, detail, who)))
+    def tell(self, kind: str, detail: str, who: str = "", *, lasting: bool = True) -> None:
+        """Forward a notice, told there or only mentioned."""
+        with contextlib.suppress(EOFError):
+            self.count()
+            self._wire.put(Record(self._order, notice=(kind, detail, who), lasting=lasting))
 
     def mention(self, kind: str, detail: str) -> None:
         """Forward a mention."""
-        self._forward(Record(self._order, notice=(kind, detail, ""), lasting=False))
-
-    def _forward(self, record: Record) -> None:
-        with contextlib.suppress(EOFError):
-            self.count()
-            self._wire.put(record)
+        self.tell(kind, detail, lasting=False)
 
 
 class Reading:
@@ -166,23 +163,8 @@ class Reading:
         self.link = None
 
 
-def read_as_ordered(wire: Wire) -> NoReturn:
-    """Read what is ordered until the other side is gone (EOFError). Raises InputError where a socket cannot be opened."""
-    priority = PromptWhileLight()
-    reading = Reading(wire, ReadOrder(0), None)
-    while True:
-        wire.sign()
-        ordered = wire.order(LIFE_S * 1000 if reading.link is None else 0)
-        if ordered is not None:
-            reading.close()
-            reading = Reading(wire, *ordered)
-        if reading.link is not None:
-            reading.hand_over(reading.link)
-        priority.tend()
-
-
 def main() -> NoReturn:
-    """Read until the other side is gone; report there in a line what ends this process early."""
+    """Read what is ordered until the other side is gone; report there in a line what ends this process early."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
     file, parent = map(int, sys.argv[1:3])
@@ -190,7 +172,17 @@ def main() -> NoReturn:
     wire = Wire(socket.socket(fileno=file))
     code = 0
     try:
-        read_as_ordered(wire)
+        priority = PromptWhileLight()
+        reading = Reading(wire, ReadOrder(0), None)
+        while True:
+            wire.sign()
+            ordered = wire.order(LIFE_S * 1000 if reading.link is None else 0)
+            if ordered is not None:
+                reading.close()
+                reading = Reading(wire, *ordered)
+            if reading.link is not None:
+                reading.hand_over(reading.link)
+            priority.tend()
     except EOFError:
         pass
     except BaseException as error:

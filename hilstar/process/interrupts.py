@@ -285,7 +285,7 @@ def end_with_parent(parent: int | None = None) -> None:
         threading.Thread(target=end_after, name="hilstar-parent", daemon=True).start()
 
 
-class QueuedStderr(io.RawIOBase):
+class _QueuedStderr(io.RawIOBase):
     """Writes go to stderr from a thread, in order; beyond MAX_WAITING_BYTES they are dropped and counted."""
 
     def __init__(self) -> None:
@@ -297,19 +297,15 @@ class QueuedStderr(io.RawIOBase):
         threading.Thread(target=self._run, name="hilstar-stderr", daemon=True).start()
 
     def writable(self) -> bool:
-        """True."""
         return True
 
     def fileno(self) -> int:
-        """The descriptor of stderr itself."""
         return DESCRIPTOR
 
     def isatty(self) -> bool:
-        """Whether stderr itself is a terminal."""
         return os.isatty(DESCRIPTOR)
 
     def write(self, data: Any) -> int:
-        """Queue bytes; returns their number."""
         piece = bytes(data)
         with self._changed:
             if self._waiting_bytes + len(piece) > MAX_WAITING_BYTES:
@@ -321,7 +317,6 @@ class QueuedStderr(io.RawIOBase):
         return len(piece)
 
     def finish(self, patience_s: float) -> None:
-        """Wait until everything has been written, for at most `patience_s`."""
         end_s = time.monotonic() + patience_s
         with self._changed:
             while self._waiting_bytes and (rest_s := end_s - time.monotonic()) > 0:
@@ -346,14 +341,14 @@ class QueuedStderr(io.RawIOBase):
                 self._changed.notify_all()
 
 
-_queued: QueuedStderr | None = None
+_queued: _QueuedStderr | None = None
 
 
 def queue_stderr() -> None:
     """Queue writes to `sys.stderr`, so that none waits."""
     global _queued  # noqa: PLW0603 - a process has one stderr
     if _queued is None and sys.stderr is not None:
-        _queued = QueuedStderr()
+        _queued = _QueuedStderr()
         encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
         sys.stderr = io.TextIOWrapper(io.BufferedWriter(_queued), encoding, "backslashreplace", line_buffering=True)
         atexit.register(finish_stderr, LAST_WORDS_S)

@@ -55,7 +55,7 @@ MIN_OFF = 3
 UNSHARED = "clock-not-shared"
 
 
-class TimeSteps:
+class _TimeSteps:
     """The usual step of t_ns from message to message."""
 
     def __init__(self) -> None:
@@ -64,7 +64,6 @@ class TimeSteps:
         self._newest_ns, self._packets = 0, 1  # the newest step of t_ns, and how many packets it spans
 
     def add(self, sample: AttitudeSample) -> None:
-        """Take the next message, refused or not."""
         if self._last is not None:
             packets = sample.sequence - self._last.sequence
             self._newest_ns, self._packets = sample.t_ns - self._last.t_ns, packets if 1 <= packets <= MAX_MISSING else 1
@@ -82,7 +81,7 @@ class TimeSteps:
         return min(abs(self._newest_ns - count * period_ns) for count in (self._packets, 1)) < abs(by_ns) / 2
 
 
-class Pace:
+class _Pace:
     """The rate of the sender's clock, from the earliest messages of each slot of the last two seconds."""
 
     def __init__(self) -> None:
@@ -90,25 +89,24 @@ class Pace:
         self._slots = Slots(maxlen=PACE_SLOTS)
 
     def add(self, host_ns: int, offset_ns: int) -> None:
-        """Take one message's arrival and (arrival - t_ns), as sent."""
+        """Take one message's arrival and (arrival - t_ns), as sent.
+
+        A slow or a fast clock drifts steadily; a jump or a queue is a step, and decides nothing.
+        """
         if self._slots.lower(host_ns, offset_ns):
             return
         if len(self._slots) == PACE_SLOTS:
-            self._look()
+            x, y = self._slots.relative_to(self._slots[0])
+            slope = y[-1] / x[-1]
+            uneven_ns = np.abs(y - slope * x).max()
+            if abs(slope) > MIN_ODD_PACE and uneven_ns < abs(y[-1]) / 5:
+                self.slowness = float(slope)
+            elif abs(slope) < MIN_ODD_PACE / 2 and uneven_ns < MIN_ODD_PACE * x[-1]:
+                self.slowness = 0.0
         self._slots.begin(host_ns, offset_ns)
 
-    def _look(self) -> None:
-        """A slow or a fast clock drifts steadily; a jump or a queue is a step, and decides nothing."""
-        x, y = self._slots.relative_to(self._slots[0])
-        slope = y[-1] / x[-1]
-        uneven_ns = np.abs(y - slope * x).max()
-        if abs(slope) > MIN_ODD_PACE and uneven_ns < abs(y[-1]) / 5:
-            self.slowness = float(slope)
-        elif abs(slope) < MIN_ODD_PACE / 2 and uneven_ns < MIN_ODD_PACE * x[-1]:
-            self.slowness = 0.0
 
-
-def is_timely(arrival: SampleArrival) -> bool:
+def _is_timely(arrival: SampleArrival) -> bool:
     """True where the arrival is known well enough to teach a clock."""
     return arrival.waited_ns <= TRUSTED_WAIT_NS
 
@@ -128,8 +126,8 @@ class JumpFilter:
         self.correction_ns = 0  # continuous time minus the sender's
         self.jumps = 0
         self._clock = clock
-        self._pace = Pace()
-        self._steps = TimeSteps()
+        self._pace = _Pace()
+        self._steps = _TimeSteps()
         self._usual_ns: deque[float] = deque(maxlen=256)  # delays that raise no doubt
         self._limit_ns: float = UNSETTLED_NS
         self._agreement_ns: float = AGREEMENT_NS
@@ -159,7 +157,7 @@ class JumpFilter:
         self._steps.add(arrival.event)
         late_ns = self._late_ns(arrival)
         known = self._clock.synchronised  # then packets that get later at their usual steps are queueing on the link
-        if is_timely(arrival):
+        if _is_timely(arrival):
             self._pace.add(arrival.host_ns, arrival.host_ns - arrival.event.t_ns)
             if self.slowness > 0 and not known and MIN_LIMIT_NS < late_ns < MAX_FOLLOWED_NS:
                 behind = self.release()
@@ -219,7 +217,7 @@ class JumpFilter:
         t_ns = arrival.event.t_ns + self.correction_ns
         if arrival.waited_ns == WAITED_UNKNOWN_NS:
             self._clock.guess(t_ns, arrival.host_ns)
-        elif is_timely(arrival):
+        elif _is_timely(arrival):
             self._clock.observe(t_ns, arrival.host_ns)
             self._learn(arrival.host_ns, late_ns)
         if not self.correction_ns:  # the usual case: every packet passes here

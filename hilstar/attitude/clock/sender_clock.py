@@ -44,7 +44,7 @@ ClockMode = Literal["none", "one-way", "exchange", "shared"]
 
 
 @dataclass(frozen=True, slots=True)
-class OffsetLine:
+class _OffsetLine:
     """offset(host) = offset_ns + drift (host - host_ns), known to `uncertainty_ns`."""
 
     host_ns: int
@@ -53,11 +53,10 @@ class OffsetLine:
     uncertainty_ns: float = math.inf
 
     def at(self, host_ns: int) -> float:
-        """The offset at a host time, ns."""
         return self.offset_ns + self.drift * (host_ns - self.host_ns)
 
 
-class Slot(NamedTuple):
+class _Slot(NamedTuple):
     """The message with the smallest offset within SLOT_NS."""
 
     number: int
@@ -65,7 +64,7 @@ class Slot(NamedTuple):
     offset_ns: int
 
 
-class Slots(deque[Slot]):
+class Slots(deque[_Slot]):
     """The smallest offset of each slot, oldest first."""
 
     def lower(self, host_ns: int, offset_ns: int) -> bool:
@@ -74,14 +73,14 @@ class Slots(deque[Slot]):
         if not self or self[-1].number != number:
             return False
         if offset_ns < self[-1].offset_ns:
-            self[-1] = Slot(number, host_ns, offset_ns)
+            self[-1] = _Slot(number, host_ns, offset_ns)
         return True
 
     def begin(self, host_ns: int, offset_ns: int) -> None:
         """Begin a new slot with this message."""
-        self.append(Slot(host_ns // SLOT_NS, host_ns, offset_ns))
+        self.append(_Slot(host_ns // SLOT_NS, host_ns, offset_ns))
 
-    def relative_to(self, origin: Slot) -> tuple[FloatArray, FloatArray]:
+    def relative_to(self, origin: _Slot) -> tuple[FloatArray, FloatArray]:
         """Host times and offsets (n,), ns, from those of `origin`."""
         x = np.array([slot.host_ns - origin.host_ns for slot in self], dtype=np.float64)
         y = np.array([slot.offset_ns - origin.offset_ns for slot in self], dtype=np.float64)
@@ -94,7 +93,7 @@ class OneWayFilter:
     def __init__(self) -> None:
         self._slots = Slots()
         self._newest_above_ns: deque[float] = deque(maxlen=NEWEST)
-        self.line: OffsetLine | None = None
+        self.line: _OffsetLine | None = None
 
     @property
     def all_above_ns(self) -> float:
@@ -109,7 +108,7 @@ class OneWayFilter:
     def guess(self, host_ns: int, offset_ns: int) -> None:
         """Take a message that waited unread: an upper bound, which the first one that did not wait replaces."""
         if self.guessed and (self.line is None or offset_ns < self.line.at(host_ns)):
-            self.line = OffsetLine(host_ns, offset_ns)
+            self.line = _OffsetLine(host_ns, offset_ns)
 
     def observe(self, host_ns: int, offset_ns: int) -> None:
         """Take one message's arrival and (arrival - t_ns)."""
@@ -121,11 +120,11 @@ class OneWayFilter:
             while host_ns - self._slots[0].host_ns > WINDOW_NS:
                 self._slots.popleft()
         if self.line is None:
-            self.line = OffsetLine(host_ns, offset_ns)
+            self.line = _OffsetLine(host_ns, offset_ns)
         elif offset_ns < self.line.at(host_ns):
             # The line was wrong by at least this much.
             uncertainty_ns = self.line.uncertainty_ns + self.line.at(host_ns) - offset_ns
-            self.line = OffsetLine(host_ns, offset_ns, self.line.drift, uncertainty_ns)
+            self.line = _OffsetLine(host_ns, offset_ns, self.line.drift, uncertainty_ns)
         self._newest_above_ns.append(offset_ns - self.line.at(host_ns))
 
     def _fit(self) -> None:
@@ -133,7 +132,7 @@ class OneWayFilter:
             return
         newest = self._slots[-1]
         x, y = self._slots.relative_to(newest)
-        drift = 0.0 if -x[0] < MIN_DRIFT_SPAN_NS else supporting_slope(x, y)
+        drift = 0.0 if -x[0] < MIN_DRIFT_SPAN_NS else _supporting_slope(x, y)
         above = y - drift * x
         level = float(above.min())
         above -= level
@@ -143,10 +142,10 @@ class OneWayFilter:
         if len(last) == RECENT_SLOTS:
             rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)
             uncertainty_ns = float(max(np.median(above), last.max(), last[-1] + rise))
-        self.line = OffsetLine(newest.host_ns, newest.offset_ns + level, drift, uncertainty_ns)
+        self.line = _OffsetLine(newest.host_ns, newest.offset_ns + level, drift, uncertainty_ns)
 
 
-def supporting_slope(x: FloatArray, y: FloatArray) -> float:
+def _supporting_slope(x: FloatArray, y: FloatArray) -> float:
     """The slope of the line under all points with the smallest sum of distances: the lower hull's edge at their mean x.
 
     0 where it is steeper than any clock drifts.
@@ -203,13 +202,13 @@ class _MeasuredExchange(NamedTuple):
     delay_ns: int
 
 
-class ExchangeFilter:
+class _ExchangeFilter:
     """The line through the quickest of the exchanges."""
 
     def __init__(self) -> None:
         self._measured: deque[_MeasuredExchange] = deque()
         self.count = 0
-        self.line: OffsetLine | None = None
+        self.line: _OffsetLine | None = None
 
     def observe(self, exchange: Exchange, base_ns: int) -> None:
         """Take one exchange; the line's offsets are less `base_ns`."""
@@ -224,7 +223,7 @@ class ExchangeFilter:
             self._measured.popleft()
         self.line = self._fit(new)
 
-    def _fit(self, new: _MeasuredExchange) -> OffsetLine:
+    def _fit(self, new: _MeasuredExchange) -> _OffsetLine:
         min_ns = min(each.delay_ns for each in self._measured)
         limit_ns = max(min_ns * QUICK_DELAY_RATIO, min_ns + QUICK_DELAY_NS)
         quick = [each for each in self._measured if each.delay_ns <= limit_ns]
@@ -240,9 +239,9 @@ class ExchangeFilter:
         uncertainty_ns = float(bounds[-RECENT_EXCHANGES:].max())
         if not drift and len(y) > 1:
             uncertainty_ns += abs(float(y[-1] - y[-2]))  # it may go on like that
-        return OffsetLine(new.host_ns, new.offset_ns + level, drift, uncertainty_ns)
+        return _OffsetLine(new.host_ns, new.offset_ns + level, drift, uncertainty_ns)
 
-    def current_line(self, host_ns: int) -> OffsetLine | None:
+    def current_line(self, host_ns: int) -> _OffsetLine | None:
         """The line while enough exchanges are recent, else None."""
         if len(self._measured) < MIN_EXCHANGES or host_ns - self._measured[-1].host_ns > EXCHANGE_LIFE_NS:
             return None
@@ -270,10 +269,10 @@ class SenderClock:
 
     def __init__(self, *, shared: bool = False) -> None:
         self._one_way = OneWayFilter()
-        self._exchanges = ExchangeFilter()
+        self._exchanges = _ExchangeFilter()
         self._shared = shared
         self._base_ns: int | None = 0 if shared else None  # the first offset: the rest fits a float64 to below 1 ns
-        self._line = OffsetLine(0, 0.0, uncertainty_ns=0.0) if shared else None  # one attribute: read whole by other threads
+        self._line = _OffsetLine(0, 0.0, uncertainty_ns=0.0) if shared else None  # one attribute: read whole by other threads
         self._mode: ClockMode = "shared" if shared else "none"
         self._first_ns: int | None = None
         self._used: tuple[int, float] | None = None  # host time and offset of the last frame

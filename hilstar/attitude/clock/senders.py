@@ -147,7 +147,6 @@ class _KnownSender:
         return made
 
     def agrees(self, arrival: SampleArrival) -> _CourseAgreement:
-        """Compare a message with this sender."""
         sample, period_ns = arrival.event, self.period_ns
         later_ns, gap_ns = sample.t_ns - self.sample.t_ns, arrival.host_ns - self.host_ns
         step = _steps(self.count, sample.sequence)
@@ -182,7 +181,6 @@ class _KnownSender:
         return min(stood_rad, math.dist(turned, [seconds * rate for rate in self.turning_rad_s]))
 
     def move(self, arrival: SampleArrival, agreed: _CourseAgreement) -> None:
-        """Take the next message of this sender."""
         sample = arrival.event
         later_ns, step = sample.t_ns - self.sample.t_ns, _steps(self.count, sample.sequence)
         if agreed.clock and later_ns <= 0:  # out of order
@@ -271,8 +269,7 @@ class Senders:
 
     def release(self) -> list[SampleArrival]:
         """What waits still, as it is."""
-        waiting, self._waiting = self._waiting, []
-        return [each.arrival for each in waiting]
+        return [each.arrival for each in self._emptied()]
 
     def _rival(self, arrival: SampleArrival, agreed: _CourseAgreement) -> _KnownSender | None:
         """The stranger that a message is rather from, if there is one."""
@@ -295,25 +292,19 @@ class Senders:
         return agreed.clock and (counts and turned)
 
     def _speaks(self, main: _KnownSender, arrival: SampleArrival, agreed: _CourseAgreement) -> list[SampleArrival]:
+        """The sender shown has spoken: what strangers said meanwhile is refused, unless it continues in one count."""
         if not agreed.sky or not agreed.clock:
             self._left = replace(main)
         elif self._left is not None and arrival.host_ns - self._left.host_ns > self._left.patience_ns(self._silent_after_ns):
             self._left = None
-        decided = self._decide(main, arrival)
-        main.move(arrival, agreed)
-        return [*decided, arrival]
-
-    def _decide(self, main: _KnownSender, arrival: SampleArrival) -> list[SampleArrival]:
-        """The sender shown has spoken: what strangers said meanwhile is refused, unless it continues in one count."""
-        waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return []
+        waiting = self._emptied()
         counts = [main.count, *(each.arrival.event.sequence for each in waiting), arrival.event.sequence]
+        main.move(arrival, agreed)
         if all(1 <= _steps(before, after) <= 2 for before, after in pairwise(counts)):
-            return [each.arrival for each in waiting]
+            return [*(each.arrival for each in waiting), arrival]
         if any(each.sender.heard >= MIN_STRANGE for each in waiting):
             self._tell_two()
-        return [_refused(each.arrival) for each in waiting]
+        return [*(_refused(each.arrival) for each in waiting), arrival]
 
     def _tell_two(self) -> None:
         self._two = True

@@ -58,8 +58,7 @@ from hilstar.attitude.logs.aem_blocks import (
     sequence,
     xml_blocks,
 )
-from hilstar.attitude.logs.entries import LogEntry, LogReading
-from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.logs.entries import LogEntry, LogReading, log_joins
 from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.rotation import conjugate, direction_of, frame_turns, multiply, rotate
@@ -95,7 +94,7 @@ def _turned(angles_rad: FloatArray, axes: tuple[int, int, int]) -> FloatArray:
     return multiply(third, multiply(second, first))
 
 
-def euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatArray | None]:
+def _euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatArray | None]:
     """Rotations (n, 4) from first to second, and their rates (n, 3), rad/s in the second's components, for EULER_DERIVATIVE.
 
     `values` (n, 3 or 6) are degrees and degrees per second.
@@ -112,7 +111,7 @@ def euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatAr
     return q, rate
 
 
-def spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
+def _spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
     """Rotations (n, 4) from first to second and rates (n, 3), rad/s in the second's components.
 
     `values` (n, 4 or 7) are alpha, delta, the angle (degrees) and its rate (degrees per second); then, with nutation, the
@@ -133,7 +132,7 @@ def spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True)
-class DatedBlock:
+class _DatedBlock:
     """One segment: its keywords, and its entries in the order of the file."""
 
     block: Block
@@ -175,12 +174,12 @@ class DatedBlock:
         return min(max(start, first), last), max(min(stop, last), first)
 
 
-def resolved(segments: list[DatedBlock]) -> tuple[list[list[LogEntry]], str | None]:
+def _resolved(segments: list[_DatedBlock]) -> tuple[list[list[LogEntry]], str | None]:
     """The entries of segments, which come in the order of their first epochs, with those that overlap made one run of pieces.
 
     And what was done, in words; None where no segments overlap. Raises AemFaultError.
     """
-    groups: list[list[DatedBlock]] = []
+    groups: list[list[_DatedBlock]] = []
     end_ns = 0
     for segment in segments:
         overlaps = bool(groups) and segment.times[0] < end_ns and segment.is_whole and all(each.is_whole for each in groups[-1])
@@ -201,7 +200,7 @@ def resolved(segments: list[DatedBlock]) -> tuple[list[list[LogEntry]], str | No
     )
 
 
-def _one_run(group: list[DatedBlock]) -> list[LogEntry]:
+def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
     if len(group) > MAX_OVERLAPPING:
         where = group[0].block.where[0]
         raise AemFaultError(where, f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each")
@@ -226,7 +225,7 @@ def _one_run(group: list[DatedBlock]) -> list[LogEntry]:
     return run
 
 
-def _piece(segment: DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
+def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
     """The attitudes of a segment from a time to another, both among them, made where it has none just then."""
     piece = segment.entries[bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)]
     own = {entry.event.t_ns for entry in (piece[:1] + piece[-1:]) if isinstance(entry.event, AttitudeSample)}
@@ -255,7 +254,9 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[LogEntry] = []
     told: dict[str, str] = {}
-    runs, overlap = resolved([DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed])
+    runs, overlap = _resolved(
+        [_DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed]
+    )
     if overlap is not None:
         told["aem-overlap"] = overlap
     for following in runs:
@@ -340,7 +341,7 @@ def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
     to_cam = _second_frame_is_cam(meta)
     with np.errstate(all="ignore"):  # an overflow is refused as not finite
         if kind not in QUATERNIONS:
-            q, rate = spin(block.values, kind) if kind in SPINS else euler(block.values, meta)
+            q, rate = _spin(block.values, kind) if kind in SPINS else _euler(block.values, meta)
             if kind == EULER_ANGVEL:
                 q = q if to_cam else conjugate(q)
                 return q, _rate_in_cam(meta, q, np.radians(block.values[:, 3:]))

@@ -110,7 +110,7 @@ class Block:
     values: FloatArray
 
 
-def fault_of(key: str, section: str, version: str) -> str | None:
+def _fault_of(key: str, section: str, version: str) -> str | None:
     """Why a keyword (other than COMMENT) may not stand in the "header" or "metadata", and what to write; None where it may."""
     if key in SECTIONS[section]:
         own, instead = ONLY_IN.get(key, (version, ""))
@@ -125,16 +125,15 @@ def fault_of(key: str, section: str, version: str) -> str | None:
     return f"{key[:40]} is not a keyword of an AEM's {section}; {advice}"
 
 
-def check_version(version: str) -> None:
-    """Raises AemFaultError for a version that is not read."""
+def _check_version(version: str) -> None:
     if version not in STATES:
         raise AemFaultError("", f"{VERSION_KEY} is {version[:40]}; write 1.0 or 2.0")
 
 
-def check_metadata(meta: dict[str, str], where: str) -> None:
+def _check_metadata(meta: dict[str, str], where: str) -> None:
     """Raises AemFaultError for a version or type that is not supported, or a missing keyword."""
     version = meta.get(VERSION_KEY, "missing")
-    check_version(version)
+    _check_version(version)
     for key in ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE"):
         if key not in meta:
             raise AemFaultError(where, f"{key} is missing in the metadata of a block")
@@ -235,14 +234,14 @@ def _keyword(line: str, section: str, version: str, where: str) -> tuple[str, st
     key, equals, value = line.partition("=")
     if not equals or section not in {"header", "metadata"}:
         raise AemFaultError(where, f"{line[:40]!r} in the {section}; write KEYWORD = value, or a marker such as META_START")
-    fault = fault_of(key.strip(), section, version)
+    fault = _fault_of(key.strip(), section, version)
     if fault is not None:
         raise AemFaultError(where, fault)
     return key.strip(), plain(value)
 
 
 def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: str) -> Block:
-    check_metadata(meta, where)
+    _check_metadata(meta, where)
     if not rows:
         raise AemFaultError(where, "the block contains no attitude")
     count = 1 + len(STATES[meta[VERSION_KEY]][meta["ATTITUDE_TYPE"]][1].split())
@@ -278,7 +277,6 @@ class _Element:
     text: str = ""
 
     def unlike(self, detail: str) -> AemFaultError:
-        """What is wrong with it."""
         return AemFaultError(f":{self.line}", f"is not an AEM in XML ({detail})")
 
     def parts(self, *names: str) -> list[_Element]:
@@ -350,7 +348,7 @@ class _XmlReading:
         if element.name == "aem" and len(self._open) <= 2:
             if attributes.get("id") != VERSION_KEY or "version" not in attributes:
                 raise element.unlike(f'<aem> has no id="{VERSION_KEY}", or no version')
-            check_version(attributes["version"])
+            _check_version(attributes["version"])
 
     def _add_text(self, text: str) -> None:
         self._open[-1].text += text
@@ -366,7 +364,7 @@ class _XmlReading:
         if place == ["aem", "body", "segment"] and element.name == "metadata":
             version = next(each for each in self._open if each.name == "aem").attributes["version"]
             meta = {VERSION_KEY: version} | _keywords(element, version)
-            check_metadata(meta, f":{element.line}")
+            _check_metadata(meta, f":{element.line}")
             self.segments.append(_XmlSegment(meta))
         elif place == ["aem", "body", "segment", "data"] and element.name == "attitudeState":
             if self._open[-2].children[0].name != "metadata":
@@ -410,7 +408,7 @@ def _keywords(element: _Element, version: str) -> dict[str, str]:
             raise inner.unlike(f"<{inner.name[:40]}> within <{child.name[:40]}>")
         if child.name == "COMMENT":
             continue
-        fault = fault_of(child.name, element.name, version)
+        fault = _fault_of(child.name, element.name, version)
         if fault is None and child.name in given:
             fault = f"{child.name} appears twice in the {element.name}; delete one"
         if fault is not None:

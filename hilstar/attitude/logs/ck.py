@@ -19,7 +19,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ LONGEST_S = 600.0  # the largest CK takes a few minutes
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
-def kernels_beside(path: Path) -> list[Path]:
+def _kernels_beside(path: Path) -> list[Path]:
     """The leap second, clock and frame kernels in the CK's folder, in that order and by name: a later version counts."""
     try:
         files = sorted(file for file in path.resolve().parent.iterdir() if file.suffix.lower() in BESIDE and file.is_file())
@@ -56,11 +56,26 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
     """
     kernels, told = list(stated.kernels), []
     if not kernels:
-        kernels = kernels_beside(path)
+        kernels = _kernels_beside(path)
         names = ", ".join(kernel.name for kernel in kernels) or "none"
         told.append(("kernels", f"kernels from beside the CK: {names}; --kernel names others"))
     arrays, said = _asked(path, kernels, stated.body)
-    return LogReading(_entries(arrays), _conventions(said), "give a CK whose times differ", told + _told(said))
+    if said["step_s"] is not None:
+        error = f"{said['error_rad'] * MAS_PER_RAD:.2g} mas"
+        told.append(
+            ("ck-step", f"read every {said['step_s']:.4g} s where the CK is a function of time; off by {error} between")
+        )
+    gaps_s = said["gaps_s"]
+    if gaps_s:
+        count = "1 gap" if len(gaps_s) == 1 else f"{len(gaps_s)} gaps"
+        told.append(("log-gap", f"the CK has {count}, the longest {max(gaps_s):.6g} s; the attitude is held there"))
+    known: list[bool] = (~np.isnan(arrays["rate"][:, 0])).tolist()
+    rows = zip(*(arrays[name].tolist() for name in ("t_ns", "q", "rate", "breaks", "tick")), strict=True)
+    entries = (
+        LogEntry(f", tick {tick:.17g}", checked_sample(t_ns, q, rate if has_rate else None, discontinuity=breaks))
+        for has_rate, (t_ns, q, rate, breaks, tick) in zip(known, rows, strict=True)
+    )
+    return LogReading(entries, _conventions(said), "give a CK whose times differ", told)
 
 
 def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, dict[str, Any]]:
@@ -89,15 +104,7 @@ def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, d
     return arrays, said
 
 
-def _entries(arrays: Arrays) -> Iterator[LogEntry]:
-    known: list[bool] = (~np.isnan(arrays["rate"][:, 0])).tolist()
-    rows = zip(*(arrays[name].tolist() for name in ("t_ns", "q", "rate", "breaks", "tick")), strict=True)
-    for has_rate, (t_ns, q, rate, breaks, tick) in zip(known, rows, strict=True):
-        yield LogEntry(f", tick {tick:.17g}", checked_sample(t_ns, q, rate if has_rate else None, discontinuity=breaks))
-
-
 def _conventions(said: dict[str, Any]) -> Conventions:
-    """What the numbers of one structure mean."""
     return Conventions(
         f"SPICE CK, structure {said['structure']}",
         f"the C-matrix turns components of {', '.join(said['references'])} (by SPICE: J2000, the ICRF) into the structure's",
@@ -107,17 +114,3 @@ def _conventions(said: dict[str, Any]) -> Conventions:
         written=lambda q: f"m2q(C), C from J2000 = {components(q)}",
         scale="TDB",
     )
-
-
-def _told(said: dict[str, Any]) -> list[tuple[str, str]]:
-    told = []
-    if said["step_s"] is not None:
-        error = f"{said['error_rad'] * MAS_PER_RAD:.2g} mas"
-        told.append(
-            ("ck-step", f"read every {said['step_s']:.4g} s where the CK is a function of time; off by {error} between")
-        )
-    gaps_s = said["gaps_s"]
-    if gaps_s:
-        count = "1 gap" if len(gaps_s) == 1 else f"{len(gaps_s)} gaps"
-        told.append(("log-gap", f"the CK has {count}, the longest {max(gaps_s):.6g} s; the attitude is held there"))
-    return told

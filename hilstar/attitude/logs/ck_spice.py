@@ -1,7 +1,7 @@
 """The process that evaluates a CK with SPICE: a damaged kernel may abort it, and SPICE's kernel pool is global to a process.
 
 A request is one JSON object on stdin: `path`, `kernels` and `body`. The answer is an NPZ file on stdout: the arrays of
-`Sampled`, and `said`, JSON text with the rest, or with `error` alone. Times are spacecraft clock ticks throughout.
+`_Sampled`, and `said`, JSON text with the rest, or with `error` alone. Times are spacecraft clock ticks throughout.
 
 1. Summaries, times, counts and quaternions are checked here before SPICE evaluates a segment. SPICE trusts them, and would
    follow a damaged list of records forever.
@@ -32,8 +32,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.logs.entries import MAX_SAMPLES
-from hilstar.attitude.logs.gaps import GAP_INTERVALS, log_joins
+from hilstar.attitude.logs.entries import GAP_INTERVALS, MAX_SAMPLES, log_joins
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.errors import InputError, shortened
@@ -71,7 +70,7 @@ MAX_NAMED_BODIES = 12
 CK_CLASS = 3  # SPICE's class of frames whose attitude is in CKs
 
 
-class Summary(NamedTuple):
+class _Summary(NamedTuple):
     """One array of a DAF: the summary's doubles and integers, of which the last two are the first and last word (from 1)."""
 
     doubles: tuple[float, ...]
@@ -79,14 +78,14 @@ class Summary(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Daf:
+class _Daf:
     """A DAF whose list of summaries is whole, and whose arrays lie within the file."""
 
     path: Path
     order: str
-    summaries: list[Summary]
+    summaries: list[_Summary]
 
-    def words(self, summary: Summary) -> FloatArray:
+    def words(self, summary: _Summary) -> FloatArray:
         """The doubles (n,) of an array. Raises InputError where the file cannot be read."""
         first, last = summary.integers[-2:]
         with open_regular(self.path, "give a SPICE kernel") as file:
@@ -97,7 +96,7 @@ class Daf:
         return np.frombuffer(raw, self.order + "f8").astype(np.float64)
 
 
-def read_daf(path: Path, limit_bytes: int) -> Daf:
+def _read_daf(path: Path, limit_bytes: int) -> _Daf:
     """The summaries of a DAF, in the file's order. Raises InputError for a file that is not one, or is damaged."""
     with open_regular(path, "give a SPICE kernel", limit_bytes) as file:
         size_words = os.fstat(file.fileno()).st_size // WORD_BYTES
@@ -112,16 +111,16 @@ def read_daf(path: Path, limit_bytes: int) -> Daf:
         if not (0 <= doubles <= 124 and 2 <= integers <= 250 and doubles + (integers + 1) // 2 <= 125):
             raise InputError(f"{path}: is a damaged DAF: its summaries have {doubles} doubles and {integers} integers")
         layout = struct.Struct(f"{order}{doubles}d{integers}i")
-        summaries: list[Summary] = []
+        summaries: list[_Summary] = []
         for raw in _raw_summaries(path, file, struct.unpack(order + "2i", head[76:84]), order, layout.size):
             numbers = layout.unpack_from(raw)
             begin, end = numbers[-2:]
             if not RECORD_BYTES // WORD_BYTES < begin <= end <= size_words:
                 raise _damaged(path, f"an array has the words {begin} to {end} of {size_words}")
-            summaries.append(Summary(numbers[:doubles], numbers[doubles:]))
+            summaries.append(_Summary(numbers[:doubles], numbers[doubles:]))
             if len(summaries) > MAX_SUMMARIES:
                 raise InputError(f"{path}: has more than {MAX_SUMMARIES} segments; split it into several")
-    return Daf(path, order, summaries)
+    return _Daf(path, order, summaries)
 
 
 def _raw_summaries(path: Path, file: IO[bytes], ends: tuple[int, int], order: str, size: int) -> Iterator[bytes]:
@@ -149,7 +148,7 @@ def _damaged(path: Path, what: str) -> InputError:
 
 
 @dataclass(frozen=True, slots=True)
-class CkSegment:
+class _CkSegment:
     """A segment's descriptor; `number` counts from 1 in the file, and a higher one has priority. Ticks."""
 
     number: int
@@ -159,7 +158,7 @@ class CkSegment:
     reference: int
     kind: int
     has_rate: bool
-    summary: Summary
+    summary: _Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,9 +169,9 @@ class Coverage:
     epochs: FloatArray
 
 
-def read_segments(path: Path, limit_bytes: int) -> tuple[Daf, list[CkSegment]]:
+def _read_segments(path: Path, limit_bytes: int) -> tuple[_Daf, list[_CkSegment]]:
     """The segments of a CK in the file's order. Raises InputError for a file that is damaged or another type of segment."""
-    daf = read_daf(path, limit_bytes)
+    daf = _read_daf(path, limit_bytes)
     segments = []
     for number, summary in enumerate(daf.summaries, start=1):
         if (len(summary.doubles), len(summary.integers)) != (CK_DOUBLES, CK_INTEGERS):
@@ -183,13 +182,13 @@ def read_segments(path: Path, limit_bytes: int) -> tuple[Daf, list[CkSegment]]:
             raise InputError(f"{path}: segment {number} spans the ticks {start:g} to {stop:g}; is the file damaged?")
         if kind not in TYPES:
             raise InputError(f"{path}: segment {number} is of type {kind}; types 1 to 6 are read")
-        segments.append(CkSegment(number, start, stop, body, reference, kind, has_rate != 0, summary))
+        segments.append(_CkSegment(number, start, stop, body, reference, kind, has_rate != 0, summary))
     if not segments:
         raise InputError(f"{path}: contains no segment; is the file cut off?")
     return daf, segments
 
 
-def coverage(daf: Daf, segment: CkSegment) -> Coverage | None:
+def _coverage(daf: _Daf, segment: _CkSegment) -> Coverage | None:
     """What a segment covers; None for types 4 and 6, whose intervals SPICE tells (`ckcov`). Raises InputError.
 
     A quaternion that is not unit is refused here: of one that is all zeros SPICE would make an attitude.
@@ -227,7 +226,7 @@ def _type_2(words: FloatArray) -> Read | None:
     return np.column_stack((starts, stops)), np.empty(0), words[: 8 * count].reshape(count, 8)[:, :QUATERNION_WORDS]
 
 
-def _epochs(words: FloatArray, segment: CkSegment) -> Read | None:
+def _epochs(words: FloatArray, segment: _CkSegment) -> Read | None:
     """Types 1, 3 and 5: packets, their times, a directory; 3 and 5 also the starts of intervals, a directory and counts."""
     counts = _counts(words, segment)
     if counts is None:
@@ -247,7 +246,7 @@ def _epochs(words: FloatArray, segment: CkSegment) -> Read | None:
     return np.column_stack((starts, epochs[np.append(first[1:], count) - 1])), epochs, q
 
 
-def _counts(words: FloatArray, segment: CkSegment) -> tuple[int, int, int] | None:
+def _counts(words: FloatArray, segment: _CkSegment) -> tuple[int, int, int] | None:
     """Words of a packet, packets and intervals, from the end of the segment; None where they do not fit its size."""
     trailer = {1: 1, 3: 2, 5: 5}[segment.kind]
     if len(words) < trailer or not np.isfinite(words[-trailer:]).all():
@@ -267,10 +266,10 @@ def _is_directory(directory: FloatArray, times: FloatArray) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class _Piece:
     """Ticks from `start` to `stop` of a segment; `epochs` (n,) are the times strictly within at which it holds attitudes."""
 
-    segment: CkSegment
+    segment: _CkSegment
     start: float
     stop: float
     epochs: FloatArray
@@ -291,7 +290,7 @@ class Piece:
         return np.concatenate([*inner, ticks[-1:]])
 
 
-def pieces_of(covered: list[tuple[CkSegment, Coverage]]) -> list[Piece]:
+def _pieces_of(covered: list[tuple[_CkSegment, Coverage]]) -> list[_Piece]:
     """The pieces of the segments of one structure, in order of time; segments come in the file's order."""
     owners = [(segment, cover.epochs, *span) for segment, cover in covered for span in cover.intervals.tolist()]
     if not owners:
@@ -314,12 +313,12 @@ def pieces_of(covered: list[tuple[CkSegment, Coverage]]) -> list[Piece]:
     for owner, first, last in spans:
         (segment, epochs, *_), start, stop = owners[owner], float(bounds[first]), float(bounds[last])
         within = slice(int(np.searchsorted(epochs, start, "right")), int(np.searchsorted(epochs, stop, "left")))
-        found.append(Piece(segment, start, stop, epochs[within]))
+        found.append(_Piece(segment, start, stop, epochs[within]))
     return sorted(found, key=lambda piece: piece.start)
 
 
 @dataclass(frozen=True)
-class Structure:
+class _Structure:
     """A structure whose CK is loaded: `body` its id, `clock` that of its clock; `turning` where all its segments have rates."""
 
     path: Path
@@ -329,7 +328,6 @@ class Structure:
 
     @cached_property
     def clock(self) -> int:
-        """The id of the clock that counts its ticks."""
         return int(self.spice.ckmeta(self.body, "SCLK"))
 
     def t_s(self, tick: float) -> float:
@@ -350,7 +348,6 @@ class Structure:
         return np.asarray(matrix, dtype=np.float64)
 
     def q_icrs_to_body(self, tick: float) -> FloatArray:
-        """The attitude (4,)."""
         return from_matrix(self.matrix(tick))
 
     def attitude(self, tick: float, with_rate: bool) -> tuple[FloatArray, FloatArray | None]:
@@ -384,7 +381,7 @@ class Structure:
 
 
 @dataclass(frozen=True, slots=True)
-class Sampled:
+class _Sampled:
     """n attitudes of a structure, and how good they are.
 
     `t_ns` (n,); `q` (n, 4) is q_icrs_to_body; `rate` (n, 3), rad/s, in the structure's components, NaN where there is none;
@@ -402,7 +399,7 @@ class Sampled:
     gaps_s: list[float]
 
 
-def sample(structure: Structure, pieces: Sequence[Piece]) -> Sampled:
+def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
     """The attitudes of pieces in order of time. Raises InputError for more than MAX_SAMPLES of them."""
     smooth = [piece for piece in pieces if piece.segment.kind in SMOOTH and piece.stop > piece.start]
     step = error_rad = 0.0
@@ -417,10 +414,10 @@ def sample(structure: Structure, pieces: Sequence[Piece]) -> Sampled:
     t_ns, q, rate = (np.concatenate(each) for each in zip(*parts, strict=True))
     breaks = np.zeros(len(t_ns), dtype=np.bool_)
     breaks[np.cumsum([0, *map(len, ticks[:-1])])] = broken
-    return Sampled(t_ns, q, rate, breaks, np.concatenate(ticks), step_s, error_rad, gaps_s)
+    return _Sampled(t_ns, q, rate, breaks, np.concatenate(ticks), step_s, error_rad, gaps_s)
 
 
-def _step_of(structure: Structure, smooth: Sequence[Piece]) -> tuple[float, float]:
+def _step_of(structure: _Structure, smooth: Sequence[_Piece]) -> tuple[float, float]:
     """The step of the smooth pieces, ticks, and the largest error between samples that far apart, rad."""
     total = sum(piece.stop - piece.start for piece in smooth)
     steps = FIRST_STEPS
@@ -439,7 +436,7 @@ def _step_of(structure: Structure, smooth: Sequence[Piece]) -> tuple[float, floa
         steps *= 2
 
 
-def _error_rad(structure: Structure, piece: Piece, ticks: FloatArray, k: int) -> tuple[float, float]:
+def _error_rad(structure: _Structure, piece: _Piece, ticks: FloatArray, k: int) -> tuple[float, float]:
     """How far the log's interpolation is off at one place between the ticks k and k + 1 of a piece, rad.
 
     And the share of it that no step mends: the turn in the time that a double of ephemeris time does not resolve.
@@ -459,7 +456,7 @@ def _error_rad(structure: Structure, piece: Piece, ticks: FloatArray, k: int) ->
     return angle_between_rad(shown.q_icrs_to_cam, structure.q_icrs_to_body(tick)), clock_rad
 
 
-def _attitudes(structure: Structure, piece: Piece, ticks: FloatArray) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
+def _attitudes(structure: _Structure, piece: _Piece, ticks: FloatArray) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Times (n,), attitudes (n, 4) and rates (n, 3) of a piece; a smooth segment without rates has them by difference."""
     by_difference = piece.segment.kind in SMOOTH and not piece.segment.has_rate and len(ticks) > 1
     step = float(ticks[1] - ticks[0]) * DIFFERENCE_STEPS if by_difference else 0.0
@@ -475,7 +472,7 @@ def _attitudes(structure: Structure, piece: Piece, ticks: FloatArray) -> tuple[n
     return t_ns, q, rates
 
 
-def _parted(structure: Structure, pieces: Sequence[Piece], ticks: list[FloatArray]) -> tuple[list[bool], list[float]]:
+def _parted(structure: _Structure, pieces: Sequence[_Piece], ticks: list[FloatArray]) -> tuple[list[bool], list[float]]:
     """Whether each piece begins with a break, after a gap or a jump, and the lengths of the gaps, s.
 
     Where two pieces touch, both ends lie on one tick: `ticks` is changed to have one of them, or both beside it. The attitude
@@ -515,7 +512,7 @@ def _checked(spice: Any, kernel: Path, meta: Path | None = None) -> list[Path]:
     if meta is not None and head.startswith(b"KPL/MK"):
         raise InputError(f"{meta}: names another meta-kernel, {kernel}; name its kernels instead")
     if head.startswith(b"DAF/"):
-        read_daf(kernel, MAX_BINARY_BYTES)
+        _read_daf(kernel, MAX_BINARY_BYTES)
         return [kernel]
     if head.startswith((b"DAFETF", b"DASETF")):
         raise InputError(f"{kernel}: is a transfer file; convert it by tobin")
@@ -550,7 +547,7 @@ def _strings(spice: Any, name: str) -> list[str]:
     raise InputError(f"a meta-kernel has more than {MAX_NAMED} {name}; split it into several")
 
 
-def in_words(error: Any) -> str:
+def _in_words(error: Any) -> str:
     """What SPICE says, and what to give where a kernel is missing."""
     said = shortened(" ".join(str(error.long or error.explain or error.short).split()), 300)
     if "SCLK" in said and ("not found" in said or "kernel" in said.lower()):
@@ -560,29 +557,29 @@ def in_words(error: Any) -> str:
     return f"SPICE refuses it ({said})"
 
 
-def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[Sampled, dict[str, Any]]:
+def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sampled, dict[str, Any]]:
     """The attitudes of the CK's structure, with its name and the frames that its segments refer to. Raises InputError."""
     import spiceypy
 
-    daf, segments = read_segments(path, MAX_CK_BYTES)
+    daf, segments = _read_segments(path, MAX_CK_BYTES)
     try:
         with spiceypy.no_found_check():
             load(spiceypy, path, kernels)
             body = _body(spiceypy, path, segments, stated)
             own = [segment for segment in segments if segment.body == body]
-            pieces = pieces_of(list(zip(own, _coverages(spiceypy, daf, own), strict=True)))
+            pieces = _pieces_of(list(zip(own, _coverages(spiceypy, daf, own), strict=True)))
             if not pieces:
                 raise InputError(f"{path}: its segments of {body} cover no time")
-            structure = Structure(path, spiceypy, body, all(segment.has_rate for segment in own))
+            structure = _Structure(path, spiceypy, body, all(segment.has_rate for segment in own))
             references = sorted({spiceypy.frmnam(segment.reference) or str(segment.reference) for segment in own})
             return sample(structure, pieces), {"structure": _name(spiceypy, body), "references": references}
     except spiceypy.utils.exceptions.SpiceyError as error:
-        raise InputError(f"{path}: {in_words(error)}") from error
+        raise InputError(f"{path}: {_in_words(error)}") from error
 
 
-def _coverages(spice: Any, daf: Daf, segments: list[CkSegment]) -> list[Coverage]:
+def _coverages(spice: Any, daf: _Daf, segments: list[_CkSegment]) -> list[Coverage]:
     """What each segment covers; SPICE tells the intervals of types 4 and 6."""
-    found = [coverage(daf, segment) for segment in segments]
+    found = [_coverage(daf, segment) for segment in segments]
     if None not in found:
         return [each for each in found if each is not None]
     words = sum(segment.summary.integers[-1] - segment.summary.integers[-2] for segment in segments)
@@ -596,7 +593,7 @@ def _coverages(spice: Any, daf: Daf, segments: list[CkSegment]) -> list[Coverage
     return result
 
 
-def _body(spice: Any, path: Path, segments: list[CkSegment], stated: str | None) -> int:
+def _body(spice: Any, path: Path, segments: list[_CkSegment], stated: str | None) -> int:
     """The id of the structure: the only one, or what the user states."""
     bodies = sorted({segment.body for segment in segments})
     named = ", ".join(_name(spice, body) for body in bodies[:MAX_NAMED_BODIES]) + (", ..." * (len(bodies) > MAX_NAMED_BODIES))

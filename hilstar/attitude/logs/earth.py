@@ -79,7 +79,7 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
         return values[before] + share * (values[after] - values[before])
 
     table, mjd = _table(), UNIX_MJD + hours / 24.0
-    tai_utc_s = tai_minus_utc_s(hours // 24)
+    tai_utc_s = _tai_minus_utc_s(hours // 24)
     tt_days = (tai_utc_s + TT_FROM_TAI_S) / 86400.0
     # Linear over an hour, these are within 5 microarcsec: the shortest nutation of note takes 5.5 days.
     x, y, s = (between(values) for values in erfa.xys06a(MJD_ZERO_JD, mjd + tt_days))
@@ -142,11 +142,11 @@ def _table() -> _EarthTable:
     rows = iers.IERS_A.read(iers.IERS_A_FILE)
     mjd = np.array(rows["MJD"].value, dtype=np.float64)
     ut1_utc_s, x_arcsec, y_arcsec = (np.array(rows[name].value, dtype=np.float64) for name in ("UT1_UTC", "PM_x", "PM_y"))
-    ut1_tai_s = ut1_utc_s - tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
+    ut1_tai_s = ut1_utc_s - _tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
     return _EarthTable(mjd, ut1_tai_s, np.radians(x_arcsec / 3600), np.radians(y_arcsec / 3600))
 
 
-def tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
+def _tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
     """TAI-UTC in seconds at the beginnings of days since 1970."""
     year, month, day, _ = erfa.jd2cal(MJD_ZERO_JD + UNIX_MJD, np.asarray(unix_days, dtype=np.float64))
     with warnings.catch_warnings():
@@ -175,7 +175,7 @@ def q_icrs_to_date(frame: str, scale: str, t_ns: IntArray) -> tuple[FloatArray, 
     elif scale in TO_TAI_S:
         tai_ns = t_ns + round(TO_TAI_S[scale] * NS_PER_S)
         days = (tai_ns - 37 * NS_PER_S) // (24 * HOUR_NS)  # within a second of UTC's day since 2017
-        utc_ns = tai_ns - np.round(tai_minus_utc_s(days) * NS_PER_S).astype(np.int64)
+        utc_ns = tai_ns - np.round(_tai_minus_utc_s(days) * NS_PER_S).astype(np.int64)
     else:
         raise AemFaultError(
             "", f"TIME_SYSTEM = {scale} does not tell UTC, by which the {frame} turns; write UTC, TAI, TT, TDB or GPS"
@@ -243,10 +243,10 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
         return Reference(kind)
     if stated.place is None:
         raise InputError(f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place LAT,LON,HEIGHT")
-    return Reference(kind, stated.place[:2], zero_utc_ns(path, stated, first_ns))
+    return Reference(kind, stated.place[:2], _zero_utc_ns(path, stated, first_ns))
 
 
-def zero_utc_ns(path: Path, stated: Stated, first_ns: int) -> int:
+def _zero_utc_ns(path: Path, stated: Stated, first_ns: int) -> int:
     """What makes UTC (ns since 1970) of the log's times. Raises InputError as `stated_reference`."""
     dated = first_ns >= FIRST_DATE_NS
     if stated.epoch_utc is None:

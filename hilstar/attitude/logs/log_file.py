@@ -19,8 +19,16 @@ import msgspec
 
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
-from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, MAX_SAMPLES, AttitudeLog, LogEntry, LogReading, Stated
-from hilstar.attitude.logs.gaps import LogJoins, log_joins
+from hilstar.attitude.logs.entries import (
+    MAX_QUOTED_CHARACTERS,
+    MAX_SAMPLES,
+    AttitudeLog,
+    LogEntry,
+    LogJoins,
+    LogReading,
+    Stated,
+    log_joins,
+)
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, checked_sample, decode
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError, MachineError
@@ -53,8 +61,7 @@ SECONDS_FORM = "write seconds after its first sample"
 TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 
 
-def read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
-    """The entries of a CSV log's lines."""
+def _read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
     reader = csv.reader(lines)
     rows = (row for row in reader if row and not row[0].startswith("#"))
     header = [name.strip() for name in next(rows, [])]
@@ -101,7 +108,7 @@ def ns_of_seconds(seconds: str) -> int:
     return int(value.scaleb(9).to_integral_value())
 
 
-def write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
     """Write samples with every column; a rate that is not known is an empty cell. Raises OSError."""
     file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
     for sample in samples:
@@ -112,7 +119,7 @@ def write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
         file.write((",".join((t_s, *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")) + "\n").encode())
 
 
-def read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
+def _read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
     """The entries of a log's lines; blank ones are ignored."""
     for number, line in enumerate(lines, start=1):
         if line.strip():
@@ -122,7 +129,7 @@ def read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
             yield LogEntry(f":{number}", event)
 
 
-def write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
     """Write one object for each sample; a rate that is not known has no key. Raises OSError."""
     encoder = msgspec.json.Encoder()
     for sample in samples:
@@ -190,9 +197,9 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
         raise InputError(f"{path}: no attitude to write")
     with whole_file(path) as file:
         if ending == ".csv":
-            write_csv(file, samples)
+            _write_csv(file, samples)
         elif ending in {".jsonl", ".json"}:
-            write_json_lines(file, samples)
+            _write_json_lines(file, samples)
         elif ending == ".mcap":
             from hilstar.attitude.logs.mcap_log import write_attitudes
 
@@ -204,7 +211,7 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
 
 
 def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:
-    """A timeline of every sample of a log, joined as the log's own samples require (see `gaps`)."""
+    """A timeline of every sample of a log, joined as the log's own samples require (see `entries`)."""
     policy = replace(policy, prediction="rate")  # nothing is predicted of a log
     timeline = Timeline(policy, capacity=len(samples), joins=log_joins(samples) if joins is None else joins)
     for sample in samples:
@@ -290,9 +297,9 @@ def _open_text(path: Path) -> Iterator[LogReading]:
         )
     with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
         if word.startswith("{"):
-            yield LogReading(read_json_lines(lines), replace(PACKETS, source="JSON lines"))
+            yield LogReading(_read_json_lines(lines), replace(PACKETS, source="JSON lines"))
         else:
-            yield LogReading(read_csv(lines), replace(PACKETS, source="CSV"))
+            yield LogReading(_read_csv(lines), replace(PACKETS, source="CSV"))
 
 
 def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None) -> int:

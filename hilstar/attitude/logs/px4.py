@@ -8,7 +8,7 @@ from the user.
 
 A ULog file (docs.px4.io, "ULog File Format") is a head of 16 bytes, then messages: size (u16), kind (one letter), content. A
 logger that lost power leaves a cut message; a card that could not keep up leaves bytes that are no message, and the next
-synchronisation message says where messages begin again. `sieve` copies the few topics needed into a small ULog file, in one
+synchronisation message says where messages begin again. `_sieve` copies the few topics needed into a small ULog file, in one
 pass and bounded memory. pyulog reads that copy: of a whole file it would read all topics and follow nested formats of
 any size, and it searches a damaged file in quadratic time.
 """
@@ -68,7 +68,7 @@ OLD_RATES = ("rollspeed", "pitchspeed", "yawspeed")  # in vehicle_attitude itsel
 ORDER_ADVICE = "the log has two attitudes of one time, or is damaged there"
 
 
-class ULogTopic(NamedTuple):
+class _ULogTopic(NamedTuple):
     """A topic of the log, and which of its instances."""
 
     name: str
@@ -76,11 +76,11 @@ class ULogTopic(NamedTuple):
 
 
 @dataclass(slots=True)
-class Sieved:
+class _Sieved:
     """What is left of a log: `ulog` is a whole file of the wanted topics; `topics` are all that the log has."""
 
     ulog: bytes = b""
-    topics: set[ULogTopic] = field(default_factory=set)
+    topics: set[_ULogTopic] = field(default_factory=set)
     lost_ms: int = 0
     damaged_bytes: int = 0
     cut_at: int | None = None
@@ -101,9 +101,9 @@ class Sieved:
         return lines
 
 
-def sieve(path: Path, wanted: frozenset[str]) -> Sieved:
+def _sieve(path: Path, wanted: frozenset[str]) -> _Sieved:
     """The messages of topics by name. Raises InputError for what is no ULog, or one of a newer kind."""
-    result = Sieved()
+    result = _Sieved()
     ids: set[int] = set()
     with open_regular(path, ULOG_ADVICE) as file:
         head = file.read(HEAD_BYTES)
@@ -121,7 +121,7 @@ def sieve(path: Path, wanted: frozenset[str]) -> Sieved:
     return result
 
 
-def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], found: tuple[set[int], set[ULogTopic]]) -> bool:
+def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], found: tuple[set[int], set[_ULogTopic]]) -> bool:
     ids, topics = found
     if kind == ord("D"):
         return len(content) > _u16.size and _u16.unpack_from(content)[0] in ids
@@ -136,7 +136,7 @@ def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], fo
             )
         return True
     if kind == ord("A") and len(content) > 3:
-        topic = ULogTopic(content[3:].decode("ascii", "replace"), content[0])
+        topic = _ULogTopic(content[3:].decode("ascii", "replace"), content[0])
         if len(topics) < MAX_SUBSCRIPTIONS:
             topics.add(topic)
         if topic.name in wanted and len(ids) < MAX_SUBSCRIPTIONS:
@@ -145,7 +145,7 @@ def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], fo
     return False
 
 
-def _messages(path: Path, file: IO[bytes], result: Sieved) -> Iterator[tuple[int, bytes]]:
+def _messages(path: Path, file: IO[bytes], result: _Sieved) -> Iterator[tuple[int, bytes]]:
     """Kind and content of every message that is whole; `result` gets what is not."""
     ends: list[int] = []
     last = file.tell()
@@ -176,7 +176,7 @@ def _messages(path: Path, file: IO[bytes], result: Sieved) -> Iterator[tuple[int
         yield kind, content
 
 
-def _find_sync(file: IO[bytes], last: int, place: int, result: Sieved) -> bool:
+def _find_sync(file: IO[bytes], last: int, place: int, result: _Sieved) -> bool:
     """Go on after the next synchronisation message; the size of the message at `last` may be what is damaged."""
     file.seek(last + _head.size)
     at, tail = file.tell(), b""
@@ -204,7 +204,7 @@ def _appended(path: Path, content: bytes, place: int) -> list[int]:
     return sorted(offset for offset in offsets if offset > place) if flags[0] & APPENDED else []
 
 
-class Series(NamedTuple):
+class _Series(NamedTuple):
     """The columns of one topic, by the names of its fields (`q[0]`), each (n,); `t_us` is the boot clock, microseconds."""
 
     t_us: IntArray
@@ -217,12 +217,11 @@ class Series(NamedTuple):
             return None
         return np.stack([np.asarray(self.columns[each], dtype=np.float64) for each in names], axis=1)
 
-    def where(self, good: npt.NDArray[np.bool_]) -> Series:
-        """Some of the rows."""
-        return Series(self.t_us[good], {name: column[good] for name, column in self.columns.items()})
+    def where(self, good: npt.NDArray[np.bool_]) -> _Series:
+        return _Series(self.t_us[good], {name: column[good] for name, column in self.columns.items()})
 
 
-def read_series(path: Path, sieved: Sieved) -> dict[ULogTopic, Series]:
+def _read_series(path: Path, sieved: _Sieved) -> dict[_ULogTopic, _Series]:
     """Every topic that the sieved log has messages of. Raises InputError where pyulog reads none of it."""
     import pyulog
 
@@ -237,7 +236,7 @@ def read_series(path: Path, sieved: Sieved) -> dict[ULogTopic, Series]:
     series = {}
     for data in log.data_list:
         if "timestamp" in data.data:
-            series[ULogTopic(data.name, data.multi_id)] = Series(_times_us(path, data.data), data.data)
+            series[_ULogTopic(data.name, data.multi_id)] = _Series(_times_us(path, data.data), data.data)
     return series
 
 
@@ -251,7 +250,7 @@ def _times_us(path: Path, columns: dict[str, npt.NDArray[Any]]) -> IntArray:
     return times.astype(np.int64)
 
 
-def at_times(series: Series, values: FloatArray, t_us: IntArray) -> FloatArray:
+def _at_times(series: _Series, values: FloatArray, t_us: IntArray) -> FloatArray:
     """Values (n, k) at other times (m,), linear between samples; NaN outside of them and within gaps."""
     order = np.argsort(series.t_us, kind="stable")
     times, values = series.t_us[order], values[order]
@@ -264,7 +263,7 @@ def at_times(series: Series, values: FloatArray, t_us: IntArray) -> FloatArray:
     return found
 
 
-def boot_utc(path: Path, stated: Stated, topics: dict[ULogTopic, Series], told: list[tuple[str, str]]) -> tuple[int, str]:
+def _boot_utc(path: Path, stated: Stated, topics: dict[_ULogTopic, _Series], told: list[tuple[str, str]]) -> tuple[int, str]:
     """The UTC of boot, and where it is from: `--epoch-utc`, else the median over the receiver's times.
 
     Raises InputError where there is neither.
@@ -288,7 +287,7 @@ def boot_utc(path: Path, stated: Stated, topics: dict[ULogTopic, Series], told: 
     return gps_ns, f"{epoch_text(gps_ns)} by {len(offsets_us)} GPS times, 90 % of them within {spread_s:.3g} s"
 
 
-def _offsets_us(topics: dict[ULogTopic, Series]) -> IntArray:
+def _offsets_us(topics: dict[_ULogTopic, _Series]) -> IntArray:
     """UTC less the boot clock (n,), microseconds, of the first receiver that has dates."""
     for series in _of(topics, GPS):
         utc_us = series.columns.get("time_utc_usec")
@@ -300,14 +299,14 @@ def _offsets_us(topics: dict[ULogTopic, Series]) -> IntArray:
     return np.array([], dtype=np.int64)
 
 
-def _fixed_us(series: Series) -> IntArray:
+def _fixed_us(series: _Series) -> IntArray:
     """When a fix was true: when its message came, or as much earlier as the newer receivers' drivers say."""
     late_us = series.columns.get("timestamp_time_relative")
     return series.t_us if late_us is None else series.t_us + late_us.astype(np.int64)
 
 
-def place_at(
-    path: Path, stated: Stated, topics: dict[ULogTopic, Series], t_us: IntArray, suffix: str
+def _place_at(
+    path: Path, stated: Stated, topics: dict[_ULogTopic, _Series], t_us: IntArray, suffix: str
 ) -> tuple[FloatArray, FloatArray, str]:
     """Latitudes and longitudes (n,), and where they are from: `--place`, else the estimated position, else a receiver's.
 
@@ -328,7 +327,7 @@ def place_at(
     raise InputError(f"{path}: has no position; give the place with --place LAT,LON,HEIGHT")
 
 
-def _degrees(series: Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
+def _degrees(series: _Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
     """Times, latitudes and longitudes of the rows that have any."""
     columns = series.columns
     names = next((pair for pair in PLACE_FIELDS if set(pair) <= set(columns)), None)
@@ -347,7 +346,7 @@ def _degrees(series: Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
     return times_us[order], latitude_deg[good][order], longitude_deg[good][order]
 
 
-def _of(topics: dict[ULogTopic, Series], names: tuple[str, ...]) -> list[Series]:
+def _of(topics: dict[_ULogTopic, _Series], names: tuple[str, ...]) -> list[_Series]:
     """The series of topics by name, the first instance first."""
     return [topics[topic] for name in names for topic in sorted(topics) if topic.name == name]
 
@@ -377,9 +376,9 @@ def read_ulog(path: Path, stated: Stated) -> LogReading:
         raise InputError(f"{path}: a PX4 log's attitudes refer to north, east, down; leave out --reference {stated.reference}")
     name, _, number = (stated.topic or ATTITUDE).partition(":")
     suffix = GROUND_TRUTH if name.endswith(GROUND_TRUTH) else ""
-    sieved = sieve(path, frozenset({name, RATES + suffix, GLOBAL_POSITION + suffix, *GPS}))
+    sieved = _sieve(path, frozenset({name, RATES + suffix, GLOBAL_POSITION + suffix, *GPS}))
     topic = _chosen(path, sieved.topics, name, int(number) if number.isdecimal() and len(number) < 4 else None)
-    topics = read_series(path, sieved)
+    topics = _read_series(path, sieved)
     series = topics.get(topic)
     q = None if series is None else series.stacked("q", 4)
     if series is None or q is None:
@@ -388,8 +387,8 @@ def read_ulog(path: Path, stated: Stated) -> LogReading:
         )
     told = sieved.told
     series, q = _ready(path, series, q, told)
-    boot_utc_ns, utc_words = boot_utc(path, stated, topics, told)
-    latitude_deg, longitude_deg, place_words = place_at(path, stated, topics, series.t_us, suffix)
+    boot_utc_ns, utc_words = _boot_utc(path, stated, topics, told)
+    latitude_deg, longitude_deg, place_words = _place_at(path, stated, topics, series.t_us, suffix)
     turning = Turning(boot_utc_ns, utc_words, latitude_deg, longitude_deg, place_words)
     rates = _rates(series, topics, suffix)
     first_ns, last_ns = (int(t_us) * 1000 + turning.boot_utc_ns for t_us in (series.t_us.min(), series.t_us.max()))
@@ -399,7 +398,7 @@ def read_ulog(path: Path, stated: Stated) -> LogReading:
     return LogReading(entries, _conventions(topic, series, turning, rates is not None), ORDER_ADVICE, told)
 
 
-def _chosen(path: Path, topics: set[ULogTopic], name: str, instance: int | None) -> ULogTopic:
+def _chosen(path: Path, topics: set[_ULogTopic], name: str, instance: int | None) -> _ULogTopic:
     found = sorted(topic for topic in topics if topic.name == name and instance in {None, topic.instance})
     if not found:
         others = sorted(f"{topic.name}:{topic.instance}" for topic in topics if topic.name in ATTITUDES)
@@ -413,7 +412,7 @@ def _chosen(path: Path, topics: set[ULogTopic], name: str, instance: int | None)
     return found[0]
 
 
-def _ready(path: Path, series: Series, q: FloatArray, told: list[tuple[str, str]]) -> tuple[Series, FloatArray]:
+def _ready(path: Path, series: _Series, q: FloatArray, told: list[tuple[str, str]]) -> tuple[_Series, FloatArray]:
     """The attitudes from the first that is one."""
     good = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0)
     if not good.any():
@@ -424,17 +423,17 @@ def _ready(path: Path, series: Series, q: FloatArray, told: list[tuple[str, str]
     return series.where(np.arange(len(q)) >= begin), q[begin:]
 
 
-def _rates(series: Series, topics: dict[ULogTopic, Series], suffix: str) -> FloatArray | None:
+def _rates(series: _Series, topics: dict[_ULogTopic, _Series], suffix: str) -> FloatArray | None:
     """Body rates (n, 3), rad/s, at the attitudes' times; NaN where the log has none, None where it has none at all."""
     for other in _of(topics, (RATES + suffix,)):
         rates = other.stacked("xyz", 3)
-        return None if rates is None else at_times(other, rates, series.t_us)
+        return None if rates is None else _at_times(other, rates, series.t_us)
     if all(name in series.columns for name in OLD_RATES):
         return np.stack([np.asarray(series.columns[name], dtype=np.float64) for name in OLD_RATES], axis=1)
     return None
 
 
-def _entries(series: Series, q: FloatArray, rates: FloatArray | None, turning: Turning) -> Iterator[LogEntry]:
+def _entries(series: _Series, q: FloatArray, rates: FloatArray | None, turning: Turning) -> Iterator[LogEntry]:
     counter = series.columns.get("quat_reset_counter", np.zeros(len(q)))
     resets = [False, *np.diff(counter.astype(np.int64)).astype(bool).tolist()]
     with np.errstate(all="ignore"):
@@ -445,7 +444,7 @@ def _entries(series: Series, q: FloatArray, rates: FloatArray | None, turning: T
         yield LogEntry(f": attitude {number}", checked_sample(t_us * 1000, tuple(own), known, discontinuity=reset))
 
 
-def _conventions(topic: ULogTopic, series: Series, turning: Turning, has_rates: bool) -> Conventions:
+def _conventions(topic: _ULogTopic, series: _Series, turning: Turning, has_rates: bool) -> Conventions:
     q_icrs_to_ned = turning.q_icrs_to_ned(series.t_us[:1], slice(1))[0]
     begin_s = int(series.t_us[0]) / 1e6
     words = "turns components of the body (front, right, down) into north, east, down"

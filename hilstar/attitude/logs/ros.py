@@ -88,14 +88,14 @@ def typestore(encoding: Encoding) -> Typestore:
     return store
 
 
-def decoded(topic: BagTopic, data: bytes) -> Any:
+def _decoded(topic: BagTopic, data: bytes) -> Any:
     """The message in some bytes. Raises rosbags.serde.SerdeError."""
     store = typestore(topic.encoding)
     read = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
     return read(data, OWN_NAMES.get(topic.type, topic.type))
 
 
-def check_definition(where: str, topic: BagTopic) -> None:
+def _check_definition(where: str, topic: BagTopic) -> None:
     """Refuse (InputError) a type that only has the name of ROS's own."""
     if not topic.definition:
         return
@@ -111,7 +111,7 @@ def check_definition(where: str, topic: BagTopic) -> None:
         raise InputError(f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it")
 
 
-class RosTurn(NamedTuple):
+class _RosTurn(NamedTuple):
     """One orientation: `q` (w, x, y, z) turns components of the body into those of the reference.
 
     `stamp_ns` is the header's time, None where it has none; frames are None where the message does not name them. `rate` is in
@@ -133,7 +133,7 @@ def frame(text: str) -> str:
     return text.lstrip("/")
 
 
-def turns(type_name: str, message: Any) -> Iterator[RosTurn]:
+def turns(type_name: str, message: Any) -> Iterator[_RosTurn]:
     """The orientations in a message of one of TYPES; several in a TFMessage."""
     if type_name in TF_TYPES:
         for transform in message.transforms:
@@ -152,7 +152,7 @@ def turns(type_name: str, message: Any) -> Iterator[RosTurn]:
         rate = None if message.angular_velocity_covariance[0] == -1 else _vector(message.angular_velocity)
         if message.orientation_covariance[0] == -1:
             fault = "orientation_covariance[0] is -1: the IMU gives no orientation"
-    yield RosTurn(stamp_ns, reference, body, (q.w, q.x, q.y, q.z), rate, type_name == IMU, fault)
+    yield _RosTurn(stamp_ns, reference, body, (q.w, q.x, q.y, q.z), rate, type_name == IMU, fault)
 
 
 def _vector(vector: Any) -> Numbers:
@@ -160,7 +160,7 @@ def _vector(vector: Any) -> Numbers:
 
 
 @dataclass(slots=True)
-class Edge:
+class _Edge:
     """Every transform from one child to one parent: times (header's and recorder's), and (w, x, y, z) from child to parent."""
 
     parent: str
@@ -170,8 +170,7 @@ class Edge:
     numbers: array[float] = field(default_factory=lambda: array("d"))
     moves: bool = False
 
-    def add(self, turn: RosTurn, received_ns: int) -> None:
-        """One more transform."""
+    def add(self, turn: _RosTurn, received_ns: int) -> None:
         self.moves |= bool(self.numbers) and tuple(self.numbers[:4]) != turn.q
         self.stamps_ns.append(turn.stamp_ns or 0)
         self.received_ns.append(received_ns)
@@ -205,15 +204,15 @@ class Edge:
         return found
 
 
-class FrameChain(NamedTuple):
+class _FrameChain(NamedTuple):
     """The transforms from a body up to the frame that its attitude refers to, and the one whose times the attitudes have."""
 
     body: str
     reference: str
-    edges: tuple[Edge, ...]
-    timed: Edge
+    edges: tuple[_Edge, ...]
+    timed: _Edge
 
-    def heard(self, told: list[tuple[str, str]]) -> Iterator[Heard]:
+    def heard(self, told: list[tuple[str, str]]) -> Iterator[_Heard]:
         """The orientation of the whole chain at each transform of the timed part.
 
         Other parts are unit; the timed one keeps its norm, for its check.
@@ -236,31 +235,31 @@ class FrameChain(NamedTuple):
         received_ns, stamps_ns = np.array(self.timed.received_ns)[known], np.array(self.timed.stamps_ns)[known]
         rows = zip(received_ns.tolist(), stamps_ns.tolist(), whole[known].tolist(), strict=True)
         for number, (received, stamp_ns, (w, x, y, z)) in enumerate(rows, start=1):
-            turn = RosTurn(stamp_ns, self.reference, self.body, (w, x, y, z))
-            yield Heard(f": transform {number} of {name}", received, turn)
+            turn = _RosTurn(stamp_ns, self.reference, self.body, (w, x, y, z))
+            yield _Heard(f": transform {number} of {name}", received, turn)
 
 
-class Tree:
+class _Tree:
     """The transforms of a bag."""
 
-    def __init__(self, path: Path, transforms: Iterable[Heard]) -> None:
+    def __init__(self, path: Path, transforms: Iterable[_Heard]) -> None:
         self._path = path
-        self._up: dict[str, dict[str, Edge]] = {}
+        self._up: dict[str, dict[str, _Edge]] = {}
         count = 0
         for _, received_ns, turn in transforms:
             body, reference = turn.body or "", turn.reference or ""
             parents = self._up.setdefault(body, {})
             if reference not in parents:
-                parents[reference] = Edge(reference, body)
+                parents[reference] = _Edge(reference, body)
                 count += 1
                 if count > MAX_EDGES:
                     raise InputError(f"{path}: tf has more than {MAX_EDGES} transforms; record those that are wanted")
             parents[reference].add(turn, received_ns)
 
-    def _all(self) -> list[Edge]:
+    def _all(self) -> list[_Edge]:
         return [edge for parents in self._up.values() for edge in parents.values()]
 
-    def chain(self, body: str | None, reference: str | None) -> FrameChain:
+    def chain(self, body: str | None, reference: str | None) -> _FrameChain:
         """From `body` up to `reference`, or as far as the tree goes; the body may be left out where one frame moves.
 
         Raises InputError where the tree has no such chain, or one of its transforms is no rotation.
@@ -281,10 +280,10 @@ class Tree:
                 raise InputError(
                     f"{self._path}: the transform {_edge_names([edge])} has a quaternion whose norm is off by {worst:.3g}"
                 )
-        return FrameChain(body, edges[-1].parent, edges, timed)
+        return _FrameChain(body, edges[-1].parent, edges, timed)
 
-    def _edges(self, body: str, reference: str | None) -> tuple[Edge, ...]:
-        found: list[Edge] = []
+    def _edges(self, body: str, reference: str | None) -> tuple[_Edge, ...]:
+        found: list[_Edge] = []
         frame, seen = body, {body}
         while frame in self._up and frame != reference:
             parents = list(self._up[frame].values())
@@ -303,7 +302,7 @@ class Tree:
         return tuple(found)
 
 
-def _edge_names(edges: Sequence[Edge]) -> str:
+def _edge_names(edges: Sequence[_Edge]) -> str:
     return _listed([f"{edge.parent} -> {edge.child}" for edge in edges], MAX_NAMED, 400)
 
 
@@ -311,14 +310,14 @@ def _listed(names: list[str], count: int, limit: int) -> str:
     return shortened(", ".join([*names[:count], *["..."] * (len(names) > count)]), limit)
 
 
-class Named(NamedTuple):
+class _Named(NamedTuple):
     """What `--reference` says: the frame of the bag, and what its axes are; None for what it does not say."""
 
     frame: str | None = None
     kind: Kind | None = None
 
 
-def named(reference: str | None) -> Named:
+def named(reference: str | None) -> _Named:
     """What `--reference` says. Raises InputError for a meaning that is none."""
     frame, equals, meaning = (reference or "").rpartition("=")
     kind = KINDS.get(meaning.lower())
@@ -326,10 +325,10 @@ def named(reference: str | None) -> Named:
         raise InputError(
             f"--reference {reference}: the axes of {frame} are {FORM}; write --reference {frame}=icrs, for example"
         )
-    return Named(reference) if kind is None else Named(frame or None, kind)
+    return _Named(reference) if kind is None else _Named(frame or None, kind)
 
 
-def kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]) -> Kind:
+def _kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]) -> Kind:
     """What the axes of the bag's frame are; `why` says which frame that is, where the bag does not name it.
 
     Raises InputError where neither its name nor the user says, or they differ.
@@ -353,35 +352,33 @@ def kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told:
     return kind
 
 
-class Heard(NamedTuple):
+class _Heard(NamedTuple):
     """An orientation, where it stands in the bag, and when it was recorded."""
 
     where: str
     receive_ns: int
-    turn: RosTurn
+    turn: _RosTurn
 
 
-class Start(NamedTuple):
+class _Start(NamedTuple):
     """The first orientation, and whether the messages have times of their own."""
 
-    turn: RosTurn
+    turn: _RosTurn
     receive_ns: int
     stamped: bool
 
-    def t_ns(self, turn: RosTurn, receive_ns: int) -> int:
-        """The time of an orientation of the same topic."""
+    def t_ns(self, turn: _RosTurn, receive_ns: int) -> int:
         return (turn.stamp_ns or 0) if self.stamped else receive_ns
 
     @property
     def first_ns(self) -> int:
-        """The time of the first."""
         return self.t_ns(self.turn, self.receive_ns)
 
 
 def read_ros(bag: Bag, stated: Stated) -> LogReading:
     """The body's attitudes of one topic. Raises InputError where the bag, or what is stated, does not say which they are."""
     topic = _chosen(bag, stated.topic)
-    check_definition(f"{bag.path}: {topic.name}", topic)
+    _check_definition(f"{bag.path}: {topic.name}", topic)
     told: list[tuple[str, str]] = []
     every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
     start, heard = _begin(bag, topic, every, stated.body)
@@ -390,7 +387,7 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     why = f"the messages of {topic.name} do not say which frame their orientation refers to"
     if topic.type == IMU:
         why += " (ROS recommends east, north, up: REP 145)"
-    kind = kind_of_frame(bag.path, start.turn.reference, stated, why, told)
+    kind = _kind_of_frame(bag.path, start.turn.reference, stated, why, told)
     reference = stated_reference(bag.path, kind, stated, start.first_ns)
     entries = to_icrs(_entries(heard, start), reference, start.turn.gyro, told)
     body = start.turn.body
@@ -402,7 +399,7 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     )
 
 
-def _begin(bag: Bag, topic: BagTopic, heard: Iterator[Heard], body: str | None) -> tuple[Start, Iterator[Heard]]:
+def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None) -> tuple[_Start, Iterator[_Heard]]:
     """What the first orientations say, and all of those of the stated body. Raises InputError where there are none."""
     first = next(heard, None)
     if first is None:
@@ -418,7 +415,7 @@ def _begin(bag: Bag, topic: BagTopic, heard: Iterator[Heard], body: str | None) 
         raise InputError(f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has")
     # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
     stamped = any(each.turn.stamp_ns for each in begin)
-    return Start(begin[0].turn, begin[0].receive_ns, stamped), chain(begin, heard)
+    return _Start(begin[0].turn, begin[0].receive_ns, stamped), chain(begin, heard)
 
 
 def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
@@ -446,26 +443,26 @@ def _topic_names(topics: list[BagTopic]) -> str:
     return _listed(names, MAX_NAMED_TOPICS, 600) or "no topic of ROS"
 
 
-def _of_topic(bag: Bag, topic: BagTopic) -> Iterator[Heard]:
+def _of_topic(bag: Bag, topic: BagTopic) -> Iterator[_Heard]:
     for number, message in enumerate(bag.messages(topic), start=1):
         where = f": message {number} of {topic.name}"
         try:
-            found = list(turns(topic.type, decoded(topic, message.data)))
+            found = list(turns(topic.type, _decoded(topic, message.data)))
         except Exception as error:  # rosbags's generated code raises what its bytes lead to
             raise InputError(f"{bag.path}{where} is no {topic.type} ({shortened(error)}); record the bag again") from error
-        yield from (Heard(where, message.receive_ns, turn) for turn in found)
+        yield from (_Heard(where, message.receive_ns, turn) for turn in found)
 
 
-def _of_tf(bag: Bag, topic: BagTopic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[Heard]:
+def _of_tf(bag: Bag, topic: BagTopic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[_Heard]:
     """The chain of transforms that is stated, from this topic and the static one beside it."""
     beside = topic.name.rpartition("/")[0] + "/" + STATIC_TF
     statics = [other for other in bag.topics() if other.type in TF_TYPES and other.name == beside and other != topic]
-    tree = Tree(bag.path, chain.from_iterable(_of_topic(bag, each) for each in [*statics, topic]))
+    tree = _Tree(bag.path, chain.from_iterable(_of_topic(bag, each) for each in [*statics, topic]))
     body = None if stated.body is None else frame(stated.body)
     yield from tree.chain(body, named(stated.reference).frame).heard(told)
 
 
-def _entries(heard: Iterator[Heard], start: Start) -> Iterator[LogEntry]:
+def _entries(heard: Iterator[_Heard], start: _Start) -> Iterator[LogEntry]:
     """Each attitude from the reference to the body, at its time, or why it is none."""
     for where, receive_ns, turn in heard:
         w, x, y, z = turn.q
@@ -473,7 +470,7 @@ def _entries(heard: Iterator[Heard], start: Start) -> Iterator[LogEntry]:
         yield LogEntry(where, fault or checked_sample(start.t_ns(turn, receive_ns), (w, -x, -y, -z), turn.rate))
 
 
-def _fault(turn: RosTurn, start: Start) -> Refusal | None:
+def _fault(turn: _RosTurn, start: _Start) -> Refusal | None:
     first = start.turn
     if turn.fault is not None:
         return Refusal("format", turn.fault)
@@ -492,7 +489,7 @@ def _with_notices(entries: Iterator[LogEntry], bag: Bag, told: list[tuple[str, s
     told.extend(bag.told())
 
 
-def _conventions(topic: BagTopic, start: Start, reference: Reference) -> Conventions:
+def _conventions(topic: BagTopic, start: _Start, reference: Reference) -> Conventions:
     turn, t_ns = start.turn, start.first_ns
     if not start.stamped:
         time = "when each message was recorded, ns since 1970"

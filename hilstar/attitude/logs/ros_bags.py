@@ -19,7 +19,7 @@ import sqlite3
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple
+from typing import IO, Literal, NamedTuple
 from urllib.parse import quote
 
 import zstandard
@@ -78,7 +78,7 @@ def type_name(text: str) -> str:
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else "/".join(parts)
 
 
-def chunk_bytes(data: bytes, compression: str, size: int) -> bytes:
+def _chunk_bytes(data: bytes, compression: str, size: int) -> bytes:
     """A chunk, unpacked to the `size` that the bag states. Raises ValueError, and what the unpackers raise."""
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
@@ -87,39 +87,23 @@ def chunk_bytes(data: bytes, compression: str, size: int) -> bytes:
     return unpacked(data, compression, size)
 
 
-def message_bytes(data: bytes) -> bytes:
+def _message_bytes(data: bytes) -> bytes:
     """A message's bytes, unpacked where the recorder packed each by itself (no CDR begins as Zstandard does)."""
     return unpacked(data, "zstd", MAX_CHUNK_BYTES, exact=False) if data[:4] == ZSTD_MAGIC else data
 
 
-def unpack_file(path: Path, source: IO[bytes], target: IO[bytes]) -> None:
-    """A Zstandard file into another one. Raises InputError."""
-    room = FREE_BYTES + MAX_INFLATION * path.stat().st_size
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(source) as stream:
-            while piece := stream.read(PIECE_BYTES):
-                room -= len(piece)
-                if room < 0:
-                    raise InputError(f"{path}: unpacks to more than {MAX_INFLATION} times its size; {BAG_ADVICE}")
-                target.write(piece)
-    except zstandard.ZstdError as error:
-        raise damaged(path, error) from error
-
-
-def damaged(path: Path, reason: object, where: str = "") -> InputError:
-    """The refusal of a bag that is not whole."""
+def _damaged(path: Path, reason: object, where: str = "") -> InputError:
     words = shortened(" ".join(str(reason).split()))
     return InputError(f"{path}: the bag is damaged{where} ({words}); record it again, or repair it with ROS's own tools")
 
 
-class Db3File:
+class _Db3File:
     """A .db3 file: topics, messages as recorded, and notices of what is missing. Its methods raise InputError for damage."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def topics(self) -> list[BagTopic]:
-        """The rows of `topics`."""
         with self._open() as database:
             texts = {}
             if self._tables(database, "message_definitions"):
@@ -133,7 +117,6 @@ class Db3File:
             return list(dict.fromkeys(found))
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic, in the order of recording."""
         with self._open() as database:
             topics = database.execute("SELECT id, name, type FROM topics").fetchmany(MAX_TOPICS)
             ids = [number for number, name, kind in topics if (name, type_name(str(kind))) == (topic.name, topic.type)]
@@ -141,11 +124,10 @@ class Db3File:
             rows = database.execute(f"SELECT timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id", ids)
             for receive_ns, data in rows:
                 if not isinstance(receive_ns, int) or not isinstance(data, bytes):
-                    raise damaged(self._path, "a message without time or bytes")
-                yield Message(receive_ns, message_bytes(data))
+                    raise _damaged(self._path, "a message without time or bytes")
+                yield Message(receive_ns, _message_bytes(data))
 
     def told(self) -> list[tuple[str, str]]:
-        """That the recorder was killed before all was in the file."""
         log = self._path.with_name(self._path.name + "-wal")
         if not log.is_file() or not log.stat().st_size:
             return []
@@ -163,7 +145,7 @@ class Db3File:
                     raise InputError(f"{self._path}: an SQLite database, but no bag of ROS 2: it lacks topics and messages")
                 yield database
         except (sqlite3.Error, ValueError, OverflowError, zstandard.ZstdError) as error:
-            raise damaged(self._path, error) from error
+            raise _damaged(self._path, error) from error
 
     def _tables(self, database: sqlite3.Connection, *names: str) -> int:
         """How many of the names are tables (a view would run what the file says)."""
@@ -172,24 +154,21 @@ class Db3File:
         return int(database.execute(query, names).fetchone()[0])
 
 
-class McapBag:
-    """An .mcap file, as `Db3File`."""
+class _McapBag:
+    """An .mcap file, as `_Db3File`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def topics(self) -> list[BagTopic]:
-        """The channels whose messages are ROS's."""
         return list(dict.fromkeys(found for found in self._records() if isinstance(found, BagTopic)))
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic, in the order of the file."""
         for found in self._records(topic):
             if isinstance(found, Message):
                 yield found
 
     def told(self) -> list[tuple[str, str]]:
-        """That the recorder was killed before the file's end was written."""
         with self._path.open("rb") as file:
             file.seek(-min(len(MCAP_MAGIC), self._path.stat().st_size), os.SEEK_END)
             if file.read() == MCAP_MAGIC:
@@ -204,9 +183,9 @@ class McapBag:
             if isinstance(record, McapMessage):
                 if wanted is not None and channels.get(record.channel_id) == wanted:
                     try:
-                        yield Message(record.log_time, message_bytes(record.data))
+                        yield Message(record.log_time, _message_bytes(record.data))
                     except (ValueError, zstandard.ZstdError) as error:
-                        raise damaged(self._path, error) from error
+                        raise _damaged(self._path, error) from error
             elif isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel) and record.message_encoding in ROS_ENCODINGS and record.schema_id in schemas:
@@ -217,12 +196,12 @@ class McapBag:
                 yield channels[record.id]
 
 
-class CutError(Exception):
+class _CutError(Exception):
     """The file ends within a record."""
 
 
-class BagFile:
-    """A .bag file, as `Db3File`."""
+class _BagFile:
+    """A .bag file, as `_Db3File`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -238,13 +217,11 @@ class BagFile:
         return list(dict.fromkeys(self._topics.values()))
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic, in the order of the file."""
         for connection, message in self._records(len(VERSION)):
             if self._topics.get(connection) == topic:
                 yield message
 
     def told(self) -> list[tuple[str, str]]:
-        """That the bag was cut short."""
         if self._cut_at is None:
             return []
         return [("log-cut", f"{self._path} ends within a record at byte {self._cut_at}; all that is whole before it is read")]
@@ -260,8 +237,8 @@ class BagFile:
                     raise InputError(f"{self._path}: an encrypted bag; decrypt it with rosbag's own tools")
                 at: int = _u64.unpack(fields[b"index_pos"])[0]
             except FAULTS as error:
-                raise damaged(self._path, error) from error
-            except CutError:
+                raise _damaged(self._path, error) from error
+            except _CutError:
                 return 0
         return at if at < self._path.stat().st_size else 0
 
@@ -274,17 +251,17 @@ class BagFile:
                 while (record := _record(file)) is not None:
                     fields, data = record
                     if _operation(fields) == CHUNK:
-                        chunk = chunk_bytes(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
+                        chunk = _chunk_bytes(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
                         room -= len(chunk)
                         if room < 0:
                             raise ValueError(f"unpacks to more than {MAX_INFLATION} times its size")
                         yield from self._inside(io.BytesIO(chunk))
                     elif _operation(fields) == CONNECTION:
                         self._connect(fields, data)
-            except CutError:
+            except _CutError:
                 self._cut_at = file.tell()
             except FAULTS as error:
-                raise damaged(self._path, error, f" before byte {file.tell()}") from error
+                raise _damaged(self._path, error, f" before byte {file.tell()}") from error
 
     def _inside(self, chunk: IO[bytes]) -> Iterator[tuple[int, Message]]:
         try:
@@ -295,7 +272,7 @@ class BagFile:
                     yield _u32.unpack(fields[b"conn"])[0], Message(seconds * NS_PER_S + ns, data)
                 elif _operation(fields) == CONNECTION:
                     self._connect(fields, data)
-        except CutError as error:
+        except _CutError as error:
             raise ValueError("a record is longer than its chunk") from error
 
     def _connect(self, fields: Fields, data: bytes) -> None:
@@ -315,13 +292,13 @@ def _record(file: IO[bytes]) -> tuple[Fields, bytes] | None:
 
 def _part(file: IO[bytes], length: bytes, limit: int) -> bytes:
     if len(length) < _u32.size:
-        raise CutError
+        raise _CutError
     size: int = _u32.unpack(length)[0]
     if size > limit:
         raise ValueError(f"a record of {size} bytes; at most {limit} are read")
     data = file.read(size)
     if len(data) < size:
-        raise CutError
+        raise _CutError
     return data
 
 
@@ -342,7 +319,7 @@ def _operation(fields: Fields) -> int:
     return fields[b"op"][0] if fields.get(b"op") else 0
 
 
-Storage = Db3File | McapBag | BagFile  # one file of a bag
+Storage = _Db3File | _McapBag | _BagFile  # one file of a bag
 
 
 class Bag:
@@ -386,33 +363,24 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 def _files_of(path: Path, told: list[tuple[str, str]]) -> list[Path]:
     """The files that the bag's metadata names; without it, all of the directory."""
-    if (path / METADATA).is_file():
-        files = [path / Path(name).name for name in _listed_files(path / METADATA)]
-        missing = [file.name for file in files if not file.is_file()]
-        if missing:
-            raise InputError(f"{path}: lacks {shortened(', '.join(missing))}, which its {METADATA} names; copy the whole bag")
-    else:
-        files = sorted((file for file in path.iterdir() if FILE_NAME.fullmatch(file.name)), key=_number)
+    metadata = path / METADATA
+    if not metadata.is_file():
         told.append(("log-cut", f"{path} has no {METADATA} (its recorder was killed?); all of its bag files are read"))
-    return files
-
-
-def _number(file: Path) -> list[Any]:
-    """NAME_2 comes before NAME_10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)]
-
-
-def _listed_files(metadata: Path) -> list[str]:
-    """relative_file_paths, one to a line or in brackets, as ROS 2 writes them; a YAML reader's time has no bound."""
-    text = read_text(metadata, "give a bag of ROS 2", MAX_METADATA_BYTES)
-    found = FILE_LIST.search(text)
+        files = [file for file in path.iterdir() if FILE_NAME.fullmatch(file.name)]  # NAME_2 comes before NAME_10
+        return sorted(files, key=lambda file: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", file.name)])
+    # relative_file_paths, one to a line or in brackets, as ROS 2 writes them; a YAML reader's time has no bound.
+    found = FILE_LIST.search(read_text(metadata, "give a bag of ROS 2", MAX_METADATA_BYTES))
     if found is None:
         raise InputError(f"{metadata}: has no relative_file_paths; remove the file to read all of the directory")
     items = found[1].split(",") if found[1] is not None else [line.strip()[1:] for line in found[2].splitlines()]
     names = [name for item in items if (name := item.strip().strip("'\""))]
     if not names or len(names) > MAX_FILES or max(map(len, names)) > MAX_NAME_CHARACTERS:
         raise InputError(f"{metadata}: names no files of a bag; remove it to read all of the directory")
-    return names
+    files = [path / Path(name).name for name in names]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise InputError(f"{path}: lacks {shortened(', '.join(missing))}, which its {METADATA} names; copy the whole bag")
+    return files
 
 
 def _storage(path: Path, place: Path) -> Storage:
@@ -420,16 +388,20 @@ def _storage(path: Path, place: Path) -> Storage:
     with open_regular(path, BAG_ADVICE) as file:
         head = file.read(HEAD_BYTES)
         if head.startswith(ZSTD_MAGIC):
-            whole = place / path.stem
+            whole, room = place / path.stem, FREE_BYTES + MAX_INFLATION * path.stat().st_size
             file.seek(0)
-            with whole.open("wb") as target:
-                unpack_file(path, file, target)
+            try:
+                with whole.open("wb") as target, zstandard.ZstdDecompressor().stream_reader(file) as stream:
+                    while piece := stream.read(PIECE_BYTES):
+                        room -= len(piece)
+                        if room < 0:
+                            raise InputError(f"{path}: unpacks to more than {MAX_INFLATION} times its size; {BAG_ADVICE}")
+                        target.write(piece)
+            except zstandard.ZstdError as error:
+                raise _damaged(path, error) from error
             return _storage(whole, place)
-    if head.startswith(ROSBAG_MAGIC):
-        return BagFile(path)
-    if head.startswith(SQLITE_MAGIC):
-        return Db3File(path)
-    if head.startswith(MCAP_MAGIC):
-        return McapBag(path)
+    for magic, kind in ((ROSBAG_MAGIC, _BagFile), (SQLITE_MAGIC, _Db3File), (MCAP_MAGIC, _McapBag)):
+        if head.startswith(magic):
+            return kind(path)
     refuse_kind(path, head, BAG_ADVICE)
     raise InputError(f"{path}: not a file of a bag; {BAG_ADVICE}")

@@ -121,11 +121,11 @@ def _check_socket_file(path: Path, text: str, bind: bool) -> None:
         return
     if not stat.S_ISSOCK(mode):
         raise InputError(f"{text}: an existing file that is not a socket, and binding would delete it; write another path")
-    if bind and is_served(path):
+    if bind and _is_served(path):
         raise InputError(f"{text}: in use by a running program; stop that program, or write another path")
 
 
-def is_served(path: Path) -> bool:
+def _is_served(path: Path) -> bool:
     """Whether a program listens at the socket `path`, or may."""
     with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as asker:
         asker.setblocking(False)

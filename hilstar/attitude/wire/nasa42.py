@@ -191,7 +191,6 @@ class _Connection(Link):
             self.endpoint = f"tcp://{bound}:{self._listener.getsockname()[1]}"
 
     def messages(self, timeout_ms: int) -> list[RawMessage]:
-        """The messages that have arrived, oldest first."""
         if self._connection is None and self._listener is None:
             self._connect(timeout_ms)
         if not self.wait_for_message(timeout_ms):
@@ -216,7 +215,6 @@ class _Connection(Link):
         return []
 
     def arrival(self, message: RawMessage) -> Arrival[Event]:
-        """What a message says."""
         return Arrival(message.host_ns, self._reader.decode(message.parts[0]), message.parts[0], message.waited_ns)
 
     def acknowledge(self, count: int = 1) -> None:

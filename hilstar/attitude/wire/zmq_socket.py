@@ -1,8 +1,8 @@
 """The ZeroMQ socket under every ZeroMQ link: its context, its keys, its limits against floods, and how it is reopened.
 
 libzmq reports connections on a monitor socket and limits nothing: it accepts until the process has no file descriptors left.
-`Doorkeeper` closes connections over MAX_CONNECTIONS at once, the newest first, so that the established ones stay. libzmq itself
-closes a peer that does not finish its handshake within HANDSHAKE_MS. `MemoryWatch` bounds what libzmq keeps of a message
+`_Doorkeeper` closes connections over MAX_CONNECTIONS at once, the newest first: the established ones stay. libzmq itself
+closes a peer that does not finish its handshake within HANDSHAKE_MS. `_MemoryWatch` bounds what libzmq keeps of a message
 that never ends.
 """
 
@@ -63,7 +63,7 @@ REBIND_S = 2.0  # a port is free again some milliseconds after its socket was cl
 BIND_RETRY_S = 0.002
 
 
-class MemoryWatch:
+class _MemoryWatch:
     """Whether this process has grown by more than MAX_GROWTH_BYTES since `begin`.
 
     libzmq keeps a message until its last part arrives, with no limit on parts, and does not report what it keeps: only the
@@ -78,7 +78,6 @@ class MemoryWatch:
         self._next_look = clock.within(0.0)
 
     def begin(self) -> None:
-        """Count from what is used now."""
         self._base_bytes = self._used_bytes()
 
     def grown_bytes(self) -> int:
@@ -107,13 +106,12 @@ class MemoryWatch:
         return 0
 
     def close(self) -> None:
-        """Close the file."""
         if self._file >= 0:
             os.close(self._file)
         self._file = -1
 
 
-def raise_file_limit() -> None:
+def _raise_file_limit() -> None:
     """Raise the limit of open files up to WANTED_FILES: each connection needs one, and so do ledger and display."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = WANTED_FILES if hard == resource.RLIM_INFINITY else min(hard, WANTED_FILES)
@@ -122,7 +120,7 @@ def raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-class Doorkeeper:
+class _Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
     `lost` says that a connection has ended; the code that acts on it resets it. `place` is the port or path that was bound.
@@ -140,7 +138,6 @@ class Doorkeeper:
         self.monitor = watched.get_monitor_socket(EVENTS)
 
     def tend(self) -> None:
-        """Take the events so far."""
         events = 0
         with contextlib.suppress(zmq.ZMQError):
             while events < MAX_EVENTS:
@@ -267,12 +264,12 @@ class ZmqSocket(Closing):
         self._pair = None if keys.secret_key is None else load_secret(keys.secret_key)
         self._server_key = None if bind or keys.server_key is None else load_public(keys.server_key)
         allowed = AllowList(keys.allowed_clients) if bind and keys.allowed_clients is not None else None
-        raise_file_limit()
-        self._memory = MemoryWatch(clock)
+        _raise_file_limit()
+        self._memory = _MemoryWatch(clock)
         self._context = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
         self._socket: zmq.Socket[bytes] | None = None
-        self._keeper: Doorkeeper | None = None
+        self._keeper: _Doorkeeper | None = None
         self._in_use = False
         self._poller = zmq.Poller()
         try:
@@ -293,7 +290,7 @@ class ZmqSocket(Closing):
         made: zmq.Socket[bytes] = self._context.socket(self._kind)
         self._configure(made)
         self._socket = made
-        self._keeper = Doorkeeper(made, bound=self._bind, counts=self.link_counts, notices=self._notices, clock=self._clock)
+        self._keeper = _Doorkeeper(made, bound=self._bind, counts=self.link_counts, notices=self._notices, clock=self._clock)
         self._poller = zmq.Poller()
         self._poller.register(made, zmq.POLLIN)
         self._poller.register(self._keeper.monitor, zmq.POLLIN)
@@ -343,7 +340,6 @@ class ZmqSocket(Closing):
                 made.curve_serverkey = self._server_key
 
     def _ready(self) -> zmq.Socket[bytes]:
-        """The socket, open."""
         if self._socket is None:
             self._memory.begin()
             return self._open()

@@ -65,6 +65,19 @@ def from_rotation_vectors(vectors_rad: FloatArray) -> FloatArray:
     return np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vectors_rad], axis=-1)
 
 
+def rotate(q: FloatArray, vectors: FloatArray) -> FloatArray:
+    """The components (n, 3) of vectors after rotations (n, 4) of unit length."""
+    pure = np.concatenate((np.zeros((len(vectors), 1)), vectors), axis=1)
+    return np.asarray(multiply(multiply(q, pure), conjugate(q))[:, 1:])
+
+
+def frame_turns(axis: int, angle_rad: FloatArray) -> FloatArray:
+    """The rotations (n, 4) of components into frames that are turned by angles (n,) about their axis 0, 1 or 2."""
+    q = np.zeros((len(angle_rad), 4))
+    q[:, 0], q[:, 1 + axis] = np.cos(angle_rad / 2), -np.sin(angle_rad / 2)
+    return q
+
+
 def to_rotation_vector(q: FloatArray) -> FloatArray:
     """The rotation vectors (..., 3), rad, of unit quaternions (..., 4), the shorter way round."""
     q = np.where(q[..., :1] < 0, -q, q)

@@ -74,7 +74,13 @@ class BackChannel:
     def talk(self, now_ns: int, *, ask: bool) -> None:
         """Send what is due; time requests only where `ask`."""
         if ask and self._traffic.time_requests and now_ns >= self._next_ask_ns:
-            self._ask(now_ns)
+            self._asks += 1
+            request = TimeRequest(self._asks, self._now_ns())
+            self._asked = {sequence: asked for sequence, asked in self._asked.items() if self._asks - sequence < FIRST_ASKS}
+            self._asked[self._asks] = request
+            self._quick_asks -= 1
+            self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS)
+            self._send(request)
         if self._traffic.status_hz and self._status is not None and now_ns >= self._next_status_ns:
             with self._posting:
                 status, self._status = self._status, None
@@ -86,15 +92,6 @@ class BackChannel:
     def ask_quickly(self, now_ns: int) -> None:
         """Begin again with quick time requests: now there is a sender to answer."""
         self._quick_asks, self._next_ask_ns = FIRST_ASKS, now_ns
-
-    def _ask(self, now_ns: int) -> None:
-        self._asks += 1
-        request = TimeRequest(self._asks, self._now_ns())
-        self._asked = {sequence: asked for sequence, asked in self._asked.items() if self._asks - sequence < FIRST_ASKS}
-        self._asked[self._asks] = request
-        self._quick_asks -= 1
-        self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS)
-        self._send(request)
 
     def follow(self, arrival: SampleArrival) -> None:
         """This attitude is shown: statuses and time requests go to its sender."""
@@ -174,10 +171,10 @@ class Receiver:
         self._failure = ""
         self._started_ns = self._retry_ns = 0
         self._back_off_ns = MIN_BACK_OFF_NS
-        self._thread = threading.Thread(target=self._run, name="hilstar-receiver", daemon=True)
 
     def start(self) -> None:
         """Begin to listen."""
+        self._thread = threading.Thread(target=self._run, name="hilstar-receiver", daemon=True)
         self._started_ns = self._now_ns()
         self._thread.start()
 
@@ -199,7 +196,6 @@ class Receiver:
             self._notices.tell("receiver-failed", f"the attitude receiver stopped ({why}); restarting it")
         if now_ns >= self._retry_ns:
             self._retry_ns, self._failure = 0, ""
-            self._thread = threading.Thread(target=self._run, name="hilstar-receiver", daemon=True)
             self.start()
 
     def close(self) -> None:
@@ -244,7 +240,9 @@ class Receiver:
         now_ns = self._now_ns()
         if not waits:
             self._empty_ns = now_ns
-        self._begin_to_learn(now_ns, waits)
+        begun_ns = self._begun_ns
+        if begun_ns is not None and self._learn_from_ns is None and (not waits or now_ns - begun_ns > QUEUE_NEVER_EMPTY_NS):
+            self._learn_from_ns = now_ns + QUEUED_NS
         arrivals = self._link.receive(POLL_MS)
         for k, arrival in enumerate(arrivals):
             # The newest of those that arrived while this thread slept woke it; the others had to wait.
@@ -258,67 +256,47 @@ class Receiver:
         if self._link.two_way:
             self._back.talk(now_ns, ask=self._learn_from_ns is not None)
 
-    def _begin_to_learn(self, now_ns: int, waits: bool) -> None:
-        begun_ns = self._begun_ns
-        if begun_ns is None or self._learn_from_ns is not None:
-            return
-        if not waits or now_ns - begun_ns > QUEUE_NEVER_EMPTY_NS:
-            self._learn_from_ns = now_ns + QUEUED_NS
-
     def _take(self, arrival: Arrival[Event], waited_ns: int) -> None:
         match arrival.event:
-            case AttitudeSample() as sample:
-                self.counts.received += 1
-                self._take_sample(Arrival(arrival.host_ns, sample, arrival.raw, waited_ns, back=arrival.back))
             case TimeRequest() as request if self._link.two_way:
                 self._back.answer(request, arrival)
             case TimeReply() as reply if self._link.two_way:
                 exchange = self._back.exchange(reply, arrival.host_ns, self.jumps.correction_ns)
                 if exchange is not None:
                     self.clock.exchange(exchange)
-            case Refusal() as refusal:
+            case AttitudeSample() as sample:
                 self.counts.received += 1
-                self._refuse(arrival, refusal)
+                refusal = self._repeats.judge(sample, arrival.host_ns, arrival.raw)
+                if refusal is not None:
+                    self._refuse(arrival, refusal)
+                    return
+                self._rates.see(sample)
+                if self._repeats.resumed():
+                    self.jumps.forgive()
+                own = Arrival(arrival.host_ns, sample, arrival.raw, waited_ns, back=arrival.back)
+                self._take_decided(self._senders.take(own))
             case other:
                 self.counts.received += 1
-                self._refuse(arrival, Refusal("format", f"a {type(other).__name__} packet is not an attitude"))
-
-    def _take_sample(self, arrival: SampleArrival) -> None:
-        sample, host_ns = arrival.event, arrival.host_ns
-        refusal = self._repeats.judge(sample, host_ns, arrival.raw)
-        if refusal is not None:
-            self._refuse(arrival, refusal)
-            return
-        self._rates.see(sample)
-        if self._repeats.resumed():
-            self.jumps.forgive()
-        self._take_decided(self._senders.take(arrival))
+                refusal = Refusal("format", f"a {type(other).__name__} packet is not an attitude")
+                self._refuse(arrival, other if isinstance(other, Refusal) else refusal)
 
     def _take_decided(self, arrivals: list[SampleArrival]) -> None:
         """Take samples whose sender is decided: the one shown, or another, whose samples are refused."""
         for arrival in arrivals:
             if arrival.refusal is not None:
                 self._refuse(arrival, arrival.refusal)
-            else:
-                self._take_own(arrival)
-
-    def _take_own(self, arrival: SampleArrival) -> None:
-        host_ns = arrival.host_ns
-        if self._learn_from_ns is None or host_ns < self._learn_from_ns:
-            arrival = replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
-        elif self.clock.unheard:
-            self._back.ask_quickly(host_ns)
-        self._settle(self.jumps.take(arrival))
-        if not self.clock.synchronised:
-            self._tell_pace(self.jumps.slowness)
-
-    def _tell_pace(self, slowness: float) -> None:
-        if not slowness:
-            return
-        detail = f"t_ns runs at {1 - slowness:.3g} times real time; it is followed in small steps"
-        if slowness > 0:
-            detail += " (a slow clock, or a link too slow for all packets)"
-        self._notices.begin("source-slow" if slowness > 0 else "source-fast", detail)
+                continue
+            if self._learn_from_ns is None or arrival.host_ns < self._learn_from_ns:
+                arrival = replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
+            elif self.clock.unheard:
+                self._back.ask_quickly(arrival.host_ns)
+            self._settle(self.jumps.take(arrival))
+            slowness = self.jumps.slowness
+            if slowness and not self.clock.synchronised:
+                detail = f"t_ns runs at {1 - slowness:.3g} times real time; it is followed in small steps"
+                if slowness > 0:
+                    detail += " (a slow clock, or a link too slow for all packets)"
+                self._notices.begin("source-slow" if slowness > 0 else "source-fast", detail)
 
     def _settle(self, decided: list[SampleArrival]) -> None:
         for arrival in decided:

@@ -102,7 +102,7 @@ def _live(file: BenchFile, at: str | None, patience_s: float) -> _Found:
 def _of_log(path: Path, at: str | None, stated: Stated) -> _Found:
     """The attitude of a log at a time."""
     from hilstar.attitude.clock.timeline import Policy
-    from hilstar.attitude.logs.gaps import log_joins
+    from hilstar.attitude.logs.entries import log_joins
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
     from hilstar.attitude.wire.packet import AttitudeSample
 

@@ -104,8 +104,7 @@ def wanted_samples(
     log: Path | None, spin: str | None, rate: float | None, radec: str | None, mounting: str | None
 ) -> tuple[Any, float]:
     """The samples to send, and their number (infinite if unknown)."""
-    from hilstar.attitude.logs.entries import Stated
-    from hilstar.attitude.logs.gaps import log_joins
+    from hilstar.attitude.logs.entries import Stated, log_joins
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.run.send_log import log_samples, spin_samples
 

@@ -101,8 +101,7 @@ def simulate_log(
     bench_file: Path, log: Path, frames: int | None, noise: FrameNoise, output: Path, scenario: Path | None
 ) -> None:
     """The virtual tracker along a log."""
-    from hilstar.attitude.logs.entries import Stated
-    from hilstar.attitude.logs.gaps import log_joins
+    from hilstar.attitude.logs.entries import Stated, log_joins
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file

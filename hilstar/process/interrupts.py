@@ -25,10 +25,7 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn
-
-if TYPE_CHECKING:
-    from multiprocessing.process import BaseProcess
+from typing import Any, NoReturn
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 THREAD_WAITS_S = 0.75  # for an end in order
@@ -63,7 +60,16 @@ def install() -> None:
     """
     if _ending.guard is not None:
         return
-    _fill_closed()
+    # Open the standard streams that the parent process closed, so that no socket takes their numbers. Python has None for one
+    # that was closed, and prints what is for None on stdout.
+    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            # The lowest number that is free; what a program of this one's writes has to go somewhere, too.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(descriptor, "w" if descriptor else "r", closefd=False))  # noqa: SIM115
     watched, told = socket.socketpair()
     told.setblocking(False)
     parent = os.getpid()
@@ -76,21 +82,6 @@ def install() -> None:
     for number in ENDING:
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _handle)
-
-
-def _fill_closed() -> None:
-    """Open the standard streams that the parent process closed, so that no socket takes their numbers.
-
-    Python has None for one that was closed, and prints what is for None on stdout.
-    """
-    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            # The lowest number that is free; what a program of this one's writes has to go somewhere, too.
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(descriptor, "w" if descriptor else "r", closefd=False))  # noqa: SIM115
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
@@ -254,7 +245,9 @@ def _guard(parent: int, watched: socket.socket) -> NoReturn:
     try:
         for number in ENDING:
             signal.signal(number, signal.SIG_IGN)  # a terminal sends Ctrl-C to both
-        _let_go_of_all_but(watched.fileno())
+        # A reader of the parent's output waits until the last writer has closed.
+        os.closerange(0, watched.fileno())
+        os.closerange(watched.fileno() + 1, 1024)
         poll = select.poll()
         poll.register(watched, select.POLLIN)
         [(_, events)] = poll.poll()
@@ -265,12 +258,6 @@ def _guard(parent: int, watched: socket.socket) -> NoReturn:
                 os.kill(parent, signal.SIGKILL)
     finally:
         os._exit(0)
-
-
-def _let_go_of_all_but(kept: int) -> None:
-    """Close the parent's file descriptors: a reader of its output waits until the last writer has closed."""
-    os.closerange(0, kept)
-    os.closerange(kept + 1, 1024)
 
 
 def end_with_parent(parent: int | None = None) -> None:
@@ -290,15 +277,15 @@ def end_with_parent(parent: int | None = None) -> None:
 
     owner = multiprocessing.parent_process()
     if owner is not None:
-        threading.Thread(target=_end_after, args=(owner,), name="hilstar-parent", daemon=True).start()
+
+        def end_after() -> NoReturn:
+            owner.join()
+            os._exit(1)
+
+        threading.Thread(target=end_after, name="hilstar-parent", daemon=True).start()
 
 
-def _end_after(owner: BaseProcess) -> None:
-    owner.join()
-    os._exit(1)
-
-
-class QueuedStderr(io.RawIOBase):
+class _QueuedStderr(io.RawIOBase):
     """Writes go to stderr from a thread, in order; beyond MAX_WAITING_BYTES they are dropped and counted."""
 
     def __init__(self) -> None:
@@ -310,19 +297,15 @@ class QueuedStderr(io.RawIOBase):
         threading.Thread(target=self._run, name="hilstar-stderr", daemon=True).start()
 
     def writable(self) -> bool:
-        """True."""
         return True
 
     def fileno(self) -> int:
-        """The descriptor of stderr itself."""
         return DESCRIPTOR
 
     def isatty(self) -> bool:
-        """Whether stderr itself is a terminal."""
         return os.isatty(DESCRIPTOR)
 
     def write(self, data: Any) -> int:
-        """Queue bytes; returns their number."""
         piece = bytes(data)
         with self._changed:
             if self._waiting_bytes + len(piece) > MAX_WAITING_BYTES:
@@ -334,7 +317,6 @@ class QueuedStderr(io.RawIOBase):
         return len(piece)
 
     def finish(self, patience_s: float) -> None:
-        """Wait until everything has been written, for at most `patience_s`."""
         end_s = time.monotonic() + patience_s
         with self._changed:
             while self._waiting_bytes and (rest_s := end_s - time.monotonic()) > 0:
@@ -347,31 +329,26 @@ class QueuedStderr(io.RawIOBase):
                     self._changed.wait()
                 piece = self._waiting.popleft()
                 dropped, self._dropped = self._dropped, 0
-            note = f"hilstar: {dropped} lines were dropped: nothing read them\n".encode() if dropped else b""
-            for data in (piece, note):
-                _write_all(data)
+            data = piece + (f"hilstar: {dropped} lines were dropped: nothing read them\n".encode() if dropped else b"")
+            with contextlib.suppress(OSError):  # there is no reader to tell
+                while data:
+                    try:
+                        data = data[os.write(DESCRIPTOR, data[:PIECE_BYTES]) :]
+                    except BlockingIOError:  # another process that shares it has made it non-blocking
+                        time.sleep(0.01)
             with self._changed:
                 self._waiting_bytes -= len(piece)
                 self._changed.notify_all()
 
 
-def _write_all(data: bytes) -> None:
-    with contextlib.suppress(OSError):  # there is no reader to tell
-        while data:
-            try:
-                data = data[os.write(DESCRIPTOR, data[:PIECE_BYTES]) :]
-            except BlockingIOError:  # another process that shares it has made it non-blocking
-                time.sleep(0.01)
-
-
-_queued: QueuedStderr | None = None
+_queued: _QueuedStderr | None = None
 
 
 def queue_stderr() -> None:
     """Queue writes to `sys.stderr`, so that none waits."""
     global _queued  # noqa: PLW0603 - a process has one stderr
     if _queued is None and sys.stderr is not None:
-        _queued = QueuedStderr()
+        _queued = _QueuedStderr()
         encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
         sys.stderr = io.TextIOWrapper(io.BufferedWriter(_queued), encoding, "backslashreplace", line_buffering=True)
         atexit.register(finish_stderr, LAST_WORDS_S)

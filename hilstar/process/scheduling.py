@@ -19,7 +19,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -31,9 +31,8 @@ HEAVY = 0.3
 LOOK_S = 0.25
 SHORT_SLICE_NS = 100_000  # the shortest that the kernel gives
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}  # Linux's numbers of a call that the C library does not have
-SCHED_ATTRIBUTES = struct.Struct(
-    "=IIQiIQQQ"
-)  # sched_setattr(2): size, policy, flags, nice, priority, runtime, deadline, period
+# sched_setattr(2): size, policy, flags, nice, priority, runtime, deadline, period
+SCHED_ATTRIBUTES = struct.Struct("=IIQiIQQQ")
 TASKS = Path("/proc/self/task")
 RASTERISERS = "llvmpipe-"
 NAMING_LOOK_S = 1e-3
@@ -146,7 +145,11 @@ class PromptWhileLight:
     """
 
     def __init__(self, wall_s: Clock = time.monotonic, cpu_s: Clock = time.process_time) -> None:
-        _ask_for_short_slices()
+        number = SCHED_SETATTR.get(platform.machine())
+        if number is not None:
+            asked = SCHED_ATTRIBUTES.pack(SCHED_ATTRIBUTES.size, os.SCHED_OTHER, 0, os.nice(0), 0, SHORT_SLICE_NS, 0, 0)
+            with contextlib.suppress(OSError, AttributeError):  # an older kernel refuses
+                ctypes.CDLL(None).syscall(number, 0, ctypes.create_string_buffer(asked, len(asked)), 0)
         self._prompt = _set_all_threads(os.SCHED_FIFO, PROMPT_PRIORITY)
         self._allowed = self._prompt
         self._wall_s, self._cpu_s = wall_s, cpu_s
@@ -177,15 +180,6 @@ def _set_all_threads(policy: int, priority: int) -> bool:
     return True
 
 
-def _ask_for_short_slices() -> None:
-    number = SCHED_SETATTR.get(platform.machine())
-    if number is None:
-        return
-    asked = SCHED_ATTRIBUTES.pack(SCHED_ATTRIBUTES.size, os.SCHED_OTHER, 0, os.nice(0), 0, SHORT_SLICE_NS, 0, 0)
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).syscall(number, 0, ctypes.create_string_buffer(asked, len(asked)), 0)  # an older kernel refuses
-
-
 @contextmanager
 def drawing_threads_apart() -> Iterator[None]:
     """Pin each thread that llvmpipe starts in this context to its own core, where it starts one per core."""
@@ -193,7 +187,10 @@ def drawing_threads_apart() -> Iterator[None]:
     yield
     begun_s = time.monotonic()
     while True:
-        rasterisers, computing = _drawing_threads(before)
+        begun = {thread: name for thread, name in sorted(_threads().items()) if thread not in before}
+        rasterisers = [thread for thread, name in begun.items() if name.startswith(RASTERISERS)]
+        # Those that compute have the process's own name; others of the driver's have one with a colon.
+        computing = [thread for thread, name in begun.items() if thread not in rasterisers and ":" not in name]
         if len(rasterisers) == len(computing):
             break
         may_be_llvmpipe = len(rasterisers) + len(computing) >= 2 * len(_cores())
@@ -203,14 +200,6 @@ def drawing_threads_apart() -> Iterator[None]:
     for group in (rasterisers, computing):
         if len(group) == len(rasterisers):
             _spread(group)
-
-
-def _drawing_threads(before: Collection[int]) -> tuple[list[int], list[int]]:
-    """The threads started since then: those that rasterise, and those that compute."""
-    begun = {thread: name for thread, name in sorted(_threads().items()) if thread not in before}
-    rasterisers = [thread for thread, name in begun.items() if name.startswith(RASTERISERS)]
-    # Those that compute have the process's own name; others of the driver's have one with a colon.
-    return rasterisers, [thread for thread, name in begun.items() if thread not in rasterisers and ":" not in name]
 
 
 def _threads() -> dict[int, str]:

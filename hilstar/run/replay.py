@@ -15,8 +15,7 @@ import numpy as np
 from msgspec.structs import replace as replaced
 
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.attitude.logs.entries import Stated
-from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
 from hilstar.attitude.logs.mcap_log import holds_ros, is_mcap, read_attitudes
 from hilstar.attitude.receiver import PacketCounts

@@ -12,7 +12,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy
-from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.logs.entries import log_joins
 from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.errors import InputError

@@ -123,7 +123,8 @@ class UdpSender(TwoWay):
 
     def _receive(self, timeout_ms: int) -> list[Arrival[Event]]:
         self._datagrams.wait(timeout_ms)
-        return [Arrival(each.host_ns, decode(each.data), each.data) for each in self._datagrams.take(MAX_TAKEN)]
+        taken = self._datagrams.take(MAX_TAKEN)
+        return [Arrival(each.host_ns, decode(each.parts[0]), each.parts[0]) for each in taken]
 
     def wait_for_listener(self, timeout_s: float) -> bool:
         """True once hilstar has answered a time request."""

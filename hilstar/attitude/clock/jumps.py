@@ -55,27 +55,19 @@ MIN_OFF = 3
 UNSHARED = "clock-not-shared"
 
 
-class _Step(NamedTuple):
-    """The step of t_ns from one message to the next, and how many packets it spans."""
-
-    ns: int
-    packets: int
-
-
-class TimeSteps:
+class _TimeSteps:
     """The usual step of t_ns from message to message."""
 
     def __init__(self) -> None:
         self._last: AttitudeSample | None = None
         self._usual_ns: deque[float] = deque(maxlen=STEPS)
-        self._newest = _Step(0, 1)
+        self._newest_ns, self._packets = 0, 1  # the newest step of t_ns, and how many packets it spans
 
     def add(self, sample: AttitudeSample) -> None:
-        """Take the next message, refused or not."""
         if self._last is not None:
             packets = sample.sequence - self._last.sequence
-            self._newest = _Step(sample.t_ns - self._last.t_ns, packets if 1 <= packets <= MAX_MISSING else 1)
-            self._usual_ns.append(self._newest.ns / self._newest.packets)
+            self._newest_ns, self._packets = sample.t_ns - self._last.t_ns, packets if 1 <= packets <= MAX_MISSING else 1
+            self._usual_ns.append(self._newest_ns / self._packets)
         self._last = sample
 
     def show_no_jump(self, by_ns: float) -> bool:
@@ -86,12 +78,10 @@ class TimeSteps:
         period_ns = float(np.median(usual_ns))
         if np.median(np.abs(usual_ns - period_ns)) > abs(by_ns) / 4:
             return False
-        newest = self._newest
-        irregular_ns = min(abs(newest.ns - newest.packets * period_ns), abs(newest.ns - period_ns))
-        return irregular_ns < abs(by_ns) / 2
+        return min(abs(self._newest_ns - count * period_ns) for count in (self._packets, 1)) < abs(by_ns) / 2
 
 
-class Pace:
+class _Pace:
     """The rate of the sender's clock, from the earliest messages of each slot of the last two seconds."""
 
     def __init__(self) -> None:
@@ -99,25 +89,24 @@ class Pace:
         self._slots = Slots(maxlen=PACE_SLOTS)
 
     def add(self, host_ns: int, offset_ns: int) -> None:
-        """Take one message's arrival and (arrival - t_ns), as sent."""
+        """Take one message's arrival and (arrival - t_ns), as sent.
+
+        A slow or a fast clock drifts steadily; a jump or a queue is a step, and decides nothing.
+        """
         if self._slots.lower(host_ns, offset_ns):
             return
         if len(self._slots) == PACE_SLOTS:
-            self._look()
+            x, y = self._slots.relative_to(self._slots[0])
+            slope = y[-1] / x[-1]
+            uneven_ns = np.abs(y - slope * x).max()
+            if abs(slope) > MIN_ODD_PACE and uneven_ns < abs(y[-1]) / 5:
+                self.slowness = float(slope)
+            elif abs(slope) < MIN_ODD_PACE / 2 and uneven_ns < MIN_ODD_PACE * x[-1]:
+                self.slowness = 0.0
         self._slots.begin(host_ns, offset_ns)
 
-    def _look(self) -> None:
-        """A slow or a fast clock drifts steadily; a jump or a queue is a step, and decides nothing."""
-        x, y = self._slots.relative_to(self._slots[0])
-        slope = y[-1] / x[-1]
-        uneven_ns = np.abs(y - slope * x).max()
-        if abs(slope) > MIN_ODD_PACE and uneven_ns < abs(y[-1]) / 5:
-            self.slowness = float(slope)
-        elif abs(slope) < MIN_ODD_PACE / 2 and uneven_ns < MIN_ODD_PACE * x[-1]:
-            self.slowness = 0.0
 
-
-def is_timely(arrival: SampleArrival) -> bool:
+def _is_timely(arrival: SampleArrival) -> bool:
     """True where the arrival is known well enough to teach a clock."""
     return arrival.waited_ns <= TRUSTED_WAIT_NS
 
@@ -137,8 +126,8 @@ class JumpFilter:
         self.correction_ns = 0  # continuous time minus the sender's
         self.jumps = 0
         self._clock = clock
-        self._pace = Pace()
-        self._steps = TimeSteps()
+        self._pace = _Pace()
+        self._steps = _TimeSteps()
         self._usual_ns: deque[float] = deque(maxlen=256)  # delays that raise no doubt
         self._limit_ns: float = UNSETTLED_NS
         self._agreement_ns: float = AGREEMENT_NS
@@ -168,14 +157,17 @@ class JumpFilter:
         self._steps.add(arrival.event)
         late_ns = self._late_ns(arrival)
         known = self._clock.synchronised  # then packets that get later at their usual steps are queueing on the link
-        if is_timely(arrival):
+        if _is_timely(arrival):
             self._pace.add(arrival.host_ns, arrival.host_ns - arrival.event.t_ns)
             if self.slowness > 0 and not known and MIN_LIMIT_NS < late_ns < MAX_FOLLOWED_NS:
                 behind = self.release()
                 self.correction_ns += round(late_ns)
                 return [*behind, self._accept(arrival)]
-        if self._usual(arrival, late_ns):
-            return [*self._contradicted(), self._accept(arrival)] if self._doubtful else [self._accept(arrival)]
+        if -self._early_limit_ns(arrival.host_ns) <= late_ns <= self._late_limit_ns(arrival.host_ns) + arrival.waited_ns:
+            # Nothing to doubt; so early ones in doubt were wrong.
+            refused = [_too_early(each) for each in self._doubtful if each.late_ns < 0]
+            self._doubtful = [each for each in self._doubtful if each.late_ns >= 0]
+            return [*refused, *self.release(), self._accept(arrival)]
         decided: list[SampleArrival] = []
         if self._doubtful and not self._agrees(arrival, late_ns):
             decided = self.release()
@@ -185,9 +177,7 @@ class JumpFilter:
             if self._shows_none and (late_ns <= UNSETTLED_NS or known):
                 return [*decided, self._accept(arrival)]
         self._doubtful.append(_Doubtful(arrival, late_ns))
-        if self._is_jump(arrival.host_ns):
-            decided += self._jump()
-        return decided
+        return [*decided, *self._jumped(arrival.host_ns)]
 
     def expire(self, host_ns: int) -> list[SampleArrival]:
         """Samples in doubt that nothing followed."""
@@ -201,18 +191,15 @@ class JumpFilter:
         self._doubtful.clear()
         return released
 
-    def _usual(self, arrival: SampleArrival, late_ns: float) -> bool:
-        """True where this delay is no reason for doubt."""
-        limit_ns = self._limit_after_silence_ns(arrival.host_ns)
-        if late_ns >= 0:
-            return late_ns <= limit_ns + arrival.waited_ns
-        if self._clock.unheard:
-            return -late_ns <= MAX_GUESSED_LATE_NS
-        return -late_ns <= (limit_ns if self.settled else MAX_FOUND_LATE_NS)
-
-    def _limit_after_silence_ns(self, host_ns: int) -> float:
+    def _late_limit_ns(self, host_ns: int) -> float:
+        """How late a message may be without doubt, after the silence before it."""
         silent_ns = 0 if self._near_ns is None else host_ns - self._near_ns
         return self._limit_ns + UNKNOWN_DRIFT * silent_ns
+
+    def _early_limit_ns(self, host_ns: int) -> float:
+        if self._clock.unheard:
+            return MAX_GUESSED_LATE_NS
+        return self._late_limit_ns(host_ns) if self.settled else MAX_FOUND_LATE_NS
 
     def _agrees(self, arrival: SampleArrival, late_ns: float) -> bool:
         """True where this one supports the samples in doubt: it is off by the same time, and follows them."""
@@ -222,12 +209,6 @@ class JumpFilter:
         follows = arrival.event.t_ns > self._doubtful[-1].arrival.event.t_ns
         return follows and abs(late_ns - self._doubtful[0].late_ns) <= by_ns
 
-    def _contradicted(self) -> list[SampleArrival]:
-        """The samples in doubt, once one came that is as late as usual: early ones were wrong."""
-        refused = [_too_early(each) for each in self._doubtful if each.late_ns < 0]
-        self._doubtful = [each for each in self._doubtful if each.late_ns >= 0]
-        return refused + self.release()
-
     def _late_ns(self, arrival: SampleArrival) -> float:
         return self._clock.late_ns(arrival.event.t_ns + self.correction_ns, arrival.host_ns)
 
@@ -236,7 +217,7 @@ class JumpFilter:
         t_ns = arrival.event.t_ns + self.correction_ns
         if arrival.waited_ns == WAITED_UNKNOWN_NS:
             self._clock.guess(t_ns, arrival.host_ns)
-        elif is_timely(arrival):
+        elif _is_timely(arrival):
             self._clock.observe(t_ns, arrival.host_ns)
             self._learn(arrival.host_ns, late_ns)
         if not self.correction_ns:  # the usual case: every packet passes here
@@ -246,35 +227,30 @@ class JumpFilter:
     def _learn(self, host_ns: int, late_ns: float) -> None:
         if self._first_ns is None:
             self._first_ns = host_ns
-        if late_ns > self._limit_after_silence_ns(host_ns):
+        if late_ns > self._late_limit_ns(host_ns):
             return
         self._near_ns = host_ns
         self._resumes = False
         self._usual_ns.append(max(late_ns, 0.0))
         self._near_count += 1
         if self._near_count >= SETTLED_AFTER and host_ns - self._first_ns >= SETTLED_AFTER_NS:
-            self._settle()
+            self._near_count = 0
+            usual_ns = sorted(self._usual_ns)
+            usual_max_ns = usual_ns[int(USUAL_SHARE * len(usual_ns))]
+            self._limit_ns = min(max(MIN_LIMIT_NS, 2 * usual_max_ns), UNSETTLED_NS)
+            self._agreement_ns = max(AGREEMENT_NS, usual_max_ns)
 
-    def _settle(self) -> None:
-        self._near_count = 0
-        usual_ns = sorted(self._usual_ns)
-        usual_max_ns = usual_ns[int(USUAL_SHARE * len(usual_ns))]
-        self._limit_ns = min(max(MIN_LIMIT_NS, 2 * usual_max_ns), UNSETTLED_NS)
-        self._agreement_ns = max(AGREEMENT_NS, usual_max_ns)
-
-    def _is_jump(self, host_ns: int) -> bool:
-        if len(self._doubtful) < MIN_AGREEING:
-            return False
-        late_ns = self._doubtful[-1].late_ns
+    def _jumped(self, host_ns: int) -> list[SampleArrival]:
+        """The samples in doubt, once they are a jump: the clock is carried across, the earliest as late as ever; else none."""
+        late_ns = [each.late_ns for each in self._doubtful]
         for_ns = host_ns - self._doubtful[0].arrival.host_ns
         if self._shows_none and not self._resumes:
-            return for_ns >= CLEARLY_LATE_FOR_NS
-        return late_ns < 0 or late_ns > SURELY_A_JUMP_NS or for_ns >= LATE_FOR_NS
-
-    def _jump(self) -> list[SampleArrival]:
-        """Carry the clock across: the earliest of the samples in doubt is as late as the earliest ever was."""
+            is_jump = for_ns >= CLEARLY_LATE_FOR_NS
+        else:
+            is_jump = late_ns[-1] < 0 or late_ns[-1] > SURELY_A_JUMP_NS or for_ns >= LATE_FOR_NS
+        if not is_jump or len(late_ns) < MIN_AGREEING:
+            return []
         is_new = not self._resumes
-        late_ns = [each.late_ns for each in self._doubtful]
         self.correction_ns += round(min(late_ns))
         released = self.release()
         if is_new:
@@ -302,20 +278,12 @@ class SharedClockFilter:
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
         """The sample itself, refused where its time is more than MAX_OFF_NS ahead of this machine's."""
-        t_ns = arrival.event.t_ns
-        late_ns = arrival.host_ns - t_ns
-        self._look(arrival.host_ns, late_ns)
-        if late_ns >= -MAX_OFF_NS:
-            return [arrival]
-        refusal = Refusal("time", f"t_ns {t_ns} is {-late_ns / NS_PER_S:.3g} s ahead of this machine's clock")
-        return [replace(arrival, refusal=refusal)]
-
-    def _look(self, host_ns: int, late_ns: int) -> None:
+        t_ns, host_ns = arrival.event.t_ns, arrival.host_ns
+        late_ns = host_ns - t_ns
         if -MIN_FUTURE_NS <= late_ns <= MAX_OFF_NS:
             self._off_since_ns, self._off = None, 0
-            return
-        if self._off_since_ns is None:
-            self._off_since_ns = host_ns
+            return [arrival]
+        self._off_since_ns = host_ns if self._off_since_ns is None else self._off_since_ns
         self._off += 1
         if self._off >= MIN_OFF and host_ns - self._off_since_ns >= PERSISTENT_NS:
             where = f"{late_ns / NS_PER_S:.3f} s behind" if late_ns > 0 else f"{-late_ns / NS_PER_S:.3f} s ahead of"
@@ -324,6 +292,10 @@ class SharedClockFilter:
                 f'[attitude] clock = "shared", but t_ns is {where} CLOCK_MONOTONIC of this machine:'
                 ' stamp with that clock, or write clock = "estimated"',
             )
+        if late_ns >= -MAX_OFF_NS:
+            return [arrival]
+        detail = f"t_ns {t_ns} is {-late_ns / NS_PER_S:.3g} s ahead of this machine's clock"
+        return [replace(arrival, refusal=Refusal("time", detail))]
 
     def forgive(self) -> None:
         """Jumps are never counted."""

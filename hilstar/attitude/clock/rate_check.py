@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -22,7 +22,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.notices import Notices
-from hilstar.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.rotation import conjugate, multiply, rotate, to_rotation_vector
 from hilstar.units import NS_PER_S
 
 WrongRates = Literal["use-quaternions", "warn", "off"]
@@ -44,7 +44,7 @@ MIN_BETTER = 3.0  # a cause leaves at most a third of the error
 WALK = 1.1  # white noise of rates, summed up: the slope of its sum is off by sqrt(6/5) of its mean's error
 
 
-class Stretch(NamedTuple):
+class _Stretch(NamedTuple):
     """Some packets in a row: (3,) rates, rad/s, cam, and their standard errors, rad/s.
 
     `turn` is that of the quaternions, `rate` the mean of the rates, and `rate_as_icrs` the same if they had ICRS components.
@@ -63,12 +63,20 @@ class Stretch(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
-    """What may be wrong with rates: `mended` are those of a stretch without it, `scale` what their noise is multiplied by."""
+class _Cause:
+    """What may be wrong with rates: `mends` (3, 3) makes them right, and `scale` is what that multiplies their noise by.
+
+    They are taken to have ICRS components where `in_icrs`, else the camera's.
+    """
 
     text: str
-    mended: Callable[[Stretch], FloatArray]
+    mends: FloatArray
     scale: float = 1.0
+    in_icrs: bool = False
+
+    def mended(self, stretch: _Stretch) -> FloatArray:
+        """The mean rate (3,) of a stretch without it."""
+        return np.asarray(self.mends @ (stretch.rate_as_icrs if self.in_icrs else stretch.rate))
 
 
 # What a rate of 1 rad/s is in units that senders confuse with it.
@@ -81,34 +89,24 @@ UNITS = {
     "revolutions/s": 1 / math.tau,
     "rad/s times pi/180": math.radians(1.0),
 }
+DEGREES = (("", 1.0), (" and in deg/s", UNITS["deg/s"]))
+SAME = np.eye(3)
 OTHER_FRAME = "they are of another frame than the camera's, such as the body's"
 OTHER_AXES = f"their axes are in another order or have the wrong sign, or {OTHER_FRAME}"
 GROSS = "no unit, sign or order of axes explains them"
 
 
-def _scaled(by: float) -> Callable[[Stretch], FloatArray]:
-    return lambda stretch: stretch.rate / by
-
-
-def _turned(matrix: FloatArray) -> Callable[[Stretch], FloatArray]:
-    return lambda stretch: matrix @ stretch.rate
-
-
-def _in_icrs(by: float) -> Callable[[Stretch], FloatArray]:
-    return lambda stretch: stretch.rate_as_icrs / by
-
-
-def _causes() -> Iterator[Cause]:
+def _causes() -> Iterator[_Cause]:
     """Those without a choice of axes, the simplest first."""
     for unit, size in UNITS.items():
-        yield Cause(f"they are in {unit}; send rad/s", _scaled(size), 1 / size)
-    for unit, size in (("", 1.0), (" and in deg/s", UNITS["deg/s"])):
-        yield Cause(f"they have the wrong sign{unit}; send the turn of the camera in the sky, rad/s", _scaled(-size), 1 / size)
+        yield _Cause(f"they are in {unit}; send rad/s", SAME / size, 1 / size)
+    for unit, size in DEGREES:
+        yield _Cause(f"they have the wrong sign{unit}; send the turn of the camera in the sky, rad/s", -SAME / size, 1 / size)
     for unit, size in (("", 1.0), (", in deg/s", UNITS["deg/s"])):
-        yield Cause(f"they have ICRS components{unit}; send the camera's, rad/s", _in_icrs(size), 1 / size)
+        yield _Cause(f"they have ICRS components{unit}; send the camera's, rad/s", SAME / size, 1 / size, in_icrs=True)
 
 
-def _permutations() -> Iterator[Cause]:
+def _permutations() -> Iterator[_Cause]:
     """Every order and sign of the axes but the right one and its opposite."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1, -1), repeat=3):
@@ -118,15 +116,14 @@ def _permutations() -> Iterator[Cause]:
             matrix[range(3), order] = signs
             sent = ", ".join(("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3))
             what = "some of their axes have the wrong sign" if order == (0, 1, 2) else "their axes are in another order"
-            for unit, size in (("", 1.0), (" and in deg/s", UNITS["deg/s"])):
-                text = f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)"
-                yield Cause(text, _turned(matrix / size), 1 / size)
+            for unit, size in DEGREES:
+                yield _Cause(f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)", matrix / size, 1 / size)
 
 
 CAUSES, PERMUTATIONS = tuple(_causes()), tuple(_permutations())
 
 
-def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
+def _stretch_of(samples: Sequence[AttitudeSample]) -> _Stretch | None:
     """What packets in a row say, in the order of their times; None where most are broken off from those before them."""
     t_s = np.array([sample.t_ns - samples[0].t_ns for sample in samples]) / NS_PER_S
     q = np.array([sample.q_icrs_to_cam for sample in samples])
@@ -145,7 +142,7 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
         return None
     at_s, turned, summed, as_icrs = (
         np.vstack((np.zeros(part.shape[1]), np.cumsum(part[whole], axis=0)))
-        for part in (step_s, turn_rad, mean * step_s, _turned_by(q[1:], mean) * step_s)
+        for part in (step_s, turn_rad, mean * step_s, rotate(q[1:], mean) * step_s)
     )
     weight = at_s[:, 0] - at_s.mean()
     spread_s2 = float(weight @ weight)
@@ -153,27 +150,21 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
     scatter = turned - turned.mean(axis=0) - weight[:, None] * turn
     turn_sigma = math.sqrt(float((scatter**2).sum()) / (3 * (count - 1)) / spread_s2)
     rate_sigma = WALK * math.sqrt(float((np.diff(rate, axis=0)[whole] ** 2).sum()) / (6 * count) / count)
-    return Stretch(turn, weight @ summed / spread_s2, weight @ as_icrs / spread_s2, turn_sigma, rate_sigma)
+    return _Stretch(turn, weight @ summed / spread_s2, weight @ as_icrs / spread_s2, turn_sigma, rate_sigma)
 
 
-def _turned_by(q: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (n, 3) turned by quaternions (n, 4)."""
-    pure = np.concatenate([np.zeros((len(vectors), 1)), vectors], axis=1)
-    return np.asarray(multiply(multiply(q, pure), conjugate(q))[:, 1:])
-
-
-def cause_of(stretches: Sequence[Stretch]) -> Cause | None:
+def _cause_of(stretches: Sequence[_Stretch]) -> _Cause | None:
     """What is wrong with the rates of these stretches, all but one in MORE_STRETCHES of them; None where they may be right."""
-    allowed = len(stretches) // MORE_STRETCHES
-    if sum(not (stretch.turns and _is_off(stretch)) for stretch in stretches) > allowed:
+    off = [s.turns and _error(s, s.rate) > max(MIN_OFF_RAD_S, _limit(s, OFF_SHARE, OFF_SIGMA)) for s in stretches]
+    if off.count(False) > len(stretches) // MORE_STRETCHES:
         return None
     if not any(stretch.rate.any() for stretch in stretches):
         coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(np.linalg.norm(s.turn) for s in stretches)
-        return Cause("they are zero; leave them out", _scaled(1.0)) if coherent else None
+        return _Cause("they are zero; leave them out", SAME) if coherent else None
     return _definite(stretches) or _indefinite(stretches)
 
 
-def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
+def _explains(stretches: Sequence[_Stretch], cause: _Cause, share: float) -> bool:
     """Whether without this cause the rates fit, all but one in MORE_STRETCHES of them, and far better than with it."""
     off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
     errors = [_error(stretch, cause.mended(stretch)) for stretch in stretches]
@@ -181,67 +172,59 @@ def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
     return fits.count(False) <= len(stretches) // MORE_STRETCHES and off >= MIN_BETTER * float(np.median(errors))
 
 
-def _definite(stretches: Sequence[Stretch]) -> Cause | None:
+def _definite(stretches: Sequence[_Stretch]) -> _Cause | None:
     """The simplest of the causes without a free choice that explains the rates."""
     for cause in CAUSES:
         if _explains(stretches, cause, FIT_SHARE):
             return cause
     found = [cause for cause in PERMUTATIONS if _explains(stretches, cause, AXES_SHARE)]
-    sharp = all(FIT_SIGMA * math.hypot(s.turn_sigma, s.rate_sigma) < FIT_SHARE * _faster(s) for s in stretches)
     if not found:
         return None
+    sharp = all(FIT_SIGMA * math.hypot(s.turn_sigma, s.rate_sigma) < FIT_SHARE * _faster(s) for s in stretches)
     return found[0] if sharp and len(found) == 1 else replace(found[0], text=OTHER_AXES)
 
 
-def _indefinite(stretches: Sequence[Stretch]) -> Cause | None:
+def _indefinite(stretches: Sequence[_Stretch]) -> _Cause | None:
     """A rotation that explains the rates, or that nothing does though they are far off: of MORE_STRETCHES alone."""
     if len(stretches) < MORE_STRETCHES:
         return None
-    rotation = _best_rotation(stretches)
+    # The rotation that turns rates best into turns (Kabsch 1976).
+    u, _, vt = np.linalg.svd(sum(np.outer(stretch.turn, stretch.rate) for stretch in stretches))
+    rotation = np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
     for unit, size in (("", 1.0), (", and in deg/s", UNITS["deg/s"])):
-        turned = Cause(OTHER_FRAME + unit, _turned(rotation / size), 1 / size)
+        turned = _Cause(OTHER_FRAME + unit, rotation / size, 1 / size)
         if _explains(stretches, turned, AXES_SHARE):
             return turned
     gross = [_error(s, s.rate) > max(MIN_GROSS_RAD_S, GROSS_SHARE * _faster(s)) for s in stretches]
-    return Cause(GROSS, _scaled(1.0)) if all(gross) else None
+    return _Cause(GROSS, SAME) if all(gross) else None
 
 
-def cause_in(samples: Sequence[AttitudeSample]) -> Cause | None:
+def cause_in(samples: Sequence[AttitudeSample]) -> _Cause | None:
     """The first cause that a log's samples show, all of which have rates; None where they show none."""
     length = _Length(0.0)
     for sample in samples:
-        if length.add(sample) and (newest := length.newest(MIN_STRETCHES)) and (cause := cause_of(newest)):
+        if length.add(sample) and (newest := length.newest(MIN_STRETCHES)) and (cause := _cause_of(newest)):
             return cause
     return None
 
 
-def fits(stretch: Stretch) -> bool:
+def fits(stretch: _Stretch) -> bool:
     """Whether a turn shows that its rates are right."""
     return stretch.turns and _error(stretch, stretch.rate) <= _limit(stretch, FIT_SHARE, FIT_SIGMA)
 
 
-def _is_off(stretch: Stretch) -> bool:
-    return _error(stretch, stretch.rate) > max(MIN_OFF_RAD_S, _limit(stretch, OFF_SHARE, OFF_SIGMA))
-
-
-def _error(stretch: Stretch, rate: FloatArray) -> float:
+def _error(stretch: _Stretch, rate: FloatArray) -> float:
     return float(np.linalg.norm(stretch.turn - rate))
 
 
-def _faster(stretch: Stretch) -> float:
+def _faster(stretch: _Stretch) -> float:
     return float(max(np.linalg.norm(stretch.turn), np.linalg.norm(stretch.rate)))
 
 
-def _limit(stretch: Stretch, share: float, sigma: float, scale: float = 1.0) -> float:
+def _limit(stretch: _Stretch, share: float, sigma: float, scale: float = 1.0) -> float:
     """How far turn and rate may be apart: a share of the turn, and the noise of both."""
     size = _faster(stretch) if scale == 1.0 else float(np.linalg.norm(stretch.turn))
     return max(share * size, sigma * math.hypot(stretch.turn_sigma, scale * stretch.rate_sigma))
-
-
-def _best_rotation(stretches: Sequence[Stretch]) -> FloatArray:
-    """The rotation (3, 3) that turns rates best into turns (Kabsch 1976)."""
-    u, _, vt = np.linalg.svd(sum(np.outer(stretch.turn, stretch.rate) for stretch in stretches))
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
 class _Length:
@@ -249,28 +232,23 @@ class _Length:
 
     def __init__(self, length_s: float) -> None:
         self._length_ns = round(length_s * NS_PER_S)
-        self._samples: list[AttitudeSample] = []
-        self.stretches: deque[Stretch] = deque(maxlen=MORE_STRETCHES)
+        self.samples: list[AttitudeSample] = []
+        self.stretches: deque[_Stretch] = deque(maxlen=MORE_STRETCHES)
 
     def add(self, sample: AttitudeSample) -> bool:
         """Take the next packet; True where it completes a stretch."""
-        samples = self._samples
+        samples = self.samples
         samples.append(sample)
         if len(samples) <= MIN_INTERVALS or sample.t_ns - samples[0].t_ns < self._length_ns:
             return False
-        stretch = stretch_of(samples)
-        self._samples = [sample]
+        stretch = _stretch_of(samples)
+        self.samples = [sample]
         if stretch is None:
             return False
         self.stretches.append(stretch)
         return True
 
-    def restart(self) -> None:
-        """Forget everything."""
-        self._samples.clear()
-        self.stretches.clear()
-
-    def newest(self, count: int) -> list[Stretch]:
+    def newest(self, count: int) -> list[_Stretch]:
         """So many of the newest stretches; [] while there are fewer."""
         return list(self.stretches)[-count:] if len(self.stretches) >= count else []
 
@@ -288,7 +266,7 @@ class RateCheck:
         self._lengths = [_Length(length_s) for length_s in STRETCHES_S]
         self._last_ns: int | None = None
         self._without = 0  # packets in a row without a rate
-        self.cause: Cause | None = None
+        self.cause: _Cause | None = None
 
     @property
     def distrusts(self) -> bool:
@@ -333,11 +311,11 @@ class RateCheck:
                 self._end("the packets' rates are those of their quaternions again")
             return
         more = length.newest(MORE_STRETCHES)
-        self.cause = cause_of(newest) or (cause_of(more) if more else None)
+        self.cause = _cause_of(newest) or (_cause_of(more) if more else None)
         if self.cause is not None:
             self._notices.begin(WRONG, self._line(self.cause, newest[-1]))
 
-    def _line(self, cause: Cause, stretch: Stretch) -> str:
+    def _line(self, cause: _Cause, stretch: _Stretch) -> str:
         turn_deg_s, rate_rad_s = np.degrees(np.linalg.norm(stretch.turn)), np.linalg.norm(stretch.rate)
         done = "the sky is drawn by the quaternions' own turn" if self.distrusts else "they are used all the same"
         if not self._used:
@@ -355,4 +333,5 @@ class RateCheck:
 
     def _restart(self) -> None:
         for length in self._lengths:
-            length.restart()
+            length.samples.clear()
+            length.stretches.clear()

@@ -44,7 +44,7 @@ ClockMode = Literal["none", "one-way", "exchange", "shared"]
 
 
 @dataclass(frozen=True, slots=True)
-class OffsetLine:
+class _OffsetLine:
     """offset(host) = offset_ns + drift (host - host_ns), known to `uncertainty_ns`."""
 
     host_ns: int
@@ -53,16 +53,10 @@ class OffsetLine:
     uncertainty_ns: float = math.inf
 
     def at(self, host_ns: int) -> float:
-        """The offset at a host time, ns."""
         return self.offset_ns + self.drift * (host_ns - self.host_ns)
 
 
-def plausible_drift(slope: float) -> float:
-    """The slope itself, or 0 where it is steeper than any clock drifts."""
-    return slope if abs(slope) <= MAX_DRIFT else 0.0
-
-
-class Slot(NamedTuple):
+class _Slot(NamedTuple):
     """The message with the smallest offset within SLOT_NS."""
 
     number: int
@@ -70,7 +64,7 @@ class Slot(NamedTuple):
     offset_ns: int
 
 
-class Slots(deque[Slot]):
+class Slots(deque[_Slot]):
     """The smallest offset of each slot, oldest first."""
 
     def lower(self, host_ns: int, offset_ns: int) -> bool:
@@ -79,14 +73,14 @@ class Slots(deque[Slot]):
         if not self or self[-1].number != number:
             return False
         if offset_ns < self[-1].offset_ns:
-            self[-1] = Slot(number, host_ns, offset_ns)
+            self[-1] = _Slot(number, host_ns, offset_ns)
         return True
 
     def begin(self, host_ns: int, offset_ns: int) -> None:
         """Begin a new slot with this message."""
-        self.append(Slot(host_ns // SLOT_NS, host_ns, offset_ns))
+        self.append(_Slot(host_ns // SLOT_NS, host_ns, offset_ns))
 
-    def relative_to(self, origin: Slot) -> tuple[FloatArray, FloatArray]:
+    def relative_to(self, origin: _Slot) -> tuple[FloatArray, FloatArray]:
         """Host times and offsets (n,), ns, from those of `origin`."""
         x = np.array([slot.host_ns - origin.host_ns for slot in self], dtype=np.float64)
         y = np.array([slot.offset_ns - origin.offset_ns for slot in self], dtype=np.float64)
@@ -99,7 +93,7 @@ class OneWayFilter:
     def __init__(self) -> None:
         self._slots = Slots()
         self._newest_above_ns: deque[float] = deque(maxlen=NEWEST)
-        self.line: OffsetLine | None = None
+        self.line: _OffsetLine | None = None
 
     @property
     def all_above_ns(self) -> float:
@@ -114,7 +108,7 @@ class OneWayFilter:
     def guess(self, host_ns: int, offset_ns: int) -> None:
         """Take a message that waited unread: an upper bound, which the first one that did not wait replaces."""
         if self.guessed and (self.line is None or offset_ns < self.line.at(host_ns)):
-            self.line = OffsetLine(host_ns, offset_ns)
+            self.line = _OffsetLine(host_ns, offset_ns)
 
     def observe(self, host_ns: int, offset_ns: int) -> None:
         """Take one message's arrival and (arrival - t_ns)."""
@@ -126,11 +120,11 @@ class OneWayFilter:
             while host_ns - self._slots[0].host_ns > WINDOW_NS:
                 self._slots.popleft()
         if self.line is None:
-            self.line = OffsetLine(host_ns, offset_ns)
+            self.line = _OffsetLine(host_ns, offset_ns)
         elif offset_ns < self.line.at(host_ns):
             # The line was wrong by at least this much.
             uncertainty_ns = self.line.uncertainty_ns + self.line.at(host_ns) - offset_ns
-            self.line = OffsetLine(host_ns, offset_ns, self.line.drift, uncertainty_ns)
+            self.line = _OffsetLine(host_ns, offset_ns, self.line.drift, uncertainty_ns)
         self._newest_above_ns.append(offset_ns - self.line.at(host_ns))
 
     def _fit(self) -> None:
@@ -138,39 +132,36 @@ class OneWayFilter:
             return
         newest = self._slots[-1]
         x, y = self._slots.relative_to(newest)
-        drift = 0.0 if -x[0] < MIN_DRIFT_SPAN_NS else supporting_slope(x, y)
+        drift = 0.0 if -x[0] < MIN_DRIFT_SPAN_NS else _supporting_slope(x, y)
         above = y - drift * x
         level = float(above.min())
-        self.line = OffsetLine(newest.host_ns, newest.offset_ns + level, drift, _spread_ns(above - level))
+        above -= level
+        # The line may lie below the truth by as much as a slot's smallest offset is above it. The last slots count one by one
+        # and are carried on to the two for which the line is used: a clock may be set by less than a jump, or drift unknown.
+        uncertainty_ns, last = math.inf, above[-RECENT_SLOTS:]
+        if len(last) == RECENT_SLOTS:
+            rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)
+            uncertainty_ns = float(max(np.median(above), last.max(), last[-1] + rise))
+        self.line = _OffsetLine(newest.host_ns, newest.offset_ns + level, drift, uncertainty_ns)
 
 
-def _spread_ns(above: FloatArray) -> float:
-    """How far the line may lie below the truth: a slot's smallest offset is never below it.
+def _supporting_slope(x: FloatArray, y: FloatArray) -> float:
+    """The slope of the line under all points with the smallest sum of distances: the lower hull's edge at their mean x.
 
-    The last slots count one by one and are extrapolated, so that the bound also holds for a clock that was set by less than a
-    jump, and for one whose drift is not known yet.
+    0 where it is steeper than any clock drifts.
     """
-    if len(above) < RECENT_SLOTS:
-        return math.inf
-    last = above[-RECENT_SLOTS:]
-    rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)  # the line is used for two more slots
-    return float(max(np.median(above), last.max(), last[-1] + rise))
-
-
-def supporting_slope(x: FloatArray, y: FloatArray) -> float:
-    """The slope of the line under all points with the smallest sum of distances: the lower hull's edge at their mean x."""
     hull: list[int] = []
-    for i in range(len(x)):
-        while len(hull) > 1 and _turns_down(x, y, hull[-2], hull[-1], i):
+    for c in range(len(x)):
+        while len(hull) > 1:
+            a, b = hull[-2:]
+            if (y[b] - y[a]) * (x[c] - x[a]) < (y[c] - y[a]) * (x[b] - x[a]):
+                break
             hull.pop()
-        hull.append(i)
+        hull.append(c)
     right = int(np.searchsorted(x[hull], x.mean()))
     a, b = hull[max(right - 1, 0)], hull[max(right, 1)]
-    return plausible_drift(float((y[b] - y[a]) / (x[b] - x[a])))
-
-
-def _turns_down(x: FloatArray, y: FloatArray, a: int, b: int, c: int) -> bool:
-    return bool((y[b] - y[a]) * (x[c] - x[a]) >= (y[c] - y[a]) * (x[b] - x[a]))
+    slope = float((y[b] - y[a]) / (x[b] - x[a]))
+    return slope if abs(slope) <= MAX_DRIFT else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,26 +202,28 @@ class _MeasuredExchange(NamedTuple):
     delay_ns: int
 
 
-class ExchangeFilter:
+class _ExchangeFilter:
     """The line through the quickest of the exchanges."""
 
     def __init__(self) -> None:
         self._measured: deque[_MeasuredExchange] = deque()
         self.count = 0
-        self.line: OffsetLine | None = None
+        self.line: _OffsetLine | None = None
 
     def observe(self, exchange: Exchange, base_ns: int) -> None:
         """Take one exchange; the line's offsets are less `base_ns`."""
         new = _MeasuredExchange((exchange.t1_ns + exchange.t4_ns) // 2, exchange.offset_ns(base_ns), exchange.delay_ns)
         self.count += 1
-        if self._contradicts(new):
-            self.restart()
+        if self.line is not None:
+            bound_ns = new.delay_ns / 2 + self.line.uncertainty_ns + MAX_DRIFT * (new.host_ns - self.line.host_ns)
+            if abs(new.offset_ns - self.line.at(new.host_ns)) > bound_ns:  # no drift explains it: the clock was set
+                self._measured.clear()
         self._measured.append(new)
         while new.host_ns - self._measured[0].host_ns > WINDOW_NS:
             self._measured.popleft()
         self.line = self._fit(new)
 
-    def _fit(self, new: _MeasuredExchange) -> OffsetLine:
+    def _fit(self, new: _MeasuredExchange) -> _OffsetLine:
         min_ns = min(each.delay_ns for each in self._measured)
         limit_ns = max(min_ns * QUICK_DELAY_RATIO, min_ns + QUICK_DELAY_NS)
         quick = [each for each in self._measured if each.delay_ns <= limit_ns]
@@ -238,33 +231,21 @@ class ExchangeFilter:
         y = np.array([each.offset_ns - new.offset_ns for each in quick], dtype=np.float64)
         drift = 0.0
         if np.ptp(x) >= MIN_DRIFT_SPAN_NS:
-            drift = plausible_drift(float(np.polyfit(x, y, 1)[0]))
+            drift = float(np.polyfit(x, y, 1)[0])
+            drift = drift if abs(drift) <= MAX_DRIFT else 0.0
         level = float(np.mean(y - drift * x))
         # The truth lies within half the delay of each exchange's own offset, however the delay divides between the two ways.
         bounds = np.abs(y - drift * x - level) + 0.5 * np.array([each.delay_ns for each in quick])
         uncertainty_ns = float(bounds[-RECENT_EXCHANGES:].max())
         if not drift and len(y) > 1:
             uncertainty_ns += abs(float(y[-1] - y[-2]))  # it may go on like that
-        return OffsetLine(new.host_ns, new.offset_ns + level, drift, uncertainty_ns)
+        return _OffsetLine(new.host_ns, new.offset_ns + level, drift, uncertainty_ns)
 
-    def _contradicts(self, new: _MeasuredExchange) -> bool:
-        """True where no drift explains the new exchange: the clock was set, by however little."""
-        line = self.line
-        if line is None:
-            return False
-        drifted_ns = MAX_DRIFT * (new.host_ns - line.host_ns)
-        return abs(new.offset_ns - line.at(new.host_ns)) > new.delay_ns / 2 + line.uncertainty_ns + drifted_ns
-
-    def current_line(self, host_ns: int) -> OffsetLine | None:
+    def current_line(self, host_ns: int) -> _OffsetLine | None:
         """The line while enough exchanges are recent, else None."""
         if len(self._measured) < MIN_EXCHANGES or host_ns - self._measured[-1].host_ns > EXCHANGE_LIFE_NS:
             return None
         return self.line
-
-    def restart(self) -> None:
-        """Forget every exchange."""
-        self._measured.clear()
-        self.line = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,25 +264,18 @@ class ClockSummary:
     jumps: int = 0
 
 
-class _Used(NamedTuple):
-    """The offset that the last frame used."""
-
-    host_ns: int
-    offset_ns: float
-
-
 class SenderClock:
     """The sender's time at any host time. One thread may observe while another asks. A `shared` one is the host's own."""
 
     def __init__(self, *, shared: bool = False) -> None:
         self._one_way = OneWayFilter()
-        self._exchanges = ExchangeFilter()
+        self._exchanges = _ExchangeFilter()
         self._shared = shared
         self._base_ns: int | None = 0 if shared else None  # the first offset: the rest fits a float64 to below 1 ns
-        self._line = OffsetLine(0, 0.0, uncertainty_ns=0.0) if shared else None  # one attribute: read whole by other threads
+        self._line = _OffsetLine(0, 0.0, uncertainty_ns=0.0) if shared else None  # one attribute: read whole by other threads
         self._mode: ClockMode = "shared" if shared else "none"
         self._first_ns: int | None = None
-        self._used: _Used | None = None
+        self._used: tuple[int, float] | None = None  # host time and offset of the last frame
 
     def observe(self, t_ns: int, host_ns: int) -> None:
         """Take one message: its time on the sender's clock and its arrival."""
@@ -350,11 +324,12 @@ class SenderClock:
             return host_ns
         offset_ns = line.at(host_ns)
         if self._used is not None and first_ns is not None and host_ns - first_ns > SETTLING_NS:
-            change_ns = offset_ns - self._used.offset_ns
+            used_host_ns, used_ns = self._used
+            change_ns = offset_ns - used_ns
             if abs(change_ns) < MAX_SLEWED_NS:
-                max_ns = SLEW * (host_ns - self._used.host_ns)
-                offset_ns = self._used.offset_ns + min(max(change_ns, -max_ns), max_ns)
-        self._used = _Used(host_ns, offset_ns)
+                max_ns = SLEW * (host_ns - used_host_ns)
+                offset_ns = used_ns + min(max(change_ns, -max_ns), max_ns)
+        self._used = host_ns, offset_ns
         return host_ns - base_ns - round(offset_ns)
 
     def latency_ns(self, t_ns: int, host_ns: int) -> float | None:
@@ -382,7 +357,7 @@ class SenderClock:
         line = self._line
         if line is None or self._base_ns is None:
             return ClockSummary(self._mode)
-        behind_ns = 0.0 if self._used is None else abs(line.at(self._used.host_ns) - self._used.offset_ns)
+        behind_ns = 0.0 if self._used is None else abs(line.at(self._used[0]) - self._used[1])
         uncertainty_ns = line.uncertainty_ns
         if self._mode == "one-way":
             uncertainty_ns = max(uncertainty_ns, self._one_way.all_above_ns) + LOCAL_DELAY_NS

@@ -61,16 +61,17 @@ class Repeats:
     def judge(self, sample: AttitudeSample, host_ns: int, raw: bytes) -> Refusal | None:
         """Why this one is refused; None where its time differs from that of the previous one, or it is another sender's."""
         last = self._last_sample
-        if last is None or sample.t_ns != last.t_ns or (raw != self._last and _is_another_s(last, sample)):
+        same_time = last is not None and sample.t_ns == last.t_ns
+        if last is not None and same_time and raw != self._last:
+            turned = _turn_rad(last.q_icrs_to_cam.tolist(), sample.q_icrs_to_cam.tolist())
+            same_time = math.hypot(*turned) <= MIN_ANOTHERS_RAD
+        if not same_time:
             self._last, self._last_sample, self._since_ns, self._count = raw, sample, host_ns, 0
             return None
         self._count += 1
         if self._count >= MIN_REPEATS and host_ns - self._since_ns >= MIN_REPEATED_NS:
-            what = (
-                "the sender repeats one packet"
-                if raw == self._last
-                else f"the sender's clock has stopped at t_ns {sample.t_ns}"
-            )
+            what = f"the sender's clock has stopped at t_ns {sample.t_ns}"
+            what = "the sender repeats one packet" if raw == self._last else what
             self._frozen = True
             self._notices.begin(FROZEN, f"{what}: refused (time), and the attitude shown is getting old")
         self._last_sample = sample
@@ -83,10 +84,6 @@ class Repeats:
         self._frozen = False
         self._notices.end(FROZEN, "source-resumed", "the sender's clock runs again")
         return True
-
-
-def _is_another_s(last: AttitudeSample, sample: AttitudeSample) -> bool:
-    return math.hypot(*_turn_rad(last.q_icrs_to_cam.tolist(), sample.q_icrs_to_cam.tolist())) > MIN_ANOTHERS_RAD
 
 
 def _steps(before: int, sequence: int) -> int:
@@ -150,45 +147,30 @@ class _KnownSender:
         return made
 
     def agrees(self, arrival: SampleArrival) -> _CourseAgreement:
-        """Compare a message with this sender."""
-        sample = arrival.event
+        sample, period_ns = arrival.event, self.period_ns
         later_ns, gap_ns = sample.t_ns - self.sample.t_ns, arrival.host_ns - self.host_ns
         step = _steps(self.count, sample.sequence)
-        on_line = self._on_line(step, sample.t_ns - self.count_t_ns)
-        usual_ns = max(gap_ns + EARLY_NS + min(self.waited_ns, NS_PER_S), 3 * (self.period_ns or 0.0))
-        clock = on_line or -EARLY_NS <= later_ns <= usual_ns
-        meanwhile_ns = later_ns if abs(later_ns) < MAX_STEP_NS else max(gap_ns, 0)
+        clock = -EARLY_NS <= later_ns <= max(gap_ns + EARLY_NS + min(self.waited_ns, NS_PER_S), 3 * (period_ns or 0.0))
+        if not self.still and period_ns is not None and step:  # time and count may advance together, however late it is
+            usual_ns = step * period_ns
+            off_ns = abs(sample.t_ns - self.count_t_ns - usual_ns)
+            clock = clock or off_ns <= 0.5 * period_ns + 0.05 * abs(usual_ns)
+        counted_ns = max(later_ns if 0 < later_ns < MAX_STEP_NS else 0, gap_ns)
+        max_step = MAX_FIRST_LOSSES if period_ns is None else 2 + 2 * counted_ns / period_ns
+        steady = period_ns is not None and STEADY[0] < later_ns / (period_ns * max(step, 1)) < STEADY[1]
         turned = _turn_rad(self.q, sample.q_icrs_to_cam.tolist())
-        far_rad = self._far_rad(turned, meanwhile_ns)
+        far_rad = self._far_rad(turned, later_ns if abs(later_ns) < MAX_STEP_NS else max(gap_ns, 0))
         if not clock:
             far_rad = min(far_rad, self._far_rad(turned, max(gap_ns, 0)))
         seconds = max(abs(later_ns) if clock else gap_ns, 0) / NS_PER_S
         return _CourseAgreement(
             clock,
-            self._counts_on(step, later_ns, gap_ns),
+            1 <= step <= max_step,
             far_rad <= MIN_FAR_RAD + FAR_RATIO * self.far_rad,
             far_rad <= MIN_FAR_RAD + PLAUSIBLE_RAD_S * seconds,
-            self._is_steady(step, later_ns),
+            steady,
             far_rad,
         )
-
-    def _on_line(self, step: int, later_ns: int) -> bool:
-        """Whether time and count advanced together, however late the message is."""
-        if self.still or self.period_ns is None or not step:
-            return False
-        usual_ns = step * self.period_ns
-        return abs(later_ns - usual_ns) <= 0.5 * self.period_ns + 0.05 * abs(usual_ns)
-
-    def _counts_on(self, step: int, later_ns: int, gap_ns: int) -> bool:
-        """Whether this counter can have reached the sequence since its last message."""
-        later_ns = max(later_ns if 0 < later_ns < MAX_STEP_NS else 0, gap_ns)
-        max_step = MAX_FIRST_LOSSES if self.period_ns is None else 2 + 2 * later_ns / self.period_ns
-        return 1 <= step <= max_step
-
-    def _is_steady(self, step: int, later_ns: int) -> bool:
-        if self.period_ns is None:
-            return False
-        return STEADY[0] < later_ns / (self.period_ns * max(step, 1)) < STEADY[1]
 
     def _far_rad(self, turned: Turn, meanwhile_ns: float) -> float:
         """The distance from its predicted attitude or its last one, whichever is nearer."""
@@ -199,7 +181,6 @@ class _KnownSender:
         return min(stood_rad, math.dist(turned, [seconds * rate for rate in self.turning_rad_s]))
 
     def move(self, arrival: SampleArrival, agreed: _CourseAgreement) -> None:
-        """Take the next message of this sender."""
         sample = arrival.event
         later_ns, step = sample.t_ns - self.sample.t_ns, _steps(self.count, sample.sequence)
         if agreed.clock and later_ns <= 0:  # out of order
@@ -288,8 +269,7 @@ class Senders:
 
     def release(self) -> list[SampleArrival]:
         """What waits still, as it is."""
-        waiting, self._waiting = self._waiting, []
-        return [each.arrival for each in waiting]
+        return [each.arrival for each in self._emptied()]
 
     def _rival(self, arrival: SampleArrival, agreed: _CourseAgreement) -> _KnownSender | None:
         """The stranger that a message is rather from, if there is one."""
@@ -312,25 +292,19 @@ class Senders:
         return agreed.clock and (counts and turned)
 
     def _speaks(self, main: _KnownSender, arrival: SampleArrival, agreed: _CourseAgreement) -> list[SampleArrival]:
+        """The sender shown has spoken: what strangers said meanwhile is refused, unless it continues in one count."""
         if not agreed.sky or not agreed.clock:
             self._left = replace(main)
         elif self._left is not None and arrival.host_ns - self._left.host_ns > self._left.patience_ns(self._silent_after_ns):
             self._left = None
-        decided = self._decide(main, arrival)
-        main.move(arrival, agreed)
-        return [*decided, arrival]
-
-    def _decide(self, main: _KnownSender, arrival: SampleArrival) -> list[SampleArrival]:
-        """The sender shown has spoken: what strangers said meanwhile is refused, unless it continues in one count."""
-        waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return []
+        waiting = self._emptied()
         counts = [main.count, *(each.arrival.event.sequence for each in waiting), arrival.event.sequence]
+        main.move(arrival, agreed)
         if all(1 <= _steps(before, after) <= 2 for before, after in pairwise(counts)):
-            return [each.arrival for each in waiting]
+            return [*(each.arrival for each in waiting), arrival]
         if any(each.sender.heard >= MIN_STRANGE for each in waiting):
             self._tell_two()
-        return [_refused(each.arrival) for each in waiting]
+        return [*(_refused(each.arrival) for each in waiting), arrival]
 
     def _tell_two(self) -> None:
         self._two = True

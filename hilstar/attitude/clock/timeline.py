@@ -2,8 +2,8 @@
 
 Times are nanoseconds on one continuous clock: the sender's, with its jumps removed (`jumps`).
 
-Prediction damps the jitter of the newest rate (`Damping`). A rate has a steady part, which a filter follows without lag through
-any constant acceleration, and jitter about it. Over a prediction time x / (2 pi f) a vibration of frequency f keeps
+Prediction damps the jitter of the newest rate (`_Damping`). A rate has a steady part, which a filter follows without lag
+through any constant acceleration, and jitter about it. Over a prediction time x / (2 pi f) a vibration of frequency f keeps
 sin(x) / x of its rate, noise keeps nothing. The share to keep is the regression of what followed on the jitter before it, over
 samples as far apart as frames predict. A constant rate has no jitter and passes unchanged to the last bit.
 """
@@ -30,7 +30,7 @@ MAX_KEPT = 256  # samples to look back on: a quarter of a second at 1000 Hz
 MAX_SIGMAS = 3.0  # larger jitter is the beginning of a turn, and is not damped
 AGE_SHARE = 0.1  # weight of each frame in the usual prediction time
 
-Vector = tuple[float, float, float]
+Vector = tuple[float, ...]  # three components
 NOTHING: Vector = (0.0, 0.0, 0.0)
 # A live timeline keeps one to two times this many samples, 5 s or more at 200 Hz: far more than a frame looks back.
 LIVE_CAPACITY = 1024
@@ -44,7 +44,7 @@ Prediction = Literal["rate", "auto"]
 Joins = Callable[[AttitudeSample, AttitudeSample], Join]
 
 
-class Damped(NamedTuple):
+class _Damped(NamedTuple):
     """The excess of a sample's rate, rad/s, cam, over what a prediction by `ahead_s` uses; less for a shorter one."""
 
     excess: Vector
@@ -57,7 +57,7 @@ class Damped(NamedTuple):
         return share * x, share * y, share * z
 
 
-UNDAMPED = Damped(NOTHING, 1.0)
+UNDAMPED = _Damped(NOTHING, 1.0)
 
 
 class _SeenSample(NamedTuple):
@@ -67,7 +67,7 @@ class _SeenSample(NamedTuple):
     jitter: Vector
 
 
-class Damping:
+class _Damping:
     """Follows one stream's rates. `usual_s` is how far ahead frames predict: anybody may set it."""
 
     def __init__(self) -> None:
@@ -83,62 +83,50 @@ class Damping:
         self._xx, self._xy = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
 
     def asked(self, seconds: float) -> None:
-        """Note the prediction time of a frame."""
         self.usual_s += AGE_SHARE * (seconds - self.usual_s)
 
-    def add(self, t_ns: int, rate: Vector, turn: Vector | None) -> Damped:
-        """Take the next sample, with its turn (rad) since the previous one; returns how to damp its rate."""
+    def add(self, t_ns: int, rate: Vector, turn: Vector | None) -> _Damped:
+        """Take the next sample, with its turn (rad) since the previous one; returns how to damp its rate.
+
+        The steady part and its trend follow by the critically damped filter of second order (Brookner 1998, 1.2).
+        """
         if turn is None or not self._seen:
             self.restart()
             self._seen.append(_SeenSample(t_ns, NOTHING, rate, NOTHING))
             return UNDAMPED
         last = self._seen[-1]
-        new = self._follow(last, t_ns, rate, turn)
-        self._learn(new, (t_ns - last.t_ns) / NS_PER_S)
-        self._seen.append(new)
-        if len(self._seen) <= MIN_SAMPLES:
-            return UNDAMPED
-        x, y, z = (self._excess(axis, new.jitter[axis]) for axis in range(3))
-        return Damped((x, y, z), self._ahead_s)
-
-    def _follow(self, last: _SeenSample, t_ns: int, rate: Vector, turn: Vector) -> _SeenSample:
-        """The steady part and its trend, by the critically damped filter of second order (Brookner 1998, 1.2)."""
         step_s = (t_ns - last.t_ns) / NS_PER_S
         keeps = math.exp(-step_s / STEADY_S)
         alpha, beta = 1 - keeps * keeps, (1 - keeps) ** 2
-        steady, turned = list(last.steady), list(last.turned)
+        steady, turned, jitter = list(last.steady), list(last.turned), [0.0, 0.0, 0.0]
         for axis in range(3):
             expected = steady[axis] + self._trend[axis] * step_s
             off = rate[axis] - expected
             steady[axis] = expected + alpha * off
             self._trend[axis] += beta * off / step_s
             turned[axis] += turn[axis]
-        jitter = rate[0] - steady[0], rate[1] - steady[1], rate[2] - steady[2]
-        return _SeenSample(t_ns, (turned[0], turned[1], turned[2]), (steady[0], steady[1], steady[2]), jitter)
-
-    def _learn(self, new: _SeenSample, step_s: float) -> None:
-        """How a sample's jitter went on until the newest one, as far ahead as frames predict."""
-        from_ns = new.t_ns - round(self.usual_s * NS_PER_S)
+            jitter[axis] = rate[axis] - steady[axis]
+        # How a sample's jitter went on until this one, as far ahead as frames predict.
+        from_ns = t_ns - round(self.usual_s * NS_PER_S)
         for before in reversed(self._seen):
             if before.t_ns <= from_ns + round(step_s * NS_PER_S / 2):
                 break
-        ahead_s = (new.t_ns - before.t_ns) / NS_PER_S
+        ahead_s = (t_ns - before.t_ns) / NS_PER_S
         keeps = math.exp(-step_s / MEMORY_S)
         self._weight = keeps * self._weight + 1
         self._ahead_s += (ahead_s - self._ahead_s) / self._weight
+        excess = [0.0, 0.0, 0.0]
         for axis in range(3):
             x = before.jitter[axis]
-            y = (new.turned[axis] - before.turned[axis]) / ahead_s - before.steady[axis]
+            y = (turned[axis] - before.turned[axis]) / ahead_s - before.steady[axis]
             self._xx[axis] = keeps * self._xx[axis] + x * x
             self._xy[axis] = keeps * self._xy[axis] + x * y
-
-    def _excess(self, axis: int, jitter: float) -> float:
-        xx = self._xx[axis]
-        if xx <= 0.0:
-            return 0.0
-        most = MAX_SIGMAS * math.sqrt(xx / self._weight)
-        goes_on = min(max(self._xy[axis] / xx, 0.0), 1.0)
-        return (1.0 - goes_on) * min(max(jitter, -most), most)
+            if self._xx[axis] > 0.0:
+                most = MAX_SIGMAS * math.sqrt(self._xx[axis] / self._weight)
+                goes_on = min(max(self._xy[axis] / self._xx[axis], 0.0), 1.0)
+                excess[axis] = (1.0 - goes_on) * min(max(jitter[axis], -most), most)
+        self._seen.append(_SeenSample(t_ns, tuple(turned), tuple(steady), tuple(jitter)))
+        return UNDAMPED if len(self._seen) <= MIN_SAMPLES else _Damped(tuple(excess), self._ahead_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,12 +172,12 @@ class Timeline:
 
     def __init__(self, policy: Policy, capacity: int = LIVE_CAPACITY, joins: Joins | None = None) -> None:
         self._policy = policy
-        self._join = self._join_live if joins is None else joins
+        self._joins = joins
         self._capacity = capacity
         self._t_ns: list[int] = []
         self._samples: list[AttitudeSample] = []
         self._received_ns: int | None = None  # when the newest sample arrived
-        self._damping = Damping() if policy.prediction == "auto" else None
+        self._damping = _Damping() if policy.prediction == "auto" else None
         self._damped = UNDAMPED  # for the newest sample
         self._lock = threading.Lock()
 
@@ -252,7 +240,7 @@ class Timeline:
         bend = (1 - u) * (before.velocity_km_s * gap_s - straight) - u * (after.velocity_km_s * gap_s - straight)
         return before.place_km + u * straight + u * (1 - u) * bend
 
-    def _at(self, t_ns: int, near: list[AttitudeSample], place: int, received_ns: int | None, damped: Damped) -> Attitude:
+    def _at(self, t_ns: int, near: list[AttitudeSample], place: int, received_ns: int | None, damped: _Damped) -> Attitude:
         newest = near[place]
         age_ns = t_ns - newest.t_ns
         if place + 1 < len(near):
@@ -277,7 +265,8 @@ class Timeline:
         bend, bend_after = (self._acceleration_rad_s2(near, k) for k in (place, place + 1))
         from_before = propagate(before.q_icrs_to_cam, rate + 0.5 * forward * bend, forward)
         from_after = propagate(after.q_icrs_to_cam, rate_after + 0.5 * backward * bend_after, backward)
-        share = smootherstep(age_ns / gap_ns)
+        u = age_ns / gap_ns
+        share = u * u * u * (10.0 + u * (6.0 * u - 15.0))  # first and second derivatives 0 at both ends (Perlin 2002)
         turning = (1 - share) * (rate + forward * bend) + share * (rate_after + backward * bend_after)
         return slerp(from_before, from_after, share), turning
 
@@ -290,13 +279,14 @@ class Timeline:
             raise AssertionError("a sample of a blend has a rate and a neighbour")
         return (rate_later - rate) / ((near[later].t_ns - near[earlier].t_ns) / NS_PER_S)
 
-    def _join_live(self, before: AttitudeSample, after: AttitudeSample) -> Join:
+    def _joined(self, before: AttitudeSample, after: AttitudeSample) -> Join:
+        if self._jumped(before, after):
+            return "hold"
+        if self._joins is not None:
+            return self._joins(before, after)
         # Rates say little about a long silence: propagated across it from both sides they overshoot; SLERP cannot.
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
         return "blend" if known and after.t_ns - before.t_ns <= self._policy.stale_after_ns else "slerp"
-
-    def _joined(self, before: AttitudeSample, after: AttitudeSample) -> Join:
-        return "hold" if self._jumped(before, after) else self._join(before, after)
 
     def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
         """True where the attitude jumps: the sample says so, or the turn would exceed the maximum rate."""
@@ -314,7 +304,7 @@ class Timeline:
             return None
         return rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
 
-    def _damp(self, sample: AttitudeSample) -> Damped:
+    def _damp(self, sample: AttitudeSample) -> _Damped:
         """What a prediction takes from the rate of the next sample; nothing from one whose acceleration is known."""
         damping, previous = self._damping, self._samples[-1] if self._samples else None
         if damping is None or (previous is not None and sample.t_ns <= previous.t_ns):
@@ -328,7 +318,7 @@ class Timeline:
         turn = rate_between_rad_s(previous.q_icrs_to_cam, sample.q_icrs_to_cam, 1.0)
         return damping.add(sample.t_ns, tuple(rate.tolist()), tuple(turn.tolist()))
 
-    def _predict(self, newest: AttitudeSample, rate: FloatArray | None, age_ns: int, damped: Damped) -> Attitude:
+    def _predict(self, newest: AttitudeSample, rate: FloatArray | None, age_ns: int, damped: _Damped) -> Attitude:
         stale = age_ns > self._policy.stale_after_ns
         if rate is None:
             return _held(newest, age_ns, stale)
@@ -347,11 +337,6 @@ class Timeline:
 
 def _held(sample: AttitudeSample, age_ns: int, stale: bool) -> Attitude:
     return Attitude(sample.q_icrs_to_cam, age_ns, stale, sample.sequence)
-
-
-def smootherstep(u: float) -> float:
-    """From 0 to 1 with first and second derivatives zero at both ends (Perlin 2002)."""
-    return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
 class StaleGate:

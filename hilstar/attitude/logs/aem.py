@@ -31,7 +31,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -59,11 +58,10 @@ from hilstar.attitude.logs.aem_blocks import (
     sequence,
     xml_blocks,
 )
-from hilstar.attitude.logs.entries import LogEntry, LogReading
-from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.logs.entries import LogEntry, LogReading, log_joins
 from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
 from hilstar.attitude.wire.source import Conventions, components
-from hilstar.rotation import conjugate, direction_of, from_rotation_vectors, multiply
+from hilstar.rotation import conjugate, direction_of, frame_turns, multiply, rotate
 from hilstar.units import NS_PER_S
 
 MAX_OVERLAPPING = 1000
@@ -90,38 +88,37 @@ COMMENTS = (
 ORDER = ("QC", "Q1", "Q2", "Q3")  # in XML; in KVN the scalar comes last
 
 
-def turned(angles_rad: FloatArray, axes: tuple[int, int, int]) -> FloatArray:
+def _turned(angles_rad: FloatArray, axes: tuple[int, int, int]) -> FloatArray:
     """The rotations (n, 4) of components from the first frame to the second, by angles (n, 3) about axes."""
-    return multiply(
-        _turn(angles_rad[:, 2], axes[2]), multiply(_turn(angles_rad[:, 1], axes[1]), _turn(angles_rad[:, 0], axes[0]))
-    )
+    first, second, third = (frame_turns(axis, angles_rad[:, k]) for k, axis in enumerate(axes))
+    return multiply(third, multiply(second, first))
 
 
-def euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatArray | None]:
+def _euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatArray | None]:
     """Rotations (n, 4) from first to second, and their rates (n, 3), rad/s in the second's components, for EULER_DERIVATIVE.
 
     `values` (n, 3 or 6) are degrees and degrees per second.
     """
     axes, values = sequence(meta), np.radians(values)
-    q = turned(values[:, :3], axes)
+    q = _turned(values[:, :3], axes)
     if meta["ATTITUDE_TYPE"] != EULER_DERIVATIVE:
         return q, None
     rate = np.zeros((len(values), 3))
     for k, axis in enumerate(axes):  # each turn's rate, then carried through the turns after it
         rate[:, axis] += values[:, 3 + k]
         if k < 2:
-            rate = rotated(_turn(values[:, k + 1], axes[k + 1]), rate)
+            rate = rotate(frame_turns(axes[k + 1], values[:, k + 1]), rate)
     return q, rate
 
 
-def spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
+def _spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
     """Rotations (n, 4) from first to second and rates (n, 3), rad/s in the second's components.
 
     `values` (n, 4 or 7) are alpha, delta, the angle (degrees) and its rate (degrees per second); then, with nutation, the
     angle of nutation, its period (s) and its phase, or the momentum's alpha and delta and the rate of nutation.
     """
     alpha, delta, angle, spin_rate = np.radians(values[:, :4].T)
-    q = turned(np.column_stack((np.pi / 2 + alpha, np.pi / 2 - delta, angle)), (2, 0, 2))
+    q = _turned(np.column_stack((np.pi / 2 + alpha, np.pi / 2 - delta, angle)), (2, 0, 2))
     rate = np.zeros((len(values), 3))
     rate[:, 2] = spin_rate
     if kind == SPIN_NUTATION:
@@ -130,27 +127,12 @@ def spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
         rate += (2 * np.pi / values[:, 5])[:, None] * momentum
     elif kind == SPIN_NUTATION_MOM:
         momentum = direction_of(values[:, 4], values[:, 5])
-        rate += np.radians(values[:, 6])[:, None] * rotated(q, momentum)
-    elif kind != SPIN:
-        raise AssertionError(kind)
+        rate += np.radians(values[:, 6])[:, None] * rotate(q, momentum)
     return q, rate
 
 
-def rotated(q: FloatArray, vectors: FloatArray) -> FloatArray:
-    """The components (n, 3) of vectors after rotations (n, 4) of unit length."""
-    pure = np.concatenate((np.zeros((len(vectors), 1)), vectors), axis=1)
-    return multiply(multiply(q, pure), conjugate(q))[:, 1:]
-
-
-def _turn(angle_rad: FloatArray, axis: int) -> FloatArray:
-    """Components in a frame that is turned by angles (n,) about an axis of the old one."""
-    vectors = np.zeros((len(angle_rad), 3))
-    vectors[:, axis] = -angle_rad
-    return from_rotation_vectors(vectors)
-
-
 @dataclass(frozen=True)
-class DatedBlock:
+class _DatedBlock:
     """One segment: its keywords, and its entries in the order of the file."""
 
     block: Block
@@ -192,12 +174,12 @@ class DatedBlock:
         return min(max(start, first), last), max(min(stop, last), first)
 
 
-def resolved(segments: list[DatedBlock]) -> tuple[list[list[LogEntry]], str | None]:
+def _resolved(segments: list[_DatedBlock]) -> tuple[list[list[LogEntry]], str | None]:
     """The entries of segments, which come in the order of their first epochs, with those that overlap made one run of pieces.
 
     And what was done, in words; None where no segments overlap. Raises AemFaultError.
     """
-    groups: list[list[DatedBlock]] = []
+    groups: list[list[_DatedBlock]] = []
     end_ns = 0
     for segment in segments:
         overlaps = bool(groups) and segment.times[0] < end_ns and segment.is_whole and all(each.is_whole for each in groups[-1])
@@ -218,7 +200,7 @@ def resolved(segments: list[DatedBlock]) -> tuple[list[list[LogEntry]], str | No
     )
 
 
-def _one_run(group: list[DatedBlock]) -> list[LogEntry]:
+def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
     if len(group) > MAX_OVERLAPPING:
         where = group[0].block.where[0]
         raise AemFaultError(where, f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each")
@@ -243,7 +225,7 @@ def _one_run(group: list[DatedBlock]) -> list[LogEntry]:
     return run
 
 
-def _piece(segment: DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
+def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
     """The attitudes of a segment from a time to another, both among them, made where it has none just then."""
     piece = segment.entries[bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)]
     own = {entry.event.t_ns for entry in (piece[:1] + piece[-1:]) if isinstance(entry.event, AttitudeSample)}
@@ -272,7 +254,9 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[LogEntry] = []
     told: dict[str, str] = {}
-    runs, overlap = resolved([DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed])
+    runs, overlap = _resolved(
+        [_DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed]
+    )
     if overlap is not None:
         told["aem-overlap"] = overlap
     for following in runs:
@@ -326,8 +310,12 @@ def _part(entries: list[LogEntry], following: list[LogEntry]) -> None:
 
 def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[LogEntry]:
     q, rate = _attitudes(block)
-    if block.meta["ATTITUDE_TYPE"] == SPIN and not _alias(block, times):
-        rate = None
+    if block.meta["ATTITUDE_TYPE"] == SPIN:
+        # Only the rate says how often a body spins between attitudes that are more than a quarter turn apart. Below that the
+        # attitudes are better: in the standard's own example (ST5) SPIN_ANGLE_VEL is a fifth more than the spin angle turns.
+        steps_s = np.diff(np.array(times, dtype=object)).astype(np.float64) / NS_PER_S
+        if not (np.abs(block.values[:-1, 3]) * steps_s > QUARTER_TURN_DEG).any():
+            rate = None
     reference, _ = _frames(block.meta)
     if reference not in INERTIAL_FRAMES:
         if any(t_ns not in INT64 for t_ns in times):
@@ -335,32 +323,16 @@ def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, st
                 block.where[-1], f"the times of the block do not fit 64 bits, so {reference} has no place there"
             )
         q_icrs_to_frame, frame_rate, notice = of_date(reference, block.meta["TIME_SYSTEM"], np.array(times, dtype=np.int64))
-        q, rate = _from_icrs(q, rate, q_icrs_to_frame, frame_rate)
+        if rate is not None:
+            with np.errstate(all="ignore"):
+                unit = q / np.linalg.norm(q, axis=1, keepdims=True)
+                rate = rate + rotate(unit, np.tile(frame_rate, (len(q), 1)))
+        q = multiply(q, q_icrs_to_frame)
         if notice is not None:
             told["earth-orientation"] = notice
     rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
     for where, t_ns, numbers, turning in zip(block.where, times, q.tolist(), rates, strict=True):
         yield LogEntry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
-
-
-def _from_icrs(
-    q: FloatArray, rate: FloatArray | None, q_icrs_to_frame: FloatArray, turning_rad_s: FloatArray
-) -> tuple[FloatArray, FloatArray | None]:
-    """Attitude and rate with respect to the ICRS of those with respect to a frame that moves."""
-    with np.errstate(all="ignore"):
-        unit = q / np.linalg.norm(q, axis=1, keepdims=True)
-        own = rotated(unit, np.tile(turning_rad_s, (len(q), 1)))
-    return multiply(q, q_icrs_to_frame), None if rate is None else rate + own
-
-
-def _alias(block: Block, times: list[int]) -> bool:
-    """Whether a spin turns by more than a quarter between its attitudes, so that only its rate tells by how much.
-
-    Where it does not, the attitudes are better: in the standard's own example (ST5) SPIN_ANGLE_VEL is that of a nutating body
-    with respect to its nutation, a fifth more than the spin angle turns.
-    """
-    turned_deg = np.abs(block.values[:-1, 3]) * np.diff(np.array(times, dtype=object)).astype(np.float64) / NS_PER_S
-    return bool((turned_deg > QUARTER_TURN_DEG).any())
 
 
 def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
@@ -369,28 +341,33 @@ def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
     to_cam = _second_frame_is_cam(meta)
     with np.errstate(all="ignore"):  # an overflow is refused as not finite
         if kind not in QUATERNIONS:
-            q, rate = spin(block.values, kind) if kind in SPINS else euler(block.values, meta)
+            q, rate = _spin(block.values, kind) if kind in SPINS else _euler(block.values, meta)
             if kind == EULER_ANGVEL:
                 q = q if to_cam else conjugate(q)
-                return q, _rate_in_cam(meta, q, np.ones((len(q), 1)), np.radians(block.values[:, 3:]))
-            return (q, rate) if to_cam else (conjugate(q), None if rate is None else -rotated(conjugate(q), rate))
+                return q, _rate_in_cam(meta, q, np.radians(block.values[:, 3:]))
+            return (q, rate) if to_cam else (conjugate(q), None if rate is None else -rotate(conjugate(q), rate))
         q, more = block.values[:, :4], block.values[:, 4:]
         if to_cam:
             q = conjugate(q)
-        norm2 = (q * q).sum(axis=1, keepdims=True)
         if kind == QUATERNION:
             return q, None
         if kind == DERIVATIVE:
             q_dot = conjugate(more) if to_cam else more
-            return q, -2.0 * multiply(q_dot, conjugate(q))[:, 1:] / norm2
-        return q, _rate_in_cam(meta, q, norm2, np.radians(more))
+            return q, -2.0 * multiply(q_dot, conjugate(q))[:, 1:] / (q * q).sum(axis=1, keepdims=True)
+        return q, _rate_in_cam(meta, q, np.radians(more))
 
 
-def _rate_in_cam(meta: dict[str, str], q: FloatArray, norm2: FloatArray, rate: FloatArray) -> FloatArray:
-    """The rate (n, 3) of cam in its components, of the second frame's with respect to the first, in either frame's."""
-    if not _second_frame_is_cam(meta):
-        rate = -rate
-    return rate if _rate_is_in_cam(meta) else rotated(q, rate) / norm2
+def _rate_in_cam(meta: dict[str, str], q: FloatArray, rate: FloatArray) -> FloatArray:
+    """The rate (n, 3) of cam in its components, from that of the second frame with respect to the first in either's."""
+    key = "RATE_FRAME" if meta["ATTITUDE_TYPE"] == RATE else "ANGVEL_FRAME"
+    if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == RATE:
+        raise AemFaultError("", f"{RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {DERIVATIVE}")
+    a, b, given = meta["REF_FRAME_A"], meta["REF_FRAME_B"], meta.get(key, "missing")
+    frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)
+    if frame not in {a, b}:
+        raise AemFaultError("", f"{key} is {given}; write {a} or {b}")
+    rate = rate if _second_frame_is_cam(meta) else -rate
+    return rotate(q, rate) / (q * q).sum(axis=1, keepdims=True) if _is_reference(frame) else rate
 
 
 def _frames(meta: dict[str, str]) -> tuple[str, str]:
@@ -415,25 +392,6 @@ def _second_frame_is_cam(meta: dict[str, str]) -> bool:
     return _is_reference(meta["REF_FRAME_A"]) == (direction == "A2B")
 
 
-def _rate_is_in_cam(meta: dict[str, str]) -> bool:
-    key = "RATE_FRAME" if meta["ATTITUDE_TYPE"] == RATE else "ANGVEL_FRAME"
-    if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == RATE:
-        raise AemFaultError("", f"{RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {DERIVATIVE}")
-    a, b, given = meta["REF_FRAME_A"], meta["REF_FRAME_B"], meta.get(key, "missing")
-    frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)
-    if frame not in {a, b}:
-        raise AemFaultError("", f"{key} is {given}; write {a} or {b}")
-    return not _is_reference(frame)
-
-
-class _WrittenBlock(NamedTuple):
-    """The keywords of a block, the epochs of its attitudes, and their components and derivatives (none for 4 columns)."""
-
-    meta: dict[str, str]
-    epochs: list[str]
-    values: list[list[float]]
-
-
 def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = None) -> str:
     """An AEM 1.0 of at least one sample, as KVN or XML: a new block at each discontinuity, ICRF to STARTRACKER_1, scalar last.
 
@@ -443,11 +401,11 @@ def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = N
     starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity]
     blocks = [samples[i:j] for i, j in zip(starts, [*starts[1:], len(samples)], strict=True)]
     header = {"CREATION_DATE": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "ORIGINATOR": "HILSTAR"}
-    lines = (_xml if xml else _kvn)(header, [_segment(block, scale) for block in blocks])
+    lines = (_xml if xml else _kvn)(header, [_written_block(block, scale) for block in blocks])
     return "\n".join(lines) + "\n"
 
 
-def _segment(samples: Sequence[AttitudeSample], scale: str | None) -> _WrittenBlock:
+def _written_block(samples: Sequence[AttitudeSample], scale: str | None) -> Block:
     rates = [sample.rate_cam_rad_s for sample in samples if sample.rate_cam_rad_s is not None]
     q = np.array([sample.q_icrs_to_cam for sample in samples])
     values = conjugate(q)
@@ -467,41 +425,35 @@ def _segment(samples: Sequence[AttitudeSample], scale: str | None) -> _WrittenBl
         "ATTITUDE_TYPE": QUATERNION if values.shape[1] == 4 else DERIVATIVE,
         "QUATERNION_TYPE": "LAST",
     }
-    return _WrittenBlock(meta, epochs, (values + 0.0).tolist())  # + 0.0: CCSDS has no -0
+    return Block(meta, [], epochs, values + 0.0)  # + 0.0: CCSDS has no -0
 
 
-def _kvn(header: dict[str, str], segments: list[_WrittenBlock]) -> Iterator[str]:
-    yield _assigned(VERSION_KEY, "1.0")
-    yield ""
-    yield from (_assigned(key, value) for key, value in header.items())
+def _kvn(header: dict[str, str], segments: list[Block]) -> Iterator[str]:
+    yield from (f"{VERSION_KEY:25}= 1.0", "", *(f"{key:25}= {value}" for key, value in header.items()))
     for segment in segments:
         yield from ("", "META_START", *(f"COMMENT {line}" for line in COMMENTS))
-        yield from (_assigned(key, value) for key, value in segment.meta.items())
+        yield from (f"{key:25}= {value}" for key, value in segment.meta.items())
         yield from ("META_STOP", "", "DATA_START")
-        for epoch, values in zip(segment.epochs, segment.values, strict=True):
+        for epoch, values in zip(segment.epochs, segment.values.tolist(), strict=True):
             last = [*values[1:4], values[0], *values[5:], *values[4:5]]
             yield "  ".join([epoch, *map(repr, last)])
         yield "DATA_STOP"
 
 
-def _assigned(key: str, value: str) -> str:
-    return f"{key:25}= {value}"
-
-
-def _xml(header: dict[str, str], segments: list[_WrittenBlock]) -> Iterator[str]:
+def _xml(header: dict[str, str], segments: list[Block]) -> Iterator[str]:
     """The lines; nothing in them needs an entity."""
-    yield '<?xml version="1.0" encoding="UTF-8"?>'
-    yield f'<aem id="{VERSION_KEY}" version="1.0">'
+    yield from ('<?xml version="1.0" encoding="UTF-8"?>', f'<aem id="{VERSION_KEY}" version="1.0">')
     yield from ("  <header>", *_elements(4, header), "  </header>", "  <body>")
     for segment in segments:
         yield from ("    <segment>", "      <metadata>", *(f"        <COMMENT>{line}</COMMENT>" for line in COMMENTS))
         yield from (*_elements(8, segment.meta), "      </metadata>", "      <data>")
         name = "quaternionState" if segment.meta["ATTITUDE_TYPE"] == QUATERNION else "quaternionDerivative"
-        for epoch, values in zip(segment.epochs, segment.values, strict=True):
+        for epoch, values in zip(segment.epochs, segment.values.tolist(), strict=True):
             yield from ("        <attitudeState>", f"          <{name}>", f"            <EPOCH>{epoch}</EPOCH>")
-            yield from _quaternion("quaternion", "", values[:4])
-            if len(values) > 4:
-                yield from _quaternion("quaternionRate", "_DOT", values[4:])
+            for kind, ending, q in (("quaternion", "", values[:4]), ("quaternionRate", "_DOT", values[4:])):
+                if q:
+                    own = {key + ending: repr(value) for key, value in zip(ORDER, q, strict=True)}
+                    yield from (f"            <{kind}>", *_elements(14, own), f"            </{kind}>")
             yield from (f"          </{name}>", "        </attitudeState>")
         yield from ("      </data>", "    </segment>")
     yield from ("  </body>", "</aem>")
@@ -509,9 +461,3 @@ def _xml(header: dict[str, str], segments: list[_WrittenBlock]) -> Iterator[str]
 
 def _elements(indent: int, texts: dict[str, str]) -> Iterator[str]:
     return (f"{' ' * indent}<{key}>{text}</{key}>" for key, text in texts.items())
-
-
-def _quaternion(name: str, ending: str, values: list[float]) -> Iterator[str]:
-    yield f"            <{name}>"
-    yield from _elements(14, {key + ending: repr(value) for key, value in zip(ORDER, values, strict=True)})
-    yield f"            </{name}>"

@@ -45,22 +45,11 @@ EULER_DERIVATIVE, EULER_ANGVEL = "EULER_ANGLE/DERIVATIVE", "EULER_ANGLE/ANGVEL"
 SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM = "SPIN", "SPIN/NUTATION", "SPIN/NUTATION_MOM"
 QUATERNIONS = frozenset({QUATERNION, DERIVATIVE, RATE, ANGVEL})
 SPINS = frozenset({SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM})
-COMPONENTS = {
-    **{QUATERNION: 4, DERIVATIVE: 8, RATE: 7, ANGVEL: 7},
-    **{EULER: 3, EULER_RATE: 6, EULER_DERIVATIVE: 6, EULER_ANGVEL: 6},
-    **{SPIN: 4, SPIN_NUTATION: 7, SPIN_NUTATION_MOM: 7},
-}
-TYPES = {
-    "1.0": (QUATERNION, DERIVATIVE, RATE, EULER, EULER_RATE, SPIN, SPIN_NUTATION),
-    "2.0": (
-        *(QUATERNION, DERIVATIVE, ANGVEL, EULER, EULER_DERIVATIVE, EULER_ANGVEL),
-        *(SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM),
-    ),
-}
 AXES = {"1": 0, "2": 1, "3": 2, "X": 0, "Y": 1, "Z": 2}
 DAY_NS = 86_400 * NS_PER_S
 UNIX_DAY = date(1970, 1, 1).toordinal()
-EPOCH = re.compile(r"(\d{4}-(?:\d\d-\d\d|\d{3}))T(\d\d):(\d\d):(\d\d)(?:\.(\d+))?Z?", re.ASCII)
+# A leap second stands at 23:59:60 alone.
+EPOCH = re.compile(r"(\d{4}-(?:\d\d-\d\d|\d{3}))T([01]\d|2[0-3]):([0-5]\d):([0-5]\d|(?<=23:59:)60)(?:\.(\d+))?Z?", re.ASCII)
 MARKERS = {  # the section that a marker ends, and the one that it begins
     "META_START": ("header", "metadata"),
     "META_STOP": ("metadata", "gap before DATA_START"),
@@ -71,35 +60,33 @@ MAX_DEPTH = 12  # in an <ndm> a number stands nine deep
 MAX_ELEMENTS = 100_000  # besides the states, and in one of them
 LONG_ELEMENT = re.compile("<[^<]{1000000}")
 
-# A state's numbers by their elements within it, in the order of KVN, with the quaternion's scalar first.
+# A state's element in XML, and its numbers by their elements within it: in the order of KVN, the quaternion's scalar first.
 Q = "quaternion/QC quaternion/Q1 quaternion/Q2 quaternion/Q3"
 Q_RATE = " quaternionRate/QC_DOT quaternionRate/Q1_DOT quaternionRate/Q2_DOT quaternionRate/Q3_DOT"
-Q_DOT = Q_RATE.replace("quaternionRate", "quaternionDot")
 TURNS = "rotationAngles/rotation1 rotationAngles/rotation2 rotationAngles/rotation3"
-RATES = " rotationRates/X_RATE rotationRates/Y_RATE rotationRates/Z_RATE"
-UNUSED_RATES = " rotationRates/rotation1 rotationRates/rotation2 rotationRates/rotation3"
 ANGLES = "ANGLE_1 ANGLE_2 ANGLE_3"
 SPIN_PARTS = "SPIN_ALPHA SPIN_DELTA SPIN_ANGLE SPIN_ANGLE_VEL"
-NUTATION_PARTS = f"{SPIN_PARTS} NUTATION NUTATION_PER NUTATION_PHASE"
+SPIN_STATES = {
+    SPIN: ("spin", SPIN_PARTS),
+    SPIN_NUTATION: ("spinNutation", f"{SPIN_PARTS} NUTATION NUTATION_PER NUTATION_PHASE"),
+}
 STATES = {
     "1.0": {
         QUATERNION: ("quaternionState", Q),
         DERIVATIVE: ("quaternionDerivative", Q + Q_RATE),
-        RATE: ("quaternionEulerRate", Q + RATES),
+        RATE: ("quaternionEulerRate", f"{Q} rotationRates/X_RATE rotationRates/Y_RATE rotationRates/Z_RATE"),
         EULER: ("eulerAngle", TURNS),
-        EULER_RATE: ("eulerAngleRate", TURNS + UNUSED_RATES),
-        SPIN: ("spin", SPIN_PARTS),
-        SPIN_NUTATION: ("spinNutation", NUTATION_PARTS),
+        EULER_RATE: ("eulerAngleRate", f"{TURNS} {TURNS.replace('rotationAngles', 'rotationRates')}"),
+        **SPIN_STATES,
     },
     "2.0": {
         QUATERNION: ("quaternionEphemeris", Q),
-        DERIVATIVE: ("quaternionDerivative", Q + Q_DOT),
-        ANGVEL: ("quaternionAngVel", Q + " angVel/ANGVEL_X angVel/ANGVEL_Y angVel/ANGVEL_Z"),
+        DERIVATIVE: ("quaternionDerivative", Q + Q_RATE.replace("quaternionRate", "quaternionDot")),
+        ANGVEL: ("quaternionAngVel", f"{Q} angVel/ANGVEL_X angVel/ANGVEL_Y angVel/ANGVEL_Z"),
         EULER: ("eulerAngle", ANGLES),
         EULER_DERIVATIVE: ("eulerAngleDerivative", f"{ANGLES} ANGLE_1_DOT ANGLE_2_DOT ANGLE_3_DOT"),
         EULER_ANGVEL: ("eulerAngleAngVel", f"{ANGLES} ANGVEL_X ANGVEL_Y ANGVEL_Z"),
-        SPIN: ("spin", SPIN_PARTS),
-        SPIN_NUTATION: ("spinNutation", NUTATION_PARTS),
+        **SPIN_STATES,
         SPIN_NUTATION_MOM: ("spinNutationMom", f"{SPIN_PARTS} MOMENTUM_ALPHA MOMENTUM_DELTA NUTATION_VEL"),
     },
 }
@@ -115,7 +102,7 @@ class AemFaultError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One block of data: its keywords; for each state its place and epoch; and `values` (n, COMPONENTS), scalar first."""
+    """One block of data: its keywords; for each state its place and epoch; and `values` (n, numbers), scalar first."""
 
     meta: dict[str, str]
     where: list[str]
@@ -123,11 +110,11 @@ class Block:
     values: FloatArray
 
 
-def fault_of(key: str, section: str, version: str) -> str | None:
+def _fault_of(key: str, section: str, version: str) -> str | None:
     """Why a keyword (other than COMMENT) may not stand in the "header" or "metadata", and what to write; None where it may."""
     if key in SECTIONS[section]:
         own, instead = ONLY_IN.get(key, (version, ""))
-        if own == version or version not in TYPES:
+        if own == version or version not in STATES:
             return None
         return f"{key} is of AEM {own}, and {VERSION_KEY} is {version}; {instead}: delete it, or write {VERSION_KEY} = {own}"
     other = "metadata" if section == "header" else "header"
@@ -138,24 +125,23 @@ def fault_of(key: str, section: str, version: str) -> str | None:
     return f"{key[:40]} is not a keyword of an AEM's {section}; {advice}"
 
 
-def check_version(version: str) -> None:
-    """Raises AemFaultError for a version that is not read."""
-    if version not in TYPES:
+def _check_version(version: str) -> None:
+    if version not in STATES:
         raise AemFaultError("", f"{VERSION_KEY} is {version[:40]}; write 1.0 or 2.0")
 
 
-def check_metadata(meta: dict[str, str], where: str) -> None:
+def _check_metadata(meta: dict[str, str], where: str) -> None:
     """Raises AemFaultError for a version or type that is not supported, or a missing keyword."""
     version = meta.get(VERSION_KEY, "missing")
-    check_version(version)
+    _check_version(version)
     for key in ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE"):
         if key not in meta:
             raise AemFaultError(where, f"{key} is missing in the metadata of a block")
     order = meta.get("QUATERNION_TYPE", "LAST")
     if order not in {"FIRST", "LAST"}:
         raise AemFaultError(where, f"QUATERNION_TYPE is {order[:40]}; write FIRST or LAST, where the scalar is")
-    if meta["ATTITUDE_TYPE"] not in TYPES[version]:
-        types = ", ".join(TYPES[version])
+    if meta["ATTITUDE_TYPE"] not in STATES[version]:
+        types = ", ".join(STATES[version])
         raise AemFaultError(
             where, f"ATTITUDE_TYPE = {meta['ATTITUDE_TYPE'][:40]} of AEM {version} is not read; write one of {types}"
         )
@@ -182,16 +168,11 @@ def epoch_ns(where: str, text: str) -> int:
     """
     match = EPOCH.fullmatch(text)
     day = _day(match[1]) if match else None
-    if match is None or day is None or not _is_time(*(int(match[i]) for i in (2, 3, 4))):
-        wanted = "write YYYY-MM-DDThh:mm:ss.f or YYYY-DDDThh:mm:ss.f"
-        raise AemFaultError(where, f"the epoch is {text[:40]!r}; {wanted}")
+    if match is None or day is None:
+        raise AemFaultError(where, f"the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or YYYY-DDDThh:mm:ss.f")
     digits = (match[5] or "").ljust(10, "0")
     seconds = 3600 * int(match[2]) + 60 * int(match[3]) + int(match[4])
     return day * DAY_NS + seconds * NS_PER_S + int(digits[:9]) + (digits[9] >= "5")
-
-
-def _is_time(hours: int, minutes: int, seconds: int) -> bool:
-    return hours < 24 and minutes < 60 and (seconds < 60 or (hours, minutes, seconds) == (23, 59, 60))
 
 
 @lru_cache(maxsize=1024)
@@ -253,17 +234,17 @@ def _keyword(line: str, section: str, version: str, where: str) -> tuple[str, st
     key, equals, value = line.partition("=")
     if not equals or section not in {"header", "metadata"}:
         raise AemFaultError(where, f"{line[:40]!r} in the {section}; write KEYWORD = value, or a marker such as META_START")
-    fault = fault_of(key.strip(), section, version)
+    fault = _fault_of(key.strip(), section, version)
     if fault is not None:
         raise AemFaultError(where, fault)
     return key.strip(), plain(value)
 
 
 def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: str) -> Block:
-    check_metadata(meta, where)
+    _check_metadata(meta, where)
     if not rows:
         raise AemFaultError(where, "the block contains no attitude")
-    count = 1 + COMPONENTS[meta["ATTITUDE_TYPE"]]
+    count = 1 + len(STATES[meta[VERSION_KEY]][meta["ATTITUDE_TYPE"]][1].split())
     order = meta.get("QUATERNION_TYPE", "LAST" if meta[VERSION_KEY] == "2.0" else "missing")
     has_quaternion = meta["ATTITUDE_TYPE"] in QUATERNIONS
     if has_quaternion and order not in {"FIRST", "LAST"}:
@@ -287,7 +268,7 @@ def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: s
 
 @dataclass(slots=True)
 class _Element:
-    """An element that is being read, or has been."""
+    """An XML element, while it is read or afterwards."""
 
     name: str
     line: int
@@ -296,23 +277,16 @@ class _Element:
     text: str = ""
 
     def unlike(self, detail: str) -> AemFaultError:
-        """What is wrong with it."""
         return AemFaultError(f":{self.line}", f"is not an AEM in XML ({detail})")
 
     def parts(self, *names: str) -> list[_Element]:
-        """Its children, each of one of these names, with nothing between them. Raises AemFaultError."""
+        """Its children, where all have one of these names and no text stands between them. Raises AemFaultError."""
         for child in self.children:
             if child.name not in names:
                 raise child.unlike(f"<{child.name[:40]}> where <{'> or <'.join(names)}> belongs")
         if self.text.strip():
             raise self.unlike(f"{self.text.strip()[:40]!r} stands in <{self.name}>, where elements belong")
         return self.children
-
-    def leaf_text(self) -> str:
-        """Its text. Raises AemFaultError where it has children."""
-        for child in self.children:
-            raise child.unlike(f"<{child.name[:40]}> within <{self.name[:40]}>")
-        return self.text.strip()
 
 
 @dataclass(slots=True)
@@ -344,7 +318,7 @@ def xml_blocks(text: str) -> list[Block]:
 
 
 class _XmlReading:
-    """Handles elements as the parser meets them. At its end, a state is reduced to its numbers."""
+    """Handles elements as the parser meets them; a state that has ended is reduced to its numbers."""
 
     def __init__(self) -> None:
         self.messages = 0
@@ -366,20 +340,20 @@ class _XmlReading:
         self._kept += 1
         if len(self._open) >= MAX_DEPTH or self._kept > MAX_ELEMENTS:
             raise element.unlike("its elements are nested too deep, or are too many")
-        if not self._open and element.name not in {"aem", "ndm"}:
-            raise element.unlike(f"<{element.name[:40]}> where <aem> or <ndm> belongs")
         if self._open:
             self._open[-1].children.append(element)
-        elif element.name == "aem":
-            _check_version(element)
+        elif element.name not in {"aem", "ndm"}:
+            raise element.unlike(f"<{element.name[:40]}> where <aem> or <ndm> belongs")
         self._open.append(element)
-        if element.name == "aem" and len(self._open) == 2:
-            _check_version(element)
+        if element.name == "aem" and len(self._open) <= 2:
+            if attributes.get("id") != VERSION_KEY or "version" not in attributes:
+                raise element.unlike(f'<aem> has no id="{VERSION_KEY}", or no version')
+            _check_version(attributes["version"])
 
     def _add_text(self, text: str) -> None:
         self._open[-1].text += text
 
-    def _end(self, name: str) -> None:
+    def _end(self, _: str) -> None:
         element = self._open.pop()
         place = [each.name for each in self._open]
         if place[:1] == ["ndm"]:
@@ -388,9 +362,17 @@ class _XmlReading:
                 self._let_go(element)
                 return
         if place == ["aem", "body", "segment"] and element.name == "metadata":
-            self._begin_segment(element)
+            version = next(each for each in self._open if each.name == "aem").attributes["version"]
+            meta = {VERSION_KEY: version} | _keywords(element, version)
+            _check_metadata(meta, f":{element.line}")
+            self.segments.append(_XmlSegment(meta))
         elif place == ["aem", "body", "segment", "data"] and element.name == "attitudeState":
-            self._take_state(element)
+            if self._open[-2].children[0].name != "metadata":
+                raise self._open[-2].unlike("a <segment> begins with its <metadata>")
+            epoch, row = _state(element, self.segments[-1].meta)
+            self.segments[-1].epochs.append(epoch)
+            self.segments[-1].rows.append(row)
+            self._let_go(element)
         elif place == ["aem", "body"] and element.name == "segment":
             self._check_segment(element)
         elif not place and element.name == "aem":
@@ -400,25 +382,6 @@ class _XmlReading:
         """Forget an element that has been read."""
         self._open[-1].children.pop()
         self._kept = sum(1 + len(each.children) for each in self._open)
-
-    @property
-    def _version(self) -> str:
-        return next(each for each in self._open if each.name == "aem").attributes["version"]
-
-    def _begin_segment(self, metadata: _Element) -> None:
-        meta = {VERSION_KEY: self._version} | _keywords(metadata, self._version)
-        check_metadata(meta, f":{metadata.line}")
-        self.segments.append(_XmlSegment(meta))
-
-    def _take_state(self, holder: _Element) -> None:
-        segment_element = self._open[-2]
-        if segment_element.children[0].name != "metadata":
-            raise segment_element.unlike("a <segment> begins with its <metadata>")
-        segment = self.segments[-1]
-        epoch, row = _state(holder, segment.meta)
-        segment.epochs.append(epoch)
-        segment.rows.append(row)
-        self._let_go(holder)
 
     def _check_segment(self, element: _Element) -> None:
         names = [part.name for part in element.parts("metadata", "data")]
@@ -437,25 +400,20 @@ class _XmlReading:
             raise element.unlike("an <aem> is one <header>, then one <body> of <segment>; is the file cut off?")
 
 
-def _check_version(element: _Element) -> None:
-    if element.attributes.get("id") != VERSION_KEY or "version" not in element.attributes:
-        raise element.unlike(f'<aem> has no id="{VERSION_KEY}", or no version')
-    check_version(element.attributes["version"])
-
-
 def _keywords(element: _Element, version: str) -> dict[str, str]:
     """The keywords of a <header> or <metadata>. Raises AemFaultError."""
     given: dict[str, str] = {}
     for child in element.children:
-        text = child.leaf_text()
+        for inner in child.children:
+            raise inner.unlike(f"<{inner.name[:40]}> within <{child.name[:40]}>")
         if child.name == "COMMENT":
             continue
-        fault = fault_of(child.name, element.name, version)
+        fault = _fault_of(child.name, element.name, version)
         if fault is None and child.name in given:
             fault = f"{child.name} appears twice in the {element.name}; delete one"
         if fault is not None:
             raise AemFaultError(f":{child.line}", fault)
-        given[child.name] = plain(text)
+        given[child.name] = plain(child.text.strip())
     if element.text.strip():
         raise element.unlike(f"{element.text.strip()[:40]!r} stands in <{element.name}>, where elements belong")
     return given

@@ -1,9 +1,10 @@
 """The process that evaluates a CK with SPICE: a damaged kernel may abort it, and SPICE's kernel pool is global to a process.
 
 A request is one JSON object on stdin: `path`, `kernels` and `body`. The answer is an NPZ file on stdout: the arrays of
-`Sampled`, and `said`, JSON text with the rest, or with `error` alone. Times are spacecraft clock ticks throughout.
+`_Sampled`, and `said`, JSON text with the rest, or with `error` alone. Times are spacecraft clock ticks throughout.
 
-1. Times, counts and quaternions are checked here before SPICE, which trusts them, evaluates a segment.
+1. Summaries, times, counts and quaternions are checked here before SPICE evaluates a segment. SPICE trusts them, and would
+   follow a damaged list of records forever.
 2. Of two segments at one time, SPICE takes the later one.
 3. Segments with attitudes at given times (types 1 and 3) are read at those times.
 4. Types 2, 4, 5 and 6 are functions of time. They are read at even steps, halved until the interpolation between them is
@@ -16,28 +17,35 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
+import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.logs.ck import Daf, Summary, in_words, load, read_daf
-from hilstar.attitude.logs.entries import MAX_SAMPLES
-from hilstar.attitude.logs.gaps import GAP_INTERVALS, log_joins
+from hilstar.attitude.logs.entries import GAP_INTERVALS, MAX_SAMPLES, log_joins
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
+from hilstar.reading import HEAD_BYTES, open_regular
 from hilstar.rotation import angle_between_rad, from_matrix, rate_between_rad_s
 from hilstar.units import NS_PER_S
 
+RECORD_BYTES, WORD_BYTES = 1024, 8
+ORDERS = {b"LTL-IEEE": "<", b"BIG-IEEE": ">"}
+MAX_SUMMARIES = 100_000
+MAX_TEXT_BYTES, MAX_BINARY_BYTES = 50_000_000, 4_000_000_000
+MAX_NAMED = 1000  # kernels of one meta-kernel
+ADVICE = "give a SPICE kernel (.tls, .tsc, .tf, .tm, ...)"
 CK_DOUBLES, CK_INTEGERS = 2, 6
 DIRECTORY = 100  # every hundredth time stands in a directory too
 QUATERNION_WORDS, RATE_WORDS = 4, 3
@@ -62,8 +70,85 @@ MAX_NAMED_BODIES = 12
 CK_CLASS = 3  # SPICE's class of frames whose attitude is in CKs
 
 
+class _Summary(NamedTuple):
+    """One array of a DAF: the summary's doubles and integers, of which the last two are the first and last word (from 1)."""
+
+    doubles: tuple[float, ...]
+    integers: tuple[int, ...]
+
+
 @dataclass(frozen=True, slots=True)
-class CkSegment:
+class _Daf:
+    """A DAF whose list of summaries is whole, and whose arrays lie within the file."""
+
+    path: Path
+    order: str
+    summaries: list[_Summary]
+
+    def words(self, summary: _Summary) -> FloatArray:
+        """The doubles (n,) of an array. Raises InputError where the file cannot be read."""
+        first, last = summary.integers[-2:]
+        with open_regular(self.path, "give a SPICE kernel") as file:
+            file.seek((first - 1) * WORD_BYTES)
+            raw = file.read((last - first + 1) * WORD_BYTES)
+        if len(raw) != (last - first + 1) * WORD_BYTES:
+            raise InputError(f"{self.path}: was cut while it was read; copy it whole")
+        return np.frombuffer(raw, self.order + "f8").astype(np.float64)
+
+
+def _read_daf(path: Path, limit_bytes: int) -> _Daf:
+    """The summaries of a DAF, in the file's order. Raises InputError for a file that is not one, or is damaged."""
+    with open_regular(path, "give a SPICE kernel", limit_bytes) as file:
+        size_words = os.fstat(file.fileno()).st_size // WORD_BYTES
+        head = file.read(RECORD_BYTES)
+        order = ORDERS.get(head[88:96])
+        if len(head) < RECORD_BYTES:
+            raise InputError(f"{path}: has {len(head)} bytes, less than a DAF's first record; is it cut off?")
+        if not head.startswith(b"DAF/") or order is None:
+            format_text = head[88:96].decode("ascii", "replace").strip() or "missing"
+            raise InputError(f"{path}: is no DAF in IEEE form (its form is {shortened(format_text)}); convert it by tobin")
+        doubles, integers = struct.unpack(order + "2i", head[8:16])
+        if not (0 <= doubles <= 124 and 2 <= integers <= 250 and doubles + (integers + 1) // 2 <= 125):
+            raise InputError(f"{path}: is a damaged DAF: its summaries have {doubles} doubles and {integers} integers")
+        layout = struct.Struct(f"{order}{doubles}d{integers}i")
+        summaries: list[_Summary] = []
+        for raw in _raw_summaries(path, file, struct.unpack(order + "2i", head[76:84]), order, layout.size):
+            numbers = layout.unpack_from(raw)
+            begin, end = numbers[-2:]
+            if not RECORD_BYTES // WORD_BYTES < begin <= end <= size_words:
+                raise _damaged(path, f"an array has the words {begin} to {end} of {size_words}")
+            summaries.append(_Summary(numbers[:doubles], numbers[doubles:]))
+            if len(summaries) > MAX_SUMMARIES:
+                raise InputError(f"{path}: has more than {MAX_SUMMARIES} segments; split it into several")
+    return _Daf(path, order, summaries)
+
+
+def _raw_summaries(path: Path, file: IO[bytes], ends: tuple[int, int], order: str, size: int) -> Iterator[bytes]:
+    """The bytes of each summary, from a list of records that each name the next and the previous one."""
+    (record, last), previous, words = ends, 0, -(-size // WORD_BYTES)
+    records = os.fstat(file.fileno()).st_size // RECORD_BYTES
+    seen: set[int] = set()
+    while record:
+        if record in seen or not 1 < record <= records:
+            raise _damaged(path, f"its list of summaries leads to record {record}")
+        seen.add(record)
+        file.seek((record - 1) * RECORD_BYTES)
+        raw = file.read(RECORD_BYTES)
+        following, before, count = struct.unpack(order + "3d", raw[:24])
+        if before != previous or not 0 <= count <= 125 // words or not (0 <= following < 2**31 and following.is_integer()):
+            raise _damaged(path, f"summary record {record} is not one of its list")
+        yield from (raw[(3 + k * words) * WORD_BYTES :] for k in range(int(count)))
+        record, previous = int(following), record
+    if previous != last:
+        raise _damaged(path, f"its list of summaries ends at record {previous}, not {last}")
+
+
+def _damaged(path: Path, what: str) -> InputError:
+    return InputError(f"{path}: is a damaged DAF: {what}; is it cut off?")
+
+
+@dataclass(frozen=True, slots=True)
+class _CkSegment:
     """A segment's descriptor; `number` counts from 1 in the file, and a higher one has priority. Ticks."""
 
     number: int
@@ -73,7 +158,7 @@ class CkSegment:
     reference: int
     kind: int
     has_rate: bool
-    summary: Summary
+    summary: _Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,9 +169,9 @@ class Coverage:
     epochs: FloatArray
 
 
-def read_segments(path: Path, limit_bytes: int) -> tuple[Daf, list[CkSegment]]:
+def _read_segments(path: Path, limit_bytes: int) -> tuple[_Daf, list[_CkSegment]]:
     """The segments of a CK in the file's order. Raises InputError for a file that is damaged or another type of segment."""
-    daf = read_daf(path, limit_bytes)
+    daf = _read_daf(path, limit_bytes)
     segments = []
     for number, summary in enumerate(daf.summaries, start=1):
         if (len(summary.doubles), len(summary.integers)) != (CK_DOUBLES, CK_INTEGERS):
@@ -97,13 +182,13 @@ def read_segments(path: Path, limit_bytes: int) -> tuple[Daf, list[CkSegment]]:
             raise InputError(f"{path}: segment {number} spans the ticks {start:g} to {stop:g}; is the file damaged?")
         if kind not in TYPES:
             raise InputError(f"{path}: segment {number} is of type {kind}; types 1 to 6 are read")
-        segments.append(CkSegment(number, start, stop, body, reference, kind, has_rate != 0, summary))
+        segments.append(_CkSegment(number, start, stop, body, reference, kind, has_rate != 0, summary))
     if not segments:
         raise InputError(f"{path}: contains no segment; is the file cut off?")
     return daf, segments
 
 
-def coverage(daf: Daf, segment: CkSegment) -> Coverage | None:
+def _coverage(daf: _Daf, segment: _CkSegment) -> Coverage | None:
     """What a segment covers; None for types 4 and 6, whose intervals SPICE tells (`ckcov`). Raises InputError.
 
     A quaternion that is not unit is refused here: of one that is all zeros SPICE would make an attitude.
@@ -141,7 +226,7 @@ def _type_2(words: FloatArray) -> Read | None:
     return np.column_stack((starts, stops)), np.empty(0), words[: 8 * count].reshape(count, 8)[:, :QUATERNION_WORDS]
 
 
-def _epochs(words: FloatArray, segment: CkSegment) -> Read | None:
+def _epochs(words: FloatArray, segment: _CkSegment) -> Read | None:
     """Types 1, 3 and 5: packets, their times, a directory; 3 and 5 also the starts of intervals, a directory and counts."""
     counts = _counts(words, segment)
     if counts is None:
@@ -161,7 +246,7 @@ def _epochs(words: FloatArray, segment: CkSegment) -> Read | None:
     return np.column_stack((starts, epochs[np.append(first[1:], count) - 1])), epochs, q
 
 
-def _counts(words: FloatArray, segment: CkSegment) -> tuple[int, int, int] | None:
+def _counts(words: FloatArray, segment: _CkSegment) -> tuple[int, int, int] | None:
     """Words of a packet, packets and intervals, from the end of the segment; None where they do not fit its size."""
     trailer = {1: 1, 3: 2, 5: 5}[segment.kind]
     if len(words) < trailer or not np.isfinite(words[-trailer:]).all():
@@ -181,16 +266,31 @@ def _is_directory(directory: FloatArray, times: FloatArray) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class _Piece:
     """Ticks from `start` to `stop` of a segment; `epochs` (n,) are the times strictly within at which it holds attitudes."""
 
-    segment: CkSegment
+    segment: _CkSegment
     start: float
     stop: float
     epochs: FloatArray
 
+    def ticks(self, step: float) -> FloatArray:
+        """The ticks at which it is read, both ends among them; a long pause between them is filled, as the file covers it."""
+        if self.stop <= self.start:
+            return np.array([self.start])
+        if self.segment.kind in SMOOTH:
+            return np.linspace(self.start, self.stop, max(math.ceil((self.stop - self.start) / step), 2) + 1)
+        ticks = np.concatenate(([self.start], self.epochs, [self.stop]))
+        spacing = np.diff(ticks)
+        longest = (GAP_INTERVALS - 1) * float(np.median(spacing))
+        if self.segment.kind != 3 or not (spacing > longest).any() or (self.stop - self.start) / longest > MAX_STEPS:
+            return ticks
+        parts = np.ceil(spacing / longest).astype(int).tolist()
+        inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(ticks[:-1], ticks[1:], parts, strict=True)]
+        return np.concatenate([*inner, ticks[-1:]])
 
-def pieces_of(covered: list[tuple[CkSegment, Coverage]]) -> list[Piece]:
+
+def _pieces_of(covered: list[tuple[_CkSegment, Coverage]]) -> list[_Piece]:
     """The pieces of the segments of one structure, in order of time; segments come in the file's order."""
     owners = [(segment, cover.epochs, *span) for segment, cover in covered for span in cover.intervals.tolist()]
     if not owners:
@@ -205,24 +305,20 @@ def pieces_of(covered: list[tuple[CkSegment, Coverage]]) -> list[Piece]:
             owner_of_point[cells.start] = index
     begins = np.flatnonzero(np.diff(owner_of_cell, prepend=-1))
     ends = np.append(begins[1:], len(bounds) - 1)
-    found = []
-    for k, end in zip(begins.tolist(), ends.tolist(), strict=True):
-        if owner_of_cell[k] >= 0:
-            found.append(_piece(owners[owner_of_cell[k]], float(bounds[k]), float(bounds[end])))
+    spans = [(owner_of_cell[k], k, end) for k, end in zip(begins.tolist(), ends.tolist(), strict=True) if owner_of_cell[k] >= 0]
     for k in np.flatnonzero(owner_of_point >= 0).tolist():
         if owner_of_cell[k] < 0 and (k == 0 or owner_of_cell[k - 1] < 0):
-            found.append(_piece(owners[owner_of_point[k]], float(bounds[k]), float(bounds[k])))
+            spans.append((owner_of_point[k], k, k))
+    found = []
+    for owner, first, last in spans:
+        (segment, epochs, *_), start, stop = owners[owner], float(bounds[first]), float(bounds[last])
+        within = slice(int(np.searchsorted(epochs, start, "right")), int(np.searchsorted(epochs, stop, "left")))
+        found.append(_Piece(segment, start, stop, epochs[within]))
     return sorted(found, key=lambda piece: piece.start)
 
 
-def _piece(owner: tuple[CkSegment, FloatArray, float, float], start: float, stop: float) -> Piece:
-    segment, epochs = owner[:2]
-    within = slice(int(np.searchsorted(epochs, start, "right")), int(np.searchsorted(epochs, stop, "left")))
-    return Piece(segment, start, stop, epochs[within])
-
-
 @dataclass(frozen=True)
-class Structure:
+class _Structure:
     """A structure whose CK is loaded: `body` its id, `clock` that of its clock; `turning` where all its segments have rates."""
 
     path: Path
@@ -232,7 +328,6 @@ class Structure:
 
     @cached_property
     def clock(self) -> int:
-        """The id of the clock that counts its ticks."""
         return int(self.spice.ckmeta(self.body, "SCLK"))
 
     def t_s(self, tick: float) -> float:
@@ -253,7 +348,6 @@ class Structure:
         return np.asarray(matrix, dtype=np.float64)
 
     def q_icrs_to_body(self, tick: float) -> FloatArray:
-        """The attitude (4,)."""
         return from_matrix(self.matrix(tick))
 
     def attitude(self, tick: float, with_rate: bool) -> tuple[FloatArray, FloatArray | None]:
@@ -275,18 +369,19 @@ class Structure:
         """
         start, stop = span
         s_per_tick = (self.t_s(stop) - self.t_s(start)) / (stop - start)
-        if start + step <= tick <= stop - step:
-            return self._mean_rate(tick - step, tick + step, s_per_tick)
-        away = step if tick < start + step else -step
-        near, far = (self._mean_rate(min(tick, tick + n * away), max(tick, tick + n * away), s_per_tick) for n in (1, 2))
-        return 2.0 * near - far
 
-    def _mean_rate(self, before: float, after: float, s_per_tick: float) -> FloatArray:
-        return rate_between_rad_s(self.q_icrs_to_body(before), self.q_icrs_to_body(after), (after - before) * s_per_tick)
+        def mean_rate(one: float, other: float) -> FloatArray:
+            before, after = sorted((one, other))
+            return rate_between_rad_s(self.q_icrs_to_body(before), self.q_icrs_to_body(after), (after - before) * s_per_tick)
+
+        if start + step <= tick <= stop - step:
+            return mean_rate(tick - step, tick + step)
+        away = step if tick < start + step else -step
+        return 2.0 * mean_rate(tick, tick + away) - mean_rate(tick, tick + 2 * away)
 
 
 @dataclass(frozen=True, slots=True)
-class Sampled:
+class _Sampled:
     """n attitudes of a structure, and how good they are.
 
     `t_ns` (n,); `q` (n, 4) is q_icrs_to_body; `rate` (n, 3), rad/s, in the structure's components, NaN where there is none;
@@ -304,13 +399,13 @@ class Sampled:
     gaps_s: list[float]
 
 
-def sample(structure: Structure, pieces: Sequence[Piece]) -> Sampled:
+def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
     """The attitudes of pieces in order of time. Raises InputError for more than MAX_SAMPLES of them."""
     smooth = [piece for piece in pieces if piece.segment.kind in SMOOTH and piece.stop > piece.start]
     step = error_rad = 0.0
     if smooth:
         step, error_rad = _step_of(structure, smooth)
-    ticks = [_ticks(piece, step) for piece in pieces]
+    ticks = [piece.ticks(step) for piece in pieces]
     if sum(map(len, ticks)) > MAX_SAMPLES:
         raise InputError(f"{structure.path}: contains more than {MAX_SAMPLES} attitudes; cut it into several (ckslicer)")
     broken, gaps_s = _parted(structure, pieces, ticks)
@@ -319,32 +414,16 @@ def sample(structure: Structure, pieces: Sequence[Piece]) -> Sampled:
     t_ns, q, rate = (np.concatenate(each) for each in zip(*parts, strict=True))
     breaks = np.zeros(len(t_ns), dtype=np.bool_)
     breaks[np.cumsum([0, *map(len, ticks[:-1])])] = broken
-    return Sampled(t_ns, q, rate, breaks, np.concatenate(ticks), step_s, error_rad, gaps_s)
+    return _Sampled(t_ns, q, rate, breaks, np.concatenate(ticks), step_s, error_rad, gaps_s)
 
 
-def _ticks(piece: Piece, step: float) -> FloatArray:
-    """The ticks at which a piece is read, both ends among them; a long pause between them is filled, as the file covers it."""
-    if piece.stop <= piece.start:
-        return np.array([piece.start])
-    if piece.segment.kind in SMOOTH:
-        return np.linspace(piece.start, piece.stop, max(math.ceil((piece.stop - piece.start) / step), 2) + 1)
-    ticks = np.concatenate(([piece.start], piece.epochs, [piece.stop]))
-    spacing = np.diff(ticks)
-    longest = (GAP_INTERVALS - 1) * float(np.median(spacing))
-    if piece.segment.kind != 3 or not (spacing > longest).any() or (piece.stop - piece.start) / longest > MAX_STEPS:
-        return ticks
-    parts = np.ceil(spacing / longest).astype(int).tolist()
-    inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(ticks[:-1], ticks[1:], parts, strict=True)]
-    return np.concatenate([*inner, ticks[-1:]])
-
-
-def _step_of(structure: Structure, smooth: Sequence[Piece]) -> tuple[float, float]:
+def _step_of(structure: _Structure, smooth: Sequence[_Piece]) -> tuple[float, float]:
     """The step of the smooth pieces, ticks, and the largest error between samples that far apart, rad."""
     total = sum(piece.stop - piece.start for piece in smooth)
     steps = FIRST_STEPS
     while True:
         step = total / steps
-        ticks = [_ticks(piece, step) for piece in smooth]
+        ticks = [piece.ticks(step) for piece in smooth]
         counts = np.cumsum([len(each) - 1 for each in ticks])
         error_rad = excess_rad = 0.0
         for place in np.unique(np.linspace(0, counts[-1] - 1, PROBES).astype(int)).tolist():
@@ -357,7 +436,7 @@ def _step_of(structure: Structure, smooth: Sequence[Piece]) -> tuple[float, floa
         steps *= 2
 
 
-def _error_rad(structure: Structure, piece: Piece, ticks: FloatArray, k: int) -> tuple[float, float]:
+def _error_rad(structure: _Structure, piece: _Piece, ticks: FloatArray, k: int) -> tuple[float, float]:
     """How far the log's interpolation is off at one place between the ticks k and k + 1 of a piece, rad.
 
     And the share of it that no step mends: the turn in the time that a double of ephemeris time does not resolve.
@@ -377,7 +456,7 @@ def _error_rad(structure: Structure, piece: Piece, ticks: FloatArray, k: int) ->
     return angle_between_rad(shown.q_icrs_to_cam, structure.q_icrs_to_body(tick)), clock_rad
 
 
-def _attitudes(structure: Structure, piece: Piece, ticks: FloatArray) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
+def _attitudes(structure: _Structure, piece: _Piece, ticks: FloatArray) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Times (n,), attitudes (n, 4) and rates (n, 3) of a piece; a smooth segment without rates has them by difference."""
     by_difference = piece.segment.kind in SMOOTH and not piece.segment.has_rate and len(ticks) > 1
     step = float(ticks[1] - ticks[0]) * DIFFERENCE_STEPS if by_difference else 0.0
@@ -393,10 +472,11 @@ def _attitudes(structure: Structure, piece: Piece, ticks: FloatArray) -> tuple[n
     return t_ns, q, rates
 
 
-def _parted(structure: Structure, pieces: Sequence[Piece], ticks: list[FloatArray]) -> tuple[list[bool], list[float]]:
+def _parted(structure: _Structure, pieces: Sequence[_Piece], ticks: list[FloatArray]) -> tuple[list[bool], list[float]]:
     """Whether each piece begins with a break, after a gap or a jump, and the lengths of the gaps, s.
 
-    Where two pieces touch, both ends lie on one tick: `ticks` is changed to have one of them, or both beside it.
+    Where two pieces touch, both ends lie on one tick: `ticks` is changed to have one of them, or both beside it. The attitude
+    jumps there where it turns by more than it does in the same time before.
     """
     broken, gaps_s = [False], []
     for k, (before, after) in enumerate(pairwise(pieces), start=1):
@@ -404,8 +484,11 @@ def _parted(structure: Structure, pieces: Sequence[Piece], ticks: list[FloatArra
             gaps_s.append(structure.t_s(after.start) - structure.t_s(before.stop))
             broken.append(True)
             continue
-        beside = _beside(structure, before, after)
-        broken.append(_jumps(structure, before.stop, beside))
+        s_per_tick = (structure.t_s(after.stop) - structure.t_s(before.start)) / (after.stop - before.start)
+        shortest = min(before.stop - before.start, after.stop - after.start)
+        beside = max(min(BESIDE_S / s_per_tick, shortest / 8), 2 * float(np.spacing(before.stop)))
+        q = [structure.q_icrs_to_body(before.stop + n * beside) for n in (-3, -1, 1)]
+        broken.append(angle_between_rad(q[1], q[2]) > JUMP_RAD + 3 * angle_between_rad(q[0], q[1]))
         if broken[-1]:
             ticks[k - 1][-1] -= beside
             ticks[k][0] += beside
@@ -414,42 +497,89 @@ def _parted(structure: Structure, pieces: Sequence[Piece], ticks: list[FloatArra
     return broken, gaps_s
 
 
-def _beside(structure: Structure, before: Piece, after: Piece) -> float:
-    """Ticks away from the boundary of two pieces that touch: BESIDE_S, or a part of a shorter piece."""
-    s_per_tick = (structure.t_s(after.stop) - structure.t_s(before.start)) / (after.stop - before.start)
-    shortest = min(before.stop - before.start, after.stop - after.start)
-    return max(min(BESIDE_S / s_per_tick, shortest / 8), 2 * float(np.spacing(before.stop)))
+def load(spice: Any, path: Path, kernels: Sequence[Path]) -> None:
+    """Load the kernels and then the CK, which so comes before any other; files are checked first (InputError)."""
+    for kernel in kernels:
+        for file in _checked(spice, kernel):
+            spice.furnsh(str(file))
+    spice.furnsh(str(path))
 
 
-def _jumps(structure: Structure, tick: float, beside: float) -> bool:
-    """Whether the attitude jumps at a tick: more than it turns in the same time before it."""
-    earlier, before, after = (structure.q_icrs_to_body(tick + n * beside) for n in (-3, -1, 1))
-    return angle_between_rad(before, after) > JUMP_RAD + 3 * angle_between_rad(earlier, before)
+def _checked(spice: Any, kernel: Path, meta: Path | None = None) -> list[Path]:
+    """The files of a kernel, checked before SPICE opens them: itself, or those that a meta-kernel names."""
+    with open_regular(kernel, ADVICE if meta is None else f"{meta} names it") as file:
+        head = file.read(HEAD_BYTES)
+    if meta is not None and head.startswith(b"KPL/MK"):
+        raise InputError(f"{meta}: names another meta-kernel, {kernel}; name its kernels instead")
+    if head.startswith(b"DAF/"):
+        _read_daf(kernel, MAX_BINARY_BYTES)
+        return [kernel]
+    if head.startswith((b"DAFETF", b"DASETF")):
+        raise InputError(f"{kernel}: is a transfer file; convert it by tobin")
+    open_regular(kernel, ADVICE, MAX_TEXT_BYTES).close()
+    if not head.startswith(b"KPL/MK") and kernel.suffix.lower() != ".tm":
+        return [kernel]
+    return [file for named in _named(spice, kernel) for file in _checked(spice, named, kernel)]
 
 
-def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[Sampled, dict[str, Any]]:
+def _named(spice: Any, meta: Path) -> list[Path]:
+    """The kernels that a meta-kernel names, its path symbols replaced; from the working directory, as SPICE has it."""
+    names = ("KERNELS_TO_LOAD", "PATH_SYMBOLS", "PATH_VALUES")
+    spice.ldpool(str(meta))
+    files, symbols, values = (_strings(spice, name) for name in names)
+    for name in names:
+        spice.dvpool(name)
+    if not files or len(symbols) != len(values):
+        raise InputError(f"{meta}: names no kernels; write KERNELS_TO_LOAD, and as many PATH_VALUES as PATH_SYMBOLS")
+    for symbol, value in sorted(zip(symbols, values, strict=True), key=lambda pair: -len(pair[0])):
+        files = [file.replace(f"${symbol}", value) for file in files]
+    return [Path(file) for file in files]
+
+
+def _strings(spice: Any, name: str) -> list[str]:
+    """The strings of a variable of the pool; one that ends in + goes on in the next."""
+    found: list[str] = []
+    for k in range(MAX_NAMED + 1):
+        text, _, there = spice.stpool(name, k, "+")
+        if not there:
+            return found
+        found.append(text)
+    raise InputError(f"a meta-kernel has more than {MAX_NAMED} {name}; split it into several")
+
+
+def _in_words(error: Any) -> str:
+    """What SPICE says, and what to give where a kernel is missing."""
+    said = shortened(" ".join(str(error.long or error.explain or error.short).split()), 300)
+    if "SCLK" in said and ("not found" in said or "kernel" in said.lower()):
+        return f"its clock is unknown; give its SCLK kernel, and leap seconds: --kernel FILE.tsc ({said})"
+    if "frame" in said.lower():
+        return f"a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own .bc, or .tpc ({said})"
+    return f"SPICE refuses it ({said})"
+
+
+def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sampled, dict[str, Any]]:
     """The attitudes of the CK's structure, with its name and the frames that its segments refer to. Raises InputError."""
     import spiceypy
 
-    daf, segments = read_segments(path, MAX_CK_BYTES)
+    daf, segments = _read_segments(path, MAX_CK_BYTES)
     try:
         with spiceypy.no_found_check():
             load(spiceypy, path, kernels)
             body = _body(spiceypy, path, segments, stated)
             own = [segment for segment in segments if segment.body == body]
-            pieces = pieces_of(list(zip(own, _coverages(spiceypy, daf, own), strict=True)))
+            pieces = _pieces_of(list(zip(own, _coverages(spiceypy, daf, own), strict=True)))
             if not pieces:
                 raise InputError(f"{path}: its segments of {body} cover no time")
-            structure = Structure(path, spiceypy, body, all(segment.has_rate for segment in own))
+            structure = _Structure(path, spiceypy, body, all(segment.has_rate for segment in own))
             references = sorted({spiceypy.frmnam(segment.reference) or str(segment.reference) for segment in own})
             return sample(structure, pieces), {"structure": _name(spiceypy, body), "references": references}
     except spiceypy.utils.exceptions.SpiceyError as error:
-        raise InputError(f"{path}: {in_words(error)}") from error
+        raise InputError(f"{path}: {_in_words(error)}") from error
 
 
-def _coverages(spice: Any, daf: Daf, segments: list[CkSegment]) -> list[Coverage]:
+def _coverages(spice: Any, daf: _Daf, segments: list[_CkSegment]) -> list[Coverage]:
     """What each segment covers; SPICE tells the intervals of types 4 and 6."""
-    found = [coverage(daf, segment) for segment in segments]
+    found = [_coverage(daf, segment) for segment in segments]
     if None not in found:
         return [each for each in found if each is not None]
     words = sum(segment.summary.integers[-1] - segment.summary.integers[-2] for segment in segments)
@@ -463,7 +593,7 @@ def _coverages(spice: Any, daf: Daf, segments: list[CkSegment]) -> list[Coverage
     return result
 
 
-def _body(spice: Any, path: Path, segments: list[CkSegment], stated: str | None) -> int:
+def _body(spice: Any, path: Path, segments: list[_CkSegment], stated: str | None) -> int:
     """The id of the structure: the only one, or what the user states."""
     bodies = sorted({segment.body for segment in segments})
     named = ", ".join(_name(spice, body) for body in bodies[:MAX_NAMED_BODIES]) + (", ..." * (len(bodies) > MAX_NAMED_BODIES))

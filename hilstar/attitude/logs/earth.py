@@ -33,7 +33,7 @@ from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns
 from hilstar.attitude.logs.entries import LogEntry, Stated
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
-from hilstar.rotation import conjugate, from_matrix, multiply, normalise
+from hilstar.rotation import frame_turns, from_matrix, multiply, normalise, rotate
 from hilstar.units import NS_PER_S
 
 IntArray = npt.NDArray[np.int64]
@@ -79,7 +79,7 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
         return values[before] + share * (values[after] - values[before])
 
     table, mjd = _table(), UNIX_MJD + hours / 24.0
-    tai_utc_s = tai_minus_utc_s(hours // 24)
+    tai_utc_s = _tai_minus_utc_s(hours // 24)
     tt_days = (tai_utc_s + TT_FROM_TAI_S) / 86400.0
     # Linear over an hour, these are within 5 microarcsec: the shortest nutation of note takes 5.5 days.
     x, y, s = (between(values) for values in erfa.xys06a(MJD_ZERO_JD, mjd + tt_days))
@@ -89,15 +89,15 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
     ut1_days = (utc_ns % (24 * HOUR_NS)) / (24 * HOUR_NS) + (ut1_tai_s + tai_utc_s[before]) / 86400.0
     era = erfa.era00(MJD_ZERO_JD + UNIX_MJD + utc_ns // (24 * HOUR_NS), ut1_days)
     node, tilt = np.arctan2(y, x), np.arcsin(np.hypot(x, y))
-    to_cirs = _chain(_turn(3, node), _turn(2, tilt), _turn(3, -node - s))
-    return _chain(to_cirs, _turn(3, era), _turn(2, -pole_x), _turn(1, -pole_y))
+    to_cirs = _chain(frame_turns(2, node), frame_turns(1, tilt), frame_turns(2, -node - s))
+    return _chain(to_cirs, frame_turns(2, era), frame_turns(1, -pole_x), frame_turns(0, -pole_y))
 
 
 def q_icrs_to_ned(utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
     """The rotations (n, 4) from ICRS to north, east, down at UTCs (n,) and geodetic places (n,) or ()."""
     zeros = np.zeros(len(utc_ns))
-    to_meridian = _turn(3, zeros + np.radians(longitude_deg))
-    return _chain(q_icrs_to_itrs(utc_ns), to_meridian, _turn(2, zeros - np.radians(latitude_deg) - np.pi / 2))
+    to_meridian = frame_turns(2, zeros + np.radians(longitude_deg))
+    return _chain(q_icrs_to_itrs(utc_ns), to_meridian, frame_turns(1, zeros - np.radians(latitude_deg) - np.pi / 2))
 
 
 def q_icrs_to_enu(utc_ns: IntArray, latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
@@ -142,23 +142,16 @@ def _table() -> _EarthTable:
     rows = iers.IERS_A.read(iers.IERS_A_FILE)
     mjd = np.array(rows["MJD"].value, dtype=np.float64)
     ut1_utc_s, x_arcsec, y_arcsec = (np.array(rows[name].value, dtype=np.float64) for name in ("UT1_UTC", "PM_x", "PM_y"))
-    ut1_tai_s = ut1_utc_s - tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
+    ut1_tai_s = ut1_utc_s - _tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
     return _EarthTable(mjd, ut1_tai_s, np.radians(x_arcsec / 3600), np.radians(y_arcsec / 3600))
 
 
-def tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
+def _tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
     """TAI-UTC in seconds at the beginnings of days since 1970."""
     year, month, day, _ = erfa.jd2cal(MJD_ZERO_JD + UNIX_MJD, np.asarray(unix_days, dtype=np.float64))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)  # a year after the last known leap second
         return np.asarray(erfa.dat(year, month, day, 0.0))
-
-
-def _turn(axis: int, angle_rad: FloatArray) -> FloatArray:
-    """Quaternions (n, 4) of frames turned about their axis 1, 2 or 3 (R1, R2, R3 of the IERS Conventions)."""
-    q = np.zeros((len(angle_rad), 4))
-    q[:, 0], q[:, axis] = np.cos(angle_rad / 2), -np.sin(angle_rad / 2)
-    return q
 
 
 def _chain(*turns: FloatArray) -> FloatArray:
@@ -182,7 +175,7 @@ def q_icrs_to_date(frame: str, scale: str, t_ns: IntArray) -> tuple[FloatArray, 
     elif scale in TO_TAI_S:
         tai_ns = t_ns + round(TO_TAI_S[scale] * NS_PER_S)
         days = (tai_ns - 37 * NS_PER_S) // (24 * HOUR_NS)  # within a second of UTC's day since 2017
-        utc_ns = tai_ns - np.round(tai_minus_utc_s(days) * NS_PER_S).astype(np.int64)
+        utc_ns = tai_ns - np.round(_tai_minus_utc_s(days) * NS_PER_S).astype(np.int64)
     else:
         raise AemFaultError(
             "", f"TIME_SYSTEM = {scale} does not tell UTC, by which the {frame} turns; write UTC, TAI, TT, TDB or GPS"
@@ -250,10 +243,10 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
         return Reference(kind)
     if stated.place is None:
         raise InputError(f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place LAT,LON,HEIGHT")
-    return Reference(kind, stated.place[:2], zero_utc_ns(path, stated, first_ns))
+    return Reference(kind, stated.place[:2], _zero_utc_ns(path, stated, first_ns))
 
 
-def zero_utc_ns(path: Path, stated: Stated, first_ns: int) -> int:
+def _zero_utc_ns(path: Path, stated: Stated, first_ns: int) -> int:
     """What makes UTC (ns since 1970) of the log's times. Raises InputError as `stated_reference`."""
     dated = first_ns >= FIRST_DATE_NS
     if stated.epoch_utc is None:
@@ -295,12 +288,9 @@ def _from_icrs(samples: list[AttitudeSample], reference: Reference, gyro: bool) 
         return []
     q_ref_to_body = np.array([sample.q_icrs_to_cam for sample in samples])
     q = multiply(q_ref_to_body, reference.q_icrs_to_reference(sample.t_ns for sample in samples))
-    own = np.array([0.0, *reference.earth_rate_rad_s])
-    earths = multiply(multiply(q_ref_to_body, own), conjugate(q_ref_to_body))[:, 1:]
+    earths = rotate(q_ref_to_body, np.tile(reference.earth_rate_rad_s, (len(samples), 1)))
     turned = []
     for sample, attitude, earth_rate in zip(samples, q, earths, strict=True):
-        rate = sample.rate_cam_rad_s
-        turned.append(
-            replace(sample, q_icrs_to_cam=attitude, rate_cam_rad_s=rate if rate is None or gyro else rate + earth_rate)
-        )
+        rate = sample.rate_cam_rad_s if sample.rate_cam_rad_s is None or gyro else sample.rate_cam_rad_s + earth_rate
+        turned.append(replace(sample, q_icrs_to_cam=attitude, rate_cam_rad_s=rate))
     return turned

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import importlib.util
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
@@ -19,8 +19,16 @@ import msgspec
 
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
-from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, MAX_SAMPLES, AttitudeLog, LogEntry, LogReading, Stated
-from hilstar.attitude.logs.gaps import LogJoins, log_joins
+from hilstar.attitude.logs.entries import (
+    MAX_QUOTED_CHARACTERS,
+    MAX_SAMPLES,
+    AttitudeLog,
+    LogEntry,
+    LogJoins,
+    LogReading,
+    Stated,
+    log_joins,
+)
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, checked_sample, decode
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError, MachineError
@@ -46,14 +54,14 @@ MAX_NAMED_TOPICS = 12
 MAX_LOG_BYTES = 500_000_000
 MAX_AEM_BYTES = 50_000_000
 NOTHING_STATED = Stated()
+ENDINGS = (".csv", ".jsonl", ".json", ".mcap", ".aem", ".kvn", ".xml")
 READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP, SPICE CKs, bags of ROS and ULogs of PX4"
 YEAR_NS = 31_557_600 * NS_PER_S
 SECONDS_FORM = "write seconds after its first sample"
 TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 
 
-def read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
-    """The entries of a CSV log's lines."""
+def _read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
     reader = csv.reader(lines)
     rows = (row for row in reader if row and not row[0].startswith("#"))
     header = [name.strip() for name in next(rows, [])]
@@ -100,22 +108,18 @@ def ns_of_seconds(seconds: str) -> int:
     return int(value.scaleb(9).to_integral_value())
 
 
-def write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
     """Write samples with every column; a rate that is not known is an empty cell. Raises OSError."""
     file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
     for sample in samples:
         rate = sample.rate_cam_rad_s
         numbers = [*map(repr, sample.q_icrs_to_cam.tolist()), *(("", "", "") if rate is None else map(repr, rate.tolist()))]
-        row = (_seconds(sample.t_ns), *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")
-        file.write((",".join(row) + "\n").encode())
+        seconds, ns = divmod(abs(sample.t_ns), NS_PER_S)
+        t_s = f"{'-' if sample.t_ns < 0 else ''}{seconds}.{ns:09}"
+        file.write((",".join((t_s, *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")) + "\n").encode())
 
 
-def _seconds(t_ns: int) -> str:
-    seconds, ns = divmod(abs(t_ns), NS_PER_S)
-    return f"{'-' if t_ns < 0 else ''}{seconds}.{ns:09}"
-
-
-def read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
+def _read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
     """The entries of a log's lines; blank ones are ignored."""
     for number, line in enumerate(lines, start=1):
         if line.strip():
@@ -125,7 +129,7 @@ def read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
             yield LogEntry(f":{number}", event)
 
 
-def write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
     """Write one object for each sample; a rate that is not known has no key. Raises OSError."""
     encoder = msgspec.json.Encoder()
     for sample in samples:
@@ -150,14 +154,14 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
     samples: list[AttitudeSample] = []
     try:
         with _open_log(path, stated) as reading:
-            mounted = stated.mounting.sample if reading.conventions.of_body else _as_it_is
+            of_body = reading.conventions.of_body
             for where, event in reading.entries:
                 if isinstance(event, Refusal):
                     raise InputError(f"{path}{where}: {event.detail}")
                 if samples and event.t_ns <= samples[-1].t_ns:
                     times = f"t_ns {event.t_ns} after {samples[-1].t_ns}"
                     raise InputError(f"{path}{where}: time does not increase ({times}); {reading.advice}")
-                samples.append(mounted(event))
+                samples.append(stated.mounting.sample(event) if of_body else event)
                 if len(samples) > MAX_SAMPLES:
                     raise InputError(f"{path}{where}: more than {MAX_SAMPLES} attitudes; split the log into several")
     except (OSError, csv.Error) as error:
@@ -165,12 +169,7 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
     if not samples:
         _refuse_other_topics(path)
         raise InputError(f"{path}: contains no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
-    mounting = stated.mounting.told if reading.conventions.of_body else []
-    return AttitudeLog(samples, reading.conventions, [*reading.told, *mounting])
-
-
-def _as_it_is(sample: AttitudeSample) -> AttitudeSample:
-    return sample
+    return AttitudeLog(samples, reading.conventions, [*reading.told, *(stated.mounting.told if of_body else [])])
 
 
 def _refuse_other_topics(path: Path) -> None:
@@ -192,19 +191,27 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
     Raises InputError for another ending, for no samples, and when the file cannot be written.
     """
     ending = path.suffix.lower()
-    if ending not in _WRITERS and ending not in _AEM_IN_XML:
-        raise InputError(f"{path}: not a log's name; end it in one of {', '.join([*_WRITERS, *_AEM_IN_XML])}")
+    if ending not in ENDINGS:
+        raise InputError(f"{path}: not a log's name; end it in one of {', '.join(ENDINGS)}")
     if not samples:
         raise InputError(f"{path}: no attitude to write")
     with whole_file(path) as file:
-        if ending in _AEM_IN_XML:
-            _write_aem(file, samples, _AEM_IN_XML[ending], scale)
+        if ending == ".csv":
+            _write_csv(file, samples)
+        elif ending in {".jsonl", ".json"}:
+            _write_json_lines(file, samples)
+        elif ending == ".mcap":
+            from hilstar.attitude.logs.mcap_log import write_attitudes
+
+            write_attitudes(file, samples)
         else:
-            _WRITERS[ending](file, samples)
+            from hilstar.attitude.logs.aem import aem_text
+
+            file.write(aem_text(samples, ending == ".xml", scale).encode())
 
 
 def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:
-    """A timeline of every sample of a log, joined as the log's own samples require (see `gaps`)."""
+    """A timeline of every sample of a log, joined as the log's own samples require (see `entries`)."""
     policy = replace(policy, prediction="rate")  # nothing is predicted of a log
     timeline = Timeline(policy, capacity=len(samples), joins=log_joins(samples) if joins is None else joins)
     for sample in samples:
@@ -214,51 +221,23 @@ def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins 
 
 @contextlib.contextmanager
 def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
-    """The reading of a file, by what it holds."""
-    if path.is_dir():
-        head = b""
-    else:
+    """The reading of a file, by what it holds. A format's reader, and its library, are imported where a log needs them."""
+    head = b""
+    if not path.is_dir():
         with open_regular(path, READABLE) as file:
             head = file.read(HEAD_BYTES)
     if _is_bag(path, head):
-        with _ros(path, stated) as reading:
+        _require("rosbags", "ros", f"{path}: a ROS bag")
+        from hilstar.attitude.logs.ros import read_ros
+        from hilstar.attitude.logs.ros_bags import open_bag
+
+        with open_bag(path) as bag:
+            yield read_ros(bag, stated)
+    elif head.startswith((MCAP_MAGIC, ULOG_MAGIC, CK_MAGIC)):
+        yield _read_binary(path, head, stated)
+    else:
+        with _open_text(path) as reading:
             yield reading
-        return
-    if head.startswith(MCAP_MAGIC):
-        yield _mcap(path)
-        return
-    if head.startswith(ULOG_MAGIC):
-        yield _ulog(path, stated)
-        return
-    if head.startswith(CK_MAGIC):
-        yield _ck(path, stated)
-        return
-    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        word = _first_word(lines)
-    if word.startswith("<") or word.startswith("CCSDS_AEM_VERS"):
-        yield _aem(path, read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_AEM_BYTES))
-        return
-    if word.startswith("CCSDS_"):
-        raise InputError(
-            f"{path}: starts with {word[:MAX_QUOTED_CHARACTERS]}; of the CCSDS messages, only CCSDS_AEM_VERS is read"
-        )
-    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        if word.startswith("{"):
-            yield LogReading(read_json_lines(lines), replace(PACKETS, source="JSON lines"))
-        else:
-            yield LogReading(read_csv(lines), replace(PACKETS, source="CSV"))
-
-
-def _first_word(lines: Iterable[str]) -> str:
-    """The first word of the first line that is not a comment; it tells AEM, JSON and XML apart."""
-    for line in lines:
-        words = line.split(maxsplit=1)
-        if words and words[0] != "COMMENT" and not words[0].startswith("#"):
-            return words[0]
-    return ""
-
-
-# A format's reader, and its library, are imported where a log needs them.
 
 
 def _is_bag(path: Path, head: bytes) -> bool:
@@ -273,72 +252,54 @@ def _is_bag(path: Path, head: bytes) -> bool:
     return head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))
 
 
-@contextlib.contextmanager
-def _ros(path: Path, stated: Stated) -> Iterator[LogReading]:
-    try:
-        import rosbags  # noqa: F401
-    except ImportError as error:
-        raise MachineError(f"{path}: a ROS bag; reading it needs rosbags: pip install 'hilstar[ros]'") from error
-    from hilstar.attitude.logs.ros import read_ros
-    from hilstar.attitude.logs.ros_bags import open_bag
-
-    with open_bag(path) as bag:
-        yield read_ros(bag, stated)
+def _require(library: str, extra: str, what: str) -> None:
+    if importlib.util.find_spec(library) is None:
+        raise MachineError(f"{what}; reading it needs {library}: pip install 'hilstar[{extra}]'")
 
 
-def _mcap(path: Path) -> LogReading:
+def _read_binary(path: Path, head: bytes, stated: Stated) -> LogReading:
+    if head.startswith(ULOG_MAGIC):
+        _require("pyulog", "px4", f"{path}: a ULog of PX4")
+        from hilstar.attitude.logs.px4 import read_ulog
+
+        return read_ulog(path, stated)
+    if head.startswith(CK_MAGIC):
+        _require("spiceypy", "spice", f"{path}: a SPICE CK")
+        from hilstar.attitude.logs.ck import read_ck
+
+        return read_ck(path, stated)
     from hilstar.attitude.logs.mcap_log import read_attitudes
 
     entries = (LogEntry(f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
     return LogReading(entries, replace(PACKETS, source="MCAP"), "the sender restarted here; give a log of one run")
 
 
-def _aem(path: Path, text: str) -> LogReading:
-    from hilstar.attitude.logs.aem import read_aem
-    from hilstar.attitude.logs.aem_blocks import AemFaultError
-    from hilstar.attitude.logs.earth import q_icrs_to_date
+@contextlib.contextmanager
+def _open_text(path: Path) -> Iterator[LogReading]:
+    """The reading of a text, told by the first word of its first line that is no comment."""
+    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
+        firsts = (line.split(maxsplit=1)[0] for line in lines if line.strip())
+        word = next((first for first in firsts if first != "COMMENT" and not first.startswith("#")), "")
+    if word.startswith(("<", "CCSDS_AEM_VERS")):
+        from hilstar.attitude.logs.aem import read_aem
+        from hilstar.attitude.logs.earth import q_icrs_to_date
 
-    try:
-        return read_aem(text, q_icrs_to_date)
-    except AemFaultError as fault:
-        raise InputError(f"{path}{fault.where}: {fault}") from fault
-
-
-def _ulog(path: Path, stated: Stated) -> LogReading:
-    try:
-        import pyulog  # noqa: F401
-    except ImportError as error:
-        raise MachineError(f"{path}: a ULog of PX4; reading it needs pyulog: pip install 'hilstar[px4]'") from error
-    from hilstar.attitude.logs.px4 import read_ulog
-
-    return read_ulog(path, stated)
-
-
-def _ck(path: Path, stated: Stated) -> LogReading:
-    from hilstar.attitude.logs.ck import read_ck
-
-    return read_ck(path, stated)
-
-
-def _write_aem(file: IO[bytes], samples: Sequence[AttitudeSample], xml: bool, scale: str | None) -> None:
-    from hilstar.attitude.logs.aem import aem_text
-
-    file.write(aem_text(samples, xml, scale).encode())
-
-
-def _write_mcap(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    from hilstar.attitude.logs.mcap_log import write_attitudes
-
-    write_attitudes(file, samples)
-
-
-_WRITERS: dict[str, Callable[[IO[bytes], Sequence[AttitudeSample]], None]] = {
-    ".csv": write_csv,
-    ".jsonl": write_json_lines,
-    ".json": write_json_lines,
-    ".mcap": _write_mcap,
-}
-_AEM_IN_XML = {".aem": False, ".kvn": False, ".xml": True}
+        text = read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_AEM_BYTES)
+        try:
+            reading = read_aem(text, q_icrs_to_date)
+        except AemFaultError as fault:
+            raise InputError(f"{path}{fault.where}: {fault}") from fault
+        yield reading
+        return
+    if word.startswith("CCSDS_"):
+        raise InputError(
+            f"{path}: starts with {word[:MAX_QUOTED_CHARACTERS]}; of the CCSDS messages, only CCSDS_AEM_VERS is read"
+        )
+    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
+        if word.startswith("{"):
+            yield LogReading(_read_json_lines(lines), replace(PACKETS, source="JSON lines"))
+        else:
+            yield LogReading(_read_csv(lines), replace(PACKETS, source="CSV"))
 
 
 def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None) -> int:
@@ -349,7 +310,16 @@ def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None)
     first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
     if text is None:
         return first_ns
-    t_ns = _named_ns(text, first_ns)
+    try:
+        seconds = float(text)
+        if not abs(seconds) <= 1e12:
+            raise InputError(f"--at {text}: {TIME_FORM}")
+        t_ns = first_ns + round(seconds * NS_PER_S)
+    except ValueError:
+        try:
+            t_ns = epoch_ns("", text)
+        except AemFaultError as fault:
+            raise InputError(f"--at {text}: {fault}") from fault
     if not first_ns <= t_ns <= last_ns:
         span = f"{(last_ns - first_ns) / NS_PER_S:.9g} s long"
         if first_ns < YEAR_NS:
@@ -357,16 +327,3 @@ def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None)
         span += f", from {epoch_text(first_ns)} to {epoch_text(last_ns)} on its own scale"
         raise InputError(f"--at {text}: {path} is {span}; {TIME_FORM}")
     return t_ns
-
-
-def _named_ns(text: str, first_ns: int) -> int:
-    try:
-        seconds = float(text)
-    except ValueError:
-        try:
-            return epoch_ns("", text)
-        except AemFaultError as fault:
-            raise InputError(f"--at {text}: {fault}") from fault
-    if not math.isfinite(seconds) or abs(seconds) > 1e12:
-        raise InputError(f"--at {text}: {TIME_FORM}")
-    return first_ns + round(seconds * NS_PER_S)

@@ -182,7 +182,35 @@ def holds_ros(path: Path) -> bool:
 def records_of(path: Path) -> Iterator[McapRecord]:
     """Every record of one file, chunks unpacked into their schemas, channels and messages. Raises InputError for damage."""
     with open_regular(path, ADVICE) as file:
-        yield from _open_records(path, file)
+        finished = _is_finished(file)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        if not MCAP_MAGIC.startswith(file.read(len(MCAP_MAGIC))):
+            raise InputError(f"{path}: is no MCAP file; {ADVICE}")
+        file.seek(0)
+        capped = _Capped(file, size)
+        reader = StreamReader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
+        records = reader.records
+        room = FREE_BYTES + MAX_INFLATION * size
+        while True:
+            try:
+                record = next(records, None)
+                data = _unpacked(record, room) if isinstance(record, Chunk) else None
+            except Exception as error:  # the reader passes on what struct, zstd, lz4 and UTF-8 raise
+                cut_off = isinstance(error, RecordLengthLimitExceeded) or not capped.left
+                if cut_off and not finished and not isinstance(error, TooLargeError):
+                    return
+                raise _refused(path, file, error) from error
+            if record is None:
+                return
+            if data is None:
+                yield record
+                continue
+            room -= len(data)
+            try:
+                yield from _inside(data)
+            except Exception as error:
+                raise _refused(path, file, error) from error
 
 
 class _Capped:
@@ -205,40 +233,6 @@ def _is_finished(file: IO[bytes]) -> bool:
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - len(MCAP_MAGIC)))
     return size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
-
-
-def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
-    finished = _is_finished(file)
-    size = file.seek(0, os.SEEK_END)
-    file.seek(0)
-    if not MCAP_MAGIC.startswith(file.read(len(MCAP_MAGIC))):
-        raise InputError(f"{path}: is no MCAP file; {ADVICE}")
-    file.seek(0)
-    capped = _Capped(file, size)
-    reader = StreamReader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
-    records = reader.records
-    room = FREE_BYTES + MAX_INFLATION * size
-    while True:
-        try:
-            record = next(records, None)
-            inner = []
-            if isinstance(record, Chunk):
-                inner = [_unpacked(record, room)]
-                room -= len(inner[0])
-        except Exception as error:  # the reader passes on what struct, zstd, lz4 and UTF-8 raise
-            cut_off = isinstance(error, RecordLengthLimitExceeded) or not capped.left
-            if cut_off and not finished and not isinstance(error, TooLargeError):
-                return
-            raise _refused(path, file, error) from error
-        if record is None:
-            return
-        if not inner:
-            yield record
-        for data in inner:
-            try:
-                yield from _inside(data)
-            except Exception as error:
-                raise _refused(path, file, error) from error
 
 
 def _refused(path: Path, file: IO[bytes], error: Exception) -> InputError:
@@ -330,7 +324,7 @@ class McapWriter:
         self._indexed = True
         self._counts: Counter[int] = Counter()
         self._chunks = 0
-        self._times_ns: tuple[int, int] | None = None
+        self._times_ns: list[int] = []  # the first and the last of all messages
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
         head = Metadata(metadata_name, dict(metadata))
         before = MCAP_MAGIC + _bytes_of(Header("", "hilstar"))
@@ -371,64 +365,51 @@ class McapWriter:
         first_ns, last_ns = min(times_ns), max(times_ns)
         packed = self._compressor.compress(data)
         chunk = _bytes_of(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data)))
-        indexes, offsets = self._message_indexes(self.size_bytes + len(chunk))
-        place = self.size_bytes
+        entries: dict[int, list[tuple[int, int]]] = {}  # of each channel, the times of its messages and where they begin
+        offset = 0
+        for channel, time_ns, record in self._pending:
+            entries.setdefault(channel, []).append((time_ns, offset))
+            offset += len(record)
+        indexes, offsets, place = b"", {}, self.size_bytes
+        for channel, records in entries.items():
+            offsets[channel] = place + len(chunk) + len(indexes)
+            indexes += _bytes_of(MessageIndex(channel, records))
         self._append(chunk + indexes)
-        entry = ChunkIndex(len(chunk), place, "zstd", len(packed), last_ns, len(indexes), offsets, first_ns, len(data))
-        self._note(entry, first_ns, last_ns)
+        self._counts.update(entry.channel for entry in self._pending)
+        self._pending, self.pending_bytes = [], 0
+        self._chunks += 1
+        self._times_ns += [first_ns, last_ns]
+        self._times_ns = [min(self._times_ns), max(self._times_ns)]
+        if self._indexed:
+            entry = ChunkIndex(len(chunk), place, "zstd", len(packed), last_ns, len(indexes), offsets, first_ns, len(data))
+            self._index += _bytes_of(entry)
+        if len(self._index) > MAX_INDEX_BYTES:
+            self._indexed, self._index = False, bytearray()
 
     def finish(self) -> None:
         """Write what was added, the index and the end. Raises OSError; the file is then as if its writer had been killed."""
         self.flush()
         end = _bytes_of(DataEnd(self.crc))
-        summary, offset_start = self._summary(self.size_bytes + len(end))
         start = self.size_bytes + len(end)
-        crc = zlib.crc32(_footer_head.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
-        self._append(end + summary + _bytes_of(Footer(start, offset_start, crc)) + MCAP_MAGIC)
-
-    def _message_indexes(self, place: int) -> tuple[bytes, dict[int, int]]:
-        """The index of each channel's messages in the chunk, to be written at `place`, and where each begins."""
-        entries: dict[int, list[tuple[int, int]]] = {}
-        offset = 0
-        for channel, time_ns, record in self._pending:
-            entries.setdefault(channel, []).append((time_ns, offset))
-            offset += len(record)
-        written, offsets = b"", {}
-        for channel, records in entries.items():
-            offsets[channel] = place + len(written)
-            written += _bytes_of(MessageIndex(channel, records))
-        return written, offsets
-
-    def _note(self, entry: ChunkIndex, first_ns: int, last_ns: int) -> None:
-        """A chunk is on the disk."""
-        self._counts.update(entry.channel for entry in self._pending)
-        self._pending, self.pending_bytes = [], 0
-        self._chunks += 1
-        self._times_ns = (first_ns, last_ns) if self._times_ns is None else _span(self._times_ns, (first_ns, last_ns))
-        if self._indexed:
-            self._index += _bytes_of(entry)
-        if len(self._index) > MAX_INDEX_BYTES:
-            self._indexed, self._index = False, bytearray()
-
-    def _summary(self, place: int) -> tuple[bytes, int]:
-        """The summary, to be written at `place`, and where the offsets in it begin."""
         first_ns, last_ns = self._times_ns or (0, 0)
-        counts = dict(self._counts)
-        channels = len(self._channels)
-        totals = (sum(counts.values()), last_ns, first_ns)
+        totals = (self.written, last_ns, first_ns)
+        statistics = Statistics(0, len(self._channels), dict(self._counts), self._chunks, *totals, 1, len(self._schemas))
         groups = {
             Opcode.SCHEMA: _bytes_of(*self._schemas),
             Opcode.CHANNEL: _bytes_of(*self._channels),
-            Opcode.STATISTICS: _bytes_of(Statistics(0, channels, counts, self._chunks, *totals, 1, len(self._schemas))),
+            Opcode.STATISTICS: _bytes_of(statistics),
             Opcode.CHUNK_INDEX: bytes(self._index),
             Opcode.METADATA_INDEX: _bytes_of(self._metadata_index),
         }
-        written, offsets = b"", b""
+        summary, offsets = b"", b""
         for opcode, group in groups.items():
             if group:
-                offsets += _bytes_of(SummaryOffset(opcode, place + len(written), len(group)))
-            written += group
-        return written + offsets, place + len(written)
+                offsets += _bytes_of(SummaryOffset(opcode, start + len(summary), len(group)))
+            summary += group
+        offset_start = start + len(summary)
+        summary += offsets
+        crc = zlib.crc32(_footer_head.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
+        self._append(end + summary + _bytes_of(Footer(start, offset_start, crc)) + MCAP_MAGIC)
 
     def _append(self, data: bytes) -> None:
         """Write at the end, all or nothing."""
@@ -452,10 +433,6 @@ def _bytes_of(*records: McapRecord) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def _span(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
-    return min(one[0], other[0]), max(one[1], other[1])
-
-
 class _Form(msgspec.Struct):
     t_ns: int | None
     sequence: int | None = 0
@@ -476,18 +453,15 @@ _encoder = msgspec.json.Encoder()
 
 def attitude_message(sample: AttitudeSample, receive_ns: int | None = None, raw: bytes | None = None) -> bytes:
     """The JSON of an accepted sample; `receive_ns` is the receiver's clock at arrival, `raw` the packet as received."""
-    q, rate = sample.q_icrs_to_cam.tolist(), sample.rate_cam_rad_s
-    turning = None if rate is None else tuple(rate.tolist())
-    packet = None if raw is None else raw.hex()
-    return _encoder.encode(_Form(sample.t_ns, sample.sequence, tuple(q), turning, sample.discontinuity, receive_ns, raw=packet))
+    q, rate = tuple(sample.q_icrs_to_cam.tolist()), sample.rate_cam_rad_s
+    turning, packet = None if rate is None else tuple(rate.tolist()), None if raw is None else raw.hex()
+    return _encoder.encode(_Form(sample.t_ns, sample.sequence, q, turning, sample.discontinuity, receive_ns, raw=packet))
 
 
 def refused_message(reason: str, detail: str, receive_ns: int | None, raw: bytes | None) -> bytes:
     """The JSON of a refused packet, with "reason: detail"."""
-    packet = None if raw is None else raw.hex()
-    return _encoder.encode(
-        _Form(None, None, None, receive_ns=receive_ns, accepted=False, reason=f"{reason}: {detail}", raw=packet)
-    )
+    packet, why = None if raw is None else raw.hex(), f"{reason}: {detail}"
+    return _encoder.encode(_Form(None, None, receive_ns=receive_ns, accepted=False, reason=why, raw=packet))
 
 
 def register_attitudes(writer: Writer) -> int:
@@ -520,20 +494,16 @@ def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
     message that is not an attitude.
     """
     for number, data in enumerate(read_messages(path, ATTITUDE_TOPIC), start=1):
-        entry = _sample(data)
-        if isinstance(entry, Refusal):
-            raise InputError(f"{path}: message {number} of {ATTITUDE_TOPIC}: {entry.detail}")
-        if entry is not None:
-            yield entry
-
-
-def _sample(data: bytes) -> AttitudeSample | Refusal | None:
-    try:
-        form = _decoder.decode(data)
-    except NOT_JSON as error:
-        return Refusal("format", f"is not a hilstar attitude ({error})")
-    if not form.accepted:
-        return None
-    if form.t_ns is None or form.q is None:
-        return Refusal("format", "is accepted, but lacks t_ns or q")
-    return checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)
+        where = f"{path}: message {number} of {ATTITUDE_TOPIC}:"
+        try:
+            form = _decoder.decode(data)
+        except NOT_JSON as error:
+            raise InputError(f"{where} is not a hilstar attitude ({error})") from error
+        if not form.accepted:
+            continue
+        if form.t_ns is None or form.q is None:
+            raise InputError(f"{where} is accepted, but lacks t_ns or q")
+        sample = checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)
+        if isinstance(sample, Refusal):
+            raise InputError(f"{where} {sample.detail}")
+        yield sample

@@ -8,7 +8,7 @@ from the user.
 
 A ULog file (docs.px4.io, "ULog File Format") is a head of 16 bytes, then messages: size (u16), kind (one letter), content. A
 logger that lost power leaves a cut message; a card that could not keep up leaves bytes that are no message, and the next
-synchronisation message says where messages begin again. `sieve` copies the few topics needed into a small ULog file, in one
+synchronisation message says where messages begin again. `_sieve` copies the few topics needed into a small ULog file, in one
 pass and bounded memory. pyulog reads that copy: of a whole file it would read all topics and follow nested formats of
 any size, and it searches a damaged file in quadratic time.
 """
@@ -20,7 +20,7 @@ import io
 import math
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -55,6 +55,7 @@ MAX_TIME_US = 2**53  # 285 years: what a boot clock never shows
 GAP_INTERVALS = 5  # usual intervals: farther than this from both neighbours, a value is unknown
 GLOBAL_POSITION = "vehicle_global_position"
 GPS = ("vehicle_gps_position", "sensor_gps")
+PLACE_FIELDS = (("latitude_deg", "longitude_deg"), ("lat", "lon"))
 GROUND_TRUTH = "_groundtruth"
 # A receiver without a fix reports 0, or an old date.
 FIRST_DATE_US, LAST_DATE_US = 946_684_800_000_000, 4_102_444_800_000_000  # 2000 and 2100
@@ -67,7 +68,7 @@ OLD_RATES = ("rollspeed", "pitchspeed", "yawspeed")  # in vehicle_attitude itsel
 ORDER_ADVICE = "the log has two attitudes of one time, or is damaged there"
 
 
-class ULogTopic(NamedTuple):
+class _ULogTopic(NamedTuple):
     """A topic of the log, and which of its instances."""
 
     name: str
@@ -75,11 +76,11 @@ class ULogTopic(NamedTuple):
 
 
 @dataclass(slots=True)
-class Sieved:
+class _Sieved:
     """What is left of a log: `ulog` is a whole file of the wanted topics; `topics` are all that the log has."""
 
     ulog: bytes = b""
-    topics: set[ULogTopic] = field(default_factory=set)
+    topics: set[_ULogTopic] = field(default_factory=set)
     lost_ms: int = 0
     damaged_bytes: int = 0
     cut_at: int | None = None
@@ -100,16 +101,15 @@ class Sieved:
         return lines
 
 
-def sieve(path: Path, wanted: frozenset[str]) -> Sieved:
+def _sieve(path: Path, wanted: frozenset[str]) -> _Sieved:
     """The messages of topics by name. Raises InputError for what is no ULog, or one of a newer kind."""
-    result = Sieved()
-    kept = bytearray()
+    result = _Sieved()
     ids: set[int] = set()
     with open_regular(path, ULOG_ADVICE) as file:
         head = file.read(HEAD_BYTES)
         if len(head) < HEAD_BYTES or not head.startswith(ULOG_MAGIC):
             raise InputError(f"{path}: not a ULog file, or cut within its first {HEAD_BYTES} bytes; {ULOG_ADVICE}")
-        kept += head
+        kept = bytearray(head)
         for kind, content in _messages(path, file, result):
             if kind == ord("O") and len(content) == _u16.size:
                 result.lost_ms += _u16.unpack(content)[0]
@@ -121,7 +121,7 @@ def sieve(path: Path, wanted: frozenset[str]) -> Sieved:
     return result
 
 
-def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], found: tuple[set[int], set[ULogTopic]]) -> bool:
+def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], found: tuple[set[int], set[_ULogTopic]]) -> bool:
     ids, topics = found
     if kind == ord("D"):
         return len(content) > _u16.size and _u16.unpack_from(content)[0] in ids
@@ -136,7 +136,7 @@ def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], fo
             )
         return True
     if kind == ord("A") and len(content) > 3:
-        topic = ULogTopic(content[3:].decode("ascii", "replace"), content[0])
+        topic = _ULogTopic(content[3:].decode("ascii", "replace"), content[0])
         if len(topics) < MAX_SUBSCRIPTIONS:
             topics.add(topic)
         if topic.name in wanted and len(ids) < MAX_SUBSCRIPTIONS:
@@ -145,7 +145,7 @@ def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], fo
     return False
 
 
-def _messages(path: Path, file: IO[bytes], result: Sieved) -> Iterator[tuple[int, bytes]]:
+def _messages(path: Path, file: IO[bytes], result: _Sieved) -> Iterator[tuple[int, bytes]]:
     """Kind and content of every message that is whole; `result` gets what is not."""
     ends: list[int] = []
     last = file.tell()
@@ -176,7 +176,7 @@ def _messages(path: Path, file: IO[bytes], result: Sieved) -> Iterator[tuple[int
         yield kind, content
 
 
-def _find_sync(file: IO[bytes], last: int, place: int, result: Sieved) -> bool:
+def _find_sync(file: IO[bytes], last: int, place: int, result: _Sieved) -> bool:
     """Go on after the next synchronisation message; the size of the message at `last` may be what is damaged."""
     file.seek(last + _head.size)
     at, tail = file.tell(), b""
@@ -204,7 +204,7 @@ def _appended(path: Path, content: bytes, place: int) -> list[int]:
     return sorted(offset for offset in offsets if offset > place) if flags[0] & APPENDED else []
 
 
-class Series(NamedTuple):
+class _Series(NamedTuple):
     """The columns of one topic, by the names of its fields (`q[0]`), each (n,); `t_us` is the boot clock, microseconds."""
 
     t_us: IntArray
@@ -217,12 +217,11 @@ class Series(NamedTuple):
             return None
         return np.stack([np.asarray(self.columns[each], dtype=np.float64) for each in names], axis=1)
 
-    def where(self, good: npt.NDArray[np.bool_]) -> Series:
-        """Some of the rows."""
-        return Series(self.t_us[good], {name: column[good] for name, column in self.columns.items()})
+    def where(self, good: npt.NDArray[np.bool_]) -> _Series:
+        return _Series(self.t_us[good], {name: column[good] for name, column in self.columns.items()})
 
 
-def read_series(path: Path, sieved: Sieved) -> dict[ULogTopic, Series]:
+def _read_series(path: Path, sieved: _Sieved) -> dict[_ULogTopic, _Series]:
     """Every topic that the sieved log has messages of. Raises InputError where pyulog reads none of it."""
     import pyulog
 
@@ -237,7 +236,7 @@ def read_series(path: Path, sieved: Sieved) -> dict[ULogTopic, Series]:
     series = {}
     for data in log.data_list:
         if "timestamp" in data.data:
-            series[ULogTopic(data.name, data.multi_id)] = Series(_times_us(path, data.data), data.data)
+            series[_ULogTopic(data.name, data.multi_id)] = _Series(_times_us(path, data.data), data.data)
     return series
 
 
@@ -251,7 +250,7 @@ def _times_us(path: Path, columns: dict[str, npt.NDArray[Any]]) -> IntArray:
     return times.astype(np.int64)
 
 
-def at_times(series: Series, values: FloatArray, t_us: IntArray) -> FloatArray:
+def _at_times(series: _Series, values: FloatArray, t_us: IntArray) -> FloatArray:
     """Values (n, k) at other times (m,), linear between samples; NaN outside of them and within gaps."""
     order = np.argsort(series.t_us, kind="stable")
     times, values = series.t_us[order], values[order]
@@ -264,23 +263,11 @@ def at_times(series: Series, values: FloatArray, t_us: IntArray) -> FloatArray:
     return found
 
 
-class Utc(NamedTuple):
-    """The UTC at boot (ns since 1970), and where that is from."""
+def _boot_utc(path: Path, stated: Stated, topics: dict[_ULogTopic, _Series], told: list[tuple[str, str]]) -> tuple[int, str]:
+    """The UTC of boot, and where it is from: `--epoch-utc`, else the median over the receiver's times.
 
-    boot_ns: int
-    words: str
-
-
-class VehiclePlace(NamedTuple):
-    """Geodetic latitude and longitude, degrees, each (n,), and where they are from."""
-
-    latitude_deg: FloatArray
-    longitude_deg: FloatArray
-    words: str
-
-
-def boot_utc(path: Path, stated: Stated, topics: dict[ULogTopic, Series], told: list[tuple[str, str]]) -> Utc:
-    """The UTC of boot: `--epoch-utc`, else the median over the receiver's times. Raises InputError where there is neither."""
+    Raises InputError where there is neither.
+    """
     offsets_us = _offsets_us(topics)
     gps_ns = round(float(np.median(offsets_us - offsets_us[0]))) * 1000 + int(offsets_us[0]) * 1000 if len(offsets_us) else None
     if stated.epoch_utc is not None:
@@ -289,7 +276,7 @@ def boot_utc(path: Path, stated: Stated, topics: dict[ULogTopic, Series], told: 
             told.append(
                 ("log-utc", f"--epoch-utc is {(boot_ns - gps_ns) / NS_PER_S:+.3g} s from the log's own GPS time at boot")
             )
-        return Utc(boot_ns, f"{epoch_text(boot_ns)}, as stated")
+        return boot_ns, f"{epoch_text(boot_ns)}, as stated"
     if gps_ns is None:
         raise InputError(f"{path}: has no UTC (no GPS fix with a time); give --epoch-utc TIME, the UTC at boot")
     low, high = np.percentile(offsets_us - offsets_us[0], [5, 95])
@@ -297,10 +284,10 @@ def boot_utc(path: Path, stated: Stated, topics: dict[ULogTopic, Series], told: 
     if spread_s > UNSURE_S:
         turned = earth.UT1_ARCSEC_PER_S * spread_s / 2
         told.append(("log-utc", f"GPS times differ by {spread_s:.3g} s; the sky may be turned by {turned:.2g} arcsec"))
-    return Utc(gps_ns, f"{epoch_text(gps_ns)} by {len(offsets_us)} GPS times, 90 % of them within {spread_s:.3g} s")
+    return gps_ns, f"{epoch_text(gps_ns)} by {len(offsets_us)} GPS times, 90 % of them within {spread_s:.3g} s"
 
 
-def _offsets_us(topics: dict[ULogTopic, Series]) -> IntArray:
+def _offsets_us(topics: dict[_ULogTopic, _Series]) -> IntArray:
     """UTC less the boot clock (n,), microseconds, of the first receiver that has dates."""
     for series in _of(topics, GPS):
         utc_us = series.columns.get("time_utc_usec")
@@ -312,44 +299,43 @@ def _offsets_us(topics: dict[ULogTopic, Series]) -> IntArray:
     return np.array([], dtype=np.int64)
 
 
-def _fixed_us(series: Series) -> IntArray:
+def _fixed_us(series: _Series) -> IntArray:
     """When a fix was true: when its message came, or as much earlier as the newer receivers' drivers say."""
     late_us = series.columns.get("timestamp_time_relative")
     return series.t_us if late_us is None else series.t_us + late_us.astype(np.int64)
 
 
-def place_at(path: Path, stated: Stated, topics: dict[ULogTopic, Series], t_us: IntArray, suffix: str) -> VehiclePlace:
-    """The place: `--place`, else the estimated position, else a receiver's. Raises InputError where there is none."""
+def _place_at(
+    path: Path, stated: Stated, topics: dict[_ULogTopic, _Series], t_us: IntArray, suffix: str
+) -> tuple[FloatArray, FloatArray, str]:
+    """Latitudes and longitudes (n,), and where they are from: `--place`, else the estimated position, else a receiver's.
+
+    Raises InputError where there is none.
+    """
     if stated.place is not None:
-        latitude_deg, longitude_deg = (np.full(len(t_us), value) for value in stated.place[:2])
-        return VehiclePlace(
-            latitude_deg, longitude_deg, f"at latitude {stated.place[0]:g}, longitude {stated.place[1]:g}, as stated"
-        )
+        latitude_deg, longitude_deg = stated.place[:2]
+        words = f"at latitude {latitude_deg:g}, longitude {longitude_deg:g}, as stated"
+        return np.full(len(t_us), latitude_deg), np.full(len(t_us), longitude_deg), words
     for name in (GLOBAL_POSITION + suffix, *GPS):
         for series in _of(topics, (name,)):
             found = _degrees(series)
             if found is not None:
-                times, latitude_deg, longitude_deg = found
-                longitude_deg = np.unwrap(longitude_deg, period=360.0)
-                return VehiclePlace(
-                    np.interp(t_us, times, latitude_deg), np.interp(t_us, times, longitude_deg), f"at the place of {name}"
-                )
+                times, latitudes_deg, longitudes_deg = found
+                longitudes_deg = np.unwrap(longitudes_deg, period=360.0)
+                latitude, longitude = (np.interp(t_us, times, each) for each in (latitudes_deg, longitudes_deg))
+                return latitude, longitude, f"at the place of {name}"
     raise InputError(f"{path}: has no position; give the place with --place LAT,LON,HEIGHT")
 
 
-def _degrees(series: Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
+def _degrees(series: _Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
     """Times, latitudes and longitudes of the rows that have any."""
     columns = series.columns
-    if "latitude_deg" in columns and "longitude_deg" in columns:
-        names, scale = ("latitude_deg", "longitude_deg"), 1.0
-    elif "lat" in columns and "lon" in columns:
-        names, scale = ("lat", "lon"), 1.0 if columns["lat"].dtype.kind == "f" else 1e-7
-    else:
+    names = next((pair for pair in PLACE_FIELDS if set(pair) <= set(columns)), None)
+    if names is None:
         return None
+    scale = 1e-7 if names == ("lat", "lon") and columns["lat"].dtype.kind != "f" else 1.0
     latitude_deg, longitude_deg = (np.asarray(columns[name], dtype=np.float64) * scale for name in names)
-    good = (
-        np.isfinite(latitude_deg) & np.isfinite(longitude_deg) & (np.abs(latitude_deg) <= 90) & (np.abs(longitude_deg) <= 360)
-    )
+    good = (np.abs(latitude_deg) <= 90) & (np.abs(longitude_deg) <= 360)  # False for NaN
     good &= (latitude_deg != 0) | (longitude_deg != 0)
     if "fix_type" in columns:
         good &= columns["fix_type"] >= 2
@@ -360,20 +346,27 @@ def _degrees(series: Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
     return times_us[order], latitude_deg[good][order], longitude_deg[good][order]
 
 
-def _of(topics: dict[ULogTopic, Series], names: tuple[str, ...]) -> list[Series]:
+def _of(topics: dict[_ULogTopic, _Series], names: tuple[str, ...]) -> list[_Series]:
     """The series of topics by name, the first instance first."""
     return [topics[topic] for name in names for topic in sorted(topics) if topic.name == name]
 
 
 class Turning(NamedTuple):
-    """What turns north, east, down to the ICRS: UTC at boot, and the place at each attitude."""
+    """What turns north, east, down to the ICRS: UTC at boot (ns since 1970), the place at each attitude, and both in words.
 
-    utc: Utc
-    place: VehiclePlace
+    `latitude_deg` and `longitude_deg` (n,) are geodetic.
+    """
 
-    def q_icrs_to_ned(self, t_us: IntArray) -> FloatArray:
-        """The rotations (n, 4) at times of the boot clock (n,)."""
-        return earth.q_icrs_to_ned(t_us * 1000 + self.utc.boot_ns, self.place.latitude_deg, self.place.longitude_deg)
+    boot_utc_ns: int
+    utc_words: str
+    latitude_deg: FloatArray
+    longitude_deg: FloatArray
+    place_words: str
+
+    def q_icrs_to_ned(self, t_us: IntArray, rows: slice = slice(None)) -> FloatArray:
+        """The rotations (n, 4) at times of the boot clock (n,), which are those of these rows."""
+        utc_ns = t_us * 1000 + self.boot_utc_ns
+        return earth.q_icrs_to_ned(utc_ns, self.latitude_deg[rows], self.longitude_deg[rows])
 
 
 @np.errstate(all="ignore")  # damaged numbers are refused as not finite, or are unknown rates
@@ -381,11 +374,11 @@ def read_ulog(path: Path, stated: Stated) -> LogReading:
     """The body's attitudes. Raises InputError where neither the log nor the user says where and when they were."""
     if stated.reference is not None and stated.reference.lower() != "ned":
         raise InputError(f"{path}: a PX4 log's attitudes refer to north, east, down; leave out --reference {stated.reference}")
-    name, instance = _wanted(stated.topic)
+    name, _, number = (stated.topic or ATTITUDE).partition(":")
     suffix = GROUND_TRUTH if name.endswith(GROUND_TRUTH) else ""
-    sieved = sieve(path, frozenset({name, RATES + suffix, GLOBAL_POSITION + suffix, *GPS}))
-    topic = _chosen(path, sieved.topics, name, instance)
-    topics = read_series(path, sieved)
+    sieved = _sieve(path, frozenset({name, RATES + suffix, GLOBAL_POSITION + suffix, *GPS}))
+    topic = _chosen(path, sieved.topics, name, int(number) if number.isdecimal() and len(number) < 4 else None)
+    topics = _read_series(path, sieved)
     series = topics.get(topic)
     q = None if series is None else series.stacked("q", 4)
     if series is None or q is None:
@@ -394,24 +387,18 @@ def read_ulog(path: Path, stated: Stated) -> LogReading:
         )
     told = sieved.told
     series, q = _ready(path, series, q, told)
-    turning = Turning(boot_utc(path, stated, topics, told), place_at(path, stated, topics, series.t_us, suffix))
+    boot_utc_ns, utc_words = _boot_utc(path, stated, topics, told)
+    latitude_deg, longitude_deg, place_words = _place_at(path, stated, topics, series.t_us, suffix)
+    turning = Turning(boot_utc_ns, utc_words, latitude_deg, longitude_deg, place_words)
     rates = _rates(series, topics, suffix)
-    first_ns, last_ns = (int(t_us) * 1000 + turning.utc.boot_ns for t_us in (series.t_us.min(), series.t_us.max()))
+    first_ns, last_ns = (int(t_us) * 1000 + turning.boot_utc_ns for t_us in (series.t_us.min(), series.t_us.max()))
     beyond = earth.beyond_table(first_ns, last_ns)
     told += [] if beyond is None else [("log-earth", beyond)]
     entries = in_order(_entries(series, q, rates, turning), told)
-    return LogReading(entries, _conventions(topic, series, turning, rates), ORDER_ADVICE, told)
+    return LogReading(entries, _conventions(topic, series, turning, rates is not None), ORDER_ADVICE, told)
 
 
-def _wanted(text: str | None) -> tuple[str, int | None]:
-    """Name and instance of `--topic NAME` or `--topic NAME:INSTANCE`."""
-    if text is None:
-        return ATTITUDE, None
-    name, _, number = text.partition(":")
-    return name, int(number) if number.isdecimal() and len(number) < 4 else None
-
-
-def _chosen(path: Path, topics: set[ULogTopic], name: str, instance: int | None) -> ULogTopic:
+def _chosen(path: Path, topics: set[_ULogTopic], name: str, instance: int | None) -> _ULogTopic:
     found = sorted(topic for topic in topics if topic.name == name and instance in {None, topic.instance})
     if not found:
         others = sorted(f"{topic.name}:{topic.instance}" for topic in topics if topic.name in ATTITUDES)
@@ -425,7 +412,7 @@ def _chosen(path: Path, topics: set[ULogTopic], name: str, instance: int | None)
     return found[0]
 
 
-def _ready(path: Path, series: Series, q: FloatArray, told: list[tuple[str, str]]) -> tuple[Series, FloatArray]:
+def _ready(path: Path, series: _Series, q: FloatArray, told: list[tuple[str, str]]) -> tuple[_Series, FloatArray]:
     """The attitudes from the first that is one."""
     good = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0)
     if not good.any():
@@ -436,51 +423,37 @@ def _ready(path: Path, series: Series, q: FloatArray, told: list[tuple[str, str]
     return series.where(np.arange(len(q)) >= begin), q[begin:]
 
 
-def _rates(series: Series, topics: dict[ULogTopic, Series], suffix: str) -> FloatArray | None:
+def _rates(series: _Series, topics: dict[_ULogTopic, _Series], suffix: str) -> FloatArray | None:
     """Body rates (n, 3), rad/s, at the attitudes' times; NaN where the log has none, None where it has none at all."""
-    for topic in sorted(topics):
-        if topic.name == RATES + suffix:
-            rates = topics[topic].stacked("xyz", 3)
-            return None if rates is None else at_times(topics[topic], rates, series.t_us)
+    for other in _of(topics, (RATES + suffix,)):
+        rates = other.stacked("xyz", 3)
+        return None if rates is None else _at_times(other, rates, series.t_us)
     if all(name in series.columns for name in OLD_RATES):
         return np.stack([np.asarray(series.columns[name], dtype=np.float64) for name in OLD_RATES], axis=1)
     return None
 
 
-def _entries(series: Series, q: FloatArray, rates: FloatArray | None, turning: Turning) -> Iterator[LogEntry]:
+def _entries(series: _Series, q: FloatArray, rates: FloatArray | None, turning: Turning) -> Iterator[LogEntry]:
     counter = series.columns.get("quat_reset_counter", np.zeros(len(q)))
     resets = [False, *np.diff(counter.astype(np.int64)).astype(bool).tolist()]
-    with np.errstate(all="ignore"):  # too
-        body = multiply(conjugate(q), turning.q_icrs_to_ned(series.t_us))
-    rows = np.full((len(q), 3), np.nan) if rates is None else rates
-    for number, t_us in enumerate(series.t_us.tolist()):
-        w, x, y, z = body[number].tolist()
-        rate = tuple(rows[number].tolist())
-        known = None if any(map(math.isnan, rate)) else rate
-        sample = checked_sample(t_us * 1000, (w, x, y, z), known, discontinuity=resets[number])
-        yield LogEntry(f": attitude {number + 1}", sample)
+    with np.errstate(all="ignore"):
+        body = multiply(conjugate(q), turning.q_icrs_to_ned(series.t_us)).tolist()
+    rows = np.full((len(q), 3), np.nan).tolist() if rates is None else rates.tolist()
+    for number, (t_us, own, rate, reset) in enumerate(zip(series.t_us.tolist(), body, rows, resets, strict=True), start=1):
+        known = None if any(map(math.isnan, rate)) else tuple(rate)
+        yield LogEntry(f": attitude {number}", checked_sample(t_us * 1000, tuple(own), known, discontinuity=reset))
 
 
-def _conventions(topic: ULogTopic, series: Series, turning: Turning, rates: FloatArray | None) -> Conventions:
+def _conventions(topic: _ULogTopic, series: _Series, turning: Turning, has_rates: bool) -> Conventions:
+    q_icrs_to_ned = turning.q_icrs_to_ned(series.t_us[:1], slice(1))[0]
+    begin_s = int(series.t_us[0]) / 1e6
     words = "turns components of the body (front, right, down) into north, east, down"
-    gyro = "" if rates is None else "; the gyroscopes' rate, with respect to the stars"
+    gyro = "; the gyroscopes' rate, with respect to the stars" if has_rates else ""
     return Conventions(
         f"PX4 ULog, {topic.name}:{topic.instance}",
-        f"q {words} {turning.place.words}, {earth.TURNED}{gyro}",
+        f"q {words} {turning.place_words}, {earth.TURNED}{gyro}",
         "scalar first (w, x, y, z), Hamilton, single precision (0.02 arcsec)",
-        f"microseconds since boot, which was at UTC {turning.utc.words}",
+        f"microseconds since boot, which was at UTC {turning.utc_words}",
         of_body=True,
-        written=_written(series, turning),
+        written=lambda q: f"q = {components(multiply(q_icrs_to_ned, conjugate(q)))} at {begin_s:.6f} s",
     )
-
-
-def _written(series: Series, turning: Turning) -> Callable[[FloatArray], str]:
-    """An attitude (q_icrs_to_body) as the log has it, at its first time."""
-    t_us = series.t_us[:1]
-    place = VehiclePlace(turning.place.latitude_deg[:1], turning.place.longitude_deg[:1], "")
-    q_icrs_to_ned = Turning(turning.utc, place).q_icrs_to_ned(t_us)[0]
-
-    def words(q: FloatArray) -> str:
-        return f"q = {components(multiply(q_icrs_to_ned, conjugate(q)))} at {int(t_us[0]) / 1e6:.6f} s"
-
-    return words

@@ -20,10 +20,11 @@ Type definitions in the bag are compared with those of rosbags and never registe
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain, islice
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -34,7 +35,7 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.earth import AXES, EXACT, FIRST_DATE_NS, KINDS, Kind, Reference, stated_reference, to_icrs
 from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated, in_order
 from hilstar.attitude.logs.ros_bags import Bag, BagTopic, Encoding
-from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
+from hilstar.attitude.wire.packet import Refusal, checked_sample
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.errors import InputError, shortened
@@ -45,6 +46,22 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
+OWN_NAMES = {OLD_TF: TF}  # types that rosbags knows by another name
+TF_TYPES = frozenset({TF, OLD_TF})
+TRANSFORM, IMU, ODOMETRY = "geometry_msgs/msg/TransformStamped", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
+# Where each message has its quaternion.
+QUATERNIONS: dict[str, Callable[[Any], Any]] = {
+    "geometry_msgs/msg/Quaternion": lambda message: message,
+    "geometry_msgs/msg/QuaternionStamped": attrgetter("quaternion"),
+    "geometry_msgs/msg/Pose": attrgetter("orientation"),
+    "geometry_msgs/msg/PoseStamped": attrgetter("pose.orientation"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": attrgetter("pose.pose.orientation"),
+    "geometry_msgs/msg/Transform": attrgetter("rotation"),
+    TRANSFORM: attrgetter("transform.rotation"),
+    IMU: attrgetter("orientation"),
+    ODOMETRY: attrgetter("pose.pose.orientation"),
+}
+TYPES = frozenset(QUATERNIONS) | TF_TYPES
 TF_TEXT = "geometry_msgs/TransformStamped[] transforms"
 MAX_DEFINITION_CHARACTERS = 100_000
 Numbers = tuple[float, ...]
@@ -55,7 +72,6 @@ FORM = "icrs, enu or ned"
 STATE = "state its axes with --reference icrs, or with --reference enu or ned and --place LAT,LON,HEIGHT"
 MAX_NAMED_TOPICS = 12
 STATIC_TF = "tf_static"
-IMU = "sensor_msgs/msg/Imu"
 OPTICAL = ("_optical_frame", "_optical")
 ORDER_ADVICE = "the bag has two attitudes of one time, or its clock was set back; choose one sender, or cut the bag there"
 
@@ -72,19 +88,14 @@ def typestore(encoding: Encoding) -> Typestore:
     return store
 
 
-def own_name(type_name: str) -> str:
-    """The type's name in rosbags's stores."""
-    return TF if type_name == OLD_TF else type_name
-
-
-def decoded(topic: BagTopic, data: bytes) -> Any:
+def _decoded(topic: BagTopic, data: bytes) -> Any:
     """The message in some bytes. Raises rosbags.serde.SerdeError."""
     store = typestore(topic.encoding)
     read = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
-    return read(data, own_name(topic.type))
+    return read(data, OWN_NAMES.get(topic.type, topic.type))
 
 
-def check_definition(where: str, topic: BagTopic) -> None:
+def _check_definition(where: str, topic: BagTopic) -> None:
     """Refuse (InputError) a type that only has the name of ROS's own."""
     if not topic.definition:
         return
@@ -92,7 +103,7 @@ def check_definition(where: str, topic: BagTopic) -> None:
 
     text, ours = topic.definition[:MAX_DEFINITION_CHARACTERS], typestore(topic.encoding).fielddefs
     try:
-        theirs = get_types_from_msg("\n".join(text.splitlines()), own_name(topic.type))
+        theirs = get_types_from_msg("\n".join(text.splitlines()), OWN_NAMES.get(topic.type, topic.type))
     except TypesysError:
         theirs = {}
     # Some writers leave out the inner types.
@@ -100,7 +111,7 @@ def check_definition(where: str, topic: BagTopic) -> None:
         raise InputError(f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it")
 
 
-class RosTurn(NamedTuple):
+class _RosTurn(NamedTuple):
     """One orientation: `q` (w, x, y, z) turns components of the body into those of the reference.
 
     `stamp_ns` is the header's time, None where it has none; frames are None where the message does not name them. `rate` is in
@@ -117,76 +128,39 @@ class RosTurn(NamedTuple):
     fault: str | None = None
 
 
-def turns(type_name: str, message: Any) -> Iterator[RosTurn]:
-    """The orientations in a message of one of TYPES; several in a TFMessage."""
-    if type_name in TF_TYPES:
-        yield from map(_transform_stamped, message.transforms)
-    else:
-        yield _TURN[type_name](message)
-
-
 def frame(text: str) -> str:
     """A frame's name without the slash that the first tf had before it."""
     return text.lstrip("/")
 
 
-def _plain(q: Any) -> RosTurn:
-    return RosTurn(None, None, None, _q(q))
-
-
-def _stamped(message: Any, q: Any) -> RosTurn:
-    return RosTurn(_stamp_ns(message), frame(message.header.frame_id), None, _q(q))
-
-
-def _transform_stamped(message: Any) -> RosTurn:
-    q = _q(message.transform.rotation)
-    return RosTurn(_stamp_ns(message), frame(message.header.frame_id), frame(message.child_frame_id), q)
-
-
-def _imu(message: Any) -> RosTurn:
-    unknown = (
-        "orientation_covariance[0] is -1: the IMU gives no orientation" if message.orientation_covariance[0] == -1 else None
-    )
-    rate = None if message.angular_velocity_covariance[0] == -1 else _vector(message.angular_velocity)
-    body = frame(message.header.frame_id)
-    return RosTurn(_stamp_ns(message), None, body, _q(message.orientation), rate, gyro=True, fault=unknown)
-
-
-def _odometry(message: Any) -> RosTurn:
-    body, rate = frame(message.child_frame_id), _vector(message.twist.twist.angular)
-    return RosTurn(_stamp_ns(message), frame(message.header.frame_id), body, _q(message.pose.pose.orientation), rate)
-
-
-def _q(q: Any) -> Numbers:
-    return (q.w, q.x, q.y, q.z)
+def turns(type_name: str, message: Any) -> Iterator[_RosTurn]:
+    """The orientations in a message of one of TYPES; several in a TFMessage."""
+    if type_name in TF_TYPES:
+        for transform in message.transforms:
+            yield from turns(TRANSFORM, transform)
+        return
+    q, header = QUATERNIONS[type_name](message), getattr(message, "header", None)
+    stamp_ns = reference = body = rate = fault = None
+    if header is not None:
+        stamp_ns, reference = int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec), frame(header.frame_id)
+    if type_name in {TRANSFORM, ODOMETRY}:
+        body = frame(message.child_frame_id)
+    if type_name == ODOMETRY:
+        rate = _vector(message.twist.twist.angular)
+    elif type_name == IMU:
+        reference, body = None, reference
+        rate = None if message.angular_velocity_covariance[0] == -1 else _vector(message.angular_velocity)
+        if message.orientation_covariance[0] == -1:
+            fault = "orientation_covariance[0] is -1: the IMU gives no orientation"
+    yield _RosTurn(stamp_ns, reference, body, (q.w, q.x, q.y, q.z), rate, type_name == IMU, fault)
 
 
 def _vector(vector: Any) -> Numbers:
     return (vector.x, vector.y, vector.z)
 
 
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
-TF_TYPES = frozenset({TF, OLD_TF})
-_TURN: dict[str, Callable[[Any], RosTurn]] = {
-    "geometry_msgs/msg/Quaternion": _plain,
-    "geometry_msgs/msg/QuaternionStamped": lambda m: _stamped(m, m.quaternion),
-    "geometry_msgs/msg/Pose": lambda m: _plain(m.orientation),
-    "geometry_msgs/msg/PoseStamped": lambda m: _stamped(m, m.pose.orientation),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _stamped(m, m.pose.pose.orientation),
-    "geometry_msgs/msg/Transform": lambda m: _plain(m.rotation),
-    "geometry_msgs/msg/TransformStamped": _transform_stamped,
-    "sensor_msgs/msg/Imu": _imu,
-    "nav_msgs/msg/Odometry": _odometry,
-}
-TYPES = frozenset(_TURN) | TF_TYPES
-
-
 @dataclass(slots=True)
-class Edge:
+class _Edge:
     """Every transform from one child to one parent: times (header's and recorder's), and (w, x, y, z) from child to parent."""
 
     parent: str
@@ -196,8 +170,7 @@ class Edge:
     numbers: array[float] = field(default_factory=lambda: array("d"))
     moves: bool = False
 
-    def add(self, turn: RosTurn, received_ns: int) -> None:
-        """One more transform."""
+    def add(self, turn: _RosTurn, received_ns: int) -> None:
         self.moves |= bool(self.numbers) and tuple(self.numbers[:4]) != turn.q
         self.stamps_ns.append(turn.stamp_ns or 0)
         self.received_ns.append(received_ns)
@@ -231,16 +204,16 @@ class Edge:
         return found
 
 
-class FrameChain(NamedTuple):
+class _FrameChain(NamedTuple):
     """The transforms from a body up to the frame that its attitude refers to, and the one whose times the attitudes have."""
 
     body: str
     reference: str
-    edges: tuple[Edge, ...]
-    timed: Edge
+    edges: tuple[_Edge, ...]
+    timed: _Edge
 
-    def turns(self, told: list[tuple[str, str]]) -> Iterator[tuple[int, RosTurn]]:
-        """When each transform of the timed part was recorded, and the orientation of the whole chain then.
+    def heard(self, told: list[tuple[str, str]]) -> Iterator[_Heard]:
+        """The orientation of the whole chain at each transform of the timed part.
 
         Other parts are unit; the timed one keeps its norm, for its check.
         """
@@ -252,42 +225,52 @@ class FrameChain(NamedTuple):
             known &= np.isfinite(part).all(axis=1) | (edge is self.timed)
             with np.errstate(all="ignore"):  # numbers of the timed part that are not finite are refused where they are checked
                 whole = multiply(part, whole)
-        others = [edge for edge in self.edges if edge.moves and edge is not self.timed]
+        others, name = [edge for edge in self.edges if edge.moves and edge is not self.timed], _edge_names([self.timed])
         if others:
-            told.append(("log-tf", f"{_edge_names(others)} interpolated (SLERP) to the times of {_edge_names([self.timed])}"))
+            told.append(("log-tf", f"{_edge_names(others)} interpolated (SLERP) to the times of {name}"))
         if not known.all():
             told.append(
                 ("log-tf", f"{int((~known).sum())} attitudes at times that not all of these transforms have are left out")
             )
-        rows = zip(known.tolist(), self.timed.received_ns, self.timed.stamps_ns, whole.tolist(), strict=True)
-        for is_known, received_ns, stamp_ns, (w, x, y, z) in rows:
-            if is_known:
-                yield received_ns, RosTurn(stamp_ns, self.reference, self.body, (w, x, y, z))
+        received_ns, stamps_ns = np.array(self.timed.received_ns)[known], np.array(self.timed.stamps_ns)[known]
+        rows = zip(received_ns.tolist(), stamps_ns.tolist(), whole[known].tolist(), strict=True)
+        for number, (received, stamp_ns, (w, x, y, z)) in enumerate(rows, start=1):
+            turn = _RosTurn(stamp_ns, self.reference, self.body, (w, x, y, z))
+            yield _Heard(f": transform {number} of {name}", received, turn)
 
 
-class Tree:
+class _Tree:
     """The transforms of a bag."""
 
-    def __init__(self, path: Path, transforms: Iterable[tuple[int, RosTurn]]) -> None:
+    def __init__(self, path: Path, transforms: Iterable[_Heard]) -> None:
         self._path = path
-        self._up: dict[str, dict[str, Edge]] = {}
+        self._up: dict[str, dict[str, _Edge]] = {}
         count = 0
-        for received_ns, turn in transforms:
-            parents = self._up.setdefault(turn.body or "", {})
-            edge = parents.get(turn.reference or "")
-            if edge is None:
+        for _, received_ns, turn in transforms:
+            body, reference = turn.body or "", turn.reference or ""
+            parents = self._up.setdefault(body, {})
+            if reference not in parents:
+                parents[reference] = _Edge(reference, body)
                 count += 1
                 if count > MAX_EDGES:
                     raise InputError(f"{path}: tf has more than {MAX_EDGES} transforms; record those that are wanted")
-                edge = parents[turn.reference or ""] = Edge(turn.reference or "", turn.body or "")
-            edge.add(turn, received_ns)
+            parents[reference].add(turn, received_ns)
 
-    def chain(self, body: str | None, reference: str | None) -> FrameChain:
+    def _all(self) -> list[_Edge]:
+        return [edge for parents in self._up.values() for edge in parents.values()]
+
+    def chain(self, body: str | None, reference: str | None) -> _FrameChain:
         """From `body` up to `reference`, or as far as the tree goes; the body may be left out where one frame moves.
 
         Raises InputError where the tree has no such chain, or one of its transforms is no rotation.
         """
-        body = self._only_body() if body is None else body
+        if body is None:
+            moving = [edge for edge in self._all() if edge.moves] or self._all()
+            if len(moving) != 1:
+                raise InputError(
+                    f"{self._path}: several transforms of tf could be meant: {_edge_names(moving)}; choose with --body FRAME"
+                )
+            body = moving[0].child
         edges = self._edges(body, reference)
         timed = max(edges, key=lambda edge: (edge.moves, len(edge.stamps_ns)))
         for edge in edges:
@@ -297,19 +280,10 @@ class Tree:
                 raise InputError(
                     f"{self._path}: the transform {_edge_names([edge])} has a quaternion whose norm is off by {worst:.3g}"
                 )
-        return FrameChain(body, edges[-1].parent, edges, timed)
+        return _FrameChain(body, edges[-1].parent, edges, timed)
 
-    def _only_body(self) -> str:
-        edges = [edge for parents in self._up.values() for edge in parents.values()]
-        moving = [edge for edge in edges if edge.moves] or edges
-        if len(moving) != 1:
-            raise InputError(
-                f"{self._path}: several transforms of tf could be meant: {_edge_names(moving)}; choose with --body FRAME"
-            )
-        return moving[0].child
-
-    def _edges(self, body: str, reference: str | None) -> tuple[Edge, ...]:
-        found: list[Edge] = []
+    def _edges(self, body: str, reference: str | None) -> tuple[_Edge, ...]:
+        found: list[_Edge] = []
         frame, seen = body, {body}
         while frame in self._up and frame != reference:
             parents = list(self._up[frame].values())
@@ -324,109 +298,108 @@ class Tree:
             seen.add(frame)
         if not found or (reference is not None and frame != reference):
             wanted = f"from {body!r} up to {reference!r}" if reference is not None and found else f"of {body!r}"
-            edges = _edge_names([edge for parents in self._up.values() for edge in parents.values()])
-            raise InputError(f"{self._path}: tf has no transform {wanted}; it has {edges}")
+            raise InputError(f"{self._path}: tf has no transform {wanted}; it has {_edge_names(self._all())}")
         return tuple(found)
 
 
-def _edge_names(edges: list[Edge]) -> str:
-    names = [f"{edge.parent} -> {edge.child}" for edge in edges[:MAX_NAMED]]
-    return shortened(", ".join([*names, *(["..."] if len(edges) > MAX_NAMED else [])]), 400)
+def _edge_names(edges: Sequence[_Edge]) -> str:
+    return _listed([f"{edge.parent} -> {edge.child}" for edge in edges], MAX_NAMED, 400)
 
 
-class Named(NamedTuple):
+def _listed(names: list[str], count: int, limit: int) -> str:
+    return shortened(", ".join([*names[:count], *["..."] * (len(names) > count)]), limit)
+
+
+class _Named(NamedTuple):
     """What `--reference` says: the frame of the bag, and what its axes are; None for what it does not say."""
 
     frame: str | None = None
     kind: Kind | None = None
 
 
-def named(reference: str | None) -> Named:
+def named(reference: str | None) -> _Named:
     """What `--reference` says. Raises InputError for a meaning that is none."""
-    if reference is None:
-        return Named()
-    frame, equals, meaning = reference.rpartition("=")
+    frame, equals, meaning = (reference or "").rpartition("=")
     kind = KINDS.get(meaning.lower())
     if equals and kind is None:
         raise InputError(
             f"--reference {reference}: the axes of {frame} are {FORM}; write --reference {frame}=icrs, for example"
         )
-    if kind is not None:
-        return Named(frame or None, kind)
-    return Named(reference)
+    return _Named(reference) if kind is None else _Named(frame or None, kind)
 
 
-def kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]) -> Kind:
+def _kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]) -> Kind:
     """What the axes of the bag's frame are; `why` says which frame that is, where the bag does not name it.
 
     Raises InputError where neither its name nor the user says, or they differ.
     """
     wanted, kind = named(stated.reference)
+    refers = f"{path}: its attitudes refer to the frame {frame!r}"
     if frame is not None and wanted is not None and wanted != frame:
-        raise InputError(
-            f"{path}: its attitudes refer to the frame {frame!r}, not to {wanted!r}; write --reference {frame}=icrs"
-        )
+        raise InputError(f"{refers}, not to {wanted!r}; write --reference {frame}=icrs")
     own = KINDS.get((frame or "").lower())
     if kind is None:
         if own is None:
-            raise InputError(f"{path}: {f'its attitudes refer to the frame {frame!r}' if frame else why}; {STATE}")
+            raise InputError(f"{refers if frame else f'{path}: {why}'}; {STATE}")
         if (frame or "").lower() not in EXACT and own == "icrs":
             told.append(("reference", f"the frame {frame!r} is taken as the ICRS; a frame of date is 0.4 deg off by now"))
         return own
-    if own is not None and own != kind:
-        raise InputError(
-            f"{path}: its attitudes refer to the frame {frame!r}, which is not {AXES[kind]}; leave out --reference"
-        )
     if own is None:
-        told.append(
-            ("reference", f"{f'the frame {frame!r}' if frame else 'the reference'} is taken as {AXES[kind]}, as stated")
-        )
+        called = f"the frame {frame!r}" if frame else "the reference"
+        told.append(("reference", f"{called} is taken as {AXES[kind]}, as stated"))
+    elif own != kind:
+        raise InputError(f"{refers}, which is not {AXES[kind]}; leave out --reference")
     return kind
 
 
-class Heard(NamedTuple):
+class _Heard(NamedTuple):
     """An orientation, where it stands in the bag, and when it was recorded."""
 
     where: str
     receive_ns: int
-    turn: RosTurn
+    turn: _RosTurn
 
 
-class Start(NamedTuple):
+class _Start(NamedTuple):
     """The first orientation, and whether the messages have times of their own."""
 
-    turn: RosTurn
+    turn: _RosTurn
     receive_ns: int
     stamped: bool
 
-    def t_ns(self, turn: RosTurn, receive_ns: int) -> int:
-        """The time of an orientation of the same topic."""
+    def t_ns(self, turn: _RosTurn, receive_ns: int) -> int:
         return (turn.stamp_ns or 0) if self.stamped else receive_ns
 
     @property
     def first_ns(self) -> int:
-        """The time of the first."""
         return self.t_ns(self.turn, self.receive_ns)
 
 
 def read_ros(bag: Bag, stated: Stated) -> LogReading:
     """The body's attitudes of one topic. Raises InputError where the bag, or what is stated, does not say which they are."""
     topic = _chosen(bag, stated.topic)
-    check_definition(f"{bag.path}: {topic.name}", topic)
+    _check_definition(f"{bag.path}: {topic.name}", topic)
     told: list[tuple[str, str]] = []
     every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
     start, heard = _begin(bag, topic, every, stated.body)
     if not start.stamped:
         told.append(("log-stamp", f"the messages of {topic.name} have no time of their own; when they were recorded is taken"))
-    reference = _reference(bag, topic, start, stated, told)
+    why = f"the messages of {topic.name} do not say which frame their orientation refers to"
+    if topic.type == IMU:
+        why += " (ROS recommends east, north, up: REP 145)"
+    kind = _kind_of_frame(bag.path, start.turn.reference, stated, why, told)
+    reference = stated_reference(bag.path, kind, stated, start.first_ns)
     entries = to_icrs(_entries(heard, start), reference, start.turn.gyro, told)
-    _say_optical(start.turn.body, stated, told)
+    body = start.turn.body
+    # An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would turn it twice.
+    if body is not None and body.endswith(OPTICAL) and abs(stated.mounting.q_body_to_cam[0]) < 1:
+        told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
     return LogReading(
         _with_notices(in_order(entries, told), bag, told), _conventions(topic, start, reference), ORDER_ADVICE, told
     )
 
 
-def _begin(bag: Bag, topic: BagTopic, heard: Iterator[Heard], body: str | None) -> tuple[Start, Iterator[Heard]]:
+def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None) -> tuple[_Start, Iterator[_Heard]]:
     """What the first orientations say, and all of those of the stated body. Raises InputError where there are none."""
     first = next(heard, None)
     if first is None:
@@ -442,7 +415,7 @@ def _begin(bag: Bag, topic: BagTopic, heard: Iterator[Heard], body: str | None) 
         raise InputError(f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has")
     # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
     stamped = any(each.turn.stamp_ns for each in begin)
-    return Start(begin[0].turn, begin[0].receive_ns, stamped), chain(begin, heard)
+    return _Start(begin[0].turn, begin[0].receive_ns, stamped), chain(begin, heard)
 
 
 def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
@@ -450,15 +423,14 @@ def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
     topics = bag.topics()
     readable = [topic for topic in topics if topic.type in TYPES]
     if wanted is not None:
-        for topic in topics:
-            if topic.name.lstrip("/") == wanted.lstrip("/"):
-                if topic not in readable:
-                    types = ", ".join(sorted({kind.rpartition("/")[2] for kind in TYPES}))
-                    raise InputError(f"{bag.path}: {topic.name} is of {topic.type}, which says no attitude; read are {types}")
-                return topic
-        raise InputError(f"{bag.path}: has no topic {wanted}; it has {_topic_names(topics)}")
-    dynamic = [topic for topic in readable if not topic.name.endswith(STATIC_TF)]
-    choice = dynamic or readable
+        found = next((topic for topic in topics if topic.name.lstrip("/") == wanted.lstrip("/")), None)
+        if found is None:
+            raise InputError(f"{bag.path}: has no topic {wanted}; it has {_topic_names(topics)}")
+        if found not in readable:
+            types = ", ".join(sorted({kind.rpartition("/")[2] for kind in TYPES}))
+            raise InputError(f"{bag.path}: {found.name} is of {found.type}, which says no attitude; read are {types}")
+        return found
+    choice = [topic for topic in readable if not topic.name.endswith(STATIC_TF)] or readable
     if not choice:
         raise InputError(f"{bag.path}: has no topic with attitudes; it has {_topic_names(topics)}")
     if len(choice) > 1:
@@ -467,53 +439,38 @@ def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
 
 
 def _topic_names(topics: list[BagTopic]) -> str:
-    names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics[:MAX_NAMED_TOPICS]]
-    return shortened(", ".join([*names, *(["..."] if len(topics) > MAX_NAMED_TOPICS else [])]) or "no topic of ROS", 600)
+    names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics]
+    return _listed(names, MAX_NAMED_TOPICS, 600) or "no topic of ROS"
 
 
-def _of_topic(bag: Bag, topic: BagTopic) -> Iterator[Heard]:
+def _of_topic(bag: Bag, topic: BagTopic) -> Iterator[_Heard]:
     for number, message in enumerate(bag.messages(topic), start=1):
         where = f": message {number} of {topic.name}"
         try:
-            found = list(turns(topic.type, decoded(topic, message.data)))
+            found = list(turns(topic.type, _decoded(topic, message.data)))
         except Exception as error:  # rosbags's generated code raises what its bytes lead to
             raise InputError(f"{bag.path}{where} is no {topic.type} ({shortened(error)}); record the bag again") from error
-        yield from (Heard(where, message.receive_ns, turn) for turn in found)
+        yield from (_Heard(where, message.receive_ns, turn) for turn in found)
 
 
-def _of_tf(bag: Bag, topic: BagTopic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[Heard]:
+def _of_tf(bag: Bag, topic: BagTopic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[_Heard]:
     """The chain of transforms that is stated, from this topic and the static one beside it."""
     beside = topic.name.rpartition("/")[0] + "/" + STATIC_TF
     statics = [other for other in bag.topics() if other.type in TF_TYPES and other.name == beside and other != topic]
-    found = chain.from_iterable(_of_topic(bag, each) for each in [*statics, topic])
-    tree = Tree(bag.path, ((heard.receive_ns, heard.turn) for heard in found))
+    tree = _Tree(bag.path, chain.from_iterable(_of_topic(bag, each) for each in [*statics, topic]))
     body = None if stated.body is None else frame(stated.body)
-    links = tree.chain(body, named(stated.reference).frame)
-    name = f"{links.timed.parent} -> {links.timed.child}"
-    for number, (receive_ns, turn) in enumerate(links.turns(told), start=1):
-        yield Heard(f": transform {number} of {name}", receive_ns, turn)
+    yield from tree.chain(body, named(stated.reference).frame).heard(told)
 
 
-def _reference(bag: Bag, topic: BagTopic, start: Start, stated: Stated, told: list[tuple[str, str]]) -> Reference:
-    why = f"the messages of {topic.name} do not say which frame their orientation refers to"
-    if topic.type == IMU:
-        why += " (ROS recommends east, north, up: REP 145)"
-    kind: Kind = kind_of_frame(bag.path, start.turn.reference, stated, why, told)
-    return stated_reference(bag.path, kind, stated, start.first_ns)
-
-
-def _entries(heard: Iterator[Heard], start: Start) -> Iterator[LogEntry]:
+def _entries(heard: Iterator[_Heard], start: _Start) -> Iterator[LogEntry]:
     """Each attitude from the reference to the body, at its time, or why it is none."""
     for where, receive_ns, turn in heard:
-        yield LogEntry(where, _fault(turn, start) or _sample(turn, start.t_ns(turn, receive_ns)))
+        w, x, y, z = turn.q
+        fault = _fault(turn, start)
+        yield LogEntry(where, fault or checked_sample(start.t_ns(turn, receive_ns), (w, -x, -y, -z), turn.rate))
 
 
-def _sample(turn: RosTurn, t_ns: int) -> AttitudeSample | Refusal:
-    w, x, y, z = turn.q
-    return checked_sample(t_ns, (w, -x, -y, -z), turn.rate)
-
-
-def _fault(turn: RosTurn, start: Start) -> Refusal | None:
+def _fault(turn: _RosTurn, start: _Start) -> Refusal | None:
     first = start.turn
     if turn.fault is not None:
         return Refusal("format", turn.fault)
@@ -532,43 +489,29 @@ def _with_notices(entries: Iterator[LogEntry], bag: Bag, told: list[tuple[str, s
     told.extend(bag.told())
 
 
-def _say_optical(body: str | None, stated: Stated, told: list[tuple[str, str]]) -> None:
-    """An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would turn it twice."""
-    if body is not None and body.endswith(OPTICAL) and abs(stated.mounting.q_body_to_cam[0]) < 1:
-        told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
-
-
-def _conventions(topic: BagTopic, start: Start, reference: Reference) -> Conventions:
-    turn = start.turn
+def _conventions(topic: BagTopic, start: _Start, reference: Reference) -> Conventions:
+    turn, t_ns = start.turn, start.first_ns
     if not start.stamped:
         time = "when each message was recorded, ns since 1970"
-    elif start.first_ns >= FIRST_DATE_NS:
+    elif t_ns >= FIRST_DATE_NS:
         time = "header.stamp: UTC, ns since 1970-01-01T00:00:00, leap seconds not counted"
     else:
         time = "header.stamp: seconds of a simulated clock"
     rates = "; the gyroscope's rate, with respect to the stars" if turn.gyro and turn.rate is not None else ""
-    frames = f"{_quoted(turn.body, 'the body')} into those of {_quoted(turn.reference, 'the reference')}"
+    body = f"'{turn.body}'" if turn.body else "the body"
+    frames = f"{body} into those of " + (f"'{turn.reference}'" if turn.reference else "the reference")
+
+    def written(q: FloatArray) -> str:
+        of_body = multiply(reference.q_icrs_to_reference([t_ns])[0], conjugate(q))
+        when = "" if reference.kind == "icrs" else f" at {t_ns / NS_PER_S:.9f} s"
+        return f"x y z w = {components(np.roll(of_body, -1))}{when}"
+
     return Conventions(
         f"ROS {topic.name} ({topic.type.replace('/msg/', '/')})",
         f"turns components of {frames}, taken as {reference.words}{rates}",
         "scalar last (x, y, z, w), Hamilton",
         time,
         of_body=True,
-        written=_written(reference, start.first_ns),
-        scale="UTC" if start.first_ns >= FIRST_DATE_NS else None,
+        written=written,
+        scale="UTC" if t_ns >= FIRST_DATE_NS else None,
     )
-
-
-def _quoted(frame: str | None, unnamed: str) -> str:
-    return f"'{frame}'" if frame else unnamed
-
-
-def _written(reference: Reference, t_ns: int) -> Callable[[FloatArray], str]:
-    """An attitude (q_icrs_to_body) as the messages have it, at a time of the log."""
-
-    def words(q: FloatArray) -> str:
-        of_body = multiply(reference.q_icrs_to_reference([t_ns])[0], conjugate(q))
-        when = "" if reference.kind == "icrs" else f" at {t_ns / NS_PER_S:.9f} s"
-        return f"x y z w = {components(np.roll(of_body, -1))}{when}"
-
-    return words

@@ -19,7 +19,7 @@ import sqlite3
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple
+from typing import IO, Literal, NamedTuple
 from urllib.parse import quote
 
 import zstandard
@@ -30,6 +30,7 @@ from hilstar.attitude.logs.mcap_log import ROS_ENCODINGS, records_of, unpacked
 from hilstar.errors import InputError, shortened
 from hilstar.files import temporary_folder
 from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, open_regular, read_text, refuse_kind, size_text
+from hilstar.units import NS_PER_S
 
 BAG_ADVICE = "give a bag of ROS 1 (.bag) or ROS 2 (.db3, .mcap, or the bag's directory)"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -77,7 +78,7 @@ def type_name(text: str) -> str:
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else "/".join(parts)
 
 
-def chunk_bytes(data: bytes, compression: str, size: int) -> bytes:
+def _chunk_bytes(data: bytes, compression: str, size: int) -> bytes:
     """A chunk, unpacked to the `size` that the bag states. Raises ValueError, and what the unpackers raise."""
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
@@ -86,68 +87,47 @@ def chunk_bytes(data: bytes, compression: str, size: int) -> bytes:
     return unpacked(data, compression, size)
 
 
-def message_bytes(data: bytes) -> bytes:
+def _message_bytes(data: bytes) -> bytes:
     """A message's bytes, unpacked where the recorder packed each by itself (no CDR begins as Zstandard does)."""
     return unpacked(data, "zstd", MAX_CHUNK_BYTES, exact=False) if data[:4] == ZSTD_MAGIC else data
 
 
-def unpack_file(path: Path, source: IO[bytes], target: IO[bytes]) -> None:
-    """A Zstandard file into another one. Raises InputError."""
-    room = FREE_BYTES + MAX_INFLATION * path.stat().st_size
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(source) as stream:
-            while piece := stream.read(PIECE_BYTES):
-                room -= len(piece)
-                if room < 0:
-                    raise InputError(f"{path}: unpacks to more than {MAX_INFLATION} times its size; {BAG_ADVICE}")
-                target.write(piece)
-    except zstandard.ZstdError as error:
-        raise damaged(path, error) from error
-
-
-def damaged(path: Path, reason: object, where: str = "") -> InputError:
-    """The refusal of a bag that is not whole."""
+def _damaged(path: Path, reason: object, where: str = "") -> InputError:
     words = shortened(" ".join(str(reason).split()))
     return InputError(f"{path}: the bag is damaged{where} ({words}); record it again, or repair it with ROS's own tools")
 
 
-class Db3File:
+class _Db3File:
     """A .db3 file: topics, messages as recorded, and notices of what is missing. Its methods raise InputError for damage."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def topics(self) -> list[BagTopic]:
-        """The rows of `topics`."""
         with self._open() as database:
             texts = {}
             if self._tables(database, "message_definitions"):
                 rows = database.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
                 texts = {name: text for name, encoding, text in rows.fetchmany(MAX_TOPICS) if encoding == "ros2msg"}
-            found = []
-            rows = database.execute("SELECT name, type, serialization_format FROM topics ORDER BY id")
-            for name, kind, serialised in rows.fetchmany(MAX_TOPICS):
-                if serialised == "cdr":
-                    found.append(BagTopic(str(name), type_name(str(kind)), "cdr", str(texts.get(kind, ""))))
+            rows = database.execute("SELECT name, type FROM topics WHERE serialization_format = 'cdr' ORDER BY id")
+            found = [
+                BagTopic(str(name), type_name(str(kind)), "cdr", str(texts.get(kind, "")))
+                for name, kind in rows.fetchmany(MAX_TOPICS)
+            ]
             return list(dict.fromkeys(found))
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic, in the order of recording."""
         with self._open() as database:
-            ids = [
-                number
-                for number, name, kind in database.execute("SELECT id, name, type FROM topics").fetchmany(MAX_TOPICS)
-                if (name, type_name(str(kind))) == (topic.name, topic.type)
-            ]
+            topics = database.execute("SELECT id, name, type FROM topics").fetchmany(MAX_TOPICS)
+            ids = [number for number, name, kind in topics if (name, type_name(str(kind))) == (topic.name, topic.type)]
             marks = ",".join("?" * len(ids))
             rows = database.execute(f"SELECT timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id", ids)
             for receive_ns, data in rows:
                 if not isinstance(receive_ns, int) or not isinstance(data, bytes):
-                    raise damaged(self._path, "a message without time or bytes")
-                yield Message(receive_ns, message_bytes(data))
+                    raise _damaged(self._path, "a message without time or bytes")
+                yield Message(receive_ns, _message_bytes(data))
 
     def told(self) -> list[tuple[str, str]]:
-        """That the recorder was killed before all was in the file."""
         log = self._path.with_name(self._path.name + "-wal")
         if not log.is_file() or not log.stat().st_size:
             return []
@@ -156,17 +136,16 @@ class Db3File:
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
+        place = f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1"
         try:
-            with contextlib.closing(
-                sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1", uri=True)
-            ) as database:
+            with contextlib.closing(sqlite3.connect(place, uri=True)) as database:
                 database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
                 database.execute("PRAGMA trusted_schema = off")
                 if self._tables(database, "topics", "messages") != 2:
                     raise InputError(f"{self._path}: an SQLite database, but no bag of ROS 2: it lacks topics and messages")
                 yield database
         except (sqlite3.Error, ValueError, OverflowError, zstandard.ZstdError) as error:
-            raise damaged(self._path, error) from error
+            raise _damaged(self._path, error) from error
 
     def _tables(self, database: sqlite3.Connection, *names: str) -> int:
         """How many of the names are tables (a view would run what the file says)."""
@@ -175,65 +154,54 @@ class Db3File:
         return int(database.execute(query, names).fetchone()[0])
 
 
-class McapBag:
-    """An .mcap file, as `Db3File`."""
+class _McapBag:
+    """An .mcap file, as `_Db3File`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def topics(self) -> list[BagTopic]:
-        """The channels whose messages are ROS's."""
-        return list(dict.fromkeys(topic for _, topic in self._channels()))
+        return list(dict.fromkeys(found for found in self._records() if isinstance(found, BagTopic)))
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic, in the order of the file."""
-        wanted: set[int] = set()
-        schemas: dict[int, Schema] = {}
-        for record in records_of(self._path):
-            if isinstance(record, McapMessage):
-                if record.channel_id in wanted:
-                    yield Message(record.log_time, self._unpacked(record.data))
-            elif isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel) and _topic(record, schemas.get(record.schema_id)) == topic:
-                wanted.add(record.id)
+        for found in self._records(topic):
+            if isinstance(found, Message):
+                yield found
 
     def told(self) -> list[tuple[str, str]]:
-        """That the recorder was killed before the file's end was written."""
         with self._path.open("rb") as file:
             file.seek(-min(len(MCAP_MAGIC), self._path.stat().st_size), os.SEEK_END)
             if file.read() == MCAP_MAGIC:
                 return []
         return [("log-cut", f"{self._path} was not closed by its recorder; all chunks that are whole are read")]
 
-    def _channels(self) -> Iterator[tuple[int, BagTopic]]:
+    def _records(self, wanted: BagTopic | None = None) -> Iterator[BagTopic | Message]:
+        """Every topic, and each message of the wanted one."""
+        channels: dict[int, BagTopic] = {}
         schemas: dict[int, Schema] = {}
         for record in records_of(self._path):
-            if isinstance(record, Schema):
+            if isinstance(record, McapMessage):
+                if wanted is not None and channels.get(record.channel_id) == wanted:
+                    try:
+                        yield Message(record.log_time, _message_bytes(record.data))
+                    except (ValueError, zstandard.ZstdError) as error:
+                        raise _damaged(self._path, error) from error
+            elif isinstance(record, Schema):
                 schemas[record.id] = record
-            elif isinstance(record, Channel) and (topic := _topic(record, schemas.get(record.schema_id))) is not None:
-                yield record.id, topic
-
-    def _unpacked(self, data: bytes) -> bytes:
-        try:
-            return message_bytes(data)
-        except (ValueError, zstandard.ZstdError) as error:
-            raise damaged(self._path, error) from error
+            elif isinstance(record, Channel) and record.message_encoding in ROS_ENCODINGS and record.schema_id in schemas:
+                schema = schemas[record.schema_id]
+                text = schema.data.decode(errors="replace") if schema.encoding in {"ros2msg", "ros1msg"} else ""
+                encoding: Encoding = "ros1" if record.message_encoding == "ros1" else "cdr"
+                channels[record.id] = BagTopic(record.topic, type_name(schema.name), encoding, text)
+                yield channels[record.id]
 
 
-def _topic(channel: Channel, schema: Schema | None) -> BagTopic | None:
-    if schema is None or channel.message_encoding not in ROS_ENCODINGS:
-        return None
-    text = schema.data.decode(errors="replace") if schema.encoding in {"ros2msg", "ros1msg"} else ""
-    return BagTopic(channel.topic, type_name(schema.name), "ros1" if channel.message_encoding == "ros1" else "cdr", text)
-
-
-class CutError(Exception):
+class _CutError(Exception):
     """The file ends within a record."""
 
 
-class BagFile:
-    """A .bag file, as `Db3File`."""
+class _BagFile:
+    """A .bag file, as `_Db3File`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -242,46 +210,36 @@ class BagFile:
 
     def topics(self) -> list[BagTopic]:
         """The connections of the index; without one, those of all chunks."""
-        with open_regular(self._path, BAG_ADVICE) as file:
-            self._check_version(file)
-            index = self._index_at(file)
-        for start in (index, len(VERSION)):
+        for start in (self._index_at(), len(VERSION)):
             if start and not self._topics:  # an index that names nothing is not where the bag says
                 for _ in self._records(start):
                     pass
         return list(dict.fromkeys(self._topics.values()))
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic, in the order of the file."""
         for connection, message in self._records(len(VERSION)):
             if self._topics.get(connection) == topic:
                 yield message
 
     def told(self) -> list[tuple[str, str]]:
-        """That the bag was cut short."""
         if self._cut_at is None:
             return []
         return [("log-cut", f"{self._path} ends within a record at byte {self._cut_at}; all that is whole before it is read")]
 
-    def _check_version(self, file: IO[bytes]) -> None:
-        line = file.readline(len(VERSION))
-        if line != VERSION:
-            raise InputError(f"{self._path}: a ROS 1 bag of another version than 2.0; convert it with rosbag's own tools")
-
-    def _index_at(self, file: IO[bytes]) -> int:
+    def _index_at(self) -> int:
         """Where the index begins, 0 where the bag has none."""
-        try:
-            record = _record(file, MAX_CHUNK_BYTES)
-            if record is None:
+        with open_regular(self._path, BAG_ADVICE) as file:
+            if file.readline(len(VERSION)) != VERSION:
+                raise InputError(f"{self._path}: a ROS 1 bag of another version than 2.0; convert it with rosbag's own tools")
+            try:
+                fields, _ = _record(file) or ({b"index_pos": bytes(_u64.size)}, b"")
+                if fields.get(b"encryptor"):
+                    raise InputError(f"{self._path}: an encrypted bag; decrypt it with rosbag's own tools")
+                at: int = _u64.unpack(fields[b"index_pos"])[0]
+            except FAULTS as error:
+                raise _damaged(self._path, error) from error
+            except _CutError:
                 return 0
-            fields = record[0]
-            if fields.get(b"encryptor"):
-                raise InputError(f"{self._path}: an encrypted bag; decrypt it with rosbag's own tools")
-            at: int = _u64.unpack(fields[b"index_pos"])[0]
-        except FAULTS as error:
-            raise damaged(self._path, error) from error
-        except CutError:
-            return 0
         return at if at < self._path.stat().st_size else 0
 
     def _records(self, start: int) -> Iterator[tuple[int, Message]]:
@@ -290,31 +248,31 @@ class BagFile:
             room = FREE_BYTES + MAX_INFLATION * self._path.stat().st_size
             file.seek(start)
             try:
-                while (record := _record(file, MAX_CHUNK_BYTES)) is not None:
+                while (record := _record(file)) is not None:
                     fields, data = record
                     if _operation(fields) == CHUNK:
-                        chunk = chunk_bytes(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
+                        chunk = _chunk_bytes(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
                         room -= len(chunk)
                         if room < 0:
                             raise ValueError(f"unpacks to more than {MAX_INFLATION} times its size")
                         yield from self._inside(io.BytesIO(chunk))
                     elif _operation(fields) == CONNECTION:
                         self._connect(fields, data)
-            except CutError:
+            except _CutError:
                 self._cut_at = file.tell()
             except FAULTS as error:
-                raise damaged(self._path, error, f" before byte {file.tell()}") from error
+                raise _damaged(self._path, error, f" before byte {file.tell()}") from error
 
     def _inside(self, chunk: IO[bytes]) -> Iterator[tuple[int, Message]]:
         try:
-            while (record := _record(chunk, MAX_CHUNK_BYTES)) is not None:
+            while (record := _record(chunk)) is not None:
                 fields, data = record
                 if _operation(fields) == MESSAGE:
                     seconds, ns = _time.unpack(fields[b"time"])
-                    yield _u32.unpack(fields[b"conn"])[0], Message(seconds * 10**9 + ns, data)
+                    yield _u32.unpack(fields[b"conn"])[0], Message(seconds * NS_PER_S + ns, data)
                 elif _operation(fields) == CONNECTION:
                     self._connect(fields, data)
-        except CutError as error:
+        except _CutError as error:
             raise ValueError("a record is longer than its chunk") from error
 
     def _connect(self, fields: Fields, data: bytes) -> None:
@@ -323,24 +281,24 @@ class BagFile:
         self._topics[_u32.unpack(fields[b"conn"])[0]] = BagTopic(name, kind, "ros1", more[b"message_definition"].decode())
 
 
-def _record(file: IO[bytes], limit: int) -> tuple[Fields, bytes] | None:
+def _record(file: IO[bytes]) -> tuple[Fields, bytes] | None:
     """The next record, None at the end. Raises CutError where the file ends within it, ValueError for one over the limits."""
     head = file.read(_u32.size)
     if not head:
         return None
     fields = _fields(_part(file, head, MAX_HEADER_BYTES))
-    return fields, _part(file, file.read(_u32.size), limit)
+    return fields, _part(file, file.read(_u32.size), MAX_CHUNK_BYTES)
 
 
 def _part(file: IO[bytes], length: bytes, limit: int) -> bytes:
     if len(length) < _u32.size:
-        raise CutError
+        raise _CutError
     size: int = _u32.unpack(length)[0]
     if size > limit:
         raise ValueError(f"a record of {size} bytes; at most {limit} are read")
     data = file.read(size)
     if len(data) < size:
-        raise CutError
+        raise _CutError
     return data
 
 
@@ -361,7 +319,7 @@ def _operation(fields: Fields) -> int:
     return fields[b"op"][0] if fields.get(b"op") else 0
 
 
-Storage = Db3File | McapBag | BagFile  # one file of a bag
+Storage = _Db3File | _McapBag | _BagFile  # one file of a bag
 
 
 class Bag:
@@ -405,33 +363,24 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 def _files_of(path: Path, told: list[tuple[str, str]]) -> list[Path]:
     """The files that the bag's metadata names; without it, all of the directory."""
-    if (path / METADATA).is_file():
-        files = [path / Path(name).name for name in _listed_files(path / METADATA)]
-        missing = [file.name for file in files if not file.is_file()]
-        if missing:
-            raise InputError(f"{path}: lacks {shortened(', '.join(missing))}, which its {METADATA} names; copy the whole bag")
-    else:
-        files = sorted((file for file in path.iterdir() if FILE_NAME.fullmatch(file.name)), key=_number)
+    metadata = path / METADATA
+    if not metadata.is_file():
         told.append(("log-cut", f"{path} has no {METADATA} (its recorder was killed?); all of its bag files are read"))
-    return files
-
-
-def _number(file: Path) -> list[Any]:
-    """NAME_2 comes before NAME_10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)]
-
-
-def _listed_files(metadata: Path) -> list[str]:
-    """relative_file_paths, one to a line or in brackets, as ROS 2 writes them; a YAML reader's time has no bound."""
-    text = read_text(metadata, "give a bag of ROS 2", MAX_METADATA_BYTES)
-    found = FILE_LIST.search(text)
+        files = [file for file in path.iterdir() if FILE_NAME.fullmatch(file.name)]  # NAME_2 comes before NAME_10
+        return sorted(files, key=lambda file: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", file.name)])
+    # relative_file_paths, one to a line or in brackets, as ROS 2 writes them; a YAML reader's time has no bound.
+    found = FILE_LIST.search(read_text(metadata, "give a bag of ROS 2", MAX_METADATA_BYTES))
     if found is None:
         raise InputError(f"{metadata}: has no relative_file_paths; remove the file to read all of the directory")
     items = found[1].split(",") if found[1] is not None else [line.strip()[1:] for line in found[2].splitlines()]
     names = [name for item in items if (name := item.strip().strip("'\""))]
     if not names or len(names) > MAX_FILES or max(map(len, names)) > MAX_NAME_CHARACTERS:
         raise InputError(f"{metadata}: names no files of a bag; remove it to read all of the directory")
-    return names
+    files = [path / Path(name).name for name in names]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise InputError(f"{path}: lacks {shortened(', '.join(missing))}, which its {METADATA} names; copy the whole bag")
+    return files
 
 
 def _storage(path: Path, place: Path) -> Storage:
@@ -439,16 +388,20 @@ def _storage(path: Path, place: Path) -> Storage:
     with open_regular(path, BAG_ADVICE) as file:
         head = file.read(HEAD_BYTES)
         if head.startswith(ZSTD_MAGIC):
-            whole = place / path.stem
+            whole, room = place / path.stem, FREE_BYTES + MAX_INFLATION * path.stat().st_size
             file.seek(0)
-            with whole.open("wb") as target:
-                unpack_file(path, file, target)
+            try:
+                with whole.open("wb") as target, zstandard.ZstdDecompressor().stream_reader(file) as stream:
+                    while piece := stream.read(PIECE_BYTES):
+                        room -= len(piece)
+                        if room < 0:
+                            raise InputError(f"{path}: unpacks to more than {MAX_INFLATION} times its size; {BAG_ADVICE}")
+                        target.write(piece)
+            except zstandard.ZstdError as error:
+                raise _damaged(path, error) from error
             return _storage(whole, place)
-    if head.startswith(ROSBAG_MAGIC):
-        return BagFile(path)
-    if head.startswith(SQLITE_MAGIC):
-        return Db3File(path)
-    if head.startswith(MCAP_MAGIC):
-        return McapBag(path)
+    for magic, kind in ((ROSBAG_MAGIC, _BagFile), (SQLITE_MAGIC, _Db3File), (MCAP_MAGIC, _McapBag)):
+        if head.startswith(magic):
+            return kind(path)
     refuse_kind(path, head, BAG_ADVICE)
     raise InputError(f"{path}: not a file of a bag; {BAG_ADVICE}")

@@ -42,7 +42,14 @@ class Telemetry:
 
 def read_telemetry(path: Path, rising: bool = True) -> Telemetry:
     """Read telemetry. Raises InputError with the line of what is no attitude and, if `rising`, of a time that does not rise."""
-    telemetry = _read_csv(path, rising) if _is_csv(path) else _read_log(path)
+    if _is_csv(path):
+        telemetry = _read_csv(path, rising)
+    else:
+        samples = read_log(path)
+        t_ns = np.array([sample.t_ns for sample in samples], dtype=np.int64)
+        q = np.array([sample.q_icrs_to_cam for sample in samples]).reshape(-1, 4)
+        valid = np.ones(len(samples), dtype=np.bool_)
+        telemetry = Telemetry(path, t_ns, q, valid, np.arange(1, len(samples) + 1), of_lines=False)
     if not telemetry.valid.any():
         rows = f"{len(telemetry.t_ns)} rows, none of them valid" if len(telemetry.t_ns) else "no row"
         raise InputError(f"{path}: has {rows}; {ADVICE}")
@@ -62,22 +69,9 @@ def _is_csv(path: Path) -> bool:
     return not first.startswith((b"<", b"{", b"CCSDS"))
 
 
-def _read_log(path: Path) -> Telemetry:
-    samples = read_log(path)
-    count = len(samples)
-    return Telemetry(
-        path,
-        np.array([sample.t_ns for sample in samples], dtype=np.int64),
-        np.array([sample.q_icrs_to_cam for sample in samples]).reshape(count, 4),
-        np.ones(count, dtype=np.bool_),
-        np.arange(1, count + 1),
-        of_lines=False,
-    )
-
-
 def _read_csv(path: Path, rising: bool) -> Telemetry:
     t_ns: list[int] = []
-    q: list[tuple[float, ...]] = []
+    q: list[list[float]] = []
     valid: list[bool] = []
     line: list[int] = []
     for number, cells in read_rows(path, COLUMNS, ADVICE, MAX_BYTES):
@@ -86,7 +80,13 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
             said = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
             raise InputError(f"{path}:{number}: time does not increase ({said}); sort the rows, and give one recording")
         valid.append(is_valid(path, number, cells[5]))
-        q.append(_quaternion(path, number, cells[1:5]) if valid[-1] else (math.nan,) * 4)
+        own = [math.nan] * 4
+        if valid[-1]:
+            own = finite_numbers(path, number, COLUMNS[1:], cells[1:5], "write valid = 0 where there is no answer")
+            if abs(math.hypot(*own) - 1) > NORM_TOLERANCE:
+                said = f"the norm of qw,qx,qy,qz is {math.hypot(*own):.6g}"
+                raise InputError(f"{path}:{number}: {said}; write unit quaternions, within {NORM_TOLERANCE:g}")
+        q.append(own)
         line.append(number)
         if len(t_ns) > MAX_ROWS:
             raise InputError(f"{path}: more than {MAX_ROWS} rows; give a shorter recording")
@@ -104,13 +104,3 @@ def _time(path: Path, line: int, cell: str) -> int:
     if t_ns is None or abs(t_ns) > MAX_T_NS:
         raise InputError(f"{path}:{line}: t_s = {shortened(cell)!r} is no time; write seconds, of any clock that runs evenly")
     return t_ns
-
-
-def _quaternion(path: Path, line: int, cells: list[str]) -> tuple[float, ...]:
-    numbers = finite_numbers(path, line, COLUMNS[1:], cells, "write valid = 0 where there is no answer")
-    norm = math.hypot(*numbers)
-    if abs(norm - 1) > NORM_TOLERANCE:
-        raise InputError(
-            f"{path}:{line}: the norm of qw,qx,qy,qz is {norm:.6g}; write unit quaternions, within {NORM_TOLERANCE:g}"
-        )
-    return tuple(numbers)

@@ -59,7 +59,7 @@ class RawLink(Protocol):
         """Close this process's end of it."""
 
 
-OpenStream = Callable[[Notices], RawLink]
+OpenStream = Callable[..., RawLink]  # its only argument: notices
 
 
 class ReadOrder(NamedTuple):
@@ -189,18 +189,16 @@ class ReaderProcess:
         # Only what was waited here counts: this process may have been stopped itself.
         waited_s = min((self._clock.now_ns() - begun_ns) / NS_PER_S, timeout_ms / 1000)
         self._silent_s = 0.0 if said else self._silent_s + waited_s
-        limit_s = (STALLED_S if self._would_run() else HUNG_S) if self._ready and self._silent_s > HUNG_S else STARTS_S
+        limit_s = STARTS_S
+        if self._ready and self._silent_s > HUNG_S:
+            limit_s = STALLED_S  # it may run, or wait for a core; one that is stopped or asleep does neither
+            with contextlib.suppress(OSError, IndexError):
+                if self._process is not None:
+                    status = Path(f"/proc/{self._process.pid}/stat").read_text()
+                    limit_s = STALLED_S if status.rpartition(")")[2].split()[0] == "R" else HUNG_S
         if self._silent_s > limit_s:
             self._ended(f"no sign of life for {limit_s:g} s")
         return said
-
-    def _would_run(self) -> bool:
-        """Whether the process runs, or waits for a core; one that is stopped or asleep does not."""
-        with contextlib.suppress(OSError, IndexError):
-            if self._process is not None:
-                status = Path(f"/proc/{self._process.pid}/stat").read_text()
-                return status.rpartition(")")[2].split()[0] == "R"
-        return True
 
     def await_ready(self) -> None:
         """Wait until the process has imported what it needs; not for long, and not for one that failed."""

@@ -69,7 +69,7 @@ class Wire:
         return newest, files[0] if newest.device and files else None
 
 
-class OpenDevice:
+class _OpenDevice:
     """A serial device, which the process that shows stars has opened and set up."""
 
     def __init__(self, file: int, clock: HostClock = HOST_CLOCK) -> None:
@@ -77,11 +77,9 @@ class OpenDevice:
         self._file, self._clock = file, clock
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """Whether a byte waits."""
         return bool(select.select([self._file], [], [], timeout_ms / 1000)[0])
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
-        """The bytes that came, as one message."""
         if not self.wait_for_message(timeout_ms):
             return []
         try:
@@ -93,12 +91,11 @@ class OpenDevice:
         return [RawMessage(self._clock.now_ns(), [chunk])]
 
     def close(self) -> None:
-        """Close this process's copy of the device."""
         with contextlib.suppress(OSError):
             os.close(self._file)
 
 
-class ForwardedNotices(Notices):
+class _ForwardedNotices(Notices):
     """Forwards a link's notices, each after the counts so far; drops them once the other side is gone."""
 
     def __init__(self, wire: Wire, order: int) -> None:
@@ -107,39 +104,33 @@ class ForwardedNotices(Notices):
         self._wire, self._order, self._counted = wire, order, LinkCounts()
 
     def count(self) -> None:
-        """Forward the growth of the counts."""
         grown, self._counted = self.link_counts - self._counted, replace(self.link_counts)
         if grown != LinkCounts():
             self._wire.put(Record(self._order, counts=grown))
 
-    def tell(self, kind: str, detail: str, who: str = "") -> None:
-        """Forward a lasting notice."""
-        self._forward(Record(self._order, notice=(kind, detail, who)))
-
-    def mention(self, kind: str, detail: str) -> None:
-        """Forward a mention."""
-        self._forward(Record(self._order, notice=(kind, detail, ""), lasting=False))
-
-    def _forward(self, record: Record) -> None:
+    def tell(self, kind: str, detail: str, who: str = "", *, lasting: bool = True) -> None:
         with contextlib.suppress(EOFError):
             self.count()
-            self._wire.put(record)
+            self._wire.put(Record(self._order, notice=(kind, detail, who), lasting=lasting))
+
+    def mention(self, kind: str, detail: str) -> None:
+        self.tell(kind, detail, lasting=False)
 
 
-class Reading:
+class _Reading:
     """An order that is carried out. Raises InputError where its socket cannot be opened."""
 
     def __init__(self, wire: Wire, order: ReadOrder, file: int | None, clock: HostClock = HOST_CLOCK) -> None:
         self._wire, self._number, self._clock = wire, order.number, clock
-        self._notices = ForwardedNotices(wire, order.number)
+        self._notices = _ForwardedNotices(wire, order.number)
         self._empty_ns = clock.now_ns()
         self.link: RawLink | None = None
         if order.stream is not None:
-            self.link = order.stream(self._notices)
+            self.link = order.stream(notices=self._notices)
             self._notices.link_counts = self.link.link_counts
         elif file is not None:
             self._empty_ns = 0  # bytes that already wait may have come at any time
-            self.link = OpenDevice(file, clock)
+            self.link = _OpenDevice(file, clock)
 
     def hand_over(self, link: RawLink) -> None:
         """Stamp and hand over what came; a device that does not answer any more is said, and closed."""
@@ -160,29 +151,13 @@ class Reading:
             self._wire.put(Record(self._number, message._replace(empty_ns=self._empty_ns, timely=timely)))
 
     def close(self) -> None:
-        """Read no more."""
         if self.link is not None:
             self.link.close()
         self.link = None
 
 
-def read_as_ordered(wire: Wire) -> NoReturn:
-    """Read what is ordered until the other side is gone (EOFError). Raises InputError where a socket cannot be opened."""
-    priority = PromptWhileLight()
-    reading = Reading(wire, ReadOrder(0), None)
-    while True:
-        wire.sign()
-        ordered = wire.order(LIFE_S * 1000 if reading.link is None else 0)
-        if ordered is not None:
-            reading.close()
-            reading = Reading(wire, *ordered)
-        if reading.link is not None:
-            reading.hand_over(reading.link)
-        priority.tend()
-
-
 def main() -> NoReturn:
-    """Read until the other side is gone; report there in a line what ends this process early."""
+    """Read what is ordered until the other side is gone; report there in a line what ends this process early."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
     file, parent = map(int, sys.argv[1:3])
@@ -190,7 +165,17 @@ def main() -> NoReturn:
     wire = Wire(socket.socket(fileno=file))
     code = 0
     try:
-        read_as_ordered(wire)
+        priority = PromptWhileLight()
+        reading = _Reading(wire, ReadOrder(0), None)
+        while True:
+            wire.sign()
+            ordered = wire.order(LIFE_S * 1000 if reading.link is None else 0)
+            if ordered is not None:
+                reading.close()
+                reading = _Reading(wire, *ordered)
+            if reading.link is not None:
+                reading.hand_over(reading.link)
+            priority.tend()
     except EOFError:
         pass
     except BaseException as error:

@@ -63,7 +63,10 @@ class Endpoint:
 def parse_endpoint(text: str) -> Endpoint:
     """The endpoint of a text. Raises InputError for any form except those listed in this module's docstring."""
     if text.startswith("ipc://"):
-        return _parse_ipc(text)
+        name = text.removeprefix("ipc://")
+        if not name.startswith("/") or not name.isprintable() or len(os.fsencode(name)) > MAX_PATH_BYTES:
+            raise InputError(f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}")
+        return Endpoint(text, loopback=True, path=Path(name))
     match = TCP.fullmatch(text)
     port = match[2] if match else ""
     if match is None or (port != "*" and int(port) > 65_535):
@@ -94,13 +97,6 @@ def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
     return f"[{address}]" if bracketed else str(address), address.is_loopback, address.is_unspecified
 
 
-def _parse_ipc(text: str) -> Endpoint:
-    name = text.removeprefix("ipc://")
-    if not name.startswith("/") or not name.isprintable() or len(os.fsencode(name)) > MAX_PATH_BYTES:
-        raise InputError(f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}")
-    return Endpoint(text, loopback=True, path=Path(name))
-
-
 def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
     """Refuse (InputError) an endpoint that cannot be bound or connected, or whose file a bind would delete."""
     if endpoint.path is not None:
@@ -125,11 +121,11 @@ def _check_socket_file(path: Path, text: str, bind: bool) -> None:
         return
     if not stat.S_ISSOCK(mode):
         raise InputError(f"{text}: an existing file that is not a socket, and binding would delete it; write another path")
-    if bind and is_served(path):
+    if bind and _is_served(path):
         raise InputError(f"{text}: in use by a running program; stop that program, or write another path")
 
 
-def is_served(path: Path) -> bool:
+def _is_served(path: Path) -> bool:
     """Whether a program listens at the socket `path`, or may."""
     with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as asker:
         asker.setblocking(False)
@@ -163,7 +159,13 @@ class AllowedSenders:
     """The addresses and networks whose datagrams are read: this machine alone where none are given."""
 
     def __init__(self, texts: Iterable[str] = ()) -> None:
-        self.listed = tuple(_network(text) for text in texts)
+        networks: list[Network] = []
+        for text in texts:
+            try:
+                networks.append(ipaddress.ip_network(text.strip("[]")))
+            except ValueError as error:
+                raise InputError(f'allow = ["{shortened(text)}"]: {error}; {ALLOW_FORM}') from error
+        self.listed = tuple(networks)
         self._known: dict[str, bool] = {}  # a flood asks for each of its datagrams
 
     def __bool__(self) -> bool:
@@ -234,10 +236,3 @@ def _port(text: str, word: str) -> int:
     if not re.fullmatch(r"\d{1,5}", text) or int(text) > 65_535:
         raise InputError(f"{word}: not a port; write a number from 1 to 65535, such as port = {DEFAULT_PORT}")
     return int(text)
-
-
-def _network(text: str) -> Network:
-    try:
-        return ipaddress.ip_network(text.strip("[]"))
-    except ValueError as error:
-        raise InputError(f'allow = ["{shortened(text)}"]: {error}; {ALLOW_FORM}') from error

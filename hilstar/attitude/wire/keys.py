@@ -10,7 +10,6 @@ import contextlib
 import logging
 import os
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,38 +72,26 @@ def make_keys(directory: Path) -> list[Path]:
     allowed = directory / "allowed_clients"
     written = [directory / f"{name}.{kind}" for name in ("server", "client") for kind in ("key", "key_secret")]
     written.append(allowed / "client.key")
+    before = os.umask(OTHERS)
     try:
         there = [path for path in written if exists(path)]
         if there:
             raise InputError(f"{there[0]}: exists already, and may be in use; choose another directory")
-        with _only_for_the_owner():
-            allowed.mkdir(parents=True, exist_ok=True)
-            _make_in(directory, allowed)
+        allowed.mkdir(parents=True, exist_ok=True)
+        # All keys are made in a temporary directory, then renamed into place: an incomplete set is useless.
+        with tempfile.TemporaryDirectory(dir=directory, prefix=".keys") as folder:
+            for name in ("server", "client"):
+                zmq.auth.create_certificates(folder, name)
+            made = Path(folder)
+            (made / "allowed").write_bytes((made / "client.key").read_bytes())
+            (made / "allowed").rename(allowed / "client.key")
+            for path in sorted(made.iterdir()):
+                path.rename(directory / path.name)
     except (OSError, ValueError) as error:
         raise cannot_write(directory, error) from error
-    return written
-
-
-def _make_in(directory: Path, allowed: Path) -> None:
-    """Make all keys in a temporary directory, then rename them into place: an incomplete set is useless."""
-    with tempfile.TemporaryDirectory(dir=directory, prefix=".keys") as folder:
-        for name in ("server", "client"):
-            zmq.auth.create_certificates(folder, name)
-        made = Path(folder)
-        (made / "allowed").write_bytes((made / "client.key").read_bytes())
-        (made / "allowed").rename(allowed / "client.key")
-        for path in sorted(made.iterdir()):
-            path.rename(directory / path.name)
-
-
-@contextlib.contextmanager
-def _only_for_the_owner() -> Iterator[None]:
-    """Files and directories made inside are readable only by their owner."""
-    before = os.umask(OTHERS)
-    try:
-        yield
     finally:
         os.umask(before)
+    return written
 
 
 def load_public(path: Path) -> bytes:
@@ -155,7 +142,12 @@ class AllowList:
         """Whether a client with this public key (Z85) may connect."""
         seen = self._look()
         if seen != self._seen:
-            self._seen, self._keys = seen, set(self._readable(seen))
+            self._seen, self._keys = seen, set()
+            for path in seen:
+                try:
+                    self._keys.add(load_public(path))
+                except InputError as error:
+                    log.warning("%s", error)
         return key in self._keys
 
     def _look(self) -> dict[Path, tuple[int, int, int]]:
@@ -166,11 +158,3 @@ class AllowList:
                 status = path.stat()
                 found[path] = (status.st_mtime_ns, status.st_size, status.st_ino)
         return found
-
-    @staticmethod
-    def _readable(paths: dict[Path, tuple[int, int, int]]) -> Iterator[bytes]:
-        for path in paths:
-            try:
-                yield load_public(path)
-            except InputError as error:
-                log.warning("%s", error)

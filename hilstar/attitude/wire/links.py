@@ -1,7 +1,6 @@
 """The contract of every link into hilstar: what it can do, messages with their time of arrival, limits against floods.
 
-A packet has two names on its way in: an `Arrival`, which is what came and when, and the `AttitudeSample` that it says. A link
-whose messages are passed over in a flood keeps them as `RawMessage` until they are decoded.
+A packet has two names on its way in: what arrived (`RawMessage`, once decoded `Arrival`), and the `AttitudeSample` in it.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from operator import add, sub
-from typing import ClassVar, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal, Status
@@ -25,7 +24,6 @@ MAX_BURST = 1000  # as many as may have waited while the receiver was stopped
 PAUSE_S = 0.005  # a flooded receiver rests: the frame loop needs the interpreter lock
 OVER_NS = NS_PER_S  # a flood is over once no packet was dropped for this long
 MAX_LOOKED_AT = 1000  # passed-over packets searched for a discontinuity, which is declared once
-T = TypeVar("T")
 E_co = TypeVar("E_co", bound=Event, covariant=True)
 
 
@@ -65,10 +63,11 @@ class FloodGate:
         self._seen_ns = clock.now_ns()
         self._dropped_ns = self._seen_ns - OVER_NS - 1
 
-    def newest(self, waiting: list[T], declares_discontinuity: Callable[[T], bool]) -> list[T]:
+    def newest(self, waiting: list[RawMessage], declares_discontinuity: Callable[[bytes], bool]) -> list[RawMessage]:
         """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses where others are passed over.
 
-        The newest passed-over message that declares a discontinuity is taken too: no attitude is interpolated across it.
+        The newest passed-over message whose last part declares a discontinuity is taken too: no attitude is interpolated across
+        it.
         """
         now_ns = self._clock.now_ns()
         self._left = min(self._left + (now_ns - self._seen_ns) * MAX_PACKETS_PER_S / NS_PER_S, MAX_BURST)
@@ -84,14 +83,14 @@ class FloodGate:
         self._dropped_ns = now_ns
         self._clock.sleep(PAUSE_S)
         for k in range(passed_over - 1, max(passed_over - MAX_LOOKED_AT, 0) - 1, -1):
-            if declares_discontinuity(waiting[k]):
+            if declares_discontinuity(waiting[k].parts[-1]):
                 self._counts.flooded -= 1
                 return [waiting[k], *waiting[passed_over:]]
         return waiting[passed_over:]
 
 
 class RawMessage(NamedTuple):
-    """A message as it arrived, not decoded: host time in ns, its parts, and how long it may have waited unread.
+    """What arrived, before it is decoded: host time in ns, its parts, and who sent it, where a link has several senders.
 
     `empty_ns` is when nothing waited last. A `timely` message woke its reader and did not wait.
     """
@@ -100,6 +99,7 @@ class RawMessage(NamedTuple):
     parts: Sequence[bytes]
     empty_ns: int = 0
     timely: bool = True
+    sender: tuple[Any, ...] | None = None
 
     @property
     def waited_ns(self) -> int:
@@ -109,7 +109,7 @@ class RawMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Arrival(Generic[E_co]):
-    """One message: host time of its arrival, what it says, its bytes as received, and how long it may have waited unread.
+    """What arrived: host time, what it says, its bytes as received, and how long it may have waited unread.
 
     `refusal` says why a packet that is an attitude is not used. `back` sends to the sender of this message, where a link has
     several senders.

@@ -24,7 +24,7 @@ from datetime import date
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.wire.endpoint import AllowedSenders, Endpoint, check_use, parse_endpoint
+from hilstar.attitude.wire.endpoint import AllowedSenders, check_use, parse_endpoint
 from hilstar.attitude.wire.links import Arrival, Link, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, Status, checked_sample
 from hilstar.attitude.wire.source import Conventions, Mounting, components
@@ -173,56 +173,49 @@ class _Connection(Link):
         if place.path is not None:
             raise InputError(f"{endpoint}: 42 speaks TCP; write tcp://HOST:PORT, such as tcp://127.0.0.1:10001")
         self.endpoint, self.verb = endpoint, "bound to" if bind else "connecting to"
-        self._host, self._port = _host_and_port(place)
+        host, _, port = place.address.removeprefix("tcp://").rpartition(":")
+        self._place = "0.0.0.0" if host == "*" else host.strip("[]"), 0 if port == "*" else int(port)
         self._reader, self._splitter = reader, MessageSplitter()
         self._allowed = AllowedSenders() if allowed is None else allowed
         self._connection: socket.socket | None = None
         self._retry = clock.within(0.0)
-        self._listener = self._listen() if bind else None
-
-    def _listen(self) -> socket.socket:
-        try:
-            made = socket.create_server(
-                (self._host, self._port), family=socket.AF_INET6 if ":" in self._host else socket.AF_INET
-            )
-        except OSError as error:
-            raise InputError(f"{self.endpoint}: cannot bind ({error.strerror}); write another address or port") from error
-        made.setblocking(False)
-        host = f"[{self._host}]" if ":" in self._host else self._host
-        self.endpoint = f"tcp://{host}:{made.getsockname()[1]}"
-        return made
+        self._listener: socket.socket | None = None
+        if bind:
+            six = ":" in self._place[0]
+            try:
+                self._listener = socket.create_server(self._place, family=socket.AF_INET6 if six else socket.AF_INET)
+            except OSError as error:
+                raise InputError(f"{endpoint}: cannot bind ({error.strerror}); write another address or port") from error
+            self._listener.setblocking(False)
+            bound = f"[{self._place[0]}]" if six else self._place[0]
+            self.endpoint = f"tcp://{bound}:{self._listener.getsockname()[1]}"
 
     def messages(self, timeout_ms: int) -> list[RawMessage]:
-        """The messages that have arrived, oldest first."""
         if self._connection is None and self._listener is None:
             self._connect(timeout_ms)
         if not self.wait_for_message(timeout_ms):
             return []
-        chunk, host_ns = self._read()
-        if not chunk:  # the connection says no more for now, or ever
-            self._accept()
-            return []
-        whole = self._splitter.feed(chunk)
-        # The kernel's stamp is that of the last.
-        return [RawMessage(host_ns, [each], self._stamps.empty_ns, k == len(whole)) for k, each in enumerate(whole, 1)]
-
-    def arrival(self, message: RawMessage) -> Arrival[Event]:
-        """What a message says."""
-        return Arrival(message.host_ns, self._reader.decode(message.parts[0]), message.parts[0], message.waited_ns)
-
-    def _read(self) -> tuple[bytes, int]:
-        """What has come, and when the last of it did."""
-        if self._connection is None:
-            return b"", 0
-        with contextlib.suppress(OSError):
+        if self._connection is not None:
             try:
                 chunk, ancillary, _, _ = self._connection.recvmsg(MAX_READ_BYTES, ANCILLARY_BYTES)
+                host_ns = self._stamps.arrived_ns(ancillary, self._clock.now_ns())
             except BlockingIOError:
-                return b"", 0
+                self._accept()
+                return []
+            except OSError:
+                chunk = b""
             if chunk:
-                return chunk, self._stamps.arrived_ns(ancillary, self._clock.now_ns())
-        self._lose()
-        return b"", 0
+                whole = self._splitter.feed(chunk)
+                # The kernel's stamp is that of the last.
+                return [RawMessage(host_ns, [m], self._stamps.empty_ns, k == len(whole)) for k, m in enumerate(whole, 1)]
+            self.link_counts.lost += 1
+            self._notices.tell("lost", f"{self.endpoint}: 42 closed the connection; waiting for it to come back")
+            self._shut()
+        self._accept()
+        return []
+
+    def arrival(self, message: RawMessage) -> Arrival[Event]:
+        return Arrival(message.host_ns, self._reader.decode(message.parts[0]), message.parts[0], message.waited_ns)
 
     def acknowledge(self, count: int = 1) -> None:
         """Let 42 compute on: it waits after each message."""
@@ -236,7 +229,7 @@ class _Connection(Link):
             return
         self._retry = self._clock.within(RETRY_S)
         with contextlib.suppress(OSError):
-            self._take(socket.create_connection((self._host, self._port), timeout=CONNECT_S))
+            self._take(socket.create_connection(self._place, timeout=CONNECT_S))
 
     def _accept(self) -> None:
         while self._listener is not None:
@@ -268,11 +261,6 @@ class _Connection(Link):
         self._connection, self._stamps = made, KernelStamps(made, self._clock)
         if self.link_counts.connections > 1:
             self._notices.tell("back", "42 is connected again")
-
-    def _lose(self) -> None:
-        self.link_counts.lost += 1
-        self._notices.tell("lost", f"{self.endpoint}: 42 closed the connection; waiting for it to come back")
-        self._shut()
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once unread bytes or a new connection wait."""
@@ -307,7 +295,7 @@ class Nasa42Link(_Connection, StreamLink):
         """The messages that have arrived, and only the newest of a flood; each is acknowledged."""
         messages = self.messages(timeout_ms)
         self.acknowledge(len(messages))
-        return [self.arrival(message) for message in self._gate.newest(messages, lambda message: False)]  # 42 declares none
+        return [self.arrival(message) for message in self._gate.newest(messages, lambda _: False)]  # 42 declares none
 
 
 class Nasa42Lockstep(_Connection, LockstepLink):
@@ -326,8 +314,3 @@ class Nasa42Lockstep(_Connection, LockstepLink):
     def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
         """Let 42 compute on."""
         self.acknowledge()
-
-
-def _host_and_port(place: Endpoint) -> tuple[str, int]:
-    host, _, port = place.address.removeprefix("tcp://").rpartition(":")
-    return "0.0.0.0" if host == "*" else host.strip("[]"), 0 if port == "*" else int(port)

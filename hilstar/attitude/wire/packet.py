@@ -135,8 +135,11 @@ _json_decoder = msgspec.json.Decoder(_JsonAttitude)
 def encode(packet: Packet) -> bytes:
     """The bytes of a packet; counters wrap at 2^32, and a status's times are clamped to 64 bits."""
     match packet:
-        case AttitudeSample():
-            body = _attitude_body(packet)
+        case AttitudeSample(rate_cam_rad_s=rate):
+            flags = 0 if rate is None else protocol.FLAG_RATE_VALID
+            flags |= protocol.FLAG_DISCONTINUITY if packet.discontinuity else 0
+            head = (VERSION, protocol.KIND_ATTITUDE, flags, packet.sequence % U32, packet.t_ns)
+            body = protocol.ATTITUDE_BODY.pack(*head, *packet.q_icrs_to_cam, *((0.0, 0.0, 0.0) if rate is None else rate))
         case TimeRequest(sequence, t1_ns):
             body = protocol.TIME_REQUEST_BODY.pack(VERSION, protocol.KIND_TIME_REQUEST, 0, sequence % U32, t1_ns)
         case TimeReply(sequence):
@@ -144,17 +147,9 @@ def encode(packet: Packet) -> bytes:
             body = protocol.TIME_REPLY_BODY.pack(VERSION, protocol.KIND_TIME_REPLY, 0, sequence % U32, *times)
         case Status():
             counts = (packet.attitude_sequence % U32, packet.accepted % U32, packet.refused % U32)
-            head = (VERSION, protocol.KIND_STATUS, packet.health, packet.frame % U32)
             held = (min(max(t_ns, INT64[0]), INT64[-1]) for t_ns in (packet.light_t_ns, packet.attitude_age_ns))
-            body = protocol.STATUS_BODY.pack(*head, *held, *counts)
+            body = protocol.STATUS_BODY.pack(VERSION, protocol.KIND_STATUS, packet.health, packet.frame % U32, *held, *counts)
     return body + CRC.pack(zlib.crc32(body))
-
-
-def _attitude_body(sample: AttitudeSample) -> bytes:
-    rate = sample.rate_cam_rad_s
-    flags = (0 if rate is None else protocol.FLAG_RATE_VALID) | (protocol.FLAG_DISCONTINUITY if sample.discontinuity else 0)
-    head = (VERSION, protocol.KIND_ATTITUDE, flags, sample.sequence % U32, sample.t_ns)
-    return protocol.ATTITUDE_BODY.pack(*head, *sample.q_icrs_to_cam, *((0.0, 0.0, 0.0) if rate is None else rate))
 
 
 def decode(message: bytes) -> Event:
@@ -273,7 +268,11 @@ class StreamDecoder:
         self._keep(first, found)
         if not others:
             return found
-        self._end_frame(found)
+        body, overlong, whole = bytes(self._kept), self._overlong, self._synchronised
+        self._kept.clear()
+        self._overlong, self._synchronised = False, True
+        if body and not overlong and (whole or not isinstance(decode_frame(body), Refusal)):
+            found.append(body)
         rest = others.pop()
         found += [frame[: MAX_FRAME_BYTES + 1] for frame in others if frame]
         self._keep(rest, found)
@@ -288,14 +287,6 @@ class StreamDecoder:
             if self._synchronised:
                 found.append(bytes(self._kept))
             self._kept.clear()
-
-    def _end_frame(self, found: list[bytes]) -> None:
-        body, overlong, whole = bytes(self._kept), self._overlong, self._synchronised
-        self._kept.clear()
-        self._overlong = False
-        self._synchronised = True
-        if body and not overlong and (whole or not isinstance(decode_frame(body), Refusal)):
-            found.append(body)
 
 
 def decode_frame(body: bytes) -> Event:

@@ -9,7 +9,6 @@ import select
 import termios
 import warnings
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import serial
 from serial.tools import list_ports
@@ -66,20 +65,6 @@ def adapters() -> list[str]:
     return [f"{words.count(word)} x {word}" if words.count(word) > 1 else word for word in dict.fromkeys(words)]
 
 
-class Framed(NamedTuple):
-    """A frame, and the bytes as they came that completed it; `last` of their frames or not."""
-
-    body: bytes
-    chunk: RawMessage
-    last: bool
-
-    def arrival(self) -> Arrival[Event]:
-        """What it says; frames before the chunk's last were there earlier, and waited for it."""
-        chunk = self.chunk
-        waited_ns = chunk.waited_ns if self.last else chunk.host_ns - chunk.empty_ns
-        return Arrival(chunk.host_ns, decode_frame(self.body), self.body, waited_ns)
-
-
 class SerialLink(StreamLink):
     """A serial port that is reopened, with back-off, whenever it disappears.
 
@@ -100,7 +85,7 @@ class SerialLink(StreamLink):
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
-            raise InputError(f"{self.endpoint}: {opening_fault(error, port)}") from error
+            raise InputError(f"{self.endpoint}: {_opening_fault(error, port)}") from error
 
     @property
     def reconnects(self) -> int:
@@ -125,11 +110,13 @@ class SerialLink(StreamLink):
         except (OSError, TypeError) as error:  # pyserial raises TypeError for a port closed meanwhile
             self._lose(str(error))
             return []
-        waiting: list[Framed] = []
+        waiting: list[RawMessage] = []
         for chunk in chunks:
             bodies = self._decoder.frames(chunk.parts[0])
-            waiting += [Framed(body, chunk, k == len(bodies)) for k, body in enumerate(bodies, 1)]
-        return [each.arrival() for each in self._gate.newest(waiting, lambda each: frame_declares_discontinuity(each.body))]
+            for k, body in enumerate(bodies, 1):  # frames before the chunk's last were there earlier, and waited for it
+                waiting.append(chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies)))
+        taken = self._gate.newest(waiting, frame_declares_discontinuity)
+        return [Arrival(each.host_ns, decode_frame(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
         """What has come, read now."""
@@ -260,7 +247,7 @@ class SerialApart(SerialLink):
         self._reader.close()
 
 
-def opening_fault(error: BaseException, port: str) -> str:
+def _opening_fault(error: BaseException, port: str) -> str:
     """Why a port could not be opened, and what to do."""
     text = str(error).lower()
     if "permission" in text:
@@ -283,7 +270,7 @@ def read_lines(port: str, baud: int, seconds: float, clock: HostClock = HOST_CLO
     try:
         device = serial.Serial(port, baud, timeout=READ_S, exclusive=True)
     except (OSError, ValueError, OverflowError) as error:
-        raise InputError(f"{name}: {opening_fault(error, port)}") from error
+        raise InputError(f"{name}: {_opening_fault(error, port)}") from error
     with device:
         device.reset_input_buffer()
         end, line = clock.within(seconds), b""
@@ -314,13 +301,11 @@ class RtsLine:
         try:
             self.open()
         except (*LOST, OverflowError) as error:
-            raise InputError(f"[sync] port = {port}: {self._fault(error)}") from error
-
-    def _fault(self, error: BaseException) -> str:
-        if self._device is not None:
-            self.close()
-            return f"has no line RTS ({one_line(str(error))}); write a serial port with modem lines, such as /dev/ttyUSB0"
-        return opening_fault(error, self.port)
+            fault = _opening_fault(error, port)
+            if self._device is not None:
+                self.close()
+                fault = f"has no line RTS ({one_line(str(error))}); write a serial port with modem lines, such as /dev/ttyUSB0"
+            raise InputError(f"[sync] port = {port}: {fault}") from error
 
     @property
     def is_open(self) -> bool:

@@ -19,12 +19,11 @@ import socket
 import struct
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
-from hilstar.attitude.wire.links import PAUSE_S, Arrival, StreamLink
+from hilstar.attitude.wire.links import PAUSE_S, Arrival, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, declares_discontinuity, decode, encode
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -49,6 +48,11 @@ WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows; a small datagr
 SO_MEMINFO = 55  # Linux's number, which Python does not name (asm-generic/socket.h)
 MEMINFO = struct.Struct("=9I")  # linux/sock_diag.h; the last is SK_MEMINFO_DROPS
 
+TROUBLE = {
+    errno.EADDRINUSE: "the port is in use; stop the program that has it, or choose another port",
+    errno.EADDRNOTAVAIL: "not an address of this machine; write one that `ip addr` lists, or 0.0.0.0 for all",
+    errno.EACCES: "not permitted; write a port from 1024 to 65535",
+}
 SocketAddress = tuple[Any, ...]
 MAX_TAKEN = 1000  # in one go
 MAX_STRANGERS = 1000  # datagrams a second of senders that are not allowed, before the kernel is asked
@@ -112,15 +116,6 @@ class KernelStamps:
         return offset_ns
 
 
-@dataclass(frozen=True, slots=True)
-class Datagram:
-    """When it arrived (host time), its bytes, and who sent it."""
-
-    host_ns: int
-    data: bytes
-    sender: SocketAddress
-
-
 class Datagrams:
     """A socket, bound to a place of this machine or connected to a peer, that never waits but in `wait`."""
 
@@ -143,7 +138,8 @@ class Datagrams:
             made.bind(found[0][4])
         except OSError as error:
             made.close()
-            raise InputError(f"{place}: {_trouble(error)}") from error
+            trouble = TROUBLE.get(error.errno or 0, f"cannot bind ({error.strerror}); write an address of this machine")
+            raise InputError(f"{place}: {trouble}") from error
         return cls(made, clock)
 
     @classmethod
@@ -171,10 +167,10 @@ class Datagrams:
         self._stamps.empty_ns = asked_ns
         return False
 
-    def take(self, count: int) -> list[Datagram]:
+    def take(self, count: int) -> list[RawMessage]:
         """The datagrams that wait, oldest first, `count` at most."""
         offset_ns = self._stamps.monotonic_minus_realtime_ns()
-        taken: list[Datagram] = []
+        taken: list[RawMessage] = []
         for _ in range(count):
             asked_ns = self._clock.now_ns()
             try:
@@ -184,7 +180,8 @@ class Datagrams:
                 break
             except OSError:  # a connected socket hears that nobody listens at its peer's port
                 continue
-            taken.append(Datagram(self._stamps.arrived_ns(ancillary, asked_ns, offset_ns), data, sender))
+            host_ns = self._stamps.arrived_ns(ancillary, asked_ns, offset_ns)
+            taken.append(RawMessage(host_ns, [data], sender=sender))
         return taken
 
     def put(self, data: bytes, to: SocketAddress | None = None) -> bool:
@@ -222,16 +219,6 @@ class Datagrams:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-def _trouble(error: OSError) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return "the port is in use; stop the program that has it, or choose another port"
-    if error.errno == errno.EADDRNOTAVAIL:
-        return "not an address of this machine; write one that `ip addr` lists, or 0.0.0.0 for all"
-    if error.errno == errno.EACCES:
-        return "not permitted; write a port from 1024 to 65535"
-    return f"cannot bind ({error.strerror}); write an address of this machine"
 
 
 class Credit:
@@ -279,21 +266,25 @@ class UdpLink(StreamLink):
         if not self._datagrams.wait(timeout_ms):
             return []
         taken = self._datagrams.take(MAX_TAKEN)
-        waiting = [datagram for datagram in taken if self._admits(datagram)]
+        waiting: list[RawMessage] = []
+        for datagram in taken:
+            host = (datagram.sender or ("",))[0]
+            if self._allowed.admits(host):
+                waiting.append(datagram)
+                continue
+            self.link_counts.rejected += 1
+            said = f"datagrams from {host} are dropped: it is not in [attitude] allow; further ones are only counted"
+            self._notices.begin("sender-not-allowed", said)
         self._look(len(taken) - len(waiting))
-        admitted = self._gate.newest(waiting, lambda datagram: declares_discontinuity(datagram.data))
+        admitted = self._gate.newest(waiting, declares_discontinuity)
         if len(taken) == MAX_TAKEN:
             self._clock.sleep(PAUSE_S)
-        return [self._arrival(datagram) for datagram in admitted]
-
-    def _admits(self, datagram: Datagram) -> bool:
-        host = datagram.sender[0]
-        if self._allowed.admits(host):
-            return True
-        self.link_counts.rejected += 1
-        said = f"datagrams from {host} are dropped: it is not in [attitude] allow; further ones are only counted"
-        self._notices.begin("sender-not-allowed", said)
-        return False
+        arrivals: list[Arrival[Event]] = []
+        for host_ns, (data,), _, _, sender in admitted:
+            peer = sender or ()
+            self._credit.earn(peer, len(data))
+            arrivals.append(Arrival(host_ns, decode(data), data, back=partial(self._answer, peer)))
+        return arrivals
 
     def _look(self, strangers: int) -> None:
         """Count what the kernel dropped, and have it drop the strangers where they are many."""
@@ -309,11 +300,6 @@ class UdpLink(StreamLink):
             dropped = self._datagrams.dropped()
             self.link_counts.flooded += dropped - self._dropped
             self._dropped = dropped
-
-    def _arrival(self, datagram: Datagram) -> Arrival[Event]:
-        self._credit.earn(datagram.sender, len(datagram.data))
-        back = partial(self._answer, datagram.sender)
-        return Arrival(datagram.host_ns, decode(datagram.data), datagram.data, back=back)
 
     def _answer(self, peer: SocketAddress, packet: Packet) -> None:
         data = encode(packet)

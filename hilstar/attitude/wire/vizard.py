@@ -99,13 +99,10 @@ def quaternion_of_mrp(sigma: tuple[float, ...]) -> tuple[float, float, float, fl
     return w, share * x, share * y, share * z
 
 
-def mrp_of_quaternion(q: FloatArray) -> FloatArray:
-    """The MRP (3,) of at most length 1 of a quaternion that turns N's components into the body's."""
-    return np.asarray(-q[1:] / (1.0 + q[0]) if q[0] >= 0 else q[1:] / (1.0 - q[0]))
-
-
 def _written(q: FloatArray) -> str:
-    return f"sigma_BN = ({', '.join(f'{c:.7f}' for c in mrp_of_quaternion(q))})"
+    """A body's attitude as Basilisk has it: the MRP of at most length 1."""
+    sigma = -q[1:] / (1.0 + q[0]) if q[0] >= 0 else q[1:] / (1.0 - q[0])
+    return f"sigma_BN = ({', '.join(f'{c:.7f}' for c in sigma)})"
 
 
 TURNS = "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body components"
@@ -193,11 +190,29 @@ class Follower:
         return sample, update
 
     def _state(self, update: SimUpdate, craft: VizBody) -> tuple[FloatArray | None, FloatArray | None] | Refusal:
-        """Place and velocity, as far as they are taken."""
+        """Place (3,), km, and velocity (3,), km/s, as far as they are taken, or why they are not.
+
+        A "state" is about the Earth's centre: where the message has it, else at N's origin. A "velocity" is against N's origin.
+        """
+        if self._taken == "attitude":
+            return None, None
+        place_m, velocity_m_s = craft.position_m, craft.velocity_m_s
         if self._taken == "state":
-            return state_about_earth(update, craft)
-        velocity = velocity_km_s(craft) if self._taken == "velocity" else None
-        return velocity if isinstance(velocity, Refusal) else (None, velocity)
+            earth = next((body for body in update.bodies if body.name.lower() in EARTHS), VizBody())
+            place_m, velocity_m_s = _against(place_m, earth.position_m), _against(velocity_m_s, earth.velocity_m_s)
+        speed_m_s, far_km = math.hypot(*velocity_m_s), math.hypot(*place_m) / M_PER_KM
+        if len(velocity_m_s) != 3 or not speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
+            told = f"{speed_m_s:.3g} m/s" if velocity_m_s else "nothing"
+            advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
+            return Refusal("format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}")
+        velocity = np.array(velocity_m_s) / M_PER_KM
+        if self._taken == "velocity":
+            return None, velocity
+        if len(place_m) == 3 and MIN_PLACE_KM < far_km < MAX_PLACE_KM:
+            return np.array(place_m) / M_PER_KM, velocity
+        told = f"{far_km:.4g} km from the Earth's centre" if place_m else "nowhere"
+        advice = f'[spacecraft] orbit = "source" takes {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km'
+        return Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
 
     def _chosen(self, spacecraft: tuple[VizBody, ...]) -> VizBody | Refusal:
         """The spacecraft that is followed; parts of others (a parent is named) are taken only by their own name."""
@@ -241,28 +256,6 @@ def disagreement(camera: VizCamera, tracker: TrackerCamera) -> str | None:
     return f"Basilisk's camera {camera.identity} is not the bench's [tracker], whose pictures it gets: {'; '.join(differences)}"
 
 
-def velocity_km_s(craft: VizBody) -> FloatArray | Refusal:
-    """The spacecraft's velocity (3,) against N's origin, or why it is not taken."""
-    return _checked_velocity(craft, craft.velocity_m_s)
-
-
-def state_about_earth(update: SimUpdate, craft: VizBody) -> tuple[FloatArray, FloatArray] | Refusal:
-    """Place (3,), km, and velocity (3,), km/s, about the Earth's centre, or why they are not taken.
-
-    The Earth is where the message has it; without one it stands at N's origin.
-    """
-    earth = next((body for body in update.bodies if body.name.lower() in EARTHS), VizBody())
-    velocity = _checked_velocity(craft, _against(craft.velocity_m_s, earth.velocity_m_s))
-    if isinstance(velocity, Refusal):
-        return velocity
-    place_m = _against(craft.position_m, earth.position_m)
-    if len(place_m) == 3 and MIN_PLACE_KM < math.hypot(*place_m) / M_PER_KM < MAX_PLACE_KM:
-        return np.array(place_m) / M_PER_KM, velocity
-    told = f"{math.hypot(*place_m) / M_PER_KM:.4g} km from the Earth's centre" if place_m else "nowhere"
-    advice = f'[spacecraft] orbit = "source" takes {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km'
-    return Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
-
-
 def named(craft: VizBody) -> str:
     """A spacecraft's name for a person."""
     return shortened(printable(craft.name)) or "one without a name"
@@ -270,15 +263,6 @@ def named(craft: VizBody) -> str:
 
 def _against(own: Components, other: Components) -> Components:
     return tuple(a - b for a, b in zip(own, other, strict=True)) if len(own) == len(other) == 3 else own
-
-
-def _checked_velocity(craft: VizBody, found_m_s: Components) -> FloatArray | Refusal:
-    speed_m_s = math.hypot(*found_m_s)
-    if len(found_m_s) == 3 and speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
-        return np.array(found_m_s) / M_PER_KM
-    told = f"{speed_m_s:.3g} m/s" if found_m_s else "nothing"
-    advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
-    return Refusal("format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}")
 
 
 class VizardLive(ZmqSocket, LockstepLink):
@@ -332,10 +316,8 @@ class VizardLive(ZmqSocket, LockstepLink):
         if message is None:
             return Arrival(host_ns, Refusal("format", f"SIM_UPDATE of {len(parts)} parts; Basilisk sends four"), parts[-1])
         event, update = self._follower.take(message)
-        if isinstance(event, AttitudeSample):
-            self._sample = event
-        if update is not None:
-            self._described |= {camera.identity: camera for camera in update.cameras}
+        self._sample = event if isinstance(event, AttitudeSample) else None
+        self._described |= {camera.identity: camera for camera in (update.cameras if update is not None else ())}
         return Arrival(host_ns, event, message)
 
     def _picture(self, camera: int) -> bytes:

@@ -2,7 +2,7 @@
 
 Laws:
 1. Every message gives fields or one `WireFormatError`; nothing else is raised.
-2. No value is copied before its length is known to lie within the message. A `FieldReader` reads at most MAX_FIELDS fields,
+2. No value is copied before its length is known to lie within the message. A `_FieldReader` reads at most MAX_FIELDS fields,
    including those of nested messages, and at most MAX_PACKED_BYTES of packed numbers.
 
 The wire format is that of the Protocol Buffers documentation (varints, wire types 0, 1, 2 and 5). Groups (3 and 4) belong to
@@ -36,7 +36,7 @@ class WireFormatError(ValueError):
     """Bytes that are no protobuf message, or not the one that is wanted."""
 
 
-class FieldReader:
+class _FieldReader:
     """Reads one message and those within it."""
 
     def __init__(self) -> None:
@@ -180,7 +180,7 @@ class SimUpdate:
     bodies: tuple[VizBody, ...] = ()
 
 
-class FormField(NamedTuple):
+class _FormField(NamedTuple):
     """A field of a message: its name here, how it is read, and how many components it has; 0 where it is no list."""
 
     name: str
@@ -188,16 +188,16 @@ class FormField(NamedTuple):
     components: int = 0
 
 
-Form = dict[int, FormField]
+Form = dict[int, _FormField]
 CURRENT_TIME, CELESTIAL_BODIES, SPACECRAFT, CAMERAS = 1, 2, 3, 4  # fields of a VizMessage
-TIME_STAMP = {1: FormField("frame", _int64), 2: FormField("elapsed_ns", _double)}
-PLANET = {1: FormField("name", _text), 2: FormField("position_m", _doubles, 3), 3: FormField("velocity_m_s", _doubles, 3)}
-CRAFT = {**PLANET, 4: FormField("sigma_bn", _doubles, 3), 19: FormField("parent", _text)}
+TIME_STAMP = {1: _FormField("frame", _int64), 2: _FormField("elapsed_ns", _double)}
+PLANET = {1: _FormField("name", _text), 2: _FormField("position_m", _doubles, 3), 3: _FormField("velocity_m_s", _doubles, 3)}
+CRAFT = {**PLANET, 4: _FormField("sigma_bn", _doubles, 3), 19: _FormField("parent", _text)}
 CAMERA = {
-    1: FormField("identity", _int64),
-    3: FormField("field_of_view_deg", _double),
-    4: FormField("resolution_px", _int64s, 2),
-    8: FormField("sigma", _doubles, 3),
+    1: _FormField("identity", _int64),
+    3: _FormField("field_of_view_deg", _double),
+    4: _FormField("resolution_px", _int64s, 2),
+    8: _FormField("sigma", _doubles, 3),
 }
 
 
@@ -205,7 +205,7 @@ def decode_update(message: bytes) -> SimUpdate:
     """A VizMessage. Raises WireFormatError for bytes that are none, and for one without a time."""
     stamp: dict[str, Any] | None = None
     spacecraft, cameras, bodies = [], [], []
-    reader = FieldReader()
+    reader = _FieldReader()
     for number, kind, value in reader.fields(memoryview(message)):
         if number == CURRENT_TIME:
             stamp = (stamp or {}) | reader.read(_message(kind, value), TIME_STAMP)

@@ -7,8 +7,7 @@ import math
 import struct
 from collections.abc import Iterable
 from functools import partial
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 import zmq
@@ -30,6 +29,7 @@ from hilstar.attitude.wire.packet import (
 from hilstar.attitude.wire.source import PACKETS, Conventions, Mounting
 from hilstar.attitude.wire.zmq_socket import MAX_PART_BYTES, QUEUE_MESSAGES, ZmqSocket
 from hilstar.notices import Notices
+from hilstar.process.closing import Closing
 from hilstar.process.interrupts import caught
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
 
@@ -91,7 +91,7 @@ class ZmqReceiver(ZmqSocket, StreamLink):
     def opener(self) -> OpenStream:
         """What another process opens the same socket by."""
         more: dict[str, Any] = {"keys": self._keys, "topic": self.topic, "max_part_bytes": self._max_part_bytes}
-        return partial(_open_again, self.endpoint, bind=self._bind, **more)
+        return partial(ZmqReceiver, self.endpoint, bind=self._bind, **more)
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
         super()._configure(made)
@@ -110,7 +110,7 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (parts := self._take_parts()) is not None:
             waiting.append(RawMessage(self._clock.now_ns(), parts))
             taken_bytes += sum(map(len, parts))
-        return self._gate.newest(waiting, lambda message: declares_discontinuity(message.parts[-1]))
+        return self._gate.newest(waiting, declares_discontinuity)
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once a message waits."""
@@ -127,10 +127,6 @@ class ZmqReceiver(ZmqSocket, StreamLink):
             with contextlib.suppress(zmq.ZMQError):  # the ended session may be gone already
                 self._socket.disconnect(self._address)
             self._socket.connect(self._address)
-
-
-def _open_again(endpoint: str, notices: Notices, **more: Any) -> ZmqReceiver:
-    return ZmqReceiver(endpoint, notices=notices, **more)
 
 
 class ZmqApart(StreamLink):
@@ -175,22 +171,20 @@ class ZmqApart(StreamLink):
         deadline = self._clock.within(timeout_ms / 1000)
         while not self._waiting:
             left_ms = math.ceil(deadline.left_s * 1000)
-            if self._reader.wait(left_ms):
-                self._take()
-            elif not left_ms:
-                break
+            if not self._reader.wait(left_ms):
+                if not left_ms:
+                    break
+                continue
+            for record in self._reader.take():
+                if record.message is not None:
+                    self._waiting.append(record.message)
+                if record.counts is not None:
+                    self.link_counts += record.counts
+                if record.notice is not None and record.lasting:
+                    self._notices.tell(*record.notice)
+                elif record.notice is not None:
+                    self._notices.mention(*record.notice[:2])
         return bool(self._waiting)
-
-    def _take(self) -> None:
-        for record in self._reader.take():
-            if record.message is not None:
-                self._waiting.append(record.message)
-            if record.counts is not None:
-                self.link_counts += record.counts
-            if record.notice is not None and record.lasting:
-                self._notices.tell(*record.notice)
-            elif record.notice is not None:
-                self._notices.mention(*record.notice[:2])
 
     def close(self) -> None:
         """End the process, and with it the socket."""
@@ -277,7 +271,7 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
             self._ready().send(message, zmq.NOBLOCK)
 
 
-class Feed:
+class Feed(Closing):
     """A PUB socket that hands on what a source brings; a head that is slow or gone delays no other."""
 
     def __init__(self, endpoint: str) -> None:
@@ -295,10 +289,8 @@ class Feed:
         with contextlib.suppress(zmq.Again):
             self._socket.send_multipart([STAMP.pack(arrival.host_ns), raw], zmq.NOBLOCK)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def close(self) -> None:
+        """Close the socket."""
         self._socket.close()
         self._context.term()
 

@@ -1,8 +1,8 @@
 """The ZeroMQ socket under every ZeroMQ link: its context, its keys, its limits against floods, and how it is reopened.
 
 libzmq reports connections on a monitor socket and limits nothing: it accepts until the process has no file descriptors left.
-`Doorkeeper` closes connections over MAX_CONNECTIONS at once, the newest first, so that the established ones stay. libzmq itself
-closes a peer that does not finish its handshake within HANDSHAKE_MS. `MemoryWatch` bounds what libzmq keeps of a message
+`_Doorkeeper` closes connections over MAX_CONNECTIONS at once, the newest first: the established ones stay. libzmq itself
+closes a peer that does not finish its handshake within HANDSHAKE_MS. `_MemoryWatch` bounds what libzmq keeps of a message
 that never ends.
 """
 
@@ -63,7 +63,7 @@ REBIND_S = 2.0  # a port is free again some milliseconds after its socket was cl
 BIND_RETRY_S = 0.002
 
 
-class MemoryWatch:
+class _MemoryWatch:
     """Whether this process has grown by more than MAX_GROWTH_BYTES since `begin`.
 
     libzmq keeps a message until its last part arrives, with no limit on parts, and does not report what it keeps: only the
@@ -78,7 +78,6 @@ class MemoryWatch:
         self._next_look = clock.within(0.0)
 
     def begin(self) -> None:
-        """Count from what is used now."""
         self._base_bytes = self._used_bytes()
 
     def grown_bytes(self) -> int:
@@ -107,13 +106,12 @@ class MemoryWatch:
         return 0
 
     def close(self) -> None:
-        """Close the file."""
         if self._file >= 0:
             os.close(self._file)
         self._file = -1
 
 
-def raise_file_limit() -> None:
+def _raise_file_limit() -> None:
     """Raise the limit of open files up to WANTED_FILES: each connection needs one, and so do ledger and display."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = WANTED_FILES if hard == resource.RLIM_INFINITY else min(hard, WANTED_FILES)
@@ -122,7 +120,7 @@ def raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-class Doorkeeper:
+class _Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
     `lost` says that a connection has ended; the code that acts on it resets it. `place` is the port or path that was bound.
@@ -140,7 +138,6 @@ class Doorkeeper:
         self.monitor = watched.get_monitor_socket(EVENTS)
 
     def tend(self) -> None:
-        """Take the events so far."""
         events = 0
         with contextlib.suppress(zmq.ZMQError):
             while events < MAX_EVENTS:
@@ -160,17 +157,13 @@ class Doorkeeper:
         elif event == zmq.EVENT_DISCONNECTED:
             self._leave(value)
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED and not self._bound:
-            self._arrive()
+            self._counts.connections += 1
+            if self._counts.connections > 1:
+                self._notices.tell("back", "reconnected to the sender")
+            else:
+                self._notices.mention("connected", "connected to the sender")
         elif event in FAILED:
             self._failure = FAILED[zmq.Event(event)]
-
-    def _arrive(self) -> None:
-        """A connecting socket's peer has answered, for the first time or again."""
-        self._counts.connections += 1
-        if self._counts.connections > 1:
-            self._notices.tell("back", "reconnected to the sender")
-        else:
-            self._notices.mention("connected", "connected to the sender")
 
     def _leave(self, file: int) -> None:
         self.lost = True
@@ -183,10 +176,8 @@ class Doorkeeper:
             self._notices.tell("client-rejected", f"a connection from {who or 'an unknown peer'} was rejected: {failure}")
         elif failure:
             self._counts.rejected += 1
-            self._notices.tell(
-                "link-rejected",
-                "the other side rejected us: check its allowed_clients, and our curve_server_key",
-            )
+            advice = "check its allowed_clients, and our curve_server_key"
+            self._notices.tell("link-rejected", f"the other side rejected us: {advice}")
         elif not self._bound:
             self._counts.lost += 1
             self._notices.tell("lost", "lost the connection to the sender; waiting for it")
@@ -204,13 +195,10 @@ class Doorkeeper:
             self._counts.refused += 1
             self._shut.add(file)
             with _connection(file) as connection:
-                if connection is not None and self._is_ours(connection):
-                    connection.shutdown(socket.SHUT_RDWR)
-
-    def _is_ours(self, connection: socket.socket) -> bool:
-        """Whether the descriptor is still a connection of this socket; it may have been reused for another file."""
-        name = connection.getsockname()
-        return bool((name[1] if isinstance(name, tuple) else name) == self.place)
+                if connection is not None:
+                    name = connection.getsockname()  # the descriptor may have been reused for another file
+                    if (name[1] if isinstance(name, tuple) else name) == self.place:
+                        connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Stop watching; before its socket is closed."""
@@ -276,37 +264,33 @@ class ZmqSocket(Closing):
         self._pair = None if keys.secret_key is None else load_secret(keys.secret_key)
         self._server_key = None if bind or keys.server_key is None else load_public(keys.server_key)
         allowed = AllowList(keys.allowed_clients) if bind and keys.allowed_clients is not None else None
-        raise_file_limit()
-        self._memory = MemoryWatch(clock)
+        _raise_file_limit()
+        self._memory = _MemoryWatch(clock)
         self._context = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
         self._socket: zmq.Socket[bytes] | None = None
-        self._keeper: Doorkeeper | None = None
+        self._keeper: _Doorkeeper | None = None
         self._in_use = False
         self._poller = zmq.Poller()
         try:
             if allowed is not None:
-                self._authenticate(allowed)
+                from zmq.auth.thread import ThreadAuthenticator  # brings asyncio
+
+                self._authenticator = ThreadAuthenticator(self._context)
+                self._authenticator.start()
+                self._authenticator.configure_curve_callback("*", allowed)
             if bind:
                 self._open(0.0)
         except InputError:
             self.close()
             raise
 
-    def _authenticate(self, allowed: AllowList) -> None:
-        from zmq.auth.thread import ThreadAuthenticator  # brings asyncio
-
-        self._authenticator = ThreadAuthenticator(self._context)
-        self._authenticator.start()
-        self._authenticator.configure_curve_callback("*", allowed)
-
     def _open(self, patience_s: float = REBIND_S) -> zmq.Socket[bytes]:
         """The socket, opened. Raises InputError where it cannot be bound within `patience_s`."""
         made: zmq.Socket[bytes] = self._context.socket(self._kind)
         self._configure(made)
-        self._secure(made)
         self._socket = made
-        self._keeper = Doorkeeper(made, bound=self._bind, counts=self.link_counts, notices=self._notices, clock=self._clock)
+        self._keeper = _Doorkeeper(made, bound=self._bind, counts=self.link_counts, notices=self._notices, clock=self._clock)
         self._poller = zmq.Poller()
         self._poller.register(made, zmq.POLLIN)
         self._poller.register(self._keeper.monitor, zmq.POLLIN)
@@ -348,18 +332,14 @@ class ZmqSocket(Closing):
         made.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
         made.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
         made.setsockopt(zmq.RECONNECT_IVL_MAX, MAX_RECONNECT_MS)
-
-    def _secure(self, made: zmq.Socket[bytes]) -> None:
-        if self._pair is None:
-            return
-        made.curve_publickey, made.curve_secretkey = self._pair
-        if self._server_key is None:
-            made.curve_server = True
-        else:
-            made.curve_serverkey = self._server_key
+        if self._pair is not None:
+            made.curve_publickey, made.curve_secretkey = self._pair
+            if self._server_key is None:
+                made.curve_server = True
+            else:
+                made.curve_serverkey = self._server_key
 
     def _ready(self) -> zmq.Socket[bytes]:
-        """The socket, open."""
         if self._socket is None:
             self._memory.begin()
             return self._open()

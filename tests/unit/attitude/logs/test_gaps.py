@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.clock.timeline import Policy
-from hilstar.attitude.logs.gaps import GAP_INTERVALS, log_joins
+from hilstar.attitude.logs.entries import GAP_INTERVALS, log_joins
 from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate, to_matrix

@@ -31,7 +31,7 @@ def plain(_: object) -> bool:
 def test_a_burst_passes_and_a_flood_does_not():
     clock, counts, notices = FakeClock(), LinkCounts(), Notices()
     gate = FloodGate(counts, notices, clock)
-    burst = list(range(MAX_BURST))
+    burst = [RawMessage(k, [b""]) for k in range(MAX_BURST)]
     assert gate.newest(burst, plain) == burst
     admitted = 0
     for _ in range(20):
@@ -95,8 +95,9 @@ def test_a_jump_that_is_passed_over_still_separates_what_is_before_it_from_what_
                for k, message in enumerate(messages)]  # fmt: skip
     as_json[1800] = b'{"discontinuity":true}'
     for form in (messages, as_json):
-        taken = FloodGate(LinkCounts(), Notices()).newest(form, declares_discontinuity)
-        events = [decode(message) for message in taken]
+        waiting = [RawMessage(k, [message]) for k, message in enumerate(form)]
+        taken = FloodGate(LinkCounts(), Notices()).newest(waiting, declares_discontinuity)
+        events = [decode(message.parts[0]) for message in taken]
         for found in (events, on_line):
             assert [event.sequence for event in found] == [1500, *range(2 * MAX_BURST, 3 * MAX_BURST)]
             assert [event.discontinuity for event in found[:2]] == [True, False]

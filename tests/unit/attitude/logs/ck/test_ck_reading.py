@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.clock.timeline import Policy
 from hilstar.attitude.logs.ck_spice import answer
-from hilstar.attitude.logs.entries import Stated
-from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Mounting

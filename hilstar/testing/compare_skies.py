@@ -102,16 +102,13 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
 def _measurable(golden: FloatArray, seeds: Seeds, psf: Psf) -> tuple[Seeds, int]:
     """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many stars do not."""
     count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
-    seeds = _in_view(seeds, psf, shape)
-    seeds = _in_view(Seeds(refined(golden, seeds.places_px, psf), seeds.hip), psf, shape)
+    seeds = seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
+    seeds = Seeds(refined(golden, seeds.places_px, psf), seeds.hip)
+    seeds = seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
     templates = StarTemplates(seeds.places_px, psf, shape)
     flux = templates.fit(golden)[:, 0]
     seeds = seeds.only(flux > templates.errors(flux, PIXEL_ERROR)[0] / MAX_ERROR)
     return seeds, count - seeds.stars
-
-
-def _in_view(seeds: Seeds, psf: Psf, shape: tuple[int, int]) -> Seeds:
-    return seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
 
 
 class _SkyFit:
@@ -132,12 +129,13 @@ class _SkyFit:
         start = self.templates.places_px
         fit = _SkyFit(frame, start, self.psf)
         for _ in range(MOVE_STEPS):
-            shift = np.hypot(*(fit.places_px - self.places_px).T)
-            there = fit.flux > MISSING_SHARE * self.flux
-            moved = there & (shift > SMALL_MOVE_PX) & (shift <= MAX_MOVE_SIGMAS * max(self.psf.width_px))
+            move = fit.places_px - self.places_px
+            shift = np.hypot(*move.T)
+            moved = (fit.flux > MISSING_SHARE * self.flux) & (shift > SMALL_MOVE_PX)
+            moved &= shift <= MAX_MOVE_SIGMAS * max(self.psf.width_px)
             if not moved.any():
                 break
-            fit = _SkyFit(frame, start + np.where(moved[:, None], fit.places_px - self.places_px, 0.0), self.psf)
+            fit = _SkyFit(frame, start + np.where(moved[:, None], move, 0.0), self.psf)
         return fit
 
 
@@ -170,9 +168,8 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
     places = refined(light, seeds, fit.psf)
     flux = StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[:, 0]
     column, row = seeds.astype(np.intp).T
-    return places, np.maximum(
-        flux, light[row, column]
-    )  # two stars at one place: the fit may give one too much and the other less than 0
+    # Two stars at one place: the fit may give one too much and the other less than 0.
+    return places, np.maximum(flux, light[row, column])
 
 
 def read_frame_fits(path: Path) -> FloatArray:

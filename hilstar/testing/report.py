@@ -21,18 +21,8 @@ ROOM_PX = 3.0  # between two names
 MIN_ERROR = 1e-8  # as drawn: a tenth of float32's rounding
 STYLES = (("same", ".", MUTED), ("changed", "o", RED), ("missing", "v", PURPLE), ("extra", "^", ORANGE))
 COLUMNS = (
-    "kind",
-    "hip",
-    "x_px",
-    "y_px",
-    "flux_e_per_s",
-    "flux_error_mag",
-    "dx_px",
-    "dy_px",
-    "centroid_error_px",
-    "flux_limit_mag",
-    "centroid_limit_px",
-    "differs",  # 1 where the star differs from what is common to all
+    *("kind", "hip", "x_px", "y_px", "flux_e_per_s", "flux_error_mag", "dx_px", "dy_px", "centroid_error_px"),
+    *("flux_limit_mag", "centroid_limit_px", "differs"),  # 1 where the star differs from what is common to all
 )
 
 
@@ -51,7 +41,17 @@ def draw(path: Path, comparison: SkyComparison) -> None:
             axis.set(yscale="log", ylabel=f"{what}{less} [{unit}]")
             axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         axes[1].set_xlabel("magnitudes below the brightest star [mag]")
-        _make_room(axes[0], names)
+        # Remove the names that overlap those of worse stars, and those that are too many.
+        if (figure := axes[0].get_figure(root=True)) is not None:
+            figure.draw_without_rendering()
+        for texts in names:  # worst first, of each panel
+            kept: list[Bbox] = []
+            for text in texts:
+                box = text.get_window_extent().padded(ROOM_PX)
+                if len(kept) == MAX_NAMES or any(box.overlaps(other) for other in kept):
+                    text.remove()
+                else:
+                    kept.append(box)
 
 
 class ChartPanel:
@@ -98,9 +98,8 @@ class ChartPanel:
             axis.axhline(self.common, color=GREEN, lw=1.2, label=f"in common: {self.common:.3g} {self.unit}")
         wider = [point for star in self.of("same", "changed") if (point := self.point(star))[2] > self.limit]
         if wider:
-            axis.plot(
-                [p[0] for p in wider], [p[2] for p in wider], "_", color=INK, ms=8, label=f"a star's own limit: {len(wider)}"
-            )
+            at, _, limits = zip(*wider, strict=True)
+            axis.plot(at, limits, "_", color=INK, ms=8, label=f"a star's own limit: {len(wider)}")
         axis.set_ylim(MIN_ERROR / 2, 300 * self.row)
         axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
 
@@ -116,34 +115,19 @@ class ChartPanel:
         return names[:MAX_TRIED]
 
 
-def _make_room(axis: Axes, names: list[list[Annotation]]) -> None:
-    """Remove the names that overlap those of worse stars, and those that are too many."""
-    figure = axis.get_figure(root=True)
-    if figure is None:
-        return
-    figure.draw_without_rendering()
-    for texts in names:  # worst first, of each panel
-        kept: list[Bbox] = []
-        for text in texts:
-            box = text.get_window_extent().padded(ROOM_PX)
-            if len(kept) == MAX_NAMES or any(box.overlaps(other) for other in kept):
-                text.remove()
-            else:
-                kept.append(box)
-
-
 def write_report(directory: Path, comparison: SkyComparison) -> None:
     """compare.csv, a row for each star, and the chart compare, errors against magnitude, as PNG and SVG.
 
     Raises InputError where one cannot be written.
     """
     odd = {(star.hip, star.x_px, star.y_px) for star in comparison.differing}
-    rows = ((*_row(star), int((star.hip, star.x_px, star.y_px) in odd)) for star in comparison.stars)
+    rows = [
+        (
+            *(star.kind, " ".join(map(str, star.hip)), star.x_px, star.y_px, star.flux_e_per_s),
+            *(star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px),
+            *(star.limits.flux_mag, star.limits.centroid_px, int((star.hip, star.x_px, star.y_px) in odd)),
+        )
+        for star in comparison.stars
+    ]
     write_csv(directory / "compare.csv", COLUMNS, rows)
     draw(directory / "compare", comparison)
-
-
-def _row(star: StarDifference) -> tuple[object, ...]:
-    hip = " ".join(map(str, star.hip))
-    errors = star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px
-    return star.kind, hip, star.x_px, star.y_px, star.flux_e_per_s, *errors, star.limits.flux_mag, star.limits.centroid_px

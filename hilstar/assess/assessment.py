@@ -1,4 +1,4 @@
-"""A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and what the bench adds."""
+"""A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and the bench's own errors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # from the stamp to the 
 
 @dataclass(frozen=True, slots=True)
 class AssessSettings:
-    """Where in an exposure times are stamped, how much later than that they are, s, and how many attitudes test the display."""
+    """Where in an exposure times are stamped, their latency, s, and at how many attitudes the display is tested."""
 
     stamp: Stamp = "middle"
     latency_s: float = 0.0
@@ -120,7 +120,7 @@ class Assessment:
 def assess_files(
     ledger: Path, telemetry: Path, settings: AssessSettings, say: Callable[[str], None] = lambda _: None
 ) -> Assessment:
-    """Assess telemetry against a ledger. Raises InputError with what is wrong with either."""
+    """Assess telemetry against a ledger. Raises InputError for a fault of either."""
     answers, run = read_telemetry(telemetry), read_ledger(ledger)
     # The telemetry's times from the run's zero where the two overlap, else from their own first.
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])

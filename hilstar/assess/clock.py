@@ -25,8 +25,8 @@ from scipy import fft, linalg, optimize
 from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray
-from hilstar.assess.places import Bumps, Scale, axes_of, bumps_at, centres_of, places_of
-from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_rotation_vector
+from hilstar.assess.places import Bumps, Scale, bumps_at, centres_of, places_of
+from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
 from hilstar.run.record.commanded import Commanded, Moments
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
@@ -343,7 +343,7 @@ class ClockSolver:
     def _refine(self, used: BoolArray, begun_s: float) -> FloatArray:
         """One generalised least squares step; its covariance (5, 5)."""
         design, left = self._design(used), self.residual[used]
-        place = places_of(axes_of(self.moments.q[used]), self.scale.focal_px, self.scale.roll_px)
+        place = places_of(to_matrix(self.moments.q[used]), self.scale.focal_px, self.scale.roll_px)
         normal, right = self._prior(begun_s)
         smooth = most_likely(place, left)
         pulls = np.zeros((len(left), 5))

@@ -31,8 +31,8 @@ import numpy as np
 from scipy import sparse
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.assess.places import Projector, Scale, axes_of, bumps_at, centres_of, places_of, weights_at
-from hilstar.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.assess.places import Projector, Scale, bumps_at, centres_of, places_of, weights_at
+from hilstar.rotation import conjugate, multiply, to_matrix, to_rotation_vector
 
 MIN_ROWS = 30
 TURNS = 3  # fits of bumps and waves by turns
@@ -102,7 +102,7 @@ def components_of(residual_arcsec: FloatArray, q_icrs_to_cam: FloatArray, scale:
     """The parts of residuals (n, 3), cam, at the commanded attitudes (n, 4)."""
     mean = residual_arcsec.mean(axis=0)
     about = residual_arcsec - mean
-    place = places_of(axes_of(q_icrs_to_cam), scale.focal_px, scale.roll_px)
+    place = places_of(to_matrix(q_icrs_to_cam), scale.focal_px, scale.roll_px)
     extent = float(np.linalg.norm(np.ptp(place, axis=0)))
     bumps, words = _bumps(place, extent, scale)
     pixel, waves = Component(NOTHING, np.zeros_like(about), 0.0), None
@@ -266,7 +266,7 @@ def phases_of(direction: FloatArray, axes: FloatArray, scale: Scale, name: str =
 
 def global_phases(about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) -> Iterator[Phases]:
     """The phases tried for the whole run, of attitudes (n, 4) with residuals (n, 3)."""
-    axes = axes_of(q_icrs_to_cam)
+    axes = to_matrix(q_icrs_to_cam)
     boresight = axes[:, 2]
     mean = boresight.mean(axis=0)
     for name, direction in (
@@ -289,7 +289,7 @@ def global_phases(about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) ->
 
 def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) -> sparse.csr_matrix:
     """Each bump times the harmonics of the phase of its own direction: (n, 4 p)."""
-    axes = axes_of(q_icrs_to_cam)
+    axes = to_matrix(q_icrs_to_cam)
     place = places_of(axes, scale.focal_px, scale.roll_px)
     centre = centres_of(place, spacing_px)
     direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)

@@ -12,13 +12,14 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.assess.assessment import Assessment
 from hilstar.assess.bench_effects import Slice
-from hilstar.assess.budget import Axes
-from hilstar.assess.places import axes_of
+from hilstar.assess.budget import Axes, Decomposed
 from hilstar.charts import BLUE, INK, MUTED, label_ends, panels_of, svg, write_csv
 from hilstar.files import write_whole
 from hilstar.html_pages import escaped, page_of, picture_of, table_of
+from hilstar.rotation import to_matrix
 
 COUNT = "1"  # the unit of counts and shares in the tables
+PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
 MAX_NAMED = 10
 MAX_POINTS = 4000
 MAX_ROWS = 200
@@ -57,21 +58,23 @@ class FigureRow(NamedTuple):
     high_95: float | None = None
 
 
-def rows_of(found: Assessment) -> Iterator[FigureRow]:
-    """The rows of budget.csv."""
-    parts, intervals = found.found, found.found.intervals
+def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRow]:
+    """The rows of bias, field-of-view error, pixel error and noise; without values where there are no parts."""
     for k, axis in enumerate("xyz"):
-        yield FigureRow("bias", axis, float(parts.bias_arcsec[k]), "arcsec", *intervals.bias[:, k].tolist())
-    for name, axes, interval in (
-        ("field-of-view error", parts.fov_arcsec, intervals.fov),
-        ("pixel error", parts.pixel_arcsec, intervals.pixel),
-        ("noise", found.noise_arcsec, intervals.noise),
-    ):
+        value = None if parts is None else float(parts.bias_arcsec[k])
+        yield FigureRow("bias", axis, value, "arcsec", *([] if parts is None else parts.intervals.bias[:, k].tolist()))
+    for part, name in PARTS.items():
+        axes = noise_arcsec if part == "noise" or parts is None else getattr(parts, f"{part}_arcsec")
         for k, axis in enumerate(("cross", "roll")):
             value = getattr(axes, axis)
-            low, high = interval[:, k].tolist() if value is not None else (None, None)
-            yield FigureRow(name, axis, value, "arcsec", low, high)
-    clock = parts.clock
+            ends = [] if parts is None or value is None else getattr(parts.intervals, part)[:, k].tolist()
+            yield FigureRow(name, axis, value, "arcsec", *ends)
+
+
+def rows_of(found: Assessment) -> Iterator[FigureRow]:
+    """The rows of budget.csv."""
+    yield from part_rows(found.found, found.noise_arcsec)
+    clock = found.found.clock
     for name, value, sigma, unit, told in (
         ("clock offset", 1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms", clock.offset_told),
         ("clock drift", 1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm", clock.drift_told),
@@ -210,7 +213,7 @@ def _over_time(found: Assessment) -> str:
 
 def _field_map(found: Assessment) -> str:
     parts, scale = found.found.components, found.run.scale
-    axes = axes_of(found.found.commanded_q)
+    axes = to_matrix(found.found.commanded_q)
     some = np.unique(np.linspace(0, len(axes) - 1, MAX_POINTS).astype(int))
     mean = axes[:, 2].mean(axis=0)
     size = float(np.linalg.norm(mean))

@@ -1,4 +1,4 @@
-"""A case: from its number and its point in the design to its attitude and bench file, and from its answers to its row."""
+"""A case: its attitude and bench file, from its number and its point in the design; and its row, from its answers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
-SEED_BITS = 63  # what a FITS header, a Parquet column of int64 and `simulate --seed` hold
+SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
 Kind = Literal["int64", "float64", "bool", "text"]
 
 DONE, FAILED = "done", "failed"
@@ -83,7 +83,7 @@ class _Log:
 
 
 class CaseMaker:
-    """Makes the cases of a plan, whose relative paths start in `folder`. Raises InputError for what the plan has wrong."""
+    """Makes the cases of a plan, whose relative paths start in `folder`. Raises InputError for a fault of the plan."""
 
     def __init__(self, plan: Plan, file: BenchFile, folder: Path) -> None:
         self.plan, self.file = plan, file

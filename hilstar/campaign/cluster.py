@@ -75,8 +75,8 @@ class Scheduler:
     def check(self) -> str:
         """The address, with `localhost` as a number: a name could be resolved to anything.
 
-        Raises InputError for what is no address, an address off loopback without TLS, and incomplete TLS. A scheduler runs
-        whatever it is sent: anyone who reaches it without a certificate runs code on every worker.
+        Raises InputError for text that is no address, an address off loopback without TLS, and incomplete TLS. A scheduler
+        runs all code that it is sent: without certificates, anyone who reaches it runs code on every worker.
         """
         named, (protocol, _, host) = f"--scheduler {self.address}", self.address.partition("://")
         if protocol not in PROTOCOLS:
@@ -129,8 +129,8 @@ class _Worker:
 class Cluster:
     """The workers of a scheduler. Use it as a context manager.
 
-    A worker of another version, bench or renderer is refused with a line through `say` and gets no case. Raises InputError for
-    what `Scheduler.check` refuses, and MachineError where no scheduler answers.
+    A worker of another version, bench or renderer is refused with a line through `say` and gets no case. Raises InputError as
+    `Scheduler.check` does, and MachineError where no scheduler answers.
     """
 
     task_s = TASK_S

@@ -112,7 +112,7 @@ KIND = Kind(Plan, "docs/campaign.md", TYPE_WORDS)
 
 
 def read_plan(path: Path) -> Plan:
-    """Read and check a plan. Raises InputError: file, key, what is wrong and what to write."""
+    """Read and check a plan. Raises InputError with file, key, fault and remedy."""
     return parse_plan(path, read_text(path, "give the path of a plan", MAX_TOML_BYTES))
 
 
@@ -201,14 +201,9 @@ class Parameter:
         value = min(max(math.exp(value), self.minimum), self.maximum) if self.log else value
         return round(value) if self.whole else value
 
-    @property
-    def own(self) -> bool:
-        """Whether it is one of the case's own keys, not one of the bench file."""
-        return self.key in OWN_KEYS
-
 
 def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
-    """The plan's parameters, each tried alone in the bench file at its ends. Raises InputError for what the file refuses."""
+    """The plan's parameters, each tried alone in the bench file at its ends. Raises InputError as the file does."""
     tables = parse_toml(file.path, file.text)
     found = []
     for varied in plan.vary:
@@ -254,7 +249,7 @@ def _parameter(varied: Varied, file: BenchFile) -> Parameter:
 
 
 def _check_value(parameter: Parameter, value: Any, file: BenchFile, tables: dict[str, Any]) -> None:
-    if not parameter.own:
+    if parameter.key not in OWN_KEYS:
         changed_bench(file, tables, {parameter.key: value})
         return
     if parameter.key == SCENARIO:
@@ -268,7 +263,7 @@ def _check_value(parameter: Parameter, value: Any, file: BenchFile, tables: dict
 
 
 def _now(names: list[str], config: Any) -> Any:
-    """The bench file's value at dotted `names`, defaults included; None where it has none."""
+    """The bench file's value at dotted `names`, defaults included; None for an unknown one."""
     for name in names:
         if isinstance(config, tuple):
             config = config[int(name)] if name.isdigit() and int(name) < len(config) else None
@@ -280,7 +275,7 @@ def _now(names: list[str], config: Any) -> Any:
 
 
 def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> None:
-    """Set the key of dotted `names`. A single number for a key of several, such as a sigma along x and y, goes to each."""
+    """Set the key of dotted `names`. One number for a key of several (sigma along x and y) sets each of them."""
     table: Any = tables
     for name in names[:-1]:
         inside = table.get(name) if isinstance(table, dict) else None

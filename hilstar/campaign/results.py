@@ -26,7 +26,7 @@ from scipy.stats import rankdata
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.assess.budget import Axes, Decomposed, assess_cases, axes_of_variance
 from hilstar.assess.places import Scale
-from hilstar.assess.report import FigureRow
+from hilstar.assess.report import PARTS, FigureRow, part_rows
 from hilstar.bench.config import BenchConfig
 from hilstar.campaign.store import failures, file_sha256
 from hilstar.charts import INK, MUTED, chart, write_csv
@@ -36,7 +36,6 @@ from hilstar.units import ARCSEC_PER_RAD
 
 MAX_READ_CASES = 50_000  # cases read for the figures, spread evenly over a larger table
 VARY = "vary."
-PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
 SCATTER = "noise within a case"
 MAX_FITTED_CASES = 20_000  # cases in the fit of the budget, whose time grows with them
 MAX_BINS, MIN_IN_BIN = 8, 8
@@ -70,7 +69,7 @@ class Columns:
 
 
 def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
-    """A campaign's table, or an even share of its cases. Raises InputError for what is no such table."""
+    """A campaign's table, or an even share of its cases. Raises InputError for another file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -129,15 +128,11 @@ def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -
 
 def budget_rows(budget: dict[str, Any], parts: Decomposed | None) -> Iterator[FigureRow]:
     """The rows of budget.csv, as `hilstar assess` has them."""
-    for k, axis in enumerate("xyz"):
-        value = None if parts is None else float(parts.bias_arcsec[k])
-        ends = (None, None) if parts is None else parts.intervals.bias[:, k].tolist()
-        yield FigureRow("bias", axis, value, "arcsec", *ends)
-    for part, name in (*PARTS.items(), ("scatter", SCATTER)):
-        axes = budget[f"{part}_arcsec"] or Axes(None, None)
-        for k, axis in enumerate(("cross", "roll")):
-            ends = (None, None) if parts is None or part == "scatter" else getattr(parts.intervals, part)[:, k].tolist()
-            yield FigureRow(name, axis, getattr(axes, axis), "arcsec", *ends)
+    unknown = Axes(None, None)
+    yield from part_rows(parts, budget["noise_arcsec"] or unknown)
+    scatter = budget["scatter_arcsec"] or unknown
+    yield FigureRow(SCATTER, "cross", scatter.cross, "arcsec")
+    yield FigureRow(SCATTER, "roll", scatter.roll, "arcsec")
     yield FigureRow("availability", "", budget["availability"])
     yield FigureRow("wrong answers", "", budget["wrong"])
     for name, value in (budget["centroids"] or {}).items():

@@ -77,7 +77,7 @@ class Campaign:
     def run(self, directory: Directory, workers: Pool | Cluster, on_done: Callable[[int], None]) -> None:
         """Run the missing cases, and write the table once none is missing. `on_done` gets the number of finished cases.
 
-        Raises InputError where nothing can be written, and what the workers raise. The same call resumes from there.
+        Raises InputError where nothing can be written, and the workers' errors. The same call goes on from there.
         """
         journal = directory.journal(self.cases)
         try:

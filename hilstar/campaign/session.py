@@ -1,4 +1,4 @@
-"""A worker's session: it checks that it computes what the campaign computes, and runs cases, one after the other.
+"""A worker's session: it checks that its rows would be the campaign's, and runs cases one after the other.
 
 Rows are the same bit for bit on every worker that has the campaign's `Identity`. One tracker serves all cases of a session, and
 changes with their bench files.
@@ -157,7 +157,7 @@ class Session:
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         for frame in range(self.plan.frames):
             view = self.maker.view(case, frame, tracker.config.tracker.exposure_s)
-            # A case of one frame is what `hilstar simulate --seed` makes of the same bench and attitude.
+            # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and attitude.
             rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
             if isinstance(tracker, Simulator):
                 exposure = tracker.expose(view, rng, faults=self.maker.faults(case, view, tracker))

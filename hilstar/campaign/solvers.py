@@ -44,7 +44,7 @@ CENTROIDS = "centroids"
 
 
 class SolverFault(Exception):
-    """A solver failed: it raised, ended with an error, took too long, or answered what is no attitude."""
+    """A solver failed: it raised, ended with an error, took too long, or gave an answer that is no attitude."""
 
 
 SolvedTracker = Simulator | DisplayTracker  # whose images are solved
@@ -154,7 +154,7 @@ class CentroidSolver:
 
 
 class FunctionSolver:
-    """Calls `function(image, tracker)`: DN, uint16 (height, width), and what a tracker's software knows of its optics.
+    """Calls `function(image, tracker)` with DN, uint16 (height, width), and the facts of the tracker's optics.
 
     It returns q_icrs_to_cam (w, x, y, z), or None where it finds none. `folder` is searched for the module first.
     Raises InputError where there is no such function.
@@ -178,7 +178,7 @@ class FunctionSolver:
         self._function: Callable[..., Any] = found
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
-        """The function's answer. Raises SolverFault where it raises, takes too long or answers what is no attitude."""
+        """The function's answer. Raises SolverFault where it raises, takes too long, or its answer is no attitude."""
         try:
             with time_limit(self._timeout_s):
                 answer = self._function(exposure.dn.copy(), tracker_facts(tracker))
@@ -192,7 +192,7 @@ class FunctionSolver:
 
 
 def tracker_facts(tracker: SolvedTracker) -> dict[str, Any]:
-    """The facts of its optics that a tracker's software knows, and none of where it looks."""
+    """The facts of its optics that a tracker's software knows; nothing about its attitude."""
     settings = tracker.config.tracker
     width, height = settings.resolution_px
     focal_length_px = settings.focal_length_mm * 1e3 / settings.pixel_pitch_um
@@ -247,7 +247,7 @@ class CommandSolver:
         self._folder, self._timeout_s = folder, timeout_s
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
-        """The command's answer. Raises SolverFault where it fails, takes too long or prints what is no attitude."""
+        """The command's answer. Raises SolverFault where it fails, takes too long, or its answer is no attitude."""
         from astropy.io import fits
 
         facts = tracker_facts(tracker)

@@ -51,7 +51,7 @@ def require_parquet() -> None:
 
 
 def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> pa.Schema:
-    """The Arrow schema of columns (name -> kind), with what the table is about in its metadata."""
+    """The Arrow schema of columns (name -> kind), with the campaign's identity in its metadata."""
     import pyarrow as pa
 
     kinds = {"int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_(), "text": pa.string()}

@@ -1,7 +1,7 @@
-"""Two images of one sky, star by star: what a change of driver may change, and what it may not; and the files they come from.
+"""Two images of one sky compared star by star, within the limits of a change of driver; and the files they come from.
 
-Stars are found in the golden image and fitted in both (see star_fit). Where the rounding of the light around a star limits
-how well a fit knows it, that star's limits are wider.
+Stars are found in the golden image and fitted in both (see star_fit). Where rounding of the light around a star limits the
+fit, that star's limits are wider.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def compare_skies(
 ) -> SkyComparison:
     """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE), `truth` the golden one's.
 
-    Raises InputError for images of different size or with a pixel that is not finite, a golden one without a star, and a
-    `truth` of another sky.
+    Raises InputError for images of different size or with a pixel that is not finite, for a golden one without a star, and
+    for a `truth` of another sky.
     """
     check_skies(frame, golden)
     psf = star_psf(golden)
@@ -112,7 +112,7 @@ def _measurable(golden: FloatArray, seeds: Seeds, psf: Psf) -> tuple[Seeds, int]
 
 
 class _SkyFit:
-    """All stars of one image, fitted at `places_px`: what they are, and the light (height, width) that they leave."""
+    """All stars of one image, fitted at `places_px`: fluxes, places, and the light (height, width) that they do not explain."""
 
     def __init__(self, image: FloatArray, places_px: FloatArray, psf: Psf) -> None:
         self.light = image
@@ -180,7 +180,7 @@ def read_frame_fits(path: Path) -> FloatArray:
     raw = _inflated(path, read_bytes(path, wanted, MAX_FITS_BYTES), wanted)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy warns about cards; what matters is checked below
+            warnings.simplefilter("ignore")  # astropy warns about cards; those that matter are checked below
             image, header = fits.getdata(io.BytesIO(raw), header=True)
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: not a FITS image; {wanted}") from error

@@ -27,7 +27,7 @@ COLUMNS = (
 
 
 def draw(path: Path, comparison: SkyComparison) -> None:
-    """Write the chart. Raises InputError where it cannot be."""
+    """Write the chart. Raises InputError where that fails."""
     said = finding(comparison)
     while title_lines(said).count("\n") > 1 and ";" in said:
         said = said.rpartition(";")[0]
@@ -82,7 +82,7 @@ class ChartPanel:
         return mag, max(star.centroid_error_px, MIN_ERROR), star.limits.centroid_px
 
     def label(self, kind: str, drawn: int) -> str:
-        """How many stars are of a kind: of those that one image alone has all, as the terminal and the table count them."""
+        """How many stars are of a kind. Missing and extra ones are all counted, as on the terminal and in the table."""
         count = len(self.comparison.of(kind)) if kind in self.rows else drawn
         common = count - drawn
         return f"{kind}: {count}" + (f"\n({common} by what is common)" if common else "")
@@ -104,7 +104,7 @@ class ChartPanel:
         axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
 
     def name_stars(self, axis: Axes) -> list[Annotation]:
-        """Names of the worst stars; those that only one image has are named in the panel of flux alone."""
+        """Names of the worst stars. Missing and extra ones are named in the panel of flux alone."""
         names = []
         for star in self.worst:
             mag, error, own = self.point(star)

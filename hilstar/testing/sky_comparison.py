@@ -1,4 +1,4 @@
-"""How two skies differ: each star, what most stars change together (shift, turn, scale, dimming), and the verdict.
+"""How two skies differ: each star, the change common to most stars (shift, turn, scale, dimming), and the verdict.
 
 The common motion is a shift, with turn and scale, or a homography, fitted so that outliers do not matter. Missing stars are
 matched with extra ones first: after a shift by more than a star's width no star is in its place.
@@ -185,7 +185,7 @@ class CommonChange:
 
     @property
     def differing(self) -> list[StarDifference]:
-        """The stars that differ from what is common."""
+        """The stars that differ beyond the common change."""
         return [star for star in self.beyond if star.kind != "same"] + self.alone
 
     def line(self) -> str:
@@ -304,7 +304,7 @@ def _worst_first(stars: list[StarDifference]) -> list[StarDifference]:
 class SkyComparison:
     """Every star compared, the missing and the extra ones; `unmeasured` stars have too little light of their own in view.
 
-    `common` is what most stars differ by together, None where there is no such thing.
+    `common` is the difference that most stars share, None without one.
     """
 
     stars: list[StarDifference]
@@ -323,7 +323,7 @@ class SkyComparison:
 
     @property
     def differing(self) -> list[StarDifference]:
-        """The stars that are beyond their limits once what is common to all is subtracted, worst first."""
+        """The stars that are beyond their limits once the common difference is subtracted, worst first."""
         return self.bad if self.common is None else _worst_first(self.common.differing)
 
     @property
@@ -374,7 +374,7 @@ class SkyComparison:
 
 
 def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str]:
-    """A line for each star that differs from what is common to all, `max_lines` of them; `rest` says where more are."""
+    """A line for each star that differs beyond the common difference, `max_lines` of them; `rest` says where more are."""
     stars = comparison.differing
     lines = [star.line() for star in stars[:max_lines]]
     return [*lines, f"and {len(stars) - max_lines} more{rest}"] if len(stars) > max_lines else lines

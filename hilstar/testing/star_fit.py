@@ -1,9 +1,9 @@
 """Stars of a noiseless linear image: found, and fitted all at once, so that a neighbour's light causes no error.
 
 Each star is a Gaussian integrated over pixels, as the renderer draws it, with its derivatives along x and y. Fluxes and
-shifts of all stars are one linear least-squares problem: a star that is dimmed by any amount is measured exactly, a shifted
-one to first order in its shift, and what no star explains stays in the residual. The stars to fit come from a truth table or
-are found in the image; near ones are one blend.
+shifts of all stars are one linear least-squares problem. A star that is dimmed by any amount is measured exactly, a shifted one
+to first order in its shift. Light that no star explains stays in the residual. The stars to fit come from a truth table or are
+found in the image; near ones are one blend.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ TITLE_PT, TEXT_PT, SMALL_PT = 11.5, 10, 9
 TITLE_COLUMNS, NOTE_COLUMNS = 80, 105
 ENDINGS = (".png", ".svg")
 
-# The colours of a chart, and what each is on a dark page.
+# The colours of a chart, and of each its colour on a dark page.
 INK, MUTED, GRID, PAPER = "#1f2328", "#5c6570", "#d8dde3", "#ffffff"
 BLUE, ORANGE, GREEN, PURPLE, TEAL, RED = "#0b62a4", "#c2500b", "#1a7f37", "#7b3fa0", "#0f7b8a", "#c0182b"
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, TEAL, RED)
@@ -270,7 +270,7 @@ def _line_ends(axes: Axes) -> Iterator[tuple[str, tuple[float, float], str]]:
 
 
 def _name_at_side(axes: Axes, named: SideNames, arrows: bool = True) -> list[Text]:
-    """The names of a panel, apart as its height now asks for, with arrows to what is far."""
+    """The names of a panel, kept apart at its present height, with arrows to far points."""
     gap = 1.3 * SMALL_PT / 72 * axes.figure.dpi / axes.bbox.height
     texts: list[Text] = []
     at = {each: axes.transAxes.inverted().transform(axes.transData.transform(each[1])) for each in named or _line_ends(axes)}
@@ -335,7 +335,7 @@ def png(figure: Figure) -> bytes:
 
 
 def svg(figure: Figure) -> str:
-    """A figure as SVG in the light colours, or the dark ones where its reader, or the page around it, prefers those."""
+    """A figure as SVG with both sets of colours: dark ones where the reader, or the page around it, prefers them."""
     from matplotlib import rc_context
 
     data = io.StringIO()

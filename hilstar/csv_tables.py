@@ -1,4 +1,4 @@
-"""Rows of CSV tables: columns by name, `valid` where there is one, and one line for what is wrong."""
+"""Rows of CSV tables: columns by name, an optional `valid`, and one line for an error."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def read_rows(
 
 
 def is_valid(path: Path, line: int, cell: str) -> bool:
-    """What a cell of `valid` says. Raises InputError."""
+    """The flag in a cell of `valid`. Raises InputError."""
     if cell.lower() not in FLAGS:
         raise InputError(f"{path}:{line}: valid = {shortened(cell)!r}; write 1 or 0")
     return FLAGS[cell.lower()]
 
 
 def finite_numbers(path: Path, line: int, columns: tuple[str, ...], cells: list[str], advice: str) -> list[float]:
-    """The numbers of the cells of `columns`. Raises InputError, with `advice`, for what is no finite number."""
+    """The numbers of the cells of `columns`. Raises InputError, with `advice`, for a cell without a finite number."""
     numbers = []
     for name, cell in zip(columns, cells, strict=True):
         try:

@@ -41,15 +41,17 @@ def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def to_matrix(q: FloatArray) -> FloatArray:
-    """The 3x3 matrix R of one unit quaternion: v_cam = R v_icrs."""
-    w, x, y, z = (float(c) for c in q)
-    return np.array(
+    """The matrices R (..., 3, 3) of unit quaternions (..., 4): v_cam = R v_icrs, so that rows are the camera's axes in ICRS."""
+    q = np.asarray(q, dtype=np.float64)
+    w, x, y, z = q.tolist() if q.ndim == 1 else np.moveaxis(q, -1, 0)
+    matrix = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+    return matrix if q.ndim == 1 else np.ascontiguousarray(np.moveaxis(matrix, (0, 1), (-2, -1)))
 
 
 def from_rotation_vector(vector_rad: FloatArray) -> FloatArray:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from hilstar.charts import read_records
 from hilstar.study import codes, timing
+from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import ROUNDING_MAG
-from hilstar.study.tradeoff.table import Figure, Trial, Trials
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"

@@ -1,11 +1,11 @@
-"""A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and what the bench adds."""
+"""A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and the bench's own errors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -40,7 +40,7 @@ TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # from the stamp to the 
 
 @dataclass(frozen=True, slots=True)
 class AssessSettings:
-    """Where in an exposure times are stamped, how much later than that they are, s, and how many attitudes test the display."""
+    """Where in an exposure times are stamped, their latency, s, and at how many attitudes the display is tested."""
 
     stamp: Stamp = "middle"
     latency_s: float = 0.0
@@ -120,9 +120,13 @@ class Assessment:
 def assess_files(
     ledger: Path, telemetry: Path, settings: AssessSettings, say: Callable[[str], None] = lambda _: None
 ) -> Assessment:
-    """Assess telemetry against a ledger. Raises InputError with what is wrong with either."""
+    """Assess telemetry against a ledger. Raises InputError for a fault of either."""
     answers, run = read_telemetry(telemetry), read_ledger(ledger)
-    tau_s, base_s = tau_of(run, answers)
+    # The telemetry's times from the run's zero where the two overlap, else from their own first.
+    zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
+    overlap = answers.t_ns[0] <= zero_ns + round(end_s * NS_PER_S) and answers.t_ns[-1] >= zero_ns
+    base_ns = zero_ns if overlap else int(answers.t_ns[0])
+    tau_s, base_s = (answers.t_ns - base_ns) / NS_PER_S, (base_ns - zero_ns) / NS_PER_S
     tau_s = tau_s + TO_MIDDLE[settings.stamp] * run.config.tracker.exposure_s - settings.latency_s
     valid = np.flatnonzero(answers.valid)
     if len(valid) < MIN_ROWS:
@@ -133,13 +137,31 @@ def assess_files(
         found = assess_run(run.commanded, tau_s[valid], answers.q[valid], coarse, run.scale, np.random.default_rng(SEED))
     except InputError as refusal:
         raise InputError(f"{telemetry}: {refusal}") from refusal
-    start_s = float(run.commanded.t_s[0])
     t_s = start_s + (tau_s - found.clock.offset_s - start_s) / (1 + found.clock.drift)
     right, wrong = np.zeros(len(t_s), dtype=np.bool_), np.zeros(len(t_s), dtype=np.bool_)
     right[valid[found.row]], wrong[valid[found.wrong]] = True, True
-    effects = _bench_effects(run, found, settings, say)
-    noise_arcsec, said = _without_display(found, effects.display)
-    notes = [*found.notes, *_said_of_base(base_s), *_said_of_clock(found), *_said_of_bend(run, found), *_said_of_slow(found)]
+    off_deg = np.degrees(np.linalg.norm(found.clock.residual_arcsec, axis=1) / ARCSEC_PER_RAD)
+    notes = _notes(run, found, base_s)
+    # The error by rate and by magnitude, and the display's own.
+    parts = found.components
+    error = parts.fov.fitted + parts.pixel.fitted + parts.left
+    freedom = parts.fov.freedom + parts.pixel.freedom + 1
+    by_rate = slices_of(np.degrees(np.linalg.norm(found.rate_rad_s, axis=1)), parts.left, error, freedom)
+    by_magnitude: tuple[Slice, ...] = ()
+    display = None
+    try:
+        file = run.bench_file()
+        say("the field's stars")
+        by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
+        if settings.display_attitudes:
+            say("the display's own error")
+            some = np.unique(np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int))
+            display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
+            if display is None:
+                notes.append("the display shows too few stars at once for an attitude: its own error was not found")
+    except HilstarError as refusal:
+        notes.append(f"neither the field's magnitude nor the display's own error could be found from the ledger: {refusal}")
+    noise_arcsec, said = _without_display(found, display)
     return Assessment(
         run=run,
         telemetry=answers,
@@ -147,22 +169,16 @@ def assess_files(
         noise_arcsec=noise_arcsec,
         offset_s=found.clock.offset_s + base_s,
         lock=lock_of(run.commanded, t_s, right, wrong),
-        wrong=_wrong(answers, found, t_s),
-        display=effects.display,
-        by_rate=effects.by_rate,
-        by_magnitude=effects.by_magnitude,
+        wrong=tuple(
+            WrongAnswer(int(answers.line[at]), int(answers.t_ns[at]) / 1e9, float(t_s[at]), float(off_deg[k]))
+            for k, at in zip(found.wrong, valid[found.wrong], strict=True)
+        ),
+        display=display,
+        by_rate=by_rate,
+        by_magnitude=by_magnitude,
         t_s=t_s,
-        notes=(*notes, *effects.notes, *said),
+        notes=(*notes, *said),
     )
-
-
-def tau_of(run: RunLedger, telemetry: Telemetry) -> tuple[FloatArray, float]:
-    """The telemetry's times (n,), s, from the run's zero where the two overlap, else from their own first; and that base, s."""
-    zero_ns = run.run.zero_ns
-    end_ns = zero_ns + round(run.commanded.t_s[-1] * NS_PER_S)
-    overlap = telemetry.t_ns[0] <= end_ns and telemetry.t_ns[-1] >= zero_ns
-    base_ns = zero_ns if overlap else int(telemetry.t_ns[0])
-    return (telemetry.t_ns - base_ns) / NS_PER_S, (base_ns - zero_ns) / NS_PER_S
 
 
 def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArray) -> CoarseClock:
@@ -172,19 +188,35 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
     """
     commanded = run.commanded
     coarse = coarse_offset(commanded, tau_s, q)
-    if coarse is not None and coarse.spread_rad <= AGREE_RAD and coarse.turn_rad <= MAX_TURN_RAD:
-        return coarse
-    if coarse is not None and coarse.spread_rad <= AGREE_RAD:
-        named = _other_axes(coarse.rotation)
-        if named:
-            raise InputError(f"{telemetry.path}: {_turned(coarse.rotation)}: {named}")
+    agreed = coarse if coarse is not None and coarse.spread_rad <= AGREE_RAD else None
+    if agreed is not None and agreed.turn_rad <= MAX_TURN_RAD:
+        return agreed
+    turned = ""
+    if agreed is not None:
+        turn = to_rotation_vector(agreed.rotation)
+        angle = float(np.linalg.norm(turn))
+        axis = ",".join(f"{value:.3f}" for value in turn / max(angle, 1e-12))
+        turned = (
+            f"{telemetry.path}: the reported attitudes are turned by {np.degrees(angle):.4g} degrees about {axis} (cam) from"
+            " the commanded ones"
+        )
+        # The nearest rotation that only names the axes otherwise, of which there are 24.
+        matrix, nearest = to_matrix(agreed.rotation), np.zeros((3, 3))
+        column = np.argmax(np.abs(matrix), axis=1)
+        nearest[range(3), column] = np.sign(matrix[range(3), column])
+        off = np.arccos(np.clip((np.trace(matrix @ nearest.T) - 1) / 2, -1, 1))
+        if abs(np.linalg.det(nearest) - 1) <= 1e-9 and off <= NEAR_AXES_RAD:
+            signs = ["-" if row.sum() < 0 else "+" for row in nearest]
+            axes = ", ".join(f"{own} = {sign}{'xyz'[k]}" for own, sign, k in zip("xyz", signs, column, strict=True))
+            cure = "write them for x right, y down in the image, z boresight"
+            raise InputError(f"{turned}: they fit axes with {axes} of hilstar's; {cure}")
     offsets = [] if coarse is None else [coarse.offset_s]
     for offset in [*offsets, *speed_offsets(commanded, tau_s, q).tolist()]:
         _refuse(run, telemetry, tau_s + offset, q)
-    if coarse is not None and coarse.spread_rad <= AGREE_RAD:
-        w, x, y, z = (float(value) for value in coarse.rotation * [1, -1, -1, -1])
+    if agreed is not None:
+        w, x, y, z = (float(value) for value in agreed.rotation * [1, -1, -1, -1])
         cure = f"turn them back by the quaternion {w:.6f},{x:.6f},{y:.6f},{z:.6f} from the left"
-        raise InputError(f"{telemetry.path}: {_turned(coarse.rotation)}: another frame or mounting; {cure}")
+        raise InputError(f"{turned}: another frame or mounting; {cure}")
     raise InputError(
         f"{telemetry.path}: at no offset of its clock do the reported attitudes follow those of {run.path}, lit for"
         f" {commanded.t_s[-1]:.6g} s; give the telemetry of this run, of which no more than half may be wild"
@@ -205,124 +237,44 @@ def _refuse(run: RunLedger, telemetry: Telemetry, t_s: FloatArray, q: FloatArray
             raise
 
 
-def _turned(rotation: FloatArray) -> str:
-    turn = to_rotation_vector(rotation)
-    angle = float(np.linalg.norm(turn))
-    axis = ",".join(f"{value:.3f}" for value in turn / max(angle, 1e-12))
-    return f"the reported attitudes are turned by {np.degrees(angle):.4g} degrees about {axis} (cam) from the commanded ones"
-
-
-def _other_axes(rotation: FloatArray) -> str:
-    """The axes that a large constant rotation (4,) stands for; "" where it is none of the 24 right-handed ways to name them."""
-    matrix = to_matrix(rotation)
-    nearest = np.zeros((3, 3))
-    for row in range(3):
-        column = int(np.argmax(np.abs(matrix[row])))
-        nearest[row, column] = np.sign(matrix[row, column])
-    off = np.arccos(np.clip((np.trace(matrix @ nearest.T) - 1) / 2, -1, 1))
-    if abs(np.linalg.det(nearest) - 1) > 1e-9 or off > NEAR_AXES_RAD:
-        return ""
-    names = ["xyz"[int(np.argmax(np.abs(row)))] for row in nearest]
-    signs = ["-" if row.sum() < 0 else "+" for row in nearest]
-    axes = ", ".join(f"{own} = {sign}{name}" for own, sign, name in zip("xyz", signs, names, strict=True))
-    return f"they fit axes with {axes} of hilstar's; write them for x right, y down in the image, z boresight"
-
-
-class _BenchEffects(NamedTuple):
-    by_rate: tuple[Slice, ...]
-    by_magnitude: tuple[Slice, ...] = ()
-    display: DisplayCost | None = None
-    notes: tuple[str, ...] = ()
-
-
-def _bench_effects(run: RunLedger, found: Decomposed, settings: AssessSettings, say: Callable[[str], None]) -> _BenchEffects:
-    """The error by rate and by magnitude, the display's own error, and notes on what could not be found."""
-    parts = found.components
-    error = parts.fov.fitted + parts.pixel.fitted + parts.left
-    freedom = parts.fov.freedom + parts.pixel.freedom + 1
-    rate_deg_s = np.degrees(np.linalg.norm(found.rate_rad_s, axis=1))
-    effects = _BenchEffects(slices_of(rate_deg_s, parts.left, error, freedom))
-    try:
-        file = run.bench_file()
-        say("the field's stars")
-        by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
-        effects = effects._replace(by_magnitude=by_magnitude)
-        if not settings.display_attitudes:
-            return effects
-        say("the display's own error")
-        some = np.unique(np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int))
-        display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
-        if display is None:
-            note = "the display shows too few stars at once for an attitude: its own error was not found"
-            return effects._replace(notes=(note,))
-        return effects._replace(display=display)
-    except HilstarError as refusal:
-        note = f"neither the field's magnitude nor the display's own error could be found from the ledger: {refusal}"
-        return effects._replace(notes=(note,))
-
-
-def _wrong(answers: Telemetry, found: DecomposedRun, t_s: FloatArray) -> tuple[WrongAnswer, ...]:
-    valid = np.flatnonzero(answers.valid)
-    off = np.degrees(np.linalg.norm(found.clock.residual_arcsec, axis=1) / ARCSEC_PER_RAD)
-    return tuple(
-        WrongAnswer(int(answers.line[valid[k]]), int(answers.t_ns[valid[k]]) / 1e9, float(t_s[valid[k]]), float(off[k]))
-        for k in found.wrong
-    )
-
-
-def _said_of_base(base_s: float) -> list[str]:
-    if base_s == 0:
-        return []
-    return [
-        f"the telemetry's times, {abs(base_s):.9g} s from the run's, do not overlap it: its clock is taken as one of its own"
-    ]
-
-
-def _said_of_clock(found: DecomposedRun) -> list[str]:
-    clock = found.clock
-    if clock.offset_told and clock.drift_told:
-        return []
+def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
+    """What a reader of the budget has to know beside its figures."""
+    notes, clock, parts = [*found.notes], found.clock, found.components
+    if base_s:
+        notes.append(
+            f"the telemetry's times, {abs(base_s):.9g} s from the run's, do not overlap it: its clock is taken as one of"
+            " its own"
+        )
     if not clock.drift_told:
-        return ["the run has no motion that tells the clock: offset and drift are not known, and times are taken as they are"]
-    return [
-        "the run turns at a constant rate: an offset of the clock cannot be told from a bias along the motion, and is taken to"
-        f" be {1e3 * clock.offset_s:.3g} ms beside the rough one"
-    ]
-
-
-def _said_of_bend(run: RunLedger, found: DecomposedRun) -> list[str]:
-    """A tracker averages over its exposure E: under an acceleration alpha that is alpha E^2 / 24 off the middle's attitude."""
-    rate = ARCSEC_PER_RAD * found.rate_rad_s
-    if len(rate) < MIN_ROWS:
-        return []
-    step_s = np.diff(found.clock.t_s[found.row])
+        notes.append(
+            "the run has no motion that tells the clock: offset and drift are not known, and times are taken as they are"
+        )
+    elif not clock.offset_told:
+        notes.append(
+            "the run turns at a constant rate: an offset of the clock cannot be told from a bias along the motion, and is taken"
+            f" to be {1e3 * clock.offset_s:.3g} ms beside the rough one"
+        )
+    # A tracker averages over its exposure E: under an acceleration alpha that is alpha E^2 / 24 off the middle's attitude.
+    step_s = np.diff(clock.t_s[found.row])
     near = step_s < 1.0
-    if not near.any():
-        return []
-    acceleration = np.linalg.norm(np.diff(rate, axis=0)[near], axis=1) / step_s[near]
-    bent = float(np.percentile(acceleration, 99)) * run.config.tracker.exposure_s**2 / 24
-    if bent < BENT_ARCSEC:
-        return []
-    return [f"in an exposure the attitude's mean differs from that in its middle by up to {bent:.2g} arcsec"]
-
-
-def _said_of_slow(found: Decomposed) -> list[str]:
-    """Noise that lasts: a slow drift, or an error that changes over the field more sharply than the bumps do."""
-    left = found.components.left
-    rows = len(left) // TOGETHER * TOGETHER
-    if rows < MIN_ROWS * TOGETHER:
-        return []
-    means = left[:rows].reshape(-1, TOGETHER, 3).mean(axis=1)
-    slow = (means**2).mean(axis=0) - found.components.noise_variance / TOGETHER
-    share = slow / np.maximum(found.components.noise_variance, 1e-12)
-    if share.max() < SLOW_SHARE:
-        return []
-    size = axes_of_variance(slow)
-    return [
-        f"the noise is not white: {size.cross:.2g} arcsec across the boresight and {size.roll:.2g} about it last for {TOGETHER}"
-        f" answers and more, besides {found.components.fov.detail or 'the bias'}: does the alignment drift with time, or"
-        " does the field-of-view error jump somewhere?"
-    ]
+    if len(found.row) >= MIN_ROWS and near.any():
+        change = np.linalg.norm(np.diff(ARCSEC_PER_RAD * found.rate_rad_s, axis=0)[near], axis=1)
+        bent = float(np.percentile(change / step_s[near], 99)) * run.config.tracker.exposure_s**2 / 24
+        if bent >= BENT_ARCSEC:
+            notes.append(f"in an exposure the attitude's mean differs from that in its middle by up to {bent:.2g} arcsec")
+    # Noise that lasts: a slow drift, or an error that changes over the field more sharply than the bumps do.
+    rows = len(parts.left) // TOGETHER * TOGETHER
+    if rows >= MIN_ROWS * TOGETHER:
+        means = parts.left[:rows].reshape(-1, TOGETHER, 3).mean(axis=1)
+        slow = (means**2).mean(axis=0) - parts.noise_variance / TOGETHER
+        if (slow / np.maximum(parts.noise_variance, 1e-12)).max() >= SLOW_SHARE:
+            size = axes_of_variance(slow)
+            notes.append(
+                f"the noise is not white: {size.cross:.2g} arcsec across the boresight and {size.roll:.2g} about it last for"
+                f" {TOGETHER} answers and more, besides {parts.fov.detail or 'the bias'}: does the alignment drift with time,"
+                " or does the field-of-view error jump somewhere?"
+            )
+    return notes
 
 
 def _without_display(found: Decomposed, display: DisplayCost | None) -> tuple[Axes, list[str]]:

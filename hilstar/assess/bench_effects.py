@@ -1,9 +1,9 @@
-"""How the error depends on what the bench shows: the field's rate, its brightness, and the display's own error.
+"""How the error depends on the frame: the field's rate, its brightness, and the display's own error.
 
-For the display's own error, the twin lets a noiseless tracker look at the display and at the sky itself, at attitudes of the
-run. A star's place differs between the two, because codes are too coarse for a place between pixels, or because the true lens
-is not the assumed one. The display's attitude error is the small rotation e that turns the sky's directions v into the shown
-ones, v + e x v, weighted by light.
+For the display's own error, the twin's noiseless tracker looks at the display and at the sky, at attitudes of the run. A star's
+place differs between the two: codes are too coarse for a place between pixels, or the true lens is not the assumed one. The
+display's attitude error is the small rotation e that turns the sky's directions v into the shown ones, v + e x v. Stars are
+weighted by their light.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.assess.places import axes_of
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_stars
 from hilstar.bench.cameras import tracker_camera
+from hilstar.rotation import to_matrix
 from hilstar.twin.verify.star_finder import StarFinder, star_finder
 from hilstar.twin.verify.twin import Twin
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
@@ -77,7 +77,7 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
     camera = tracker_camera(file.config.tracker, file.folder)
     width, height = camera.resolution_px
     some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, FIELDS).astype(int))
-    axes = axes_of(q_icrs_to_cam[some])
+    axes = to_matrix(q_icrs_to_cam[some])
     reach = 2 * np.sin(min(camera.field_radius_rad(0.0), np.pi / 2) / 2)
     light = np.zeros(len(some))
     near: list[IntArray] = [

@@ -19,16 +19,14 @@ repeats with the place is not taken for a clock, and a clock not for such an err
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import fft, linalg, optimize
 from scipy.spatial import cKDTree
 
-from hilstar.arrays import FloatArray
-from hilstar.assess.places import Bumps, Scale, axes_of, bumps_at, centres_of, places_of
-from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_rotation_vector
+from hilstar.arrays import BoolArray, FloatArray
+from hilstar.assess.places import Bumps, Scale, bumps_at, centres_of, places_of
+from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
 from hilstar.run.record.commanded import Commanded, Moments
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
@@ -79,15 +77,17 @@ def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
     """The coarse offset of telemetry with times (n,) and attitudes (n, 4); None where no offset gives an overlap."""
     few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED).astype(int))
     t, q = t_s[few], reported[few]
-    found = [_nearby(commanded, t, q, offset, reach) for offset, reach in _candidates(commanded, t_s, reported)]
-    tried = [each for each in found if each is not None]
-    if not tried:
+    # Starts or ends together, and where speeds or attitudes agree.
+    tried = [_spread_at(commanded, t, q, float(commanded.t_s[end] - t_s[end])) for end in (0, -1)]
+    for peaks, reach_s in (_by_speed(commanded, t_s, reported), _by_attitude(commanded, t_s, reported)):
+        tried += [_nearby(commanded, t, q, float(offset_s), reach_s) for offset_s in peaks]
+    known = [each for each in tried if each is not None]
+    if not known:
         return None
-    limit = AS_GOOD * min(each.spread_rad for each in tried) + SMALL_RAD
-    good = [each for each in tried if each.spread_rad <= limit]
+    limit = AS_GOOD * min(each.spread_rad for each in known) + SMALL_RAD
+    good = [each for each in known if each.spread_rad <= limit]
     many = MOST * max(each.compared for each in good)
-    good = [each for each in good if each.compared >= many]
-    best = min(good, key=lambda each: each.turn_rad)
+    best = min((each for each in good if each.compared >= many), key=lambda each: each.turn_rad)
     as_they_are = _spread_at(commanded, t, q, 0.0)
     if as_they_are is not None and as_they_are.compared >= many and as_they_are.spread_rad <= limit:
         return as_they_are if as_they_are.turn_rad <= best.turn_rad + TURN_RAD else best
@@ -102,7 +102,7 @@ def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
 def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float, reach_s: float) -> CoarseClock | None:
     """The best offset within `reach_s` of `offset_s`."""
     first = _spread_at(commanded, t_s, reported, offset_s)
-    if first is None or reach_s == 0:
+    if first is None:
         return first
 
     def spread(offset: float) -> float:
@@ -113,15 +113,6 @@ def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_
     better = optimize.minimize_scalar(spread, bounds=(low, high), method="bounded", options={"maxiter": 12})
     found = _spread_at(commanded, t_s, reported, float(better.x))
     return found if found is not None and found.spread_rad < first.spread_rad else first
-
-
-def _candidates(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> list[tuple[float, float]]:
-    """Offsets to try, with a reach around each: starts or ends together, and where speeds or attitudes agree."""
-    ends = np.array([commanded.t_s[0] - t_s[0], commanded.t_s[-1] - t_s[-1]])
-    found = [(float(offset), 0.0) for offset in ends]
-    for peaks, reach in (_by_speed(commanded, t_s, reported), _by_attitude(commanded, t_s, reported)):
-        found += [(float(offset), reach) for offset in peaks]
-    return found
 
 
 def _spread_at(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float) -> CoarseClock | None:
@@ -253,7 +244,7 @@ class ClockFit:
     moments: Moments
     t_s: FloatArray
     residual_arcsec: FloatArray
-    used: npt.NDArray[np.bool_]
+    used: BoolArray
 
     @property
     def offset_told(self) -> bool:
@@ -266,25 +257,11 @@ class ClockFit:
         return self.sigma_drift < TOLD * DRIFT_PRIOR
 
 
-@dataclass(frozen=True)
-class _State:
-    """A clock and a bias during the fit: t = tau - delay_s - stretch_s share, with the share of the run in [0, 1]."""
-
-    rotation: FloatArray
-    delay_s: float
-    stretch_s: float
-
-
-class _Refined(NamedTuple):
-    """A clock and a bias after a step, their covariance (5, 5), and the answers (n,) that the step used."""
-
-    state: _State
-    covariance: FloatArray
-    used: npt.NDArray[np.bool_]
-
-
 class ClockSolver:
-    """Fits bias and clock of telemetry with times (n,), s, and attitudes (n, 4) to the commanded attitudes."""
+    """Fits bias and clock of telemetry with times (n,), s, and attitudes (n, 4) to the commanded attitudes.
+
+    t = tau - delay_s - stretch_s share, with the share of the run in [0, 1]; `rotation` (4,) is the bias.
+    """
 
     def __init__(self, commanded: Commanded, tau_s: FloatArray, reported: FloatArray, scale: Scale) -> None:
         self.commanded, self.tau_s, self.reported, self.scale = commanded, tau_s, reported, scale
@@ -293,91 +270,81 @@ class ClockSolver:
 
     def fit(self, coarse: CoarseClock) -> ClockFit:
         """The fit, begun at a coarse clock."""
-        state, used = self._robust(_State(coarse.rotation, -coarse.offset_s, 0.0))
+        self.rotation, self.delay_s, self.stretch_s = coarse.rotation, -coarse.offset_s, 0.0
+        self._align()
+        used = self._robust(-coarse.offset_s)
         for _ in range(REFINED):
-            state, covariance, used = self._refined(state, used, -coarse.offset_s)
-        moments, residual = self._residual(state)
-        stretch = state.stretch_s / self.span_s
-        drift = stretch / (1 - stretch)
+            used = used & self.moments.known
+            covariance = self._refine(used, -coarse.offset_s)
+        stretch = self.stretch_s / self.span_s
         sigma = np.sqrt(np.diag(covariance))
         return ClockFit(
-            offset_s=state.delay_s,  # tau - delay - stretch (tau - delay - start) / span = start gives tau = start + delay
-            drift=drift,
+            offset_s=self.delay_s,  # tau - delay - stretch (tau - delay - start) / span = start gives tau = start + delay
+            drift=stretch / (1 - stretch),
             sigma_offset_s=float(sigma[3]),
             sigma_drift=float(sigma[4]) / self.span_s,
             sigma_bias_arcsec=sigma[:3],
-            rotation=state.rotation,
-            moments=moments,
-            t_s=self._times(state)[0],
-            residual_arcsec=residual,
+            rotation=self.rotation,
+            moments=self.moments,
+            t_s=self.t_s,
+            residual_arcsec=self.residual,
             used=used,
         )
 
-    def _times(self, state: _State) -> tuple[FloatArray, FloatArray]:
-        """The run's times (n,) and their share of the run."""
-        plain = self.tau_s - state.delay_s
-        share = (plain - self.start_s) / self.span_s
-        return plain - state.stretch_s * share, share
+    def _align(self, step: FloatArray | None = None) -> None:
+        """Take a step (5,) of bias, arcsec, delay and stretch, and find the run's times and the residuals there."""
+        if step is not None:
+            turn = from_rotation_vector(step[:3] / ARCSEC_PER_RAD)
+            self.rotation = normalise(multiply(turn, self.rotation))
+            self.delay_s, self.stretch_s = self.delay_s + float(step[3]), self.stretch_s + float(step[4])
+        plain = self.tau_s - self.delay_s
+        self.share = (plain - self.start_s) / self.span_s
+        self.t_s = plain - self.stretch_s * self.share
+        self.moments = self.commanded.at(self.t_s)
+        known = self.moments.known
+        turn = multiply(multiply(self.reported, conjugate(self.moments.q)), conjugate(self.rotation))
+        self.residual = np.full((len(self.t_s), 3), np.nan)
+        self.residual[known] = ARCSEC_PER_RAD * to_rotation_vector(turn[known])
 
-    def _residual(self, state: _State) -> tuple[Moments, FloatArray]:
-        t_s, _ = self._times(state)
-        moments = self.commanded.at(t_s)
-        turn = multiply(multiply(self.reported, conjugate(moments.q)), conjugate(state.rotation))
-        residual = np.full((len(t_s), 3), np.nan)
-        residual[moments.known] = ARCSEC_PER_RAD * to_rotation_vector(turn[moments.known])
-        return moments, residual
-
-    def _design(self, state: _State, moments: Moments, rows: npt.NDArray[np.bool_]) -> FloatArray:
+    def _design(self, rows: BoolArray) -> FloatArray:
         """The change of the residuals per unit of bias (arcsec), delay and stretch (s): (3, rows, 5), arcsec."""
-        _, share = self._times(state)
-        omega = ARCSEC_PER_RAD * moments.rate_rad_s[rows]
+        omega = ARCSEC_PER_RAD * self.moments.rate_rad_s[rows]
         design = np.zeros((3, int(rows.sum()), 5))
         for axis in range(3):
             design[axis, :, axis] = 1.0
             design[axis, :, 3] = omega[:, axis]
-            design[axis, :, 4] = omega[:, axis] * share[rows]
+            design[axis, :, 4] = omega[:, axis] * self.share[rows]
         return design
 
-    def _moved(self, state: _State, step: FloatArray) -> _State:
-        turn = from_rotation_vector(step[:3] / ARCSEC_PER_RAD)
-        rotation = normalise(multiply(turn, state.rotation))
-        return _State(rotation, state.delay_s + float(step[3]), state.stretch_s + float(step[4]))
-
-    def _prior(self, state: _State, delay_s: float) -> tuple[FloatArray, FloatArray]:
-        """The prior's precision (5,), and its pull (5,) towards it."""
+    def _prior(self, delay_s: float) -> tuple[FloatArray, FloatArray]:
+        """The prior's precision (5, 5), and its pull (5,) towards it."""
         precision = np.array([0, 0, 0, 1 / OFFSET_PRIOR_S**2, 1 / (DRIFT_PRIOR * self.span_s) ** 2])
-        return precision, precision * np.array([0, 0, 0, delay_s - state.delay_s, -state.stretch_s])
+        return np.diag(precision), precision * np.array([0, 0, 0, delay_s - self.delay_s, -self.stretch_s])
 
-    def _robust(self, state: _State) -> tuple[_State, npt.NDArray[np.bool_]]:
-        """Bias and clock by Tukey's weights, scaled for each axis, and which answers (n,) are not wild."""
-        begun = state.delay_s
+    def _robust(self, begun_s: float) -> BoolArray:
+        """Bias and clock by Tukey's weights, scaled for each axis; which answers (n,) are not wild."""
         for _ in range(ROUNDS):
-            moments, residual = self._residual(state)
-            rows = moments.known
-            sigma, weight = weights_of(residual[rows])
-            design = self._design(state, moments, rows)
-            precision, pull = self._prior(state, begun)
-            normal, right = np.diag(precision), pull
+            rows, residual = self.moments.known, self.residual[self.moments.known]
+            sigma, weight = weights_of(residual)
+            design = self._design(rows)
+            normal, right = self._prior(begun_s)
             for axis in range(3):
                 scaled = design[axis] * (weight / sigma[axis] ** 2)[:, None]
-                normal, right = normal + scaled.T @ design[axis], right + scaled.T @ residual[rows, axis]
+                normal, right = normal + scaled.T @ design[axis], right + scaled.T @ residual[:, axis]
             step = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
-            state = self._moved(state, step)
+            self._align(step)
             if max(np.abs(step[:3]).max(), 1e3 * np.abs(step[3:]).max()) < DONE_ARCSEC:
                 break
-        moments, residual = self._residual(state)
-        used = moments.known.copy()
-        used[moments.known] = weights_of(residual[moments.known])[1] > 0
-        return state, used
+        known = self.moments.known
+        used = known.copy()
+        used[known] = weights_of(self.residual[known])[1] > 0
+        return used
 
-    def _refined(self, state: _State, used: npt.NDArray[np.bool_], begun_s: float) -> _Refined:
-        """One generalised least squares step."""
-        moments, residual = self._residual(state)
-        used = used & moments.known
-        design, left = self._design(state, moments, used), residual[used]
-        place = places_of(axes_of(moments.q[used]), self.scale.focal_px, self.scale.roll_px)
-        precision, pull = self._prior(state, begun_s)
-        normal, right = np.diag(precision), pull
+    def _refine(self, used: BoolArray, begun_s: float) -> FloatArray:
+        """One generalised least squares step; its covariance (5, 5)."""
+        design, left = self._design(used), self.residual[used]
+        place = places_of(to_matrix(self.moments.q[used]), self.scale.focal_px, self.scale.roll_px)
+        normal, right = self._prior(begun_s)
         smooth = most_likely(place, left)
         pulls = np.zeros((len(left), 5))
         for axis in range(3):
@@ -386,8 +353,8 @@ class ClockSolver:
             right = right + design[axis].T @ whitened[:, 5]
             pulls += whitened[:, :5] * left[:, axis : axis + 1]
         covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-        step = covariance @ right
-        return _Refined(self._moved(state, step), honest(covariance, pulls, place), used)
+        self._align(covariance @ right)
+        return honest(covariance, pulls, place)
 
 
 def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> FloatArray:

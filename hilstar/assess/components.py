@@ -26,14 +26,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.assess.places import Projector, Scale, axes_of, bumps_at, centres_of, places_of, weights_at
-from hilstar.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.assess.places import Projector, Scale, bumps_at, centres_of, places_of, weights_at
+from hilstar.rotation import conjugate, multiply, to_matrix, to_rotation_vector
 
 MIN_ROWS = 30
 TURNS = 3  # fits of bumps and waves by turns
@@ -103,18 +102,16 @@ def components_of(residual_arcsec: FloatArray, q_icrs_to_cam: FloatArray, scale:
     """The parts of residuals (n, 3), cam, at the commanded attitudes (n, 4)."""
     mean = residual_arcsec.mean(axis=0)
     about = residual_arcsec - mean
-    axes = axes_of(q_icrs_to_cam)
-    place = places_of(axes, scale.focal_px, scale.roll_px)
+    place = places_of(to_matrix(q_icrs_to_cam), scale.focal_px, scale.roll_px)
     extent = float(np.linalg.norm(np.ptp(place, axis=0)))
-    nothing = Component(NOTHING, np.zeros_like(about), 0.0)
-    bumps, spacing, reason = _bumps(place, extent, scale)
-    fov, waves, pixel = replace(nothing, reason=reason), None, nothing
+    bumps, words = _bumps(place, extent, scale)
+    pixel, waves = Component(NOTHING, np.zeros_like(about), 0.0), None
+    fov = pixel if bumps is not None else replace(pixel, reason=words)
     for turn in range(TURNS):
         if bumps is not None:
-            fov = _component(bumps, about - pixel.fitted, pixel.freedom)
-            fov = replace(fov, detail=f"what repeats over {4 * spacing:.0f} px or more of the field")
+            fov = replace(_component(bumps, about - pixel.fitted, pixel.freedom), detail=words)
         if turn == 0:
-            waves, pixel = _waves(about - fov.fitted, _Attitudes(q_icrs_to_cam, axes, scale), extent, bumps)
+            waves, pixel = _waves(about - fov.fitted, q_icrs_to_cam, scale, extent, bumps)
         if waves is None:
             break
         pixel = replace(_component(waves, about - fov.fitted, fov.freedom), detail=pixel.detail)
@@ -131,87 +128,79 @@ def _component(functions: Projector, wanted: FloatArray, other_freedom: float) -
     return Component(np.maximum(variance, 0.0), fitted, functions.freedom)
 
 
-class _FieldBumps(NamedTuple):
-    """Bumps and their spacing, px, or the reason why there are none."""
-
-    projector: Projector | None
-    spacing_px: float = 0.0
-    reason: str = ""
-
-
-def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> _FieldBumps:
-    """The finest bumps that the samples can tell apart."""
+def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector | None, str]:
+    """The finest bumps that the samples can tell apart and how they are spaced, or None and the reason."""
     n = len(place)
     if extent_px < MIN_EXTENT_PX:
-        moved = f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be told from bias"
-        return _FieldBumps(None, reason=moved)
+        return None, f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be told from bias"
     spacing = FINEST_PX
     while spacing <= COARSEST_SHARE * min(scale.resolution_px):
         centre = centres_of(place, spacing)
         if 2 < len(centre) <= min(MAX_BUMPS, n // ROWS_A_BUMP):
-            return _FieldBumps(Projector(bumps_at(place, centre, spacing).value), spacing)
+            detail = f"what repeats over {4 * spacing:.0f} px or more of the field"
+            return Projector(bumps_at(place, centre, spacing).value), detail
         spacing *= 1.25
-    return _FieldBumps(None, reason="the attitudes are too far apart: field-of-view error cannot be told from noise")
-
-
-class _Attitudes(NamedTuple):
-    """The commanded attitudes (n, 4), their axes (n, 3, 3), and the tracker's sizes."""
-
-    q_icrs_to_cam: FloatArray
-    axes: FloatArray
-    scale: Scale
-
-
-class _Family(NamedTuple):
-    """Waves (n, p) that may repeat with the place within a pixel. `phases` are those of one direction, None for local ones."""
-
-    name: str
-    columns: sparse.csr_matrix
-    phases: Phases | None
+    return None, "the attitudes are too far apart: field-of-view error cannot be told from noise"
 
 
 def _waves(
-    about: FloatArray, seen: _Attitudes, extent_px: float, bumps: Projector | None
+    about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale, extent_px: float, bumps: Projector | None
 ) -> tuple[Projector | None, Component]:
     """The waves that explain most of residuals (n, 3) beyond noise, or the reason why none can be told."""
     none = Component(NOTHING, np.zeros_like(about), 0.0)
     if extent_px < MIN_EXTENT_OF_PIXEL_PX:
         reason = f"the star field moved by {extent_px:.3g} px only: pixel error cannot be told from bias"
         return None, replace(none, reason=reason)
-    freedom = 0.0 if bumps is None else bumps.freedom
-    best_power, chosen, component = 0.0, None, none
-    phases: Phases | None = None
-    apart = 0.0 if bumps is not None else 1.0
-    for family in _families(about, seen):
-        waves, is_local = Projector(family.columns), family.phases is None
-        if bumps is not None and not is_local and not family.name.endswith(SHARP):
-            apart = max(apart, _apart(family.columns, bumps))
-        if is_local and family.columns.shape[1] > len(about) // ROWS_A_BUMP:
-            break
-        found = _component(waves, about, freedom)
-        power = _surely(found, about, freedom, SURE_OF_MANY if family.name.startswith(SOUGHT) else SURE)
-        if power > best_power:
-            best_power, chosen, component, phases = power, waves, replace(found, detail=family.name), family.phases
-        elif is_local and power < HOPELESS * best_power:
-            break
-    if apart < APART:
+    tried = [*global_phases(about, q_icrs_to_cam, scale)]
+    if bumps is not None and max(_apart(phases.columns(), bumps) for phases in tried) < APART:
         reason = "each place within a pixel was seen at one place in the field only: pixel error cannot be told from it"
         return None, replace(none, reason=reason)
-    if chosen is None:
+    freedom = 0.0 if bumps is None else bumps.freedom
+    waves, found, best = _best_of(tried, about, freedom)
+    power = _surely(found, about, freedom, 0.0)
+    for spacing in LOCAL_SPACINGS_PX:
+        columns = local_columns(q_icrs_to_cam, scale, spacing)
+        if columns.shape[1] > min(MAX_LOCAL, len(about) // ROWS_A_BUMP):
+            break
+        local = Projector(columns)
+        fit = replace(_component(local, about, freedom), detail=f"{LOCAL}, {spacing:.0f} px apart")
+        explained = _surely(fit, about, freedom, SURE)
+        if explained > power:
+            power, waves, found, best = explained, local, fit, None
+        elif explained < HOPELESS * power:
+            break
+    if waves is None:
         return None, replace(none, detail="nothing repeats with the place within a pixel")
-    return (chosen, component) if phases is None else _with_edges(chosen, component, phases, about, freedom)
+    if best is not None:  # the jumps within a pixel that the waves leave unexplained
+        base = np.asarray(waves.value.todense())
+        edges = edges_of(best, base, about)
+        if edges.shape[1]:
+            waves = Projector(sparse.csr_matrix(np.concatenate([base, edges], axis=1)))
+            found = replace(_component(waves, about, freedom), detail=f"{found.detail}, with {edges.shape[1]} {EDGES}")
+    return waves, found
 
 
-def _with_edges(
-    waves: Projector, found: Component, phases: Phases, about: FloatArray, freedom: float
-) -> tuple[Projector, Component]:
-    """The waves, with the jumps within a pixel that they leave unexplained, if there are any."""
-    base = np.asarray(waves.value.todense())
-    edges = edges_of(phases, base, about)
-    if not edges.shape[1]:
-        return waves, found
-    both = Projector(sparse.csr_matrix(np.concatenate([base, edges], axis=1)))
-    return both, replace(_component(both, about, freedom), detail=f"{found.detail}, with {edges.shape[1]} {EDGES}")
+def _best_of(tried: list[Phases], about: FloatArray, freedom: float) -> tuple[Projector | None, Component, Phases | None]:
+    """Of the waves of one direction those that explain most of residuals (n, 3) beyond noise; None where none does."""
+    power, waves, best = 0.0, None, None
+    found = Component(NOTHING, np.zeros_like(about), 0.0)
+    # With answers enough those of an error that jumps from pixel to pixel are tried as well.
+    kinds = [(HARMONICS, ""), (SHARP_HARMONICS, SHARP)][: 1 + (len(about) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP)]
+    for phases in tried:
+        for harmonics, sharp in kinds:
+            mine = Projector(sparse.csr_matrix(phases.columns(harmonics)))
+            fit = replace(_component(mine, about, freedom), detail=f"{phases.name}{sharp}")
+            explained = _surely(fit, about, freedom, SURE_OF_MANY if phases.name == SOUGHT else SURE)
+            if explained > power:
+                power, waves, found, best = explained, mine, fit, phases
+    return waves, found, best
+
+
+def _apart(columns: FloatArray, bumps: Projector) -> float:
+    """The share of the power of some waves that no bump explains."""
+    columns = columns - columns.mean(axis=0)
+    power = float((columns**2).sum())
+    return float(((columns - bumps.fit(columns)) ** 2).sum()) / power if power > 0 else 0.0
 
 
 def _surely(found: Component, about: FloatArray, other_freedom: float, sure: float) -> float:
@@ -225,39 +214,9 @@ def _surely(found: Component, about: FloatArray, other_freedom: float, sure: flo
     return excess - 2 * float(np.sqrt(chance**2 + 4 * excess))
 
 
-def _families(about: FloatArray, seen: _Attitudes) -> Iterator[_Family]:
-    """The families of waves: those of one direction, then those from place to place, ever finer."""
-    q_icrs_to_cam, axes, scale = seen
-    for each in global_phases(q_icrs_to_cam, axes, scale):
-        yield from _with_sharp(f"the phase of {each.name}", each)
-    direction = best_direction(about, axes, scale)
-    if direction is not None:
-        yield from _with_sharp(SOUGHT, phases_of(direction, axes, scale))
-    for spacing in LOCAL_SPACINGS_PX:
-        columns = local_columns(q_icrs_to_cam, scale, spacing)
-        if columns.shape[1] > MAX_LOCAL:
-            break
-        yield _Family(f"{LOCAL}, {spacing:.0f} px apart", columns, None)
-
-
-def _with_sharp(name: str, phases: Phases) -> Iterator[_Family]:
-    """The smooth waves of a phase and, if there are answers enough, those of an error that jumps from pixel to pixel."""
-    yield _Family(name, sparse.csr_matrix(phases.columns()), phases)
-    if len(phases.place_px) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP:
-        yield _Family(f"{name}{SHARP}", sparse.csr_matrix(phases.columns(SHARP_HARMONICS)), phases)
-
-
-def _apart(columns: sparse.csr_matrix, bumps: Projector) -> float:
-    """The share of the power of some waves that no bump explains."""
-    dense = np.asarray(columns.todense())
-    dense = dense - dense.mean(axis=0)
-    power = float((dense**2).sum())
-    return float(((dense - bumps.fit(dense)) ** 2).sum()) / power if power > 0 else 0.0
-
-
 @dataclass(frozen=True)
 class Phases:
-    """The place (n, 2), px, of a direction that stands for the field's place within a pixel; `name` says which direction."""
+    """The place (n, 2), px, of a direction that stands for the field's place within a pixel, and its name in words."""
 
     name: str
     place_px: FloatArray
@@ -305,30 +264,32 @@ def phases_of(direction: FloatArray, axes: FloatArray, scale: Scale, name: str =
     return Phases(name, scale.focal_px * seen[:, :2] / seen[:, 2:])
 
 
-def global_phases(q_icrs_to_cam: FloatArray, axes: FloatArray, scale: Scale) -> Iterator[Phases]:
-    """The phases tried for the whole run, of attitudes (n, 4) with axes (n, 3, 3)."""
-    mean = axes[:, 2].mean(axis=0)
-    directions = [("the mean boresight", mean / max(float(np.linalg.norm(mean)), 1e-9))]
-    directions += [("the first boresight", axes[0, 2]), ("the boresight in the middle of the run", axes[len(axes) // 2, 2])]
-    for name, direction in directions:
-        if (axes[:, 2] @ direction).min() > MIN_FORWARD:
+def global_phases(about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) -> Iterator[Phases]:
+    """The phases tried for the whole run, of attitudes (n, 4) with residuals (n, 3)."""
+    axes = to_matrix(q_icrs_to_cam)
+    boresight = axes[:, 2]
+    mean = boresight.mean(axis=0)
+    for name, direction in (
+        ("the phase of the mean boresight", mean / max(float(np.linalg.norm(mean)), 1e-9)),
+        ("the phase of the first boresight", boresight[0]),
+        ("the phase of the boresight in the middle of the run", boresight[len(boresight) // 2]),
+    ):
+        if (boresight @ direction).min() > MIN_FORWARD:
             yield phases_of(direction, axes, scale, name)
     turn = to_rotation_vector(multiply(q_icrs_to_cam, conjugate(q_icrs_to_cam[0])))
-    yield Phases("the turn from the start", scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1))
-    yield Phases("the boresight's right ascension and declination", _on_the_sky(axes, scale))
-
-
-def _on_the_sky(axes: FloatArray, scale: Scale) -> FloatArray:
-    """Right ascension times the cosine of the mean declination, and declination, px (n, 2)."""
-    boresight = axes[:, 2]
-    ra = np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0]))
-    dec = np.arcsin(np.clip(boresight[:, 2], -1, 1))
-    return scale.focal_px * np.stack([(ra - ra[0]) * np.cos(dec.mean()), dec], axis=1)
+    yield Phases("the phase of the turn from the start", scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1))
+    # Right ascension times the cosine of the mean declination, and declination.
+    ra, dec = np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0])), np.arcsin(np.clip(boresight[:, 2], -1, 1))
+    place_px = scale.focal_px * np.stack([(ra - ra[0]) * np.cos(dec.mean()), dec], axis=1)
+    yield Phases("the phase of the boresight's right ascension and declination", place_px)
+    direction = best_direction(about, axes, scale)
+    if direction is not None:
+        yield phases_of(direction, axes, scale, SOUGHT)
 
 
 def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) -> sparse.csr_matrix:
     """Each bump times the harmonics of the phase of its own direction: (n, 4 p)."""
-    axes = axes_of(q_icrs_to_cam)
+    axes = to_matrix(q_icrs_to_cam)
     place = places_of(axes, scale.focal_px, scale.roll_px)
     centre = centres_of(place, spacing_px)
     direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)

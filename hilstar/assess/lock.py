@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import BoolArray, FloatArray
 from hilstar.run.record.commanded import Commanded
 
 MISSED_CYCLES = 1.5  # a longer time between right answers is an outage
@@ -65,58 +64,37 @@ class Lock:
         return float(np.median(waits)) if waits else None
 
 
-def lock_of(commanded: Commanded, t_s: FloatArray, right: npt.NDArray[np.bool_], wrong: npt.NDArray[np.bool_]) -> Lock:
+def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: BoolArray) -> Lock:
     """The lock over rows at rising run times (n,): right answers, wrong ones, and rows without an answer."""
     cycle_s = max(float(np.median(np.diff(t_s))), 1e-6)
     cycle_s = max(cycle_s, float(t_s[-1] - t_s[0]) / MAX_CYCLES)
     due = commanded.at(np.arange(t_s[0], t_s[-1] + cycle_s / 2, cycle_s)).known
-    outages = tuple(_outages(commanded, t_s, right, wrong, cycle_s))
-    count = int(right.sum())
-    return Lock(
-        cycle_s=cycle_s,
-        due=int(due.sum()),
-        right=count,
-        availability=min(count / max(int(due.sum()), 1), 1.0),
-        outages=outages,
-        acquisitions=tuple(_acquisitions(commanded, t_s, right, outages)),
-    )
-
-
-def _outages(
-    commanded: Commanded,
-    t_s: FloatArray,
-    right: npt.NDArray[np.bool_],
-    wrong: npt.NDArray[np.bool_],
-    cycle_s: float,
-) -> list[Outage]:
-    found = []
-    good = np.flatnonzero(right)
-    for before, after in pairwise(good.tolist()):
+    outages = []
+    for before, after in pairwise(np.flatnonzero(right).tolist()):
         gap_s = float(t_s[after] - t_s[before])
         if gap_s <= MISSED_CYCLES * cycle_s:
             continue
         inner = np.arange(t_s[before] + cycle_s, t_s[after] - cycle_s / 2, cycle_s)
         if len(inner) and commanded.at(inner).known.mean() > 0.5:
-            between = slice(before + 1, after)
-            length_s = gap_s - cycle_s
+            length_s, rows = gap_s - cycle_s, after - before - 1
             lost = length_s > LOST_CYCLES * cycle_s
-            found.append(Outage(float(inner[0]), length_s, lost, int(after - before - 1), int(wrong[between].sum())))
-    return found
-
-
-def _acquisitions(
-    commanded: Commanded, t_s: FloatArray, right: npt.NDArray[np.bool_], outages: tuple[Outage, ...]
-) -> list[Acquisition]:
-    """After each appearance of the sky during the telemetry, and after each loss of the lock."""
+            outages.append(Outage(float(inner[0]), length_s, lost, rows, int(wrong[before + 1 : after].sum())))
+    # After each appearance of the sky during the telemetry, and after each loss of the lock.
+    acquisitions = []
     shown = np.flatnonzero(np.diff(np.r_[False, commanded.joined].astype(int)) == 1)
     ends = np.flatnonzero(np.diff(np.r_[commanded.joined, False].astype(int)) == -1) + 1
     answers = t_s[right]
-    found = []
     for first, last in zip(commanded.t_s[shown], commanded.t_s[ends], strict=True):
-        if last <= t_s[0] or first >= t_s[-1]:
-            continue
-        first = max(first, t_s[0])  # what the tracker did before its first row is unknown
-        inside = answers[(answers >= first) & (answers <= last)]
-        found.append(Acquisition(float(first), float(inside[0] - first) if len(inside) else None))
-    found += [Acquisition(each.start_s, each.length_s) for each in outages if each.lost]
-    return sorted(found, key=lambda each: each.start_s)
+        if last > t_s[0] and first < t_s[-1]:
+            first = max(first, t_s[0])  # what the tracker did before its first row is unknown
+            inside = answers[(answers >= first) & (answers <= last)]
+            acquisitions.append(Acquisition(float(first), float(inside[0] - first) if len(inside) else None))
+    acquisitions += [Acquisition(each.start_s, each.length_s) for each in outages if each.lost]
+    return Lock(
+        cycle_s=cycle_s,
+        due=int(due.sum()),
+        right=int(right.sum()),
+        availability=min(int(right.sum()) / max(int(due.sum()), 1), 1.0),
+        outages=tuple(outages),
+        acquisitions=tuple(sorted(acquisitions, key=lambda each: each.start_s)),
+    )

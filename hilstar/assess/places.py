@@ -44,17 +44,6 @@ class Scale:
         return ARCSEC_PER_RAD / self.focal_px
 
 
-def axes_of(q_icrs_to_cam: FloatArray) -> FloatArray:
-    """The rotation matrices (n, 3, 3) of attitudes (n, 4): their rows are the camera's axes in ICRS."""
-    w, x, y, z = np.moveaxis(q_icrs_to_cam, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def places_of(axes: FloatArray, focal_px: float, roll_px: float) -> FloatArray:
     """The places (n, 6), px, of attitudes with axes (n, 3, 3)."""
     return np.concatenate([focal_px * axes[:, 2], roll_px * axes[:, 0]], axis=1)

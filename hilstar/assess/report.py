@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from collections.abc import Iterator
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,13 +12,14 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.assess.assessment import Assessment
 from hilstar.assess.bench_effects import Slice
-from hilstar.assess.budget import Axes
-from hilstar.assess.places import axes_of
+from hilstar.assess.budget import Axes, Decomposed
 from hilstar.charts import BLUE, INK, MUTED, label_ends, panels_of, svg, write_csv
 from hilstar.files import write_whole
 from hilstar.html_pages import escaped, page_of, picture_of, table_of
+from hilstar.rotation import to_matrix
 
 COUNT = "1"  # the unit of counts and shares in the tables
+PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
 MAX_NAMED = 10
 MAX_POINTS = 4000
 MAX_ROWS = 200
@@ -57,21 +58,23 @@ class FigureRow(NamedTuple):
     high_95: float | None = None
 
 
-def rows_of(found: Assessment) -> Iterator[FigureRow]:
-    """The rows of budget.csv."""
-    parts, intervals = found.found, found.found.intervals
+def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRow]:
+    """The rows of bias, field-of-view error, pixel error and noise; without values where there are no parts."""
     for k, axis in enumerate("xyz"):
-        yield FigureRow("bias", axis, float(parts.bias_arcsec[k]), "arcsec", *intervals.bias[:, k].tolist())
-    for name, axes, interval in (
-        ("field-of-view error", parts.fov_arcsec, intervals.fov),
-        ("pixel error", parts.pixel_arcsec, intervals.pixel),
-        ("noise", found.noise_arcsec, intervals.noise),
-    ):
+        value = None if parts is None else float(parts.bias_arcsec[k])
+        yield FigureRow("bias", axis, value, "arcsec", *([] if parts is None else parts.intervals.bias[:, k].tolist()))
+    for part, name in PARTS.items():
+        axes = noise_arcsec if part == "noise" or parts is None else getattr(parts, f"{part}_arcsec")
         for k, axis in enumerate(("cross", "roll")):
             value = getattr(axes, axis)
-            low, high = interval[:, k].tolist() if value is not None else (None, None)
-            yield FigureRow(name, axis, value, "arcsec", low, high)
-    clock = parts.clock
+            ends = [] if parts is None or value is None else getattr(parts.intervals, part)[:, k].tolist()
+            yield FigureRow(name, axis, value, "arcsec", *ends)
+
+
+def rows_of(found: Assessment) -> Iterator[FigureRow]:
+    """The rows of budget.csv."""
+    yield from part_rows(found.found, found.noise_arcsec)
+    clock = found.found.clock
     for name, value, sigma, unit, told in (
         ("clock offset", 1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms", clock.offset_told),
         ("clock drift", 1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm", clock.drift_told),
@@ -94,11 +97,9 @@ def rows_of(found: Assessment) -> Iterator[FigureRow]:
 def write_tables(directory: Path, found: Assessment) -> None:
     """Write budget.csv, slices.csv, wrong.csv and outages.csv. Raises InputError."""
     write_csv(directory / "budget.csv", FigureRow._fields, [_plain(row) for row in rows_of(found)])
-    names = [field.name for field in fields(Slice)]
     slices = [("rate_deg_s", each) for each in found.by_rate] + [("field_v_mag", each) for each in found.by_magnitude]
-    write_csv(
-        directory / "slices.csv", ["by", *names], [_plain((by, *(getattr(each, n) for n in names))) for by, each in slices]
-    )
+    names = ["by", *(field.name for field in fields(Slice))]
+    write_csv(directory / "slices.csv", names, [_plain((by, *astuple(each))) for by, each in slices])
     write_csv(
         directory / "wrong.csv",
         ("row", "t_s", "run_s", "off_deg"),
@@ -117,41 +118,31 @@ def _plain(row: tuple[object, ...]) -> list[object]:
 
 def lines_of(found: Assessment) -> list[tuple[str, str]]:
     """The lines of the assessment on the terminal: name and text."""
-    parts, lock = found.found, found.lock
+    parts, lock, clock, display = found.found, found.lock, found.found.clock, found.display
     x, y, z = parts.bias_arcsec.tolist()
     named = ", ".join(str(each.row) for each in found.wrong[:MAX_NAMED]) + (", ..." if len(found.wrong) > MAX_NAMED else "")
     where = "on lines" if found.telemetry.of_lines else "attitudes"
-    share = lock.acquisition_probability
+    offset = f"{1e3 * found.offset_s:.3f} +- {1e3 * clock.sigma_offset_s:.2g} ms" if clock.offset_told else "unknown"
+    drift = f"{1e6 * clock.drift:.2f} +- {1e6 * clock.sigma_drift:.2g} ppm"
+    share, wait_s = lock.acquisition_probability, lock.acquisition_s
+    wait = "-" if wait_s is None else f"{wait_s:.3g}"
+    own = "not looked at"
+    if display is not None:
+        own = f"{display.cross_arcsec:.2g} arcsec across, {display.roll_arcsec:.2g} about the boresight,"
+        own += f" at {display.attitudes} attitudes; {display.seen:.2f} +- {display.sigma_seen:.2f} of it in the answers"
     return [
         ("answers", f"{len(parts.row)} right of {int(found.telemetry.valid.sum())} valid and {len(found.telemetry.t_ns)} rows"),
         ("bias", f"x {x:.2f}, y {y:.2f}, about the boresight {z:.2f} arcsec"),
         ("field-of-view error", _text(parts.fov_arcsec, parts.intervals.fov)),
         ("pixel error", _text(parts.pixel_arcsec, parts.intervals.pixel)),
         ("noise", _text(found.noise_arcsec, parts.intervals.noise)),
-        ("clock", clock_text(found)),
+        ("clock", f"offset {offset}, fast by {drift}" if clock.drift_told else "cannot be told: the run does not turn enough"),
         ("availability", f"{100 * lock.availability:.2f} % of {lock.due} answers due, one each {1e3 * lock.cycle_s:.4g} ms"),
         ("lock lost", f"{len(lock.lost)} times"),
-        ("acquisition", "-" if share is None else f"{100 * share:.0f} %, median {_number(lock.acquisition_s)} s"),
+        ("acquisition", "-" if share is None else f"{100 * share:.0f} %, median {wait} s"),
         ("wrong", f"{len(found.wrong)}, {where} {named}" if found.wrong else "none"),
-        ("display's own error", _display_text(found)),
+        ("display's own error", own),
     ]
-
-
-def clock_text(found: Assessment) -> str:
-    """The clock in words."""
-    clock = found.found.clock
-    if not clock.drift_told:
-        return "cannot be told: the run does not turn enough"
-    offset = f"{1e3 * found.offset_s:.3f} +- {1e3 * clock.sigma_offset_s:.2g} ms" if clock.offset_told else "unknown"
-    return f"offset {offset}, fast by {1e6 * clock.drift:.2f} +- {1e6 * clock.sigma_drift:.2g} ppm"
-
-
-def _display_text(found: Assessment) -> str:
-    display = found.display
-    if display is None:
-        return "not looked at"
-    size = f"{display.cross_arcsec:.2g} arcsec across, {display.roll_arcsec:.2g} about the boresight"
-    return f"{size}, at {display.attitudes} attitudes; {display.seen:.2f} +- {display.sigma_seen:.2f} of it in the answers"
 
 
 def _text(axes: Axes, interval: FloatArray) -> str:
@@ -162,45 +153,33 @@ def _text(axes: Axes, interval: FloatArray) -> str:
     return f"{cross} across, {axes.roll:.3g} ({roll_low:.3g} to {roll_high:.3g}) arcsec about the boresight"
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
 def write_page(path: Path, found: Assessment) -> None:
     """Write the page of an assessment as one file that needs no other. Raises InputError."""
-    title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
-    notes = (f'<p class="note">{escaped(note)}</p>' for note in found.notes)
-    write_whole(path, page_of(title, [*notes, *_sections(found)]))
-
-
-def _sections(found: Assessment) -> Iterator[str]:
-    yield table_of(lines_of(found), ("", ""))
-    yield "<h2>Budget</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>"
-    rows: list[tuple[object, ...]] = [(*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)]
-    yield table_of(rows, ("quantity", "axis", "value", "unit", "low", "high"))
-    yield "<h2>Errors over the run</h2>" + _over_time(found)
-    yield "<h2>What repeats with the place in the field</h2>" + _field_map(found)
-    detail = found.found.components.pixel.detail or found.found.components.pixel.reason
-    yield f"<p>Pixel error: {escaped(detail)}.</p>"
-    yield "<h2>Noise</h2>" + _histogram(found)
+    budget: list[tuple[object, ...]] = [(*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)]
+    pixel = found.found.components.pixel
+    body = [
+        *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
+        table_of(lines_of(found), ("", "")),
+        "<h2>Budget</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>",
+        table_of(budget, ("quantity", "axis", "value", "unit", "low", "high")),
+        "<h2>Errors over the run</h2>" + _over_time(found),
+        "<h2>What repeats with the place in the field</h2>" + _field_map(found),
+        f"<p>Pixel error: {escaped(pixel.detail or pixel.reason)}.</p>",
+        "<h2>Noise</h2>" + _histogram(found),
+    ]
     for name, unit, slices in (("rate", "deg/s", found.by_rate), ("magnitude of the field", "V mag", found.by_magnitude)):
+        header = (f"from, {unit}", "to", "answers", "noise across", "noise about", "error across, rms", "error about, rms")
         if slices:
-            yield f"<h2>By {name}</h2>" + _slices(unit, slices)
+            table = table_of([astuple(each) for each in slices], header)
+            body.append(f"<h2>By {name}</h2>{table}<p>Arcsec; the error's rms is about the bias.</p>")
     if found.wrong:
-        rows = [(each.row, each.t_s, each.run_s, each.off_deg) for each in found.wrong[:MAX_ROWS]]
-        yield "<h2>Wrong answers</h2>" + table_of(rows, ("row", "t_s", "run s", "off by, deg"))
+        wrong = table_of([astuple(each) for each in found.wrong[:MAX_ROWS]], ("row", "t_s", "run s", "off by, deg"))
+        body.append("<h2>Wrong answers</h2>" + wrong)
     if found.lock.outages:
         outages = [(o.start_s, o.length_s, "yes" if o.lost else "", o.rows, o.wrong) for o in found.lock.outages[:MAX_ROWS]]
-        yield "<h2>Outages</h2>" + table_of(outages, ("run s", "length, s", "lock lost", "rows", "wrong"))
-
-
-def _slices(unit: str, slices: Sequence[Slice]) -> str:
-    header = (f"from, {unit}", "to", "answers", "noise across", "noise about", "error across, rms", "error about, rms")
-    rows = [
-        (s.low, s.high, s.answers, s.noise_cross_arcsec, s.noise_roll_arcsec, s.rms_cross_arcsec, s.rms_roll_arcsec)
-        for s in slices
-    ]
-    return table_of(rows, header) + "<p>Arcsec; the error's rms is about the bias.</p>"
+        body.append("<h2>Outages</h2>" + table_of(outages, ("run s", "length, s", "lock lost", "rows", "wrong")))
+    title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
+    write_whole(path, page_of(title, body))
 
 
 def _image(figure: Any, alt: str) -> str:
@@ -234,7 +213,7 @@ def _over_time(found: Assessment) -> str:
 
 def _field_map(found: Assessment) -> str:
     parts, scale = found.found.components, found.run.scale
-    axes = axes_of(found.found.commanded_q)
+    axes = to_matrix(found.found.commanded_q)
     some = np.unique(np.linspace(0, len(axes) - 1, MAX_POINTS).astype(int))
     mean = axes[:, 2].mean(axis=0)
     size = float(np.linalg.norm(mean))

@@ -1,4 +1,4 @@
-"""A case: from its number and its point in the design to its attitude and bench file, and from its answers to its row."""
+"""A case: its attitude and bench file, from its number and its point in the design; and its row, from its answers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
@@ -19,7 +18,7 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.bench.bench_file import BenchFile, dated
-from hilstar.bench.scenario import Scenario, read_scenario
+from hilstar.bench.scenario import read_scenario
 from hilstar.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
 from hilstar.campaign.solvers import Answer, CentroidErrors
 from hilstar.campaign.store import Row
@@ -42,7 +41,7 @@ from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
-SEED_BITS = 63  # what a FITS header, a Parquet column of int64 and `simulate --seed` hold
+SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
 Kind = Literal["int64", "float64", "bool", "text"]
 
 DONE, FAILED = "done", "failed"
@@ -66,10 +65,6 @@ CENTROIDS = (
 )
 
 
-def _kinds(names: tuple[str, ...]) -> dict[str, Kind]:
-    return {name: "text" if name in TEXTS else "int64" if name in WHOLE else "float64" for name in names}
-
-
 @dataclass(frozen=True, slots=True)
 class Case:
     """A case before its bench is made: its values by key, the seed of its noise, and the view of its first exposure."""
@@ -88,7 +83,7 @@ class _Log:
 
 
 class CaseMaker:
-    """Makes the cases of a plan, whose relative paths start in `folder`. Raises InputError for what the plan has wrong."""
+    """Makes the cases of a plan, whose relative paths start in `folder`. Raises InputError for a fault of the plan."""
 
     def __init__(self, plan: Plan, file: BenchFile, folder: Path) -> None:
         self.plan, self.file = plan, file
@@ -97,7 +92,8 @@ class CaseMaker:
         if self._log is not None:
             self.file = dated(file, self._log.scale, self._log.span_ns[0])
         self.parameters: list[Parameter] = parameters(plan, file)
-        self._scenarios = _read_scenarios(self.parameters, folder)
+        named = [str(name) for parameter in self.parameters if parameter.key == SCENARIO for name in parameter.values if name]
+        self._scenarios = {name: read_scenario(folder / name) for name in named}
         _check_through(plan, self.parameters, file)
 
     @property
@@ -130,7 +126,7 @@ class CaseMaker:
         if self._log is not None and first.t_ns is not None:
             t_ns = min(first.t_ns + step_ns, self._log.span_ns[1])
             along = view_at(self._log.timeline, self._log.span_ns, t_ns, exposure_s)
-            if not _has_rate(case.values):
+            if not any(key.startswith("rate_deg_s.") for key in case.values):
                 return along
             return View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
         q = propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S) if step_ns else first.q_icrs_to_cam
@@ -145,21 +141,17 @@ class CaseMaker:
         return faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - begin_ns)
 
     def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> View:
-        rate_rad_s = self._rate_rad_s(number, values)
+        rate_rad_s = np.radians([float(values.get(f"rate_deg_s.{axis}", 0.0)) for axis in "xyz"])
+        across = math.radians(float(values.get("rate_deg_s.across", 0.0)))
+        if across:
+            angle_rad = np.random.default_rng((self.plan.seed, number, AXIS_STREAM)).uniform(0.0, 2 * math.pi)
+            rate_rad_s += across * np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
         if self._log is not None:
             begin_ns, end_ns = self._log.span_ns
             t_ns = begin_ns + round(float(look[0]) * (end_ns - begin_ns))
             return View.exposure(view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0).q_icrs_to_cam, rate_rad_s, 0.0, t_ns)
         t_ns = round(float(values.get("time_s", 0.0)) * NS_PER_S)
         return View.exposure(looking_q(self.plan.attitudes, look), rate_rad_s, 0.0, t_ns)
-
-    def _rate_rad_s(self, number: int, values: dict[str, Any]) -> FloatArray:
-        rate = np.radians([float(values.get(f"rate_deg_s.{axis}", 0.0)) for axis in "xyz"])
-        across = math.radians(float(values.get("rate_deg_s.across", 0.0)))
-        if across:
-            angle_rad = np.random.default_rng((self.plan.seed, number, AXIS_STREAM)).uniform(0.0, 2 * math.pi)
-            rate += across * np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
-        return rate
 
 
 def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
@@ -176,16 +168,6 @@ def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
     middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
     x, y, z = math.cos(off) * middle + math.sin(off) * (math.sin(angle) * east + math.cos(angle) * north)
     return from_radec_roll_deg(math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))), roll_deg)
-
-
-def _read_scenarios(varied: list[Parameter], folder: Path) -> dict[str, Scenario]:
-    """The scenarios that a plan names, by their names. Raises InputError."""
-    names = [str(name) for parameter in varied if parameter.key == SCENARIO for name in parameter.values if name]
-    return {name: read_scenario(folder / name) for name in names}
-
-
-def _has_rate(values: dict[str, Any]) -> bool:
-    return any(key.startswith("rate_deg_s.") for key in values)
 
 
 def _read_log(path: Path, file: BenchFile) -> _Log:
@@ -230,7 +212,10 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
 def columns(parameters: list[Parameter], with_centroids: bool) -> dict[str, Kind]:
     """The columns of a campaign's rows, in their order."""
     varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
-    return _kinds(BEFORE) | varied | _kinds(AFTER) | (_kinds(CENTROIDS) if with_centroids else {})
+    found: dict[str, Kind] = {}
+    for name in (*BEFORE, *varied, *AFTER, *(CENTROIDS if with_centroids else ())):
+        found[name] = varied.get(name) or ("text" if name in TEXTS else "int64" if name in WHOLE else "float64")
+    return found
 
 
 def value_kind(parameter: Parameter) -> Kind:
@@ -308,9 +293,8 @@ class CaseTally:
             row |= dict(zip((f"solved_{name}" for name in Q), self.first_q.tolist(), strict=True))
         if self.errors_arcsec:
             errors = np.array(self.errors_arcsec)
-            row |= _by_axis("error", errors.mean(axis=0))
-            if len(errors) > 1:
-                row |= _by_axis("scatter", errors.std(axis=0, ddof=1))
+            spreads = {"error": errors.mean(axis=0)} | ({"scatter": errors.std(axis=0, ddof=1)} if len(errors) > 1 else {})
+            row |= {f"{what}_{axis}_arcsec": float(s[k]) for what, s in spreads.items() for k, axis in enumerate(AXES)}
         return row | self._centroids() if self.with_centroids and self.star_errors else row
 
     def _centroids(self) -> Row:
@@ -326,10 +310,6 @@ class CaseTally:
         if len(dx_px) > 1:
             row |= {"centroid_sigma_x_px": float(dx_px.std(ddof=1)), "centroid_sigma_y_px": float(dy_px.std(ddof=1))}
         return row
-
-
-def _by_axis(name: str, arcsec: npt.NDArray[np.float64]) -> Row:
-    return {f"{name}_{axis}_arcsec": float(value) for axis, value in zip(AXES, arcsec, strict=True)}
 
 
 def attitude_error_arcsec(q_commanded: FloatArray, q_reported: FloatArray) -> FloatArray:

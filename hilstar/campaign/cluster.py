@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.wire.endpoint import Endpoint, check_use, parse_endpoint
+from hilstar.attitude.wire.endpoint import check_use, parse_endpoint
 from hilstar.campaign.pool import Backlog, Done, Lost, Task
 from hilstar.campaign.session import Answered, Identity, Job, Session, difference
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
@@ -72,43 +72,30 @@ class Scheduler:
     tls_cert: Path | None = None
     tls_key: Path | None = None
 
-    @property
-    def given(self) -> bool:
-        """Whether a TLS file is named."""
-        return any((self.tls_ca_file, self.tls_cert, self.tls_key))
+    def check(self) -> str:
+        """The address, with `localhost` as a number: a name could be resolved to anything.
 
-    def check(self) -> None:
-        """Refuse (InputError) what is no address, an address off loopback without TLS, and incomplete TLS.
-
-        A scheduler runs whatever it is sent: anyone who reaches it without a certificate runs code on every worker.
+        Raises InputError for text that is no address, an address off loopback without TLS, and incomplete TLS. A scheduler
+        runs all code that it is sent: without certificates, anyone who reaches it runs code on every worker.
         """
-        named, protocol = f"--scheduler {self.address}", self.address.partition("://")[0]
+        named, (protocol, _, host) = f"--scheduler {self.address}", self.address.partition("://")
         if protocol not in PROTOCOLS:
             raise InputError(f"{named}: write tcp://HOST:PORT, as `dask scheduler` says it")
-        endpoint = self._endpoint()
-        if protocol == "tls":
-            missing = [name for name in ("tls_ca_file", "tls_cert") if getattr(self, name) is None]
-            if self.given and missing:
-                raise InputError(f"{named}: --{missing[0].replace('_', '-')} is missing; {GIVE_TLS}")
-        elif self.given:
-            raise InputError(f"{named}: {protocol} is not encrypted, and --tls-* would do nothing; write tls://HOST:PORT")
-        elif not endpoint.loopback:
-            raise InputError(f"{named}: non-loopback endpoints require TLS; {GIVE_TLS}, or use tcp://127.0.0.1:PORT")
-
-    def _endpoint(self) -> Endpoint:
-        host = self.address.partition("://")[2]
         try:
             endpoint = parse_endpoint(f"tcp://{host}")
             check_use(endpoint, f"tcp://{host}", bind=False)
         except InputError as error:
-            raise InputError(f"--scheduler {self.address}: {str(error).partition(': ')[2]}") from error
-        return endpoint
-
-    @property
-    def checked_address(self) -> str:
-        """The address with `localhost` as a number: a name could be resolved to anything."""
-        protocol = self.address.partition("://")[0]
-        return f"{protocol}://{self._endpoint().address.removeprefix('tcp://')}"
+            raise InputError(f"{named}: {str(error).partition(': ')[2]}") from error
+        files = self.tls_ca_file, self.tls_cert, self.tls_key
+        if protocol == "tls":
+            missing = [name for name in ("tls_ca_file", "tls_cert") if getattr(self, name) is None]
+            if any(files) and missing:
+                raise InputError(f"{named}: --{missing[0].replace('_', '-')} is missing; {GIVE_TLS}")
+        elif any(files):
+            raise InputError(f"{named}: {protocol} is not encrypted, and --tls-* would do nothing; write tls://HOST:PORT")
+        elif not endpoint.loopback:
+            raise InputError(f"{named}: non-loopback endpoints require TLS; {GIVE_TLS}, or use tcp://127.0.0.1:PORT")
+        return f"{protocol}://{endpoint.address.removeprefix('tcp://')}"
 
     def security(self) -> Any:
         """Dask's security object. Raises InputError for files that are no certificates, and for tls:// without any."""
@@ -142,8 +129,8 @@ class _Worker:
 class Cluster:
     """The workers of a scheduler. Use it as a context manager.
 
-    A worker of another version, bench or renderer is refused with a line through `say` and gets no case. Raises InputError for
-    what `Scheduler.check` refuses, and MachineError where no scheduler answers.
+    A worker of another version, bench or renderer is refused with a line through `say` and gets no case. Raises InputError as
+    `Scheduler.check` does, and MachineError where no scheduler answers.
     """
 
     task_s = TASK_S
@@ -153,8 +140,7 @@ class Cluster:
             import distributed
         except ImportError as error:
             raise MachineError(f"--scheduler needs Dask's distributed; {INSTALL}") from error
-        scheduler.check()
-        address = scheduler.checked_address
+        address = scheduler.check()
         self._address, self._job, self._identity, self._say = address, job, identity, say
         self._workers: dict[str, _Worker] = {}
         self._examined: dict[Any, str] = {}
@@ -175,25 +161,20 @@ class Cluster:
             else:
                 why = f"nothing answers there; start one: dask scheduler {self._dask_words()}"
             raise MachineError(f"--scheduler {address}: {why}") from error
-        self._say_where_it_listens()
+        listens: str = self._client.scheduler_info()["address"]
+        if not listens.startswith("tls://"):  # reached over loopback, and open to the network as well?
+            with contextlib.suppress(InputError):
+                if not parse_endpoint(f"tcp://{listens.partition('://')[2]}").loopback:
+                    self._say(
+                        f"hilstar: the scheduler listens at {listens} without TLS: who reaches that runs code on its workers;"
+                        f" start it with {self._dask_words()}"
+                    )
 
     def _dask_words(self) -> str:
         """The options with which a scheduler or worker for this address is started."""
         if self._address.startswith("tls://"):
             return "--tls-ca-file CA.pem --tls-cert CERT.pem --tls-key KEY.pem"
         return "--host 127.0.0.1"
-
-    def _say_where_it_listens(self) -> None:
-        """Warn of a scheduler without TLS that is reached over loopback but listens to the network as well."""
-        address: str = self._client.scheduler_info()["address"]
-        if address.startswith("tls://"):
-            return
-        with contextlib.suppress(InputError):
-            if not parse_endpoint(f"tcp://{address.partition('://')[2]}").loopback:
-                self._say(
-                    f"hilstar: the scheduler listens at {address} without TLS: who reaches that runs code on its workers;"
-                    f" start it with {self._dask_words()}"
-                )
 
     def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
         """Run all cases (see `Pool.run`). Raises MachineError where the scheduler, or every worker, is gone for too long."""

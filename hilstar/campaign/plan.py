@@ -48,21 +48,13 @@ Roll = Annotated[float, Meta(ge=-360, le=720)]
 # Keys of a case that are not in its bench file. Rates are those of cam with respect to icrs, in cam components; `across` is
 # about an axis in the image plane that each case draws. `misalignment_arcsec` turns the display's true mounting, cam axes.
 OWN_KEYS = (
-    "rate_deg_s.x",
-    "rate_deg_s.y",
-    "rate_deg_s.z",
-    "rate_deg_s.across",
-    "misalignment_arcsec.x",
-    "misalignment_arcsec.y",
-    "misalignment_arcsec.z",
-    "time_s",
-    "noise_seed",
-    "scenario",
+    *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
+    *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
+    *("time_s", "noise_seed", "scenario"),
 )
 MAX_OWN = {"rate_deg_s": 360.0, "misalignment_arcsec": 36_000.0, "time_s": 9e9, "noise_seed": 2.0**63 - 1}
 WHOLE = ("noise_seed",)
 SCENARIO = "scenario"  # the path of a file of faults; empty for none
-Value = float | int | bool | str
 ATTITUDE_STREAM = 1  # stream of a case's seed for the attitudes of a grid
 SOBOL_BITS = 30
 MAX_HYPERCUBE_VALUES = 200_000_000  # 1.6 GB: a Latin hypercube is made as a whole
@@ -120,7 +112,7 @@ KIND = Kind(Plan, "docs/campaign.md", TYPE_WORDS)
 
 
 def read_plan(path: Path) -> Plan:
-    """Read and check a plan. Raises InputError: file, key, what is wrong and what to write."""
+    """Read and check a plan. Raises InputError with file, key, fault and remedy."""
     return parse_plan(path, read_text(path, "give the path of a plan", MAX_TOML_BYTES))
 
 
@@ -136,7 +128,13 @@ def parse_plan(path: Path, text: str) -> Plan:
         raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
     try:
         _check_attitudes(plan.attitudes)
-        _check_varied(plan)
+        keys = [varied.key for varied in plan.vary]
+        for varied in plan.vary:
+            if keys.count(varied.key) > 1:
+                raise InputError(f'[[vary]] key = "{varied.key}" stands there twice; leave one of them out')
+            _check_range(varied, plan.sampling)
+        if plan.cases is None and plan.sampling != "grid":
+            raise InputError(f'sampling = "{plan.sampling}" needs the number of cases; add cases = 1000')
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return plan
@@ -161,17 +159,6 @@ def _check_attitudes(attitudes: Attitudes) -> None:
         )
     if attitudes.kind != "log" and attitudes.log is not None:
         raise InputError(f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or leave it out')
-
-
-def _check_varied(plan: Plan) -> None:
-    keys = [varied.key for varied in plan.vary]
-    twice = next((key for key in keys if keys.count(key) > 1), None)
-    if twice is not None:
-        raise InputError(f'[[vary]] key = "{twice}" stands there twice; leave one of them out')
-    for varied in plan.vary:
-        _check_range(varied, plan.sampling)
-    if plan.cases is None and plan.sampling != "grid":
-        raise InputError(f'sampling = "{plan.sampling}" needs the number of cases; add cases = 1000')
 
 
 def _check_range(varied: Varied, sampling: Sampling) -> None:
@@ -214,14 +201,9 @@ class Parameter:
         value = min(max(math.exp(value), self.minimum), self.maximum) if self.log else value
         return round(value) if self.whole else value
 
-    @property
-    def own(self) -> bool:
-        """Whether it is one of the case's own keys, not one of the bench file."""
-        return self.key in OWN_KEYS
-
 
 def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
-    """The plan's parameters, each tried alone in the bench file at its ends. Raises InputError for what the file refuses."""
+    """The plan's parameters, each tried alone in the bench file at its ends. Raises InputError as the file does."""
     tables = parse_toml(file.path, file.text)
     found = []
     for varied in plan.vary:
@@ -253,44 +235,35 @@ def changed_bench(file: BenchFile, tables: dict[str, Any], values: dict[str, Any
 
 
 def _parameter(varied: Varied, file: BenchFile) -> Parameter:
-    whole = varied.key in WHOLE or (varied.values is None and _is_whole(varied.key, file.config))
     if varied.values is not None:
         return Parameter(varied.key, tuple(varied.values))
     if varied.minimum is None or varied.maximum is None:
         raise AssertionError("the plan has been checked")
-    if varied.steps is None:
-        return Parameter(varied.key, (), varied.minimum, varied.maximum, varied.scale == "log", whole)
+    now = _now(varied.key.split("."), file.config)
+    now = now[0] if isinstance(now, tuple) and now else now
+    whole = varied.key in WHOLE or (isinstance(now, int) and not isinstance(now, bool))
     ends = Parameter(varied.key, (), varied.minimum, varied.maximum, varied.scale == "log", whole)
+    if varied.steps is None:
+        return ends
     return Parameter(varied.key, tuple(ends.value(step / max(1, varied.steps - 1)) for step in range(varied.steps)))
 
 
 def _check_value(parameter: Parameter, value: Any, file: BenchFile, tables: dict[str, Any]) -> None:
-    if not parameter.own:
+    if parameter.key not in OWN_KEYS:
         changed_bench(file, tables, {parameter.key: value})
         return
     if parameter.key == SCENARIO:
         if not isinstance(value, str):
             raise InputError(f'the value {shortened(value)}; write paths of scenario files, and "" for none')
         return
-    largest = MAX_OWN[parameter.key.split(".")[0]]
-    low = 0 if parameter.key in WHOLE else -largest
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int if parameter.key in WHOLE else int | float)
-        or not low <= value <= largest
-    ):
+    whole, largest = parameter.key in WHOLE, MAX_OWN[parameter.key.split(".")[0]]
+    low = 0 if whole else -largest
+    if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not low <= value <= largest:
         raise InputError(f"the value {shortened(value)}; write a number from {low:g} to {largest:g}")
 
 
-def _is_whole(key: str, config: Any) -> bool:
-    value = _now(key.split("."), config)
-    if isinstance(value, tuple) and value:
-        value = value[0]
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
 def _now(names: list[str], config: Any) -> Any:
-    """The bench file's value at dotted `names`, defaults included; None where it has none."""
+    """The bench file's value at dotted `names`, defaults included; None for an unknown one."""
     for name in names:
         if isinstance(config, tuple):
             config = config[int(name)] if name.isdigit() and int(name) < len(config) else None
@@ -302,7 +275,7 @@ def _now(names: list[str], config: Any) -> Any:
 
 
 def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> None:
-    """Set the key of dotted `names`. A single number for a key of several, such as a sigma along x and y, goes to each."""
+    """Set the key of dotted `names`. One number for a key of several (sigma along x and y) sets each of them."""
     table: Any = tables
     for name in names[:-1]:
         inside = table.get(name) if isinstance(table, dict) else None
@@ -352,25 +325,21 @@ class Design:
         if self._cube is not None:
             return self._cube[begin:end]
         if self.sampling == "sobol":
-            return self._sobol(begin, end)
-        return np.array([self._grid_point(case) for case in range(begin, end)]).reshape(end - begin, self.dimensions)
+            from scipy.stats import qmc
 
-    def _sobol(self, begin: int, end: int) -> FloatArray:
-        from scipy.stats import qmc
-
-        if self._engine is None or self._engine.num_generated > begin:
-            rng = np.random.default_rng(self.seed)
-            self._engine = qmc.Sobol(self.dimensions, scramble=True, bits=SOBOL_BITS, rng=rng)
-        if begin > self._engine.num_generated:
-            self._engine.fast_forward(begin - self._engine.num_generated)
-        with warnings.catch_warnings():  # that the number of points is no power of two: the plan decides it
-            warnings.simplefilter("ignore", UserWarning)
-            return np.asarray(self._engine.random(end - begin))
-
-    def _grid_point(self, case: int) -> FloatArray:
-        place, rest = [], case % max(1, math.prod(self.levels))
-        for count in reversed(self.levels):
-            place.append((rest % count + 0.5) / count)
-            rest //= count
-        rng = np.random.default_rng((self.seed, case, ATTITUDE_STREAM))
-        return np.concatenate([rng.random(self.attitude_dimensions), place[::-1]])
+            if self._engine is None or self._engine.num_generated > begin:
+                rng = np.random.default_rng(self.seed)
+                self._engine = qmc.Sobol(self.dimensions, scramble=True, bits=SOBOL_BITS, rng=rng)
+            if begin > self._engine.num_generated:
+                self._engine.fast_forward(begin - self._engine.num_generated)
+            with warnings.catch_warnings():  # that the number of points is no power of two: the plan decides it
+                warnings.simplefilter("ignore", UserWarning)
+                return np.asarray(self._engine.random(end - begin))
+        points = np.empty((end - begin, self.dimensions))
+        for row, case in zip(points, range(begin, end), strict=True):
+            row[: self.attitude_dimensions] = np.random.default_rng((self.seed, case, ATTITUDE_STREAM)).random(
+                self.attitude_dimensions
+            )
+            place = np.unravel_index(case % math.prod(self.levels), self.levels) if self.levels else ()
+            row[self.attitude_dimensions :] = (np.array(place) + 0.5) / self.levels
+        return points

@@ -1,4 +1,4 @@
-"""The backlog of cases that are still to be run, and the pool of processes that runs them on this machine."""
+"""The backlog of missing cases, and the pool of processes that runs them on this machine."""
 
 from __future__ import annotations
 

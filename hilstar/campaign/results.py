@@ -24,9 +24,9 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.assess.budget import Axes, Decomposed, assess_cases
+from hilstar.assess.budget import Axes, Decomposed, assess_cases, axes_of_variance
 from hilstar.assess.places import Scale
-from hilstar.assess.report import FigureRow
+from hilstar.assess.report import PARTS, FigureRow, part_rows
 from hilstar.bench.config import BenchConfig
 from hilstar.campaign.store import failures, file_sha256
 from hilstar.charts import INK, MUTED, chart, write_csv
@@ -36,12 +36,17 @@ from hilstar.units import ARCSEC_PER_RAD
 
 MAX_READ_CASES = 50_000  # cases read for the figures, spread evenly over a larger table
 VARY = "vary."
-PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
 SCATTER = "noise within a case"
 MAX_FITTED_CASES = 20_000  # cases in the fit of the budget, whose time grows with them
 MAX_BINS, MIN_IN_BIN = 8, 8
 SURE = 4.0  # standard errors between the worst and the best bin; in 1 of 100 sets of 8 bins, noise alone has so many
 MAX_PANELS = 6
+WORDS = {
+    "cross": "error across the boresight",
+    "roll": "error about the boresight",
+    "centroid": "centroid error",
+    "unanswered": "answers that are missing or wrong",
+}
 MAX_REASONS = 5
 
 
@@ -64,7 +69,7 @@ class Columns:
 
 
 def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
-    """A campaign's table, or an even share of its cases. Raises InputError for what is no such table."""
+    """A campaign's table, or an even share of its cases. Raises InputError for another file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -96,18 +101,24 @@ def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -
     asked, solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("frames", "solved", "wrong"))
     tracker = config.tracker
     scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
-    commanded, reported = cases.vectors("q{}", "wxyz"), reported_attitudes(cases)
+    # The solver's attitudes, NaN where there is none: a case's mean error applied to its commanded attitude.
+    commanded, reported = (cases.vectors(form, "wxyz") for form in ("q{}", "solved_q{}"))
+    error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
+    known = np.isfinite(error).all(axis=1)
+    reported[known] = multiply(from_rotation_vectors(error[known]), commanded[known])
     step = -(-len(commanded) // MAX_FITTED_CASES)
     parts: Decomposed | None = None
     try:
         parts = assess_cases(commanded[::step], reported[::step], scale, rng)
         notes = parts.notes
-    except InputError as error:
-        notes = (str(error),)
+    except InputError as refusal:
+        notes = (str(refusal),)
+    scatter = cases.vectors("scatter_{}_arcsec", "xyz")  # between the frames of a case; none where cases have one
+    scatter = scatter[np.isfinite(scatter).all(axis=1)]
     return {
         "bias_arcsec": None if parts is None else parts.bias_arcsec.tolist(),
         **{f"{name}_arcsec": None if parts is None else getattr(parts, f"{name}_arcsec") for name in PARTS},
-        "scatter_arcsec": _scatter(cases),
+        "scatter_arcsec": axes_of_variance((scatter**2).mean(axis=0)) if len(scatter) else None,
         "availability": (solved - wrong) / asked if asked else 0.0,
         "wrong": int(wrong),
         "centroids": _centroids(cases),
@@ -115,24 +126,17 @@ def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -
     }, parts
 
 
-def reported_attitudes(cases: Columns) -> FloatArray:
-    """The solver's attitudes (n, 4), NaN where there is none: a case's mean error applied to its commanded attitude."""
-    commanded = cases.vectors("q{}", "wxyz")
-    error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
-    known = np.isfinite(error).all(axis=1)
-    reported = cases.vectors("solved_q{}", "wxyz")
-    reported[known] = multiply(from_rotation_vectors(error[known]), commanded[known])
-    return reported
-
-
-def _scatter(cases: Columns) -> Axes | None:
-    """One sigma between the frames of a case; None where cases have one frame."""
-    scatter = cases.vectors("scatter_{}_arcsec", "xyz")
-    scatter = scatter[np.isfinite(scatter).all(axis=1)]
-    if not len(scatter):
-        return None
-    variance = (scatter**2).mean(axis=0)
-    return Axes(math.sqrt((variance[0] + variance[1]) / 2), math.sqrt(variance[2]))
+def budget_rows(budget: dict[str, Any], parts: Decomposed | None) -> Iterator[FigureRow]:
+    """The rows of budget.csv, as `hilstar assess` has them."""
+    unknown = Axes(None, None)
+    yield from part_rows(parts, budget["noise_arcsec"] or unknown)
+    scatter = budget["scatter_arcsec"] or unknown
+    yield FigureRow(SCATTER, "cross", scatter.cross, "arcsec")
+    yield FigureRow(SCATTER, "roll", scatter.roll, "arcsec")
+    yield FigureRow("availability", "", budget["availability"])
+    yield FigureRow("wrong answers", "", budget["wrong"])
+    for name, value in (budget["centroids"] or {}).items():
+        yield FigureRow(f"centroids: {name}", "", value, "px" if name.endswith("_px") else "1")
 
 
 def _centroids(cases: Columns) -> dict[str, float] | None:
@@ -157,31 +161,6 @@ def _centroids(cases: Columns) -> dict[str, float] | None:
         "found_share": float(np.nansum(numbers["matched"]) / max(np.nansum(numbers["stars"]), 1.0)),
         "false_a_frame": float(np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)),
     }
-
-
-def write_budget(path: Path, budget: dict[str, Any], parts: Decomposed | None) -> None:
-    """The budget as a table, with the columns of `hilstar assess`. Raises InputError where it cannot be written."""
-    write_csv(path, FigureRow._fields, [["" if value is None else value for value in row] for row in _rows(budget, parts)])
-
-
-def _rows(budget: dict[str, Any], parts: Decomposed | None) -> Iterator[FigureRow]:
-    unknown = (None, None)
-    for k, axis in enumerate("xyz"):
-        value = None if parts is None else float(parts.bias_arcsec[k])
-        ends = unknown if parts is None else parts.intervals.bias[:, k].tolist()
-        yield FigureRow("bias", axis, value, "arcsec", *ends)
-    for part, name in PARTS.items():
-        axes = None if parts is None else getattr(parts, f"{part}_arcsec")
-        for k, axis in enumerate(("cross", "roll")):
-            ends = unknown if parts is None else getattr(parts.intervals, part)[:, k].tolist()
-            yield FigureRow(name, axis, axes and getattr(axes, axis), "arcsec", *ends)
-    scatter = budget["scatter_arcsec"] or Axes(None, None)
-    yield FigureRow(SCATTER, "cross", scatter.cross, "arcsec")
-    yield FigureRow(SCATTER, "roll", scatter.roll, "arcsec")
-    yield FigureRow("availability", "", budget["availability"])
-    yield FigureRow("wrong answers", "", budget["wrong"])
-    for name, value in (budget["centroids"] or {}).items():
-        yield FigureRow(f"centroids: {name}", "", value, "px" if name.endswith("_px") else "1")
 
 
 @dataclass(frozen=True)
@@ -223,7 +202,8 @@ class Cost:
 def measures(cases: Columns) -> list[Measure]:
     """The measures of the cases: attitude errors across and about the boresight, centroid errors, and missing answers."""
     numbers = cases.numbers
-    x, y, z = (_about_median(numbers[f"error_{axis}_arcsec"]) for axis in "xyz")
+    errors = (numbers[f"error_{axis}_arcsec"] for axis in "xyz")
+    x, y, z = (each - np.nanmedian(each) if np.isfinite(each).any() else each for each in errors)
     found = [Measure("cross", "arcsec", np.sqrt((x**2 + y**2) / 2)), Measure("roll", "arcsec", np.abs(z))]
     if "centroid_sigma_x_px" in numbers:
         dx, dy, sx, sy = (numbers[f"centroid_{name}_px"] for name in ("dx", "dy", "sigma_x", "sigma_y"))
@@ -232,11 +212,6 @@ def measures(cases: Columns) -> list[Measure]:
     frames = np.maximum(np.nan_to_num(numbers["frames"], nan=1.0), 1.0)
     found.append(Measure("unanswered", "1", 1 - np.minimum(right / frames, 1.0), mean=True))
     return [measure for measure in found if np.isfinite(measure.values).sum() >= 2 * MIN_IN_BIN]
-
-
-def _about_median(values: FloatArray) -> FloatArray:
-    known = values[np.isfinite(values)]
-    return values - np.median(known) if len(known) else values
 
 
 def costs(cases: Columns) -> list[Cost]:
@@ -254,11 +229,8 @@ def _cost(measure: Measure, name: str, cases: Columns) -> Cost | None:
     if len(places) < 2:
         return None
     y = measure.values[good]
-    levels, errors = (
-        np.array(part) for part in zip(*(_level(y[index == k], measure.mean) for k in range(len(places))), strict=True)
-    )
+    levels, errors = np.array([_level(y[index == k], measure.mean) for k in range(len(places))]).T
     best, worst = int(np.argmin(levels)), int(np.argmax(levels))
-    total = _level(y, measure.mean)[0]
     return Cost(
         measure=measure.name,
         unit=measure.unit,
@@ -266,7 +238,7 @@ def _cost(measure: Measure, name: str, cases: Columns) -> Cost | None:
         places=places,
         level=levels,
         error=errors,
-        overall=total,
+        overall=_level(y, measure.mean)[0],
         cost=float(levels.mean() - levels[best]) if measure.mean else math.sqrt(float((levels**2).mean() - levels[best] ** 2)),
         share=_share(y, index, len(places)),
         sure=float(levels[worst] - levels[best]) > SURE * math.hypot(float(errors[best]), float(errors[worst])),
@@ -294,26 +266,20 @@ def _share(values: FloatArray, index: IntArray, bins: int) -> float:
 
 
 def _bins(name: str, cases: Columns, good: npt.NDArray[np.bool_]) -> tuple[tuple[float | str, ...], IntArray]:
-    """The places of a parameter's bins, and the bin of each good case. Few distinct values are bins themselves."""
-    if name in cases.texts:
-        texts = np.array(cases.texts[name])[good]
-        values, index = np.unique(texts, return_inverse=True)
-        return _full(tuple(values.tolist()), index)
-    numbers = cases.numbers[name][good]
-    values, index = np.unique(numbers, return_inverse=True)
-    if len(values) > MAX_BINS:
+    """The places of a parameter's bins, and the bin of each good case; none where one of them has too few cases.
+
+    Few distinct values are bins themselves.
+    """
+    column = np.array(cases.texts[name]) if name in cases.texts else cases.numbers[name]
+    values, index = np.unique(column[good], return_inverse=True)
+    if name not in cases.texts and len(values) > MAX_BINS:
+        numbers = cases.numbers[name][good]
         count = min(MAX_BINS, len(numbers) // MIN_IN_BIN)
         ends = np.quantile(numbers, np.linspace(0, 1, count + 1))[1:-1]
-        index = np.searchsorted(ends, numbers, side="right")
-        filled, index = np.unique(index, return_inverse=True)
+        filled, index = np.unique(np.searchsorted(ends, numbers, side="right"), return_inverse=True)
         values = np.array([np.median(numbers[index == k]) for k in range(len(filled))])
-    return _full(tuple(values.tolist()), index)
-
-
-def _full(places: tuple[float | str, ...], index: IntArray) -> tuple[tuple[float | str, ...], IntArray]:
-    """The bins, or none where one of them has too few cases."""
-    enough = len(places) < 2 or np.bincount(index).min() >= MIN_IN_BIN // 2
-    return (places, index) if enough else ((), index)
+    enough = len(values) < 2 or np.bincount(index).min() >= MIN_IN_BIN // 2
+    return (tuple(values.tolist()), index) if enough else ((), index)
 
 
 def write_costs(path: Path, found: list[Cost]) -> None:
@@ -331,33 +297,19 @@ def write_costs(path: Path, found: list[Cost]) -> None:
 
 def finding(found: list[Cost]) -> str:
     """The parameter that costs most of a measure, in one line."""
-    first = found[0]
+    first, what = found[0], WORDS[found[0].measure]
     if not first.sure:
-        return (
-            f"No parameter changes the {_words(first)} beyond these cases' noise: {_figure(first.overall, first)} in the median"
-        )
-    best, worst = first.best, first.worst
-    return (
-        f"{first.parameter} costs the most of the {_words(first)}: {_figure(float(first.level[best]), first)} at"
-        f" {_place(first.places[best])}, {_figure(float(first.level[worst]), first)} at {_place(first.places[worst])}"
-    )
+        return f"No parameter changes the {what} beyond these cases' noise: {_figure(first.overall, first)} in the median"
 
+    def at(k: int) -> str:
+        place = first.places[k]
+        return f"{_figure(float(first.level[k]), first)} at {place if isinstance(place, str) else f'{place:.3g}'}"
 
-def _words(cost: Cost) -> str:
-    return {
-        "cross": "error across the boresight",
-        "roll": "error about the boresight",
-        "centroid": "centroid error",
-        "unanswered": "answers that are missing or wrong",
-    }[cost.measure]
+    return f"{first.parameter} costs the most of the {what}: {at(first.best)}, {at(first.worst)}"
 
 
 def _figure(value: float, cost: Cost) -> str:
     return f"{100 * value:.3g} %" if cost.unit == "1" else f"{value:.3g} {cost.unit}"
-
-
-def _place(place: float | str) -> str:
-    return place if isinstance(place, str) else f"{place:.3g}"
 
 
 def draw_costs(path: Path, found: list[Cost]) -> None:
@@ -389,7 +341,8 @@ def write_results(table: Path, config: BenchConfig, seed: int) -> dict[str, Any]
     because = failures(table)
     cases = read_cases(table)
     budget, parts = case_budget(cases, config, np.random.default_rng(seed))
-    write_budget(table.with_name("budget.csv"), budget, parts)
+    rows = [["" if value is None else value for value in row] for row in budget_rows(budget, parts)]
+    write_csv(table.with_name("budget.csv"), FigureRow._fields, rows)
     found = costs(cases)
     write_costs(table.with_name("sensitivity.csv"), found)
     findings = []

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ from hilstar.campaign.cases import CaseMaker, columns, failed, first_row
 from hilstar.campaign.plan import Design, Plan, grid_levels, parse_plan
 from hilstar.campaign.pool import MAX_DEATHS, Backlog, Pool, Task
 from hilstar.campaign.session import Identity, Job, Session, files_sha256
-from hilstar.campaign.store import About, Directory, Journal, Row, require_parquet, schema_of, write_table
+from hilstar.campaign.store import About, Directory, Row, require_parquet, schema_of, write_table
 from hilstar.errors import InputError
 from hilstar.reading import MAX_TOML_BYTES, read_text
 
@@ -64,7 +65,7 @@ class Campaign:
             session.close()
         self.columns = columns(self.maker.parameters, "stars" in session.columns)
         levels = grid_levels(self.plan)
-        self.cases = self.plan.cases or _product(levels)
+        self.cases = self.plan.cases or math.prod(levels)
         self.design = Design(self.plan.sampling, self.plan.seed, self.cases, self.maker.attitude_dimensions, levels)
 
     def about(self) -> About:
@@ -76,7 +77,7 @@ class Campaign:
     def run(self, directory: Directory, workers: Pool | Cluster, on_done: Callable[[int], None]) -> None:
         """Run the missing cases, and write the table once none is missing. `on_done` gets the number of finished cases.
 
-        Raises InputError where nothing can be written, and what the workers raise. The same call resumes from there.
+        Raises InputError where nothing can be written, and the workers' errors. The same call goes on from there.
         """
         journal = directory.journal(self.cases)
         try:
@@ -95,25 +96,12 @@ class Campaign:
 
             if done < self.cases:
                 workers.run(Backlog(self.design, journal, workers.task_s), lambda task, answered: keep(answered.rows), lost)
-            write_table(directory.table, schema_of(self.columns, self._metadata()), self._blocks(journal))
+            about = {
+                f"hilstar.{name}": value if isinstance(value, str) else msgspec.json.encode(value).decode()
+                for name, value in msgspec.to_builtins(self.about()).items()
+            }
+            rows = (journal.rows(block) for block in range(journal.blocks))
+            write_table(directory.table, schema_of(self.columns, about), rows)
             journal.remove()
         finally:
             journal.close()
-
-    def _blocks(self, journal: Journal) -> Iterator[list[Row]]:
-        for block in range(journal.blocks):
-            yield journal.rows(block)
-
-    def _metadata(self) -> dict[str, str]:
-        return {f"hilstar.{name}": value for name, value in self._said()}
-
-    def _said(self) -> Iterator[tuple[str, str]]:
-        for name, value in msgspec.to_builtins(self.about()).items():
-            yield name, value if isinstance(value, str) else msgspec.json.encode(value).decode()
-
-
-def _product(levels: list[int]) -> int:
-    total = 1
-    for count in levels:
-        total *= count
-    return total

@@ -1,4 +1,4 @@
-"""A worker's session: it checks that it computes what the campaign computes, and runs cases, one after the other.
+"""A worker's session: it checks that its rows would be the campaign's, and runs cases one after the other.
 
 Rows are the same bit for bit on every worker that has the campaign's `Identity`. One tracker serves all cases of a session, and
 changes with their bench files.
@@ -67,11 +67,6 @@ def code_sha256() -> str:
     return digest.hexdigest()
 
 
-def own_identity(gl_renderer: str) -> Identity:
-    """This process's identity, with the name of the renderer that draws here."""
-    return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer)
-
-
 def difference(found: Identity, wanted: Identity) -> str | None:
     """The first difference of a worker's identity, in words; None where there is none."""
     for name, words in WORDS.items():
@@ -127,11 +122,13 @@ class Session:
         self.maker = CaseMaker(self.plan, self.file, Path(job.plan_path).parent)
         self.columns: dict[str, Kind] = columns(self.maker.parameters, job.solver == CENTROIDS)
         self._solver = choose_solver(job.solver, self.plan.centroids, Path(job.solver_folder), job.timeout_s)
-        self._tracker: Imaging | None = self._new_tracker(self.maker.file)
+        self._tracker: Imaging | None = None
+        self._at(self.maker.file)
 
     def identity(self) -> Identity:
         """This worker's identity."""
-        return own_identity(self._at(self.maker.file).gl_renderer)
+        renderer = self._at(self.maker.file).gl_renderer
+        return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, renderer)
 
     def run(self, begin: int, points: FloatArray) -> Answered:
         """The rows of the cases from `begin` on at their points (n, dimensions)."""
@@ -160,17 +157,17 @@ class Session:
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         for frame in range(self.plan.frames):
             view = self.maker.view(case, frame, tracker.config.tracker.exposure_s)
-            # A case of one frame is what `hilstar simulate --seed` makes of the same bench and attitude.
+            # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and attitude.
             rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
-            faults = self.maker.faults(case, view, tracker) if isinstance(tracker, Simulator) else None
-            if isinstance(tracker, Simulator) and faults is not None:
-                exposure = tracker.expose(view, rng, faults=faults)
+            if isinstance(tracker, Simulator):
+                exposure = tracker.expose(view, rng, faults=self.maker.faults(case, view, tracker))
             else:
                 exposure = tracker.expose(view, rng)
             if self.job.images:
-                name = image_name(case.number, frame, self.plan.frames)
-                row["image"] = image_name(case.number, 0, self.plan.frames)
-                path = Path(self.job.directory) / name
+                stem = f"{IMAGES}/{case.number // IMAGES_A_FOLDER:06d}/case_{case.number:09d}"
+                first, this = ("" if self.plan.frames == 1 else f"_{k:05d}" for k in (0, frame))
+                row["image"] = f"{stem}{first}.fits"
+                path = Path(self.job.directory) / f"{stem}{this}.fits"
                 make_directory(path.parent)
                 write_exposure_fits(path, tracker, exposure, noise)
             tally.see(exposure)
@@ -184,7 +181,7 @@ class Session:
         """The tracker, switched to a bench file; where that fails, the next case gets a new one."""
         tracker, self._tracker = self._tracker, None
         if tracker is None:
-            tracker = self._new_tracker(file)
+            tracker = Simulator(file) if self.plan.through == "tracker" else DisplayTracker(file)
         else:
             try:
                 tracker.change(file)
@@ -194,9 +191,6 @@ class Session:
                 raise
         self._tracker = tracker
         return tracker
-
-    def _new_tracker(self, file: BenchFile) -> Imaging:
-        return Simulator(file) if self.plan.through == "tracker" else DisplayTracker(file)
 
     def close(self) -> None:
         """Free the GL contexts."""
@@ -213,12 +207,6 @@ def files_sha256(plan: Plan, folder: Path) -> str:
             while chunk := file.read(CHUNK_BYTES):
                 digest.update(chunk)
     return digest.hexdigest()
-
-
-def image_name(case: int, frame: int, frames: int) -> str:
-    """The path of an image below the campaign's directory."""
-    part = "" if frames == 1 else f"_{frame:05d}"
-    return f"{IMAGES}/{case // IMAGES_A_FOLDER:06d}/case_{case:09d}{part}.fits"
 
 
 def peak_bytes() -> int:

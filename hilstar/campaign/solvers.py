@@ -21,16 +21,15 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import FloatArray
 from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.campaign.plan import Centroiding
 from hilstar.errors import InputError, did_you_mean, one_line, shortened
 from hilstar.files import temporary_folder
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.rotation import from_matrix, multiply, normalise
-from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars
+from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.twin.pictures import write_dn_picture
 from hilstar.twin.simulator import Exposure, Simulator
 from hilstar.twin.verify.star_finder import crowded, nearest
@@ -45,7 +44,7 @@ CENTROIDS = "centroids"
 
 
 class SolverFault(Exception):
-    """A solver failed: it raised, ended with an error, took too long, or answered what is no attitude."""
+    """A solver failed: it raised, ended with an error, took too long, or gave an answer that is no attitude."""
 
 
 SolvedTracker = Simulator | DisplayTracker  # whose images are solved
@@ -92,8 +91,8 @@ def checked_attitude(numbers: object, who: str) -> FloatArray:
     """An answer as a unit quaternion (4,), scalar first. Raises SolverFault where it is none."""
     try:
         q = np.asarray(numbers, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise SolverFault(f"{who}: answered {shortened(numbers)}; four numbers w, x, y, z are wanted") from error
+    except (TypeError, ValueError):
+        q = np.zeros(0)
     if q.shape != (4,) or not np.isfinite(q).all():
         raise SolverFault(f"{who}: answered {shortened(numbers)}; four numbers w, x, y, z are wanted")
     norm = float(np.linalg.norm(q))
@@ -110,77 +109,52 @@ class CentroidSolver:
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
         """Centroid errors, and the attitude by the matched stars."""
-        settings = self._settings(tracker)
-        found = find_stars(exposure.dn, settings)
-        truth = _on_detector(exposure)
-        index = _matched(found, truth["x_px"], truth["y_px"])
-        is_matched = index >= 0
+        wanted, psf = self._wanted, tracker.canvas.psf
+        settings = CentroidSettings(
+            threshold_sigma=wanted.threshold_sigma,
+            minimum_pixels=wanted.minimum_pixels,
+            window=wanted.window,
+            window_sigma_px=wanted.window_sigma_px or max(1.0, *psf.width_px),
+            psf_sigma_px=psf.width_px if wanted.remove_s_curve else None,
+        )
+        found, truth, (height, width) = find_stars(exposure.dn, settings), exposure.truth, exposure.dn.shape
+        with np.errstate(invalid="ignore"):
+            off_x, off_y = (np.abs(truth[name] - (side - 1) / 2) for name, side in (("x_px", width), ("y_px", height)))
+            truth = truth[(off_x <= width / 2) & (off_y <= height / 2) & truth["drawn"]]
+        # The truth is in order of light: of stars with one find, the brightest has it.
+        index = nearest(found, truth["x_px"], truth["y_px"])
+        first = np.isin(np.arange(len(index)), np.unique(index, return_index=True)[1])
+        is_matched = first & (index >= 0)
         good = is_matched & ~truth["clipped"] & ~found.at_edge[index] if len(found) else is_matched
         flux = truth["electrons_per_s"]
         if len(truth):
-            good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, tracker.canvas.psf)
+            good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, psf)
         x_px, y_px = truth["x_px"][good], truth["y_px"][good]
+        seen_x_px, seen_y_px = found.x_px[index[good]], found.y_px[index[good]]
         errors = CentroidErrors(
             stars=len(truth),
             found=len(found),
             matched=int(is_matched.sum()),
             false=len(found) - int(is_matched.sum()),
-            dx_px=found.x_px[index[good]] - x_px,
-            dy_px=found.y_px[index[good]] - y_px,
+            dx_px=seen_x_px - x_px,
+            dy_px=seen_y_px - y_px,
             x_px=x_px,
             y_px=y_px,
             v_mag=truth["v_mag"][good],
         )
         if len(x_px) < MIN_STARS:
             return Answer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
-        turn = _turn(tracker, errors, flux[good])
+        # The turn from the true attitude's cam to that of the centroids: Wahba's problem by SVD (Markley 1988). Weights are the
+        # stars' light, the inverse of photon noise's variance.
+        true = normalise(tracker.camera.rays(x_px, y_px))
+        seen = normalise(tracker.camera.rays(x_px + errors.dx_px, y_px + errors.dy_px))
+        u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", flux[good] / flux[good].sum(), seen, true))
+        turn = from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
         return Answer(multiply(turn, exposure.view.q_icrs_to_cam), "", errors)
-
-    def _settings(self, tracker: SolvedTracker) -> CentroidSettings:
-        wanted, width_px = self._wanted, tracker.canvas.psf.width_px
-        return CentroidSettings(
-            threshold_sigma=wanted.threshold_sigma,
-            minimum_pixels=wanted.minimum_pixels,
-            window=wanted.window,
-            window_sigma_px=wanted.window_sigma_px or max(1.0, *width_px),
-            psf_sigma_px=width_px if wanted.remove_s_curve else None,
-        )
-
-
-def _on_detector(exposure: Exposure) -> np.ndarray:
-    """The truth's rows of stars on the detector, brightest first."""
-    truth, (height, width) = exposure.truth, exposure.dn.shape
-    with np.errstate(invalid="ignore"):
-        inside = (np.abs(truth["x_px"] - (width - 1) / 2) <= width / 2) & (
-            np.abs(truth["y_px"] - (height - 1) / 2) <= height / 2
-        )
-    return np.asarray(truth[inside & truth["drawn"]])
-
-
-def _matched(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
-    """The index of each star's find (n,), brightest first; -1 for none, or where a brighter star has it."""
-    index = nearest(found, x_px, y_px)
-    _, first = np.unique(index, return_index=True)
-    alone = np.zeros(len(index), dtype=np.bool_)
-    alone[first] = True
-    return np.where(alone, index, -1)
-
-
-def _turn(tracker: SolvedTracker, errors: CentroidErrors, weight: FloatArray) -> FloatArray:
-    """The rotation (4,) from the true attitude's cam to that of the centroids: Wahba's problem by SVD (Markley 1988).
-
-    Weights are the stars' light, the inverse of photon noise's variance.
-    """
-    true, seen = (
-        normalise(tracker.camera.rays(errors.x_px + dx_px, errors.y_px + dy_px))
-        for dx_px, dy_px in ((np.zeros(len(weight)), np.zeros(len(weight))), (errors.dx_px, errors.dy_px))
-    )
-    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", weight / weight.sum(), seen, true))
-    return from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 
 
 class FunctionSolver:
-    """Calls `function(image, tracker)`: DN, uint16 (height, width), and what a tracker's software knows of its optics.
+    """Calls `function(image, tracker)` with DN, uint16 (height, width), and the facts of the tracker's optics.
 
     It returns q_icrs_to_cam (w, x, y, z), or None where it finds none. `folder` is searched for the module first.
     Raises InputError where there is no such function.
@@ -191,18 +165,20 @@ class FunctionSolver:
         module, _, function = name.removeprefix("python:").partition(":")
         if not module or not function:
             raise InputError(f"--solver {name}: names no function; {FORM}")
-        with _importing_from(folder):
-            try:
-                found: Any = getattr(importlib.import_module(module), function, None)
-            except Exception as error:
-                reason = one_line(f"{type(error).__name__}: {error}")
-                raise InputError(f"--solver {name}: {module} cannot be imported ({reason}); {FORM}") from error
+        sys.path.insert(0, str(folder))
+        try:
+            found: Any = getattr(importlib.import_module(module), function, None)
+        except Exception as error:
+            reason = one_line(f"{type(error).__name__}: {error}")
+            raise InputError(f"--solver {name}: {module} cannot be imported ({reason}); {FORM}") from error
+        finally:
+            sys.path.remove(str(folder))
         if not callable(found):
             raise InputError(f"--solver {name}: {module} has no function {function}; {FORM}")
         self._function: Callable[..., Any] = found
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
-        """The function's answer. Raises SolverFault where it raises, takes too long or answers what is no attitude."""
+        """The function's answer. Raises SolverFault where it raises, takes too long, or its answer is no attitude."""
         try:
             with time_limit(self._timeout_s):
                 answer = self._function(exposure.dn.copy(), tracker_facts(tracker))
@@ -216,7 +192,7 @@ class FunctionSolver:
 
 
 def tracker_facts(tracker: SolvedTracker) -> dict[str, Any]:
-    """The facts of its optics that a tracker's software knows, and none of where it looks."""
+    """The facts of its optics that a tracker's software knows; nothing about its attitude."""
     settings = tracker.config.tracker
     width, height = settings.resolution_px
     focal_length_px = settings.focal_length_mm * 1e3 / settings.pixel_pitch_um
@@ -250,15 +226,6 @@ def time_limit(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-@contextlib.contextmanager
-def _importing_from(folder: Path) -> Iterator[None]:
-    sys.path.insert(0, str(folder))
-    try:
-        yield
-    finally:
-        sys.path.remove(str(folder))
-
-
 class CommandSolver:
     """Runs a command for each image, without a shell: {image} is a FITS file of its DN alone, {png} a 16-bit PNG of them.
 
@@ -274,28 +241,48 @@ class CommandSolver:
             raise InputError(f"--solver {template}: {error}; write a command with {IMAGE}, or {PICTURE}, in it") from error
         if not any(IMAGE in word or PICTURE in word for word in self._words):
             raise InputError(
-                f"--solver {template}: names no image; {did_you_mean(template, ['centroids'])}write centroids, "
-                f"python:MODULE:FUNCTION, or a command with {IMAGE}"
-                f' in it, such as "solve {IMAGE}"'
+                f"--solver {template}: names no image; {did_you_mean(template, ['centroids'])}write centroids,"
+                f' python:MODULE:FUNCTION, or a command with {IMAGE} in it, such as "solve {IMAGE}"'
             )
         self._folder, self._timeout_s = folder, timeout_s
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
-        """The command's answer. Raises SolverFault where it fails, takes too long or prints what is no attitude."""
+        """The command's answer. Raises SolverFault where it fails, takes too long, or its answer is no attitude."""
+        from astropy.io import fits
+
+        facts = tracker_facts(tracker)
         with temporary_folder("solver") as folder:
             image, picture = folder / "image.fits", folder / "image.png"
             if any(IMAGE in word for word in self._words):
-                write_plain_fits(image, exposure.dn)
+                fits.PrimaryHDU(exposure.dn).writeto(image)  # the DN alone: no pointing, and no truth
             if any(PICTURE in word for word in self._words):
                 write_dn_picture(picture, exposure.dn)
-            places = _places(tracker) | {IMAGE: str(image), PICTURE: str(picture)}
-            words = [_filled(word, places) for word in self._words]
-            code, out, err = _run(words, self._folder, self._timeout_s)
+            words = self._words
+            for place, text in (
+                ("{fov_deg}", f"{facts['fov_deg']:.9g}"),
+                ("{focal_length_px}", f"{facts['focal_length_px']:.9g}"),
+                ("{width_px}", str(facts["resolution_px"][0])),
+                ("{height_px}", str(facts["resolution_px"][1])),
+                (IMAGE, str(image)),
+                (PICTURE, str(picture)),
+            ):
+                words = [word.replace(place, text) for word in words]
+            try:
+                child = Child(words, self._folder)
+            except OSError as error:
+                raise SolverFault(f"the solver cannot be started: {words[0]} ({error.strerror})") from error
+            with child:
+                code = child.wait(self._timeout_s)
+                if child.too_much:
+                    most = f"{MAX_OUTPUT_BYTES // 1_000_000} MB"
+                    raise SolverFault(f"the solver printed more than {most} and was ended; let it print the quaternion alone")
+                if code is None:
+                    raise SolverFault(f"the solver took longer than {self._timeout_s:g} s")
         if code:
-            said = err.strip().splitlines()[-1:] or ["it said nothing on stderr"]
+            said = child.err.strip().splitlines()[-1:] or ["it said nothing on stderr"]
             line = said[0].replace(str(image), IMAGE).replace(str(picture), PICTURE).replace(str(folder), "")
             raise SolverFault(one_line(f"the solver ended with code {code}: {line}"))
-        q = printed_attitude(out)
+        q = printed_attitude(child.out)
         return Answer(None, "the solver found no attitude") if q is None else Answer(checked_attitude(q, "the solver"))
 
 
@@ -314,46 +301,6 @@ def printed_attitude(text: str) -> object | None:
             if len(numbers) == 4:
                 return [float(number) for number in numbers]
     return None
-
-
-def write_plain_fits(path: Path, dn: npt.NDArray[np.uint16]) -> None:
-    """Write the DN alone: no pointing, and no truth."""
-    from astropy.io import fits
-
-    fits.PrimaryHDU(dn).writeto(path)
-
-
-def _places(tracker: SolvedTracker) -> dict[str, str]:
-    facts = tracker_facts(tracker)
-    width, height = facts["resolution_px"]
-    return {
-        "{fov_deg}": f"{facts['fov_deg']:.9g}",
-        "{focal_length_px}": f"{facts['focal_length_px']:.9g}",
-        "{width_px}": str(width),
-        "{height_px}": str(height),
-    }
-
-
-def _filled(word: str, places: dict[str, str]) -> str:
-    for name, text in places.items():
-        word = word.replace(name, text)
-    return word
-
-
-def _run(words: list[str], folder: Path, timeout_s: float) -> tuple[int, str, str]:
-    """Run a command in a process group of its own, which ends with it. Raises SolverFault."""
-    try:
-        child = Child(words, folder)
-    except OSError as error:
-        raise SolverFault(f"the solver cannot be started: {words[0]} ({error.strerror})") from error
-    with child:
-        code = child.wait(timeout_s)
-        if child.too_much:
-            most = f"{MAX_OUTPUT_BYTES // 1_000_000} MB"
-            raise SolverFault(f"the solver printed more than {most} and was ended; let it print the quaternion alone")
-        if code is None:
-            raise SolverFault(f"the solver took longer than {timeout_s:g} s")
-    return code, child.out, child.err
 
 
 def choose_solver(text: str, settings: Centroiding, folder: Path, timeout_s: float) -> Solver:

@@ -51,7 +51,7 @@ def require_parquet() -> None:
 
 
 def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> pa.Schema:
-    """The Arrow schema of columns (name -> kind), with what the table is about in its metadata."""
+    """The Arrow schema of columns (name -> kind), with the campaign's identity in its metadata."""
     import pyarrow as pa
 
     kinds = {"int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_(), "text": pa.string()}
@@ -67,15 +67,11 @@ def write_table(path: Path, schema: pa.Schema, blocks: Iterator[list[Row]]) -> N
         settings: Any = {"compression": COMPRESSION, "compression_level": COMPRESSION_LEVEL, "version": "2.6"}
         with pq.ParquetWriter(file, schema, **settings) as writer:
             for rows in blocks:
-                arrays = [pa.array([_exact(row[field.name], field.type) for row in rows], field.type) for field in schema]
-                writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=max(1, len(rows)))
-
-
-def _exact(value: Any, kind: Any) -> Any:
-    """A float of the journal: JSON writes a whole one without its point."""
-    import pyarrow as pa
-
-    return float(value) if kind == pa.float64() and value is not None else value
+                columns = {field.name: [row[field.name] for row in rows] for field in schema}
+                for field in schema:
+                    if field.type == pa.float64():  # JSON writes a whole number without its point
+                        columns[field.name] = [None if value is None else float(value) for value in columns[field.name]]
+                writer.write_table(pa.Table.from_pydict(columns, schema=schema), row_group_size=max(1, len(rows)))
 
 
 def failures(path: Path) -> dict[str, int]:
@@ -295,17 +291,13 @@ class Directory:
 def _changed(before: About, now: About) -> str:
     """The first thing that differs, in words."""
     said = msgspec.to_builtins(before), msgspec.to_builtins(now)
-    tables = [("plan", "the plan's "), ("identity", "this machine's ")]
-    for table, words in tables:
+    for table, words in (("plan", "the plan's "), ("identity", "this machine's ")):
         for key in sorted(set(said[0][table]) | set(said[1][table])):
             old, new = (part[table].get(key) for part in said)
             if old != new:
-                return f"{words}{key} was {shortened(_json(old))} and is {shortened(_json(new))}"
+                old, new = (shortened(msgspec.json.encode(value).decode()) for value in (old, new))
+                return f"{words}{key} was {old} and is {new}"
     for key, words in (("bench_sha256", "its bench file"), ("files_sha256", "its log or scenario"), ("solver", "--solver")):
         if said[0][key] != said[1][key]:
             return f"{words} was {shortened(said[0][key])} and is {shortened(said[1][key])}"
     return "--images was another"
-
-
-def _json(value: Any) -> str:
-    return msgspec.json.encode(value).decode()

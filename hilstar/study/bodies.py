@@ -1,6 +1,6 @@
 """The study of bodies: the cost of each in a frame, the accuracy of its disc at each size, and its approach.
 
-The cost is the difference from the same frame of a bench without bodies, with each body alone. A disc is compared with rays
+Each body is alone on its bench; its cost is the difference from the same frame without bodies. A disc is compared with rays
 traced in float64 and with a point in its place. An approaching body is judged by frame time and by finite light.
 """
 
@@ -16,18 +16,17 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.build import load
 from hilstar.bench.frame import Bench
 from hilstar.charts import BLUE, INK, MUTED, SERIES, capital, chart, label_ends, plain_ticks, value_bars, write_records
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera
-from hilstar.scene.extended import DiscView, ExtendedLight, Pose, disc_lights
+from hilstar.scene.extended import DiscView, Pose, disc_lights
 from hilstar.scene.psf import GaussianPsf
-from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.scene.sprites import join_sprites, pack_sprites
 from hilstar.sky.bodies.disc import Disc, lunar_share
-from hilstar.study.settings import Table, bench_text
+from hilstar.study.settings import FULL_HD, Table, study_bench
 from hilstar.study.sweep import Spent, in_turn
 from hilstar.units import NS_PER_S
 
@@ -78,7 +77,7 @@ FLOOR = 1e-6  # lower end of the chart's axis
 
 @dataclass(frozen=True, slots=True)
 class Boresight:
-    """Where a bench looks: so far from a body's middle, or beyond the Earth's limb, or the other way."""
+    """Where a bench looks: its angle from a body's middle, or beyond the Earth's limb (negative: on it)."""
 
     body: str
     off_deg: float
@@ -97,7 +96,7 @@ def _open(folder: Path, name: str) -> Bench:
     bodies, observer = BODIES[name]
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
-        "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "refresh_hz": REFRESH_HZ, "bits": 12},
+        "monitor": {**FULL_HD, "refresh_hz": REFRESH_HZ, "bits": 12},
         "collimator": {"focal_length_mm": 350.0},
         "sky": EPOCH,
         "render": {"quantisation": "round", "motion": "off", "brightest_v_mag": 2.0},
@@ -106,9 +105,7 @@ def _open(folder: Path, name: str) -> Bench:
         tables["sky.bodies"] = bodies
     if observer:
         tables["spacecraft"] = observer
-    path = folder / f"{name.replace(' ', '_')}.toml"
-    path.write_text(bench_text(tables))
-    return load(path)
+    return study_bench(folder / f"{name.replace(' ', '_')}.toml", tables)
 
 
 def attitude(bench: Bench, aim: Boresight) -> FloatArray:
@@ -139,8 +136,8 @@ class BodyScene:
 class BodyCost:
     """One scene: the fastest frame of the rounds, ms, with the body and without any, and the difference.
 
-    `cpu_ms` is the difference in processor time, all cores together, the driver's threads too: what a busy machine changes
-    least, and in software rendering the whole cost. `discs` are the bodies drawn as such, `stars` counts the stars drawn.
+    `cpu_ms` is the difference in processor time of all cores, the driver's threads included. A busy machine changes it least,
+    and in software rendering it is the whole cost. `discs` are the bodies drawn as discs, `stars` counts the stars drawn.
     """
 
     scene: str
@@ -228,32 +225,33 @@ def moon(radius_px: float, phase_deg: float) -> Disc:
 
 def exactness(radius_px: float, phase_deg: float) -> Exactness:
     """A Moon as it is drawn, against rays."""
+    from scipy.ndimage import center_of_mass
+
     disc = moon(radius_px, phase_deg)
     half = int(np.ceil(radius_px)) + MARGIN_PX
-    size = (2 * half + 1, 2 * half + 1)
+    size, psf = (2 * half + 1, 2 * half + 1), GaussianPsf(SIGMA_PX)
     camera = Camera(size, FOCAL_PX, (half, half), np.eye(3))
-    with Renderer(Target(size, GaussianPsf(SIGMA_PX))) as renderer:
-        point = _point(disc, camera, renderer.footprint_px)
-        lights = disc_lights(disc, DiscView(camera, GaussianPsf(SIGMA_PX), (Pose(np.eye(3)),)), covers=True)
-        renderer.draw(_dark(point, tuple(lights)))
+    with Renderer(Target(size, psf)) as renderer:
+        place = camera.project(disc.direction[None])
+        point = pack_sprites(*place, np.array([1e6]), np.zeros(1, dtype=np.intp), size, renderer.footprint_px)
+        lights = disc_lights(disc, DiscView(camera, psf, (Pose(np.eye(3)),)), covers=True)
+        renderer.draw(replace(join_sprites([], renderer.footprint_px), extended=tuple(lights)))
         drawn = renderer.linear().astype(np.float64)
         renderer.draw(point)
         as_point = renderer.linear().astype(np.float64)
     truth = traced(disc, camera)
-    off_px = np.array(_middle(drawn)) - np.array(_middle(truth))
     limb = np.nan
     if radius_px >= LIMB_PX and phase_deg <= 90:
         limb = float(np.nanmax(np.abs(_edges(drawn, radius_px, phase_deg) - _edges(truth, radius_px, phase_deg))))
-    brightest = truth.max()
     return Exactness(
         body=disc.name,
         phase_deg=phase_deg,
         radius_px=radius_px,
         flux_off=float(drawn.sum() / truth.sum() - 1),
-        middle_off_px=float(np.abs(off_px).max()),
+        middle_off_px=float(np.abs(np.subtract(center_of_mass(drawn), center_of_mass(truth))).max()),
         limb_off_px=limb,
-        pixel_off=float(np.abs(drawn - truth).max() / brightest),
-        point_pixel_off=float(np.abs(as_point - truth).max() / brightest),
+        pixel_off=float(np.abs(drawn - truth).max() / truth.max()),
+        point_pixel_off=float(np.abs(as_point - truth).max() / truth.max()),
     )
 
 
@@ -277,23 +275,8 @@ def traced(disc: Disc, camera: Camera) -> FloatArray:
     return np.asarray(down.T @ light.reshape(count, count) @ across)
 
 
-def _dark(point: Sprites, lights: tuple[ExtendedLight, ...]) -> Sprites:
-    return replace(point, data=point.data[:0], star=point.star[:0], x_px=point.x_px[:0], y_px=point.y_px[:0], extended=lights)
-
-
-def _point(disc: Disc, camera: Camera, footprint_px: int) -> Sprites:
-    x_px, y_px = camera.project(disc.direction[None])
-    return pack_sprites(x_px, y_px, np.array([1e6]), np.zeros(1, dtype=np.intp), camera.resolution_px, footprint_px)
-
-
-def _middle(image: FloatArray) -> tuple[float, float]:
-    """The centroid of an image, px."""
-    y_px, x_px = np.indices(image.shape)
-    return float((image * x_px).sum() / image.sum()), float((image * y_px).sum() / image.sum())
-
-
 def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
-    """Where an image falls to half of what it has 3 px inside the limb, on its lit side, px outward of it."""
+    """Where an image falls to half its light 3 px inside the limb, on the lit side, px outward of the limb."""
     from scipy.ndimage import map_coordinates
 
     half = image.shape[0] // 2
@@ -369,22 +352,12 @@ def run(directory: Path, quick: bool = False) -> list[str]:
             for off_deg in angles
         ]
     sizes = [exactness(radius, phase) for phase in PHASES_DEG for radius in (QUICK_RADII_PX if quick else RADII_PX)]
-    findings = [_cost_line(costs), _size_line(sizes), _limits_line(nears)]
     for name, records in (("bodies_cost", costs), ("bodies_size", sizes), ("bodies_limits", nears)):
         write_records(directory / f"{name}.csv", records)
-    draw_costs(directory / "bodies_cost", costs)
+    cost_line = draw_costs(directory / "bodies_cost", costs)
     draw_sizes(directory / "bodies_size", sizes)
     draw_limits(directory / "bodies_limits", nears)
-    return findings
-
-
-def _cost_line(costs: Sequence[BodyCost]) -> str:
-    dearest, step = max(costs, key=lambda cost: cost.cpu_ms), costs[-1]
-    unseen = max((c for c in costs[:-1] if not c.discs), key=lambda cost: cost.cpu_ms)
-    return (
-        f"bodies that are not in view, or points, take at most {max(unseen.cpu_ms, 0.0):.1f} ms of processor time a frame, and"
-        f" all of them {max(step.cpu_ms, 0.0):.1f} ms once in 2 s; the dearest: {dearest.scene}, {dearest.cpu_ms:.0f} ms"
-    )
+    return [cost_line, _size_line(sizes), _limits_line(nears)]
 
 
 def _size_line(sizes: Sequence[Exactness]) -> str:
@@ -406,15 +379,19 @@ def _limits_line(nears: Sequence[Near]) -> str:
     )
 
 
-def draw_costs(path: Path, costs: Sequence[BodyCost]) -> None:
-    """What each scene costs."""
-    dearest, unseen = (max(some, key=lambda cost: cost.cpu_ms) for some in (costs, [c for c in costs[:-1] if not c.discs]))
+def draw_costs(path: Path, costs: Sequence[BodyCost]) -> str:
+    """What each scene costs; the finding."""
+    dearest = max(costs, key=lambda cost: cost.cpu_ms)
+    unseen_ms = max(0.0, *(cost.cpu_ms for cost in costs[:-1] if not cost.discs))
     note = "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x 1080, drawn in software."
-    points = f"Bodies that are no discs cost at most {max(unseen.cpu_ms, 0):.1f} ms"
-    finding = f"{points}; the dearest, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+    finding = f"Bodies that are no discs cost at most {unseen_ms:.1f} ms; the dearest, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
     with chart(path, finding, note=note, height_inch=4.4) as (axes,):
         value_bars(axes, [capital(cost.scene) for cost in costs], [round(max(cost.cpu_ms, 0.0), 2) for cost in costs], BLUE)
         axes.set_xlabel("processor time on top [ms]")
+    return (
+        f"bodies that are not in view, or points, take at most {unseen_ms:.1f} ms of processor time a frame, and all of them"
+        f" {max(costs[-1].cpu_ms, 0.0):.1f} ms once in 2 s; the dearest: {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+    )
 
 
 def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:

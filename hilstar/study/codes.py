@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +31,7 @@ FRAME_PX = (1920, 1080)
 STARS = 1000
 SEED = 1
 STEALING = ", bit stealing"
-JUDGE: Centroider = "fit"  # what most trackers do
+JUDGE: Centroider = "fit"  # as most trackers do
 ERROR_COLUMNS = (
     "flux_rms_mag",
     "flux_max_mag",
@@ -81,18 +81,23 @@ def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:
     return pack_sprites(x_px, y_px, flux, np.arange(STARS), frame_px, footprint_px)
 
 
+def judged_phases(phases: int) -> tuple[Sprites, int, FloatArray, Judge]:
+    """phases^2 stars whose peak is white, the side of a star's tile, px, their image, and its judge by the usual tracker."""
+    sprites, tile = phase_grid(phases, USUAL_PSF)
+    bright = phase_image(sprites, USUAL_PSF)
+    judge = Judge(bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    return sprites, tile, bright, judge
+
+
 def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list[StarErrors]:
     """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the tracker is as usual."""
     panel, balance = Panel(response_of(bits, way), WHITE), Balance(USUAL_PSF, AS_USUAL)
-    sprites, _ = phase_grid(phases, USUAL_PSF)
-    bright = phase_image(sprites, USUAL_PSF)
-    judge = Judge(bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    sprites, _, bright, judge = judged_phases(phases)
     errors = []
     for mag in mags:
-        wanted = (bright * flux_ratio(mag)).astype(np.float32)
-        errors.append(
-            judge.errors(shown_by(way.method, way.frames, panel, wanted, fainter(sprites, mag), balance), flux_ratio(mag))
-        )
+        wanted, share = fainter(sprites, mag), flux_ratio(mag)
+        shown = shown_by(way.method, way.frames, panel, (bright * share).astype(np.float32), wanted, balance)
+        errors.append(judge.errors(shown, share))
     return errors
 
 
@@ -154,49 +159,33 @@ def study_frames(directory: Path, quick: bool) -> str:
     left = [row for shown in panels() for row in _left_by(shown, phases, counts)]
     write_records(directory / "over_frames.csv", left)
     draw(directory / "over_frames", left)
-    return _finding(left)
+    at = (row for row in left if (row.frames, row.method) == (AIM_FRAMES, "temporal"))
+    each = "; ".join(f"{row.panel} {row.flux_rms_mag:.2g} mag, {row.axis_rms_px_fit:.2g} px" for row in at)
+    return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {each}"
 
 
-def _left_by(shown: ShownStars, phases: int, counts: tuple[int, ...]) -> list[OverFrames]:
+def _left_by(shown: ShownStars, phases: int, counts: tuple[int, ...]) -> Iterator[OverFrames]:
     panel, share = Panel(shown.response, WHITE), flux_ratio(shown.mag)
-    sprites, tile = phase_grid(phases)
-    bright = phase_image(sprites, USUAL_PSF)
-    judge = Judge(bright, line_places(sprites), USUAL_PSF.width_px, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    sprites, tile, bright, judge = judged_phases(phases)
     stars, linear = fainter(sprites, shown.mag), (share * bright).astype(np.float32)
     quantiser = TemporalQuantiser(panel, (phases * tile, phases * tile), USUAL_PSF)
     steps = float(stars.data["electrons_per_s"][0]) / (float(shown.response.light[1]) * WHITE)
-    rows = []
+    kinds: tuple[Centroider, ...] = ("moment", "window", "fit")
     for method in ("temporal", "dither"):
-        # Light up to the end of each frame: an exposure's is the difference of two, its ends within frames.
-        whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))
+        whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))  # light up to the end of each frame
         for frame in range(len(whole) - 1):
             levels = quantiser.levels(stars) if method == "temporal" else dither_levels(linear, panel, mask_turn(frame))
             whole[frame + 1] = whole[frame] + shown_light(levels, panel)
+
+        def until(refreshes: float, whole: FloatArray = whole) -> FloatArray:
+            frame, part = int(refreshes), refreshes % 1
+            return np.asarray(whole[frame] + part * (whole[frame + 1] - whole[frame]))
+
         for count in counts:
-            means = ((_up_to(whole, begin + count) - _up_to(whole, begin)) / count for begin in BEGINS)
-            errors = [judge.errors(mean, share, ("moment", "window", "fit")) for mean in means]
-            rows.append(OverFrames(shown.name, shown.mag, steps, method, count, *_rms(errors)))
-    return rows
-
-
-def _up_to(whole: FloatArray, refreshes: float) -> FloatArray:
-    """The light of so many refreshes from the beginning."""
-    frame, part = int(refreshes), refreshes % 1
-    return np.asarray(whole[frame] + part * (whole[frame + 1] - whole[frame]))
-
-
-def _rms(errors: list[StarErrors]) -> tuple[float, ...]:
-    each = [(e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in ("moment", "window", "fit"))) for e in errors]
-    return tuple(np.sqrt(np.mean(np.square(each), axis=0)).tolist())
-
-
-def _finding(left: list[OverFrames]) -> str:
-    at = {(row.panel, row.method): row for row in left if row.frames == AIM_FRAMES}
-    each = (
-        f"{name} {at[name, 'temporal'].flux_rms_mag:.2g} mag, {at[name, 'temporal'].axis_rms_px_fit:.2g} px"
-        for name in dict.fromkeys(row.panel for row in left)
-    )
-    return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {'; '.join(each)}"
+            errors = [judge.errors((until(begin + count) - until(begin)) / count, share, kinds) for begin in BEGINS]
+            each = [(e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in kinds)) for e in errors]
+            rms = np.sqrt(np.mean(np.square(each), axis=0)).tolist()
+            yield OverFrames(shown.name, shown.mag, steps, method, count, *rms)
 
 
 def draw(path: Path, left: list[OverFrames]) -> None:
@@ -218,13 +207,10 @@ def draw(path: Path, left: list[OverFrames]) -> None:
                     (flux, "flux_rms_mag", f"{name}: {steps} steps"),
                     (place, "axis_rms_px_fit", name),
                 ):
-                    values = [_finite(getattr(row, error)) for row in rows]
+                    errors = np.array([getattr(row, error) for row in rows])
+                    values = np.where(np.isfinite(errors), errors, np.nan)
                     axes.loglog(frames, values, style, color=colour, ms=4, label=label if method == "temporal" else "_")
         flux.set_ylabel("flux error, rms [mag]")
         place.set(ylabel="place by a PSF fit, rms [px]", xlabel="frames of an exposure")
         plain_ticks(place.xaxis, sorted({row.frames for row in left}))
         label_ends(flux, place)
-
-
-def _finite(value: float) -> float:
-    return value if np.isfinite(value) else np.nan

@@ -1,21 +1,21 @@
-"""What `effort = "auto"` saves: five scenes at full effort and at the effort that they need, with their times and errors."""
+"""The gain of `effort = "auto"`: five scenes at full effort and at the effort that they need, with their times and errors."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hilstar.bench.build import load
 from hilstar.bench.frame import Bench
 from hilstar.charts import BLUE, MUTED, ORANGE, RED, SMALL_PT, chart, write_records
 from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
-from hilstar.study.settings import Isolation, Table, bench_text, lone_windows, squares, star_error
+from hilstar.study.settings import FULL_HD, GLASS, Isolation, Table, lone_windows, squares, star_error, study_bench
 from hilstar.study.sweep import medians_ms
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import stamp_errors
@@ -40,6 +40,11 @@ class EffortScene:
     bits: int
     tolerance: float
     rate_deg_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def turn(self) -> CameraTurn:
+        """The attitude, and the turn from it."""
+        return CameraTurn(from_radec_roll_deg(*self.radec_roll_deg), np.radians(self.rate_deg_s))
 
 
 SCENES = (
@@ -109,40 +114,29 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 
 def compare(scene: EffortScene, rounds: int) -> EffortComparison:
     """A scene at full effort and at the effort that it needs, timed in turn."""
-    with TemporaryDirectory() as folder:
-        benches = {name: _open(scene, keys, Path(folder) / f"{name}.toml") for name, keys in EFFORTS.items()}
-        try:
-            turn = _turn(scene)
-            draw = {
-                name: lambda k, bench=bench: bench.draw(turn.q_icrs_to_cam, k, turn.rate_cam_rad_s).levels
-                for name, bench in benches.items()
-            }
-            times = medians_ms(draw, rounds)
-            return EffortComparison(**{name: _outcome(scene, name, bench, times[name]) for name, bench in benches.items()})
-        finally:
-            for bench in benches.values():
-                bench.close()
-
-
-def _open(scene: EffortScene, effort: Table, path: Path) -> Bench:
-    tolerances = {"tolerance_mag": scene.tolerance, "tolerance_px": scene.tolerance}
     tables: dict[str, Table] = {
-        "tracker": {"resolution_px": (1024, 1024), "transmission": "n-bk7-10mm"},
+        "tracker": {"resolution_px": (1024, 1024), "transmission": GLASS},
         "sky": {"faintest_v_mag": scene.faintest_v_mag},
-        "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "bits": scene.bits},
+        "monitor": {**FULL_HD, "bits": scene.bits},
         "collimator": {"focal_length_mm": scene.focal_length_mm},
-        "render": {"brightest_v_mag": 2.0, "motion": "on", **tolerances, **effort},
     }
-    path.write_text(bench_text(tables))
-    return load(path)
-
-
-def _turn(scene: EffortScene) -> CameraTurn:
-    return CameraTurn(from_radec_roll_deg(*scene.radec_roll_deg), np.radians(scene.rate_deg_s))
+    wanted: Table = {"brightest_v_mag": 2.0, "motion": "on", "tolerance_mag": scene.tolerance, "tolerance_px": scene.tolerance}
+    turn = scene.turn
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        benches = {
+            name: stack.enter_context(study_bench(Path(folder) / f"{name}.toml", {**tables, "render": {**wanted, **keys}}))
+            for name, keys in EFFORTS.items()
+        }
+        draw = {
+            name: lambda k, bench=bench: bench.draw(turn.q_icrs_to_cam, k, turn.rate_cam_rad_s).levels
+            for name, bench in benches.items()
+        }
+        times = medians_ms(draw, rounds)
+        return EffortComparison(**{name: _outcome(scene, name, bench, times[name]) for name, bench in benches.items()})
 
 
 def _outcome(scene: EffortScene, name: str, bench: Bench, frame_ms: float) -> EffortOutcome:
-    turn, size = _turn(scene), bench.camera.resolution_px
+    turn, size = scene.turn, bench.camera.resolution_px
     drawn = bench.draw(turn.q_icrs_to_cam, 0, turn.rate_cam_rad_s)
     shown = shown_light(drawn.levels, bench.panel)
     scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
@@ -173,13 +167,13 @@ def _outcome(scene: EffortScene, name: str, bench: Bench, frame_ms: float) -> Ef
 
 
 def _line(comparison: EffortComparison) -> str:
-    full, auto = comparison.full, comparison.auto
-    errors = f"largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.worst_px:.4f} px"
-    errors += f" by the worst of six centroiders ({auto.max_px_fit:.4f} by a PSF fit)"
-    verdict = "within" if auto.within else "OVER"
+    full, auto, ratio = comparison.full, comparison.auto, comparison.speed_up
+    compared = f"{ratio:.1f} times as fast" if ratio >= 1 else f"{1 / ratio:.1f} times as SLOW"
     return (
-        f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f} ms, "
-        f"{_compared(comparison)}; {errors}, {verdict} {auto.tolerance:g}"
+        f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f} ms, {compared};"
+        f" largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.worst_px:.4f} px"
+        f" by the worst of six centroiders ({auto.max_px_fit:.4f} by a PSF fit),"
+        f" {'within' if auto.within else 'OVER'} {auto.tolerance:g}"
     )
 
 
@@ -194,11 +188,6 @@ def economy_finding(comparisons: list[EffortComparison]) -> str:
         return f"Auto effort takes {1 / quickest:.1f} to {1 / slowest:.1f} times as long as full effort, {verdict}"
     slower = f"takes up to {1 / slowest:.1f} times as long as full effort in one scene"
     return f"Auto effort {slower} and is up to {quickest:.1f} times as fast in another, {verdict}"
-
-
-def _compared(comparison: EffortComparison) -> str:
-    ratio = comparison.speed_up
-    return f"{ratio:.1f} times as fast" if ratio >= 1 else f"{1 / ratio:.1f} times as SLOW"
 
 
 def draw(path: Path, comparisons: list[EffortComparison]) -> None:

@@ -1,4 +1,4 @@
-"""What each fault on request costs in a frame, and what stray light leaves of the stars in the codes."""
+"""The cost of each fault on request in a frame, and the error of stars in the codes under stray light."""
 
 from __future__ import annotations
 
@@ -9,21 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.bench.build import load
 from hilstar.bench.fault_schedule import FaultSchedule
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
 from hilstar.bench.scenario import Scenario
 from hilstar.charts import BLUE, GREEN, INK, MUTED, chart, label_ends, write_records
-from hilstar.frame.fault_kinds import Fault, Freeze, Now, fault_of
+from hilstar.frame.fault_kinds import Freeze, Now, fault_of
 from hilstar.frame.faults import FaultLayer
 from hilstar.monitor.quantise import shown_light
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.scene.extended import GlowLight
-from hilstar.scene.sprites import Sprites, join_sprites
-from hilstar.study.settings import Isolation, bench_text, lone_windows
-from hilstar.study.settings import Table as Keys
+from hilstar.scene.sprites import join_sprites
+from hilstar.study.settings import FULL_HD, Isolation, Table, lone_windows, study_bench
 from hilstar.study.sweep import medians_ms
 from hilstar.units import NS_PER_S, magnitude
 
@@ -32,16 +29,15 @@ ROUNDS, QUICK_ROUNDS = 30, 1
 QUANTISATIONS = ("round", "exact")
 COLOURS = dict(zip(QUANTISATIONS, (GREEN, BLUE), strict=True))
 FIELD = from_radec_roll_deg(84.057, -1.2, 0.0)
-SLEW_RAD_S = np.array([0.0, 2e-4, 0.0])  # so that what is fixed on the sky is new in each frame
+SLEW_RAD_S = np.array([0.0, 2e-4, 0.0])  # so that a fault that is fixed on the sky is new in each frame
 ISOLATION = Isolation(margin_px=7, max_share=1e-3)
 SHARES = (0.0, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 QUICK_SHARES = (0.0, 0.01, 1.0)
 SPOILT_MAG, DARK_MAG = 0.1, 90.0
 LOST_MAG = 1.0  # a star this much too faint is not the star that was asked for
 
-Table = dict[str, Any]
 NOWHERE = "a scenario, nothing on"
-CASES: dict[str, list[Table]] = {
+CASES: dict[str, list[dict[str, Any]]] = {
     NOWHERE: [],
     "false star, on the sky": [{"kind": "false-star", "radec_deg": [84.2, -1.0], "v_mag": 2.0}],
     "false star, moving": [{"kind": "false-star", "tracker_px": [400, 500], "rate_px_s": [60, 10], "v_mag": 2.0}],
@@ -85,16 +81,14 @@ class Stray:
 
 def bench_of(folder: Path, quantisation: str) -> Bench:
     """The bench of a study: an 8-bit monitor of 1920 x 1080 before a tracker of 11 degrees."""
-    tables: dict[str, Keys] = {
+    np.save(folder / "stray.npy", np.hypot(*np.indices((256, 256))) * 3.0)
+    tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
-        "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "refresh_hz": REFRESH_HZ},
+        "monitor": {**FULL_HD, "refresh_hz": REFRESH_HZ},
         "collimator": {"focal_length_mm": 350},
         "render": {"quantisation": quantisation},
     }
-    np.save(folder / "stray.npy", np.hypot(*np.indices((256, 256))) * 3.0)
-    path = folder / f"{quantisation}.toml"
-    path.write_text(bench_text(tables), encoding="utf-8")
-    return load(path)
+    return study_bench(folder / f"{quantisation}.toml", tables)
 
 
 def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
@@ -110,35 +104,33 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
         return bench.draw(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)).levels
 
     def faulty(k: int) -> object:
+        """A frame of such faults, as the frame loop draws it."""
         t_ns = round(k / REFRESH_HZ * NS_PER_S)
         schedule.at(t_ns)
-        now = tuple(Now(n, fault, t_ns) for n, fault in enumerate(ready, start=1))
-        return _frame(bench, propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ), FaultLayer(view, now), ready)
+        effects = FaultLayer(view, tuple(Now(n, fault, t_ns) for n, fault in enumerate(ready, start=1)))
+        if any(isinstance(fault, Freeze) for fault in ready):
+            return bench.renderer.levels()
+        if effects.blank:
+            return bench.draw_sprites(None).levels
+        seen = effects.turned(bench.view(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)))
+        return bench.draw_sprites(bench.light(seen, effects if effects.now else None)).levels
 
     ms = medians_ms({"without": plain, "with": faulty}, rounds)
     return FaultCost(bench.config.render.quantisation, case, ms["with"], ms["without"], ms["with"] - ms["without"])
 
 
-def _frame(bench: Bench, q: FloatArray, effects: FaultLayer, faults: list[Fault]) -> object:
-    """What the frame loop does with a frame of such faults."""
-    if any(isinstance(fault, Freeze) for fault in faults):
-        return bench.renderer.levels()
-    if effects.blank:
-        return bench.draw_sprites(None).levels
-    view = effects.turned(bench.view(q))
-    return bench.draw_sprites(bench.light(view, effects if effects.now else None)).levels
-
-
 def stray_light(bench: Bench, share: float) -> Stray:
-    """What the codes leave of each star's light over even stray light: with the stars, less the same without them."""
+    """Each star's light in the codes over even stray light: the frame with the stars, less the same without them."""
     white = bench.flux_at_white_e_per_s
     sprites = bench.light(bench.view(FIELD))
     if sprites is None:
         raise AssertionError("a frame with an attitude has sprites")
     glow = GlowLight(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)  # 100 rad wide: even
     lights = (glow,) if share else ()
-    both = _shown(bench, replace(sprites, extended=lights))
-    alone = _shown(bench, replace(join_sprites([], sprites.footprint_px), extended=lights))
+    both, alone = (
+        shown_light(bench.draw_sprites(replace(each, extended=lights)).levels, bench.panel).copy()
+        for each in (sprites, join_sprites([], sprites.footprint_px))
+    )
     off_mag = []
     for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, bench.camera.resolution_px, ISOLATION):
         wanted = float(sprites.data["electrons_per_s"][sprites.star == star].sum())
@@ -148,10 +140,6 @@ def stray_light(bench: Bench, share: float) -> Stray:
     kept = np.where(np.isfinite(errors), errors, 99.0)
     median, p95 = np.percentile(kept, (50, 95)).tolist()
     return Stray(bench.config.render.quantisation, share, len(kept), median, p95, float((kept > LOST_MAG).mean()))
-
-
-def _shown(bench: Bench, sprites: Sprites) -> FloatArray:
-    return shown_light(bench.draw_sprites(sprites).levels, bench.panel).copy()
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
@@ -198,7 +186,7 @@ def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
 
 
 def draw_stray(path: Path, strays: list[Stray]) -> None:
-    """What even stray light leaves of the stars."""
+    """The error of stars under even stray light."""
     least = {name: spoilt_from(strays, name) for name in QUANTISATIONS}
     said = [f"from {value:g} of white on with {name}" for name, value in least.items() if value is not None]
     finding = (

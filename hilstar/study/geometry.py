@@ -8,12 +8,14 @@ and sees the whole screen; 5 % of the dots are lost and as many are false.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import FloatArray
 from hilstar.calibrate.geometric.calibration import matched
 from hilstar.calibrate.geometric.dots import DotPlan, plan_dots
 from hilstar.calibrate.geometric.fit import (
@@ -21,10 +23,8 @@ from hilstar.calibrate.geometric.fit import (
     PINHOLE,
     RADIAL,
     Geometry,
-    MatchedDots,
     Model,
     Nominal,
-    Problem,
     fit,
     held_out,
 )
@@ -44,7 +44,7 @@ DESIGN_FOCAL_MM = 100.0
 
 @dataclass(frozen=True, slots=True)
 class DotFaults:
-    """The noise of a centroid (one sigma, one axis), the share of lit dots that are lost, and that of false ones."""
+    """The noise of a centroid (one sigma, one axis), and the shares of lit dots that are lost and false."""
 
     noise_px: float = 0.02
     lost: float = 0.05
@@ -62,28 +62,24 @@ def observed_dots(
     """Centroids of the lit dots that are at (x, y) (n,) in a tracker's image of `resolution_px`, frame by frame."""
     width, height = resolution_px
     inside = (x_px > 0) & (x_px < width - 1) & (y_px > 0) & (y_px < height - 1)
-    frames: list[IntArray] = []
-    xs: list[FloatArray] = []
-    ys: list[FloatArray] = []
+    found: list[FloatArray] = []
     for frame in range(plan.frames):
         dots = np.flatnonzero(plan.lit[:, frame] & inside)
         dots = dots[rng.uniform(size=len(dots)) >= faults.lost]
         false = rng.poisson(faults.false * len(dots))
-        frames.append(np.full(len(dots) + false, frame))
-        for places, found, size in ((x_px, xs, width), (y_px, ys, height)):
-            seen = places[dots] + rng.normal(0, faults.noise_px, len(dots))
-            found.append(np.concatenate([seen, rng.uniform(0, size, false)]))
-    frame_of = np.concatenate(frames)
-    return Observed(frame_of, np.zeros_like(frame_of), np.concatenate(xs), np.concatenate(ys), np.ones(len(frame_of)))
+        x, y = (
+            np.concatenate([places[dots] + rng.normal(0, faults.noise_px, len(dots)), rng.uniform(0, size, false)])
+            for places, size in ((x_px, width), (y_px, height))
+        )
+        found.append(np.stack([np.full(len(x), float(frame)), x, y]))
+    frames, x, y = np.concatenate(found, axis=1)
+    frame_of = frames.astype(np.intp)
+    return Observed(frame_of, np.zeros_like(frame_of), x, y, np.ones(len(frame_of)))
 
 
 def turned(a_deg: float, b_deg: float, c_deg: float = 0.0) -> FloatArray:
     """Rotation about x, then y, then z: columns are the turned axes."""
-    a, b, c = np.radians([a_deg, b_deg, c_deg])
-    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
-    return np.asarray(z @ y @ x)
+    return np.asarray(Rotation.from_euler("xyz", (a_deg, b_deg, c_deg), degrees=True).as_matrix())
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +146,7 @@ TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38.0, (1023.5, 1023.5), np.eye(3
 
 @dataclass(frozen=True, slots=True)
 class LensModel:
-    """A model of the lens: what it is called, its free parameters, and the degree of its residual field (0: none)."""
+    """A model of the lens: its name, its free parameters, and the degree of its residual field (0: none)."""
 
     name: str
     parameters: tuple[str, ...]
@@ -159,7 +155,7 @@ class LensModel:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Frames:
-    """What was shown and seen: frames, dots lit in each, and the noise of a centroid."""
+    """A set of frames: their number, the dots lit in each, and the noise of a centroid."""
 
     count: int
     dots: int
@@ -184,7 +180,7 @@ SHORT = {"the same with a field of degree 4": "with a field, degree 4", "Brown-C
 
 @dataclass(frozen=True, slots=True)
 class CalibrationOutcome:
-    """One model on one set of frames: what dots that were held out say, and where stars all over the screen really are."""
+    """One model on one set of frames: the error of held-out dots, and that of stars all over the screen."""
 
     frames: int
     dots_per_frame: int
@@ -224,7 +220,7 @@ def _nominal() -> Nominal:
     return Nominal(monitor_camera(BENCH.resolution_px, BENCH.pitch_mm * 1e3, BENCH.focal_mm, aligned), aligned, TRACKER)
 
 
-def _outcomes(frames: Frames) -> list[CalibrationOutcome]:
+def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
     """Every model on the same centroids."""
     rng = np.random.default_rng(SEED)
     plan = plan_dots(BENCH.resolution_px, frames.count, frames.dots, rng)
@@ -232,24 +228,12 @@ def _outcomes(frames: Frames) -> list[CalibrationOutcome]:
     seen = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, DotFaults(frames.noise_px), rng)
     nominal = _nominal()
     problem, data = matched(plan, nominal, seen, first_look(plan, nominal, seen, rng))
-    return [_outcome(problem, data, frames, model) for model in MODELS]
-
-
-def _outcome(problem: Problem, data: MatchedDots, frames: Frames, model: LensModel) -> CalibrationOutcome:
-    free = Model(model.parameters)
-    candidate = held_out(problem, model.name, free, model.field_degree, data)
-    errors = _star_errors(fit(problem, free, model.field_degree, data).geometry)
-    rms = float(np.sqrt((errors**2).mean()))
-    return CalibrationOutcome(
-        frames=frames.count,
-        dots_per_frame=frames.dots,
-        noise_px=frames.noise_px,
-        model=model.name,
-        centroids=len(data),
-        held_out_arcsec=candidate.rms_arcsec,
-        stars_rms_arcsec=rms,
-        stars_max_arcsec=float(errors.max()),
-    )
+    for model in MODELS:
+        free = Model(model.parameters)
+        held_out_arcsec = held_out(problem, model.name, free, model.field_degree, data).rms_arcsec
+        errors = _star_errors(fit(problem, free, model.field_degree, data).geometry)
+        stars = float(np.sqrt((errors**2).mean())), float(errors.max())
+        yield CalibrationOutcome(frames.count, frames.dots, frames.noise_px, model.name, len(data), held_out_arcsec, *stars)
 
 
 def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

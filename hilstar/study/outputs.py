@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.charts import INK, MUTED, chart, write_csv
@@ -17,7 +16,7 @@ from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 SEED = 1
 ZOOM_PX = 160
@@ -66,43 +65,36 @@ def _draw_scene(directory: Path, scene: OutputScene) -> str:
 
 
 def _figure(path: Path, scene: OutputScene, clean: Exposure, noisy: Exposure) -> None:
-    truth, saturated = noisy.truth, int(noisy.truth["clipped"].sum())
+    truth, saturated, (height, width) = noisy.truth, int(noisy.truth["clipped"].sum()), noisy.dn.shape
     finding = f"{scene.title}: {len(truth)} stars to V = {truth['v_mag'].max():.1f}, {saturated or 'none'} saturated"
     note = "Stars are counted with the brightest first; lines: means. All three images have one stretch."
-    with chart(path, finding, 2, 3, note=note, share_x=False, height_inch=6.4) as axes:
-        _star_plots(axes[:3], truth, noisy.dn.shape)
-        _images(axes[3:], scene, clean, noisy)
-
-
-def _star_plots(axes: list[Axes], truth: npt.NDArray[np.void], shape: tuple[int, ...]) -> None:
-    centroids, magnitudes, temperatures = axes
-    height, width = shape
-    centroids.plot(truth["x_px"], truth["y_px"], ".", color=INK, ms=3)
-    centroids.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-    centroids.set(xlabel="x [px]", ylabel="y [px]", title="Centroids")
-    number = np.arange(1, len(truth) + 1)
-    for axis, column, label, unit in (
-        (magnitudes, "v_mag", "V", "mag"),
-        (temperatures, "temperature_k", "Black-body temperature", "K"),
+    with chart(path, finding, 2, 3, note=note, share_x=False, height_inch=6.4) as (
+        centroids,
+        magnitudes,
+        temperatures,
+        *images,
     ):
-        mean = float(truth[column].mean())
-        axis.plot(number, truth[column], ".", color=INK, ms=3)
-        axis.axhline(mean, color=MUTED, lw=1)
-        axis.set(xlabel="star", title=f"{label}, mean {mean:.4g} {unit}", ylabel=f"{label} [{unit}]")
-    temperatures.set(yscale="log", title=f"T, mean {truth['temperature_k'].mean():.0f} K")
-
-
-def _images(axes: list[Axes], scene: OutputScene, clean: Exposure, noisy: Exposure) -> None:
-    star = noisy.truth[noisy.truth["hip"] == scene.zoom_hip]
-    height, width = noisy.dn.shape
-    x, y = (float(star["x_px"][0]), float(star["y_px"][0])) if len(star) else (width / 2, height / 2)
-    low, high = np.percentile(noisy.dn, (1, 99.8))
-    stretch: dict[str, Any] = {"cmap": "gray", "vmin": low, "vmax": high, "interpolation": "nearest"}
-    titles = ("Without noise", "With noise", f"The same, HIP {scene.zoom_hip}")
-    for axis, exposure, title in zip(axes, (clean, noisy, noisy), titles, strict=True):
-        image = axis.imshow(exposure.dn, **stretch)
-        axis.grid(False)
-        axis.set(xlabel="x [px]", title=title)
-    axes[0].set_ylabel("y [px]")
-    axes[2].set(xlim=(x - ZOOM_PX / 2, x + ZOOM_PX / 2), ylim=(y + ZOOM_PX / 2, y - ZOOM_PX / 2))
-    axes[2].figure.colorbar(image, ax=axes, label="Signal [DN]", orientation="horizontal", shrink=0.6, aspect=40)
+        centroids.plot(truth["x_px"], truth["y_px"], ".", color=INK, ms=3)
+        centroids.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+        centroids.set(xlabel="x [px]", ylabel="y [px]", title="Centroids")
+        number = np.arange(1, len(truth) + 1)
+        for axes, column, label, unit in (
+            (magnitudes, "v_mag", "V", "mag"),
+            (temperatures, "temperature_k", "Black-body temperature", "K"),
+        ):
+            mean = float(truth[column].mean())
+            axes.plot(number, truth[column], ".", color=INK, ms=3)
+            axes.axhline(mean, color=MUTED, lw=1)
+            axes.set(xlabel="star", title=f"{label}, mean {mean:.4g} {unit}", ylabel=f"{label} [{unit}]")
+        temperatures.set(yscale="log", title=f"T, mean {truth['temperature_k'].mean():.0f} K")
+        low, high = np.percentile(noisy.dn, (1, 99.8))
+        titles = ("Without noise", "With noise", f"The same, HIP {scene.zoom_hip}")
+        for axes, exposure, title in zip(images, (clean, noisy, noisy), titles, strict=True):
+            image = axes.imshow(exposure.dn, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+            axes.grid(False)
+            axes.set(xlabel="x [px]", title=title)
+        images[0].set_ylabel("y [px]")
+        star = truth[truth["hip"] == scene.zoom_hip]
+        x, y = (float(star["x_px"][0]), float(star["y_px"][0])) if len(star) else (width / 2, height / 2)
+        images[2].set(xlim=(x - ZOOM_PX / 2, x + ZOOM_PX / 2), ylim=(y + ZOOM_PX / 2, y - ZOOM_PX / 2))
+        images[2].figure.colorbar(image, ax=images, label="Signal [DN]", orientation="horizontal", shrink=0.6, aspect=40)

@@ -3,8 +3,8 @@
 The slew is a swing of degrees, shaken on each axis (`study/predictors.py`). A frame at time t has the samples taken before
 t minus the latency, which covers link, drawing and scan-out.
 
-Then what prediction makes of a vibration, against its frequency, beside a steady turn: by the rate, with `prediction = "auto"`,
-and for the newest attitude alone.
+Then the prediction of a vibration beside a steady turn, against its frequency: by the rate, with `prediction = "auto"`, and for
+the newest attitude alone.
 """
 
 from __future__ import annotations
@@ -72,7 +72,11 @@ class PredictionOutcome:
 
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `prediction.csv` and its chart; a line for each method. Raises InputError."""
-    outcomes = measure(QUICK_SPAN_S if quick else SPAN_S)
+    span_s, outcomes = QUICK_SPAN_S if quick else SPAN_S, []
+    # Over latency at the usual rate, and over rate at the usual latency.
+    for hz, ms in sorted({(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}):
+        samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
+        outcomes += [_outcome(predictor, samples, hz, ms) for predictor in predictors() if not predictor.waits]
     write_records(directory / "prediction.csv", outcomes)
     usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
     default = next(o for o in usual if o.method == next(g.name for g in predictors() if g.is_default))
@@ -84,24 +88,22 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     _draw(directory / "prediction", finding, outcomes)
     shaken_by = measure_shaken(quick)
     write_records(directory / "prediction_jitter.csv", shaken_by)
-    told = shaken_finding(shaken_by, USUAL_HZ, USUAL_MS)
+    given, derived = (crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS) for packets in ("with rates", "without rates"))
+    told = (
+        f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is nearer than one predicted by"
+        f' {USUAL_MS} ms; "auto" is near the better of both'
+    )
     _draw_shaken(directory / "prediction_jitter", told, shaken_by)
-    return [finding, *(_line(outcome) for outcome in usual), told]
-
-
-def measure(span_s: float) -> list[PredictionOutcome]:
-    """Every predictor over latency at the usual rate, and over rate at the usual latency."""
-    cells = {(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}
-    outcomes = []
-    for hz, ms in sorted(cells):
-        samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
-        outcomes += [_outcome(predictor, samples, hz, ms) for predictor in predictors() if not predictor.waits]
-    return outcomes
+    lines = (
+        f"{o.method}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum, {o.attitude_us:.0f} us per attitude"
+        for o in usual
+    )
+    return [finding, *lines, told]
 
 
 @dataclass(frozen=True, slots=True)
 class Shaken:
-    """What a way of prediction makes of a vibration: the amplitude it shows and its error (rms), as shares of the true ones."""
+    """A vibration by one way of prediction: the amplitude shown and the error (rms), as shares of the true ones."""
 
     way: str
     packets: str
@@ -125,7 +127,7 @@ def measure_shaken(quick: bool) -> list[Shaken]:
 
 
 def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rates: bool) -> tuple[float, float]:
-    """Error (rms) and amplitude of what is shown of a vibration about z beside a steady turn, as shares of the vibration's own.
+    """Error (rms) and amplitude of a vibration about z, beside a steady turn, as shown: shares of the vibration's own.
 
     "newest" stands still between packets; the steady turn is known to it.
     """
@@ -155,7 +157,7 @@ def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rate
 
 
 def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:
-    """From which frequency on the newest attitude is nearer than one predicted by its rate; infinite where it is not."""
+    """The frequency above which the newest attitude is nearer than one predicted by its rate; infinite for none."""
     mine = [s for s in found if (s.packets, s.packet_hz, s.age_ms) == (packets, packet_hz, age_ms)]
     by = {way: [s.residual for s in mine if s.way == way] for way in WAYS}
     worse_by = np.array(by["rate"]) - np.array(by["newest"])
@@ -166,45 +168,22 @@ def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) 
     return math.inf
 
 
-def shaken_finding(found: list[Shaken], packet_hz: int, age_ms: int) -> str:
-    """The answer of the chart: above which frequency it is better not to predict a vibration."""
-    given, derived = (crossing_hz(found, packets, packet_hz, age_ms) for packets in ("with rates", "without rates"))
-    return (
-        f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is nearer than one predicted by"
-        f' {age_ms} ms; "auto" is near the better of both'
-    )
-
-
 def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, latency_ms: int) -> PredictionOutcome:
     taken_ns = [sample.t_ns for sample in samples]
-    errors = []
-    first_ns = taken_ns[NEAR] + latency_ms * NS_PER_MS
-    for frame in range(math.ceil(first_ns * FRAME_HZ / NS_PER_S), math.floor(taken_ns[-1] * FRAME_HZ / NS_PER_S)):
+    latency_ns, errors = latency_ms * NS_PER_MS, []
+    first, last = (t_ns * FRAME_HZ / NS_PER_S for t_ns in (taken_ns[NEAR] + latency_ns, taken_ns[-1]))
+    for frame in range(math.ceil(first), math.floor(last)):
         t_ns = round(frame * NS_PER_S / FRAME_HZ)
-        count = bisect_right(taken_ns, t_ns - latency_ms * NS_PER_MS)
+        count = bisect_right(taken_ns, t_ns - latency_ns)
         shown = predictor.load(samples[count - NEAR : count])(t_ns)
         errors.append(angle_between_rad(slew_attitude(t_ns), shown) * ARCSEC_PER_RAD)
-    rms = float(np.sqrt(np.mean(np.square(errors))))
-    return PredictionOutcome(
-        predictor.name, rate_hz, latency_ms, rms, max(errors), _attitude_us(predictor, samples, latency_ms)
-    )
-
-
-def _attitude_us(predictor: Predictor, samples: list[AttitudeSample], latency_ms: int) -> float:
-    """The median time of one attitude after the last sample, us."""
-    predict = predictor.load(samples[-NEAR:])
-    t_ns = samples[-1].t_ns + latency_ms * NS_PER_MS
-    times = []
+    predict, times_us = predictor.load(samples[-NEAR:]), []
     for _ in range(TIMED):
         begin_ns = time.perf_counter_ns()
-        predict(t_ns)
-        times.append((time.perf_counter_ns() - begin_ns) / 1e3)
-    return float(np.median(times))
-
-
-def _line(outcome: PredictionOutcome) -> str:
-    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} maximum"
-    return f"{outcome.method}: {errors}, {outcome.attitude_us:.0f} us per attitude"
+        predict(taken_ns[-1] + latency_ns)
+        times_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    return PredictionOutcome(predictor.name, rate_hz, latency_ms, rms, max(errors), float(np.median(times_us)))
 
 
 def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome]) -> None:

@@ -46,7 +46,7 @@ def predictors() -> tuple[Predictor, ...]:
     return (
         Predictor("hold", partial(_timeline, hold)),
         Predictor("linear, by the sample's rate", partial(_timeline, own), is_default=own.max_extrapolation_ns > 0),
-        Predictor("linear, by the last two samples", partial(_timeline_without_rates, own)),
+        Predictor("linear, by the last two samples", partial(_timeline, own, without_rates=True)),
         Predictor("rate and acceleration", _accelerated),
         Predictor(f"cubic spline through {NEAR} samples", _spline),
         Predictor("C2 blend, a sample later", partial(_timeline, own), waits=True),
@@ -90,33 +90,23 @@ def slew_sample(t_ns: int) -> AttitudeSample:
     return AttitudeSample(t_ns, slew_attitude(t_ns), rate_of(slew_attitude, t_ns))
 
 
-def _timeline(policy: Policy, near: Sequence[AttitudeSample]) -> AttitudeAt:
+def _timeline(policy: Policy, near: Sequence[AttitudeSample], without_rates: bool = False) -> AttitudeAt:
     timeline = Timeline(policy)
     for sample in near:
-        timeline.add(sample)
+        timeline.add(replace(sample, rate_cam_rad_s=None) if without_rates else sample)
     return lambda t_ns: attitude_at(timeline, t_ns).q_icrs_to_cam
-
-
-def _timeline_without_rates(policy: Policy, near: Sequence[AttitudeSample]) -> AttitudeAt:
-    return _timeline(policy, [replace(sample, rate_cam_rad_s=None) for sample in near])
 
 
 def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
     """The newest sample's rate, and the change since the one before it carried on."""
-    before, newest = near[-2:]
+    (before_ns, before), (newest_ns, newest) = ((s.t_ns, np.asarray(s.rate_cam_rad_s)) for s in near[-2:])
 
     def predicted(t_ns: int) -> FloatArray:
-        ahead_s, gap_s = (t_ns - newest.t_ns) / NS_PER_S, (newest.t_ns - before.t_ns) / NS_PER_S
-        bend = (_rate(newest) - _rate(before)) / gap_s
-        return propagate(newest.q_icrs_to_cam, _rate(newest) + 0.5 * ahead_s * bend, ahead_s)
+        ahead_s, gap_s = (t_ns - newest_ns) / NS_PER_S, (newest_ns - before_ns) / NS_PER_S
+        bend = (newest - before) / gap_s
+        return propagate(near[-1].q_icrs_to_cam, newest + 0.5 * ahead_s * bend, ahead_s)
 
     return predicted
-
-
-def _rate(sample: AttitudeSample) -> FloatArray:
-    if sample.rate_cam_rad_s is None:
-        raise AssertionError("the slew's samples have rates")
-    return sample.rate_cam_rad_s
 
 
 def _spline(near: Sequence[AttitudeSample]) -> AttitudeAt:

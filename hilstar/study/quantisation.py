@@ -1,10 +1,11 @@
-"""What each method from light to levels costs: flux and centroid errors against magnitude, and against time."""
+"""The methods from light to levels: flux and centroid errors against magnitude, and against time."""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,6 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
     phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
     found: Found = {(bits, way.name): code_errors(bits, way, phases, mags) for bits in BITS for way in WAYS}
-    times = {(bits, name): ms for bits in BITS for name, ms in _frames_ms(bits, 3 if quick else 31).items()}
     rows = [
         (bits, name, float(mag), *error_cells(e))
         for (bits, name), errors in found.items()
@@ -52,7 +52,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     ]
     write_csv(directory / "quantisation.csv", ("bits", "method", "mag_under_white", *ERROR_COLUMNS), rows)
     faintest = {key: errors[int(np.searchsorted(mags, AIMS[key[0]][1]))] for key, errors in found.items()}
-    findings = [*(_summary(bits, found, mags) for bits in BITS), _each_summary(faintest), _time_summary(times)]
+    times = _frame_times_ms(3 if quick else 31)
     _draw_magnitudes(directory / "quantisation", found, mags)
     _draw_each(directory / "quantisation_centroiders", faintest)
     _draw_times(directory / "quantisation_time", faintest, times)
@@ -61,20 +61,37 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         ("bits", "method", "frame_ms", "mag_under_white", *ERROR_COLUMNS),
         [(*key, times[key], AIMS[key[0]][1], *error_cells(e)) for key, e in faintest.items()],
     )
-    return [*findings, study_frames(directory, quick)]
+    coarsest = BITS[0]
+    rounded, exact = (faintest[coarsest, name] for name in ("round", "exact"))
+    left = ", ".join(
+        f"{kind} {exact.axis_rms_px(kind) / rounded.axis_rms_px(kind):.2f} ({exact.axis_rms_px(kind):.4f} px)"
+        for kind in FAMILY
+    )
+    ms = ", ".join(f"{way.method} {times[10, way.name]:.1f} ms" for way in WAYS[:4])
+    return [
+        *(_summary(bits, found, mags) for bits in BITS),
+        f"{coarsest} bits, {AIMS[coarsest][1]:g} magnitudes under white: of the error of round (rms along an axis) exact"
+        f" leaves, by each centroider, {left}",
+        f"{STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, 10 bits, from light to levels in memory: {ms}",
+        study_frames(directory, quick),
+    ]
 
 
-def _frames_ms(bits: int, rounds: int) -> dict[str, float]:
-    """The median time of drawing STARS stars and reading their levels back, ms, of each way, timed in turn."""
+def _frame_times_ms(rounds: int) -> dict[tuple[int, str], float]:
+    """The median time of drawing STARS stars and reading their levels back, ms, by bits and way; the ways in turn."""
     sprites = star_field(FRAME_PX, USUAL_PSF.footprint_px)
+    times: dict[tuple[int, str], float] = {}
 
     def draw(renderer: Renderer, frame: int) -> object:
         renderer.draw(sprites, frame)
         return renderer.levels()
 
-    with ExitStack() as stack:
-        targets = {way.name: Target(FRAME_PX, USUAL_PSF, response_of(bits, way), WHITE, way.method) for way in WAYS}
-        return medians_ms({name: partial(draw, stack.enter_context(Renderer(on))) for name, on in targets.items()}, rounds)
+    for bits in BITS:
+        with ExitStack() as stack:
+            targets = {way.name: Target(FRAME_PX, USUAL_PSF, response_of(bits, way), WHITE, way.method) for way in WAYS}
+            works = {name: partial(draw, stack.enter_context(Renderer(on))) for name, on in targets.items()}
+            times |= {(bits, name): ms for name, ms in medians_ms(works, rounds).items()}
+    return times
 
 
 def _summary(bits: int, found: Found, mags: FloatArray) -> str:
@@ -94,26 +111,6 @@ def _worst(errors: list[StarErrors], mags: FloatArray, limit_mag: float) -> str:
     return f"{max(e.flux_max_mag for e in within):.3f} mag and {max(e.max_px(JUDGE) for e in within):.3f} px"
 
 
-def _each_summary(faintest: dict[tuple[int, str], StarErrors]) -> str:
-    """What `exact` leaves of the error of `round`, by each centroider, at the faint end of the coarsest panel."""
-    bits = BITS[0]
-    rounded, exact = faintest[bits, "round"], faintest[bits, "exact"]
-    left = {kind: exact.axis_rms_px(kind) / rounded.axis_rms_px(kind) for kind in FAMILY}
-    each = ", ".join(f"{kind} {left[kind]:.2f} ({exact.axis_rms_px(kind):.4f} px)" for kind in FAMILY)
-    return (
-        f"{bits} bits, {AIMS[bits][1]:g} magnitudes under white: of the error of round (rms along an axis) exact leaves,"
-        f" by each centroider, {each}"
-    )
-
-
-def _time_summary(times: dict[tuple[int, str], float]) -> str:
-    ms = {way.name: times[10, way.name] for way in WAYS}
-    return (
-        f"{STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, 10 bits, from light to levels in memory: round {ms['round']:.1f} ms,"
-        f" dither {ms[WAYS[1].name]:.1f} ms, temporal {ms[WAYS[2].name]:.1f} ms, exact {ms['exact']:.1f} ms"
-    )
-
-
 def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
     bits, limit = BITS[1], AIMS[BITS[1]][1]
     exact, rounded = (_worst(found[bits, name], mags, limit) for name in ("exact", "round"))
@@ -128,14 +125,8 @@ def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
                 errors = found[bits, way.name]
                 for axes, values in ((flux, [e.flux_max_mag for e in errors]), (place, [e.max_px(JUDGE) for e in errors])):
                     shown = np.where(np.isfinite(values), np.maximum(values, MIN_ERROR), np.nan)
-                    axes.semilogy(
-                        mags,
-                        shown,
-                        ":" if way.stealing else "-",
-                        color=way.colour,
-                        lw=1.5,
-                        label=way.name.replace("mean of ", ""),
-                    )
+                    label, style = way.name.replace("mean of ", ""), ":" if way.stealing else "-"
+                    axes.semilogy(mags, shown, style, color=way.colour, lw=1.5, label=label)
             for axes, aim in ((flux, aim_mag), (place, AIM_PX)):
                 axes.plot([0, limit, limit], [aim, aim, MIN_ERROR], "--", color=INK, lw=1.1, label="_aim")
                 axes.annotate("aim", (0, aim), (2, 3), textcoords="offset points", fontsize=SMALL_PT)
@@ -165,14 +156,8 @@ def _draw_each(path: Path, faintest: dict[tuple[int, str], StarErrors]) -> None:
                 axes.plot([exact, rounded], [place, place], color=MUTED, lw=1)
                 axes.plot(rounded, place, "o", color=ORANGE, label="_" if place else "round")
                 axes.plot(exact, place, "o", color=BLUE, label="_" if place else "exact")
-                axes.annotate(
-                    f"{left[bits, kind]:.2f}",
-                    (rounded, place),
-                    (6, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=SMALL_PT,
-                )
+                beside: Any = {"textcoords": "offset points", "va": "center", "fontsize": SMALL_PT}
+                axes.annotate(f"{left[bits, kind]:.2f}", (rounded, place), (6, 0), **beside)
             axes.set(xscale="log", title=f"{bits} bits, {AIMS[bits][1]:g} mag under white", xlabel="error [monitor px]")
             axes.margins(x=0.2, y=0.12)
             axes.grid(visible=False, axis="y")

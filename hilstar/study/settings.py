@@ -6,10 +6,13 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.build import load
+from hilstar.bench.frame import Bench
 from hilstar.scene.sprites import Sprites
 from hilstar.sky.electrons import Optics, fit_table, load_library
 from hilstar.sky.spectral_types import bare_and_dusty, fit_spectra, read_types
@@ -20,6 +23,7 @@ Value = str | float | tuple[int, int]
 Table = Mapping[str, Value]
 
 TRACKER: Table = {"aperture_mm": 30, "focal_length_mm": 70, "pixel_pitch_um": 13, "quantum_efficiency": "ccd47-20"}
+FULL_HD: Table = {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65}
 APERTURE_MM = 30.0
 GLASS = "n-bk7-10mm"
 MAX_RELIABLE_VI_MAG = 2.5
@@ -34,6 +38,12 @@ def bench_text(tables: Mapping[str, Table]) -> str:
         # Text, numbers and pairs are written alike in JSON and TOML.
         lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in whole.items())]
     return "\n".join(lines) + "\n"
+
+
+def study_bench(path: Path, tables: Mapping[str, Table]) -> Bench:
+    """The bench of `bench_text`, whose file is written to `path`. Raises InputError or MachineError."""
+    path.write_text(bench_text(tables), encoding="utf-8")
+    return load(path)
 
 
 def study_optics(sensor: str) -> Optics:
@@ -54,7 +64,7 @@ def held_out_errors(rates: FloatArray) -> FloatArray:
 
 
 def held_out_by_type(rates: FloatArray) -> FloatArray:
-    """Relative error (2m,) of the rate of each spectrum of `bare_and_dusty` by type, each star held out with its dusty one."""
+    """Relative error (2m,) of each spectrum's rate by type, over `bare_and_dusty`; each star is held out with its dusty one."""
     library = bare_and_dusty()
     kind = read_types(np.array(library.spectral_type, dtype=np.bytes_))
     count, errors = len(rates) // 2, np.empty(len(rates))
@@ -70,7 +80,7 @@ def held_out_by_type(rates: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Isolation:
-    """Margin of a window around a star's sprites, px, and the largest share of its light that other stars may add there."""
+    """Margin of a window around a star's sprites, px, and the share of its light that other stars may add there."""
 
     margin_px: float
     max_share: float

@@ -1,7 +1,7 @@
 """Methods side by side: their times in turn, the front of error against time, and how busy the machine was meanwhile.
 
 Works are timed in rounds, so that other load on the machine is in the times of all of them. On a busy machine no time says
-which method is faster, so a study also notes what else ran.
+which method is faster, so a study also notes the load by others.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import math
 import os
 import resource
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -45,8 +46,8 @@ def spent(work: Callable[[], object]) -> Spent:
 def in_turn(works: Mapping[str, Callable[[int], object]], rounds: int, share_s: float = math.inf) -> dict[str, list[Spent]]:
     """The times of at most `rounds` calls of each work, which is given the number of its round.
 
-    Each round has an order of its own, so that no work always follows the same one. A work that has had `share_s` skips what
-    follows MIN_ROUNDS. Round 0 comes first and is not counted: it compiles shaders and fills caches.
+    Each round has an order of its own, so that no work always follows the same one. A work that has had `share_s` skips the
+    rounds after MIN_ROUNDS. Round 0 is not counted: it compiles shaders and fills caches.
     """
     times: dict[str, list[Spent]] = {name: [] for name in works}
     names, rng = list(works), np.random.default_rng(SEED)
@@ -76,6 +77,79 @@ def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
 def pareto_front(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
     """Which methods (n,) no other beats, by error and time; two that are equal in both are both on the front."""
     return np.asarray(~beaten_by(errors, times_ms).any(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A measure of methods: its name and unit; figures under `floor` count as 0."""
+
+    name: str
+    unit: str
+    floor: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A method: its error and a second figure, in the units of its `Trials`, and the work that is timed.
+
+    `more` are further figures by the names of their columns. The others are measured against the exact one. `measured` adds
+    the median time and its quartiles, ms; `on_front` where no other is both as accurate and as fast; and in `beaten` the method
+    that beats the default, and why the default stays.
+    """
+
+    method: str
+    error: float
+    second: float
+    work: Callable[[], object]
+    is_default: bool = False
+    is_exact: bool = False
+    more: dict[str, float] = field(default_factory=dict)
+    time_ms: float = np.nan
+    quartiles_ms: tuple[float, float] = (np.nan, np.nan)
+    on_front: bool = False
+    beaten: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """All methods of a step. `work` names the timed work, `why_default` is the reason for the default where another beats it.
+
+    `remark` is a caution that the figures alone would hide.
+    """
+
+    name: str
+    work: str
+    error: Figure
+    second: Figure
+    why_default: str
+    trials: Sequence[Trial]
+    remark: str = ""
+
+    @property
+    def default(self) -> Trial:
+        """The method that hilstar takes."""
+        return next(trial for trial in self.trials if trial.is_default)
+
+
+def measured(step: Trials, budget_s: float) -> Trials:
+    """Time the methods of a step in turn, mark the front, and put the fastest first."""
+    works = {trial.method: lambda _, work=trial.work: work() for trial in step.trials}
+    times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
+    low, middle, high = np.array([np.percentile([one.wall_ms for one in took], (25, 50, 75)) for took in times.values()]).T
+    errors = [max(trial.error, step.error.floor) for trial in step.trials]
+    beaten = beaten_by(errors, middle)
+    found = [
+        replace(trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any())
+        for trial, q1, ms, q3, beats in zip(step.trials, low, middle, high, beaten, strict=True)
+    ]
+    own = next(k for k, trial in enumerate(found) if trial.is_default)
+    if not found[own].on_front:
+        best = min((trial for trial, beats in zip(found, beaten[own], strict=True) if beats), key=lambda trial: trial.time_ms)
+        saved = 100 * (1 - best.time_ms / found[own].time_ms)
+        noise = ", and the quartiles of both overlap" if best.quartiles_ms[1] >= found[own].quartiles_ms[0] else ""
+        why = f"'{best.method}' is no worse and takes {saved:.0f} % less time{noise}; {step.why_default}"
+        found[own] = replace(found[own], beaten=why)
+    return replace(step, trials=sorted(found, key=lambda trial: trial.time_ms))
 
 
 class _CoreTimes(NamedTuple):
@@ -113,12 +187,12 @@ class OtherWork:
 
 
 def is_busy(others_cores: float) -> bool:
-    """Whether so much other work makes times worthless."""
+    """Whether other work makes times worthless."""
     return others_cores > BUSY_SHARE * (os.cpu_count() or 1)
 
 
 def busy_line(others_cores: float) -> str:
-    """What a person has to know of times that were taken beside other work."""
+    """The caution about times that were taken beside other work."""
     return (
         f"a busy machine: other processes took {others_cores:.1f} of its {os.cpu_count()} cores meanwhile, so these times name"
         " no winner; run it again when the machine is idle"

@@ -1,15 +1,15 @@
 """The study of timing: the effect of a screen's timing on a slewing tracker, and the gain and cost of each compensation.
 
-The virtual tracker integrates over several frames of a simulated panel that lights row by row and holds each row until it is
+The virtual tracker integrates over several frames of a simulated panel, which lights row by row and holds each row until it is
 written again. Its image is compared with that of the sky in the same exposure, star by star. Each row is at its own phase, so
-the stars of one exposure see the whole beat; the beat is compared with what `run.sync` predicts.
+the stars of one exposure see the whole beat. The beat is compared with the prediction of `run.sync`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,20 +19,19 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.bench.build import load
 from hilstar.bench.cameras import tracker_camera
 from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.quantise import shown_light
+from hilstar.monitor.response import Levels
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
-from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
 from hilstar.study.predictors import attitude_at
-from hilstar.study.settings import Isolation, Table, bench_text, centroid_px, lone_windows, star_error
+from hilstar.study.settings import FULL_HD, GLASS, Isolation, Table, centroid_px, lone_windows, star_error, study_bench
 from hilstar.study.sweep import medians_ms
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
@@ -77,21 +76,10 @@ class Slew:
 
 @dataclass(frozen=True, slots=True)
 class Compensation:
-    """What a bench compensates: further keys of [monitor], and `motion` of [render]."""
+    """A bench's compensation: further keys of [monitor], and `motion` of [render]."""
 
     monitor_keys: Table
     motion: str
-
-    def bench_text(self, exposure_s: float) -> str:
-        """The bench file with this compensation."""
-        tables: dict[str, Table] = {
-            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": "n-bk7-10mm"},
-            "sky": {"faintest_v_mag": 6.0},
-            "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "bits": 10, **self.monitor_keys},
-            "collimator": {"focal_length_mm": 350},
-            "render": {"quantisation": "exact", "motion": self.motion, "brightest_v_mag": 1.5},
-        }
-        return bench_text(tables)
 
 
 WAYS = {
@@ -126,13 +114,17 @@ class ScanningPanel:
     """
 
     def __init__(self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0) -> None:
-        compensation = WAYS[way]
-        if lit < 1:
-            compensation = replace(compensation, monitor_keys={**compensation.monitor_keys, "hold_ms": lit * REFRESH_MS})
-        path.write_text(compensation.bench_text(exposure_s))
+        held: Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
+        tables: dict[str, Table] = {
+            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": GLASS},
+            "sky": {"faintest_v_mag": 6.0},
+            "monitor": {**FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
+            "collimator": {"focal_length_mm": 350},
+            "render": {"quantisation": "exact", "motion": WAYS[way].motion, "brightest_v_mag": 1.5},
+        }
         self.way = way
         self.start_s = START_S
-        self.bench = load(path)
+        self.bench = study_bench(path, tables)
         config = self.bench.config
         self.period_s = 1 / config.monitor.refresh_hz
         self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s)
@@ -150,10 +142,10 @@ class ScanningPanel:
             light_s = math.floor((swap_s - DRAW_TO_SWAP_S) * PACKET_HZ) / PACKET_HZ
         return attitude_at(timeline, round(light_s * NS_PER_S))
 
-    def draw(self, attitude: Attitude, number: int) -> FloatArray:
-        """The light of one frame, (H, W)."""
+    def levels(self, attitude: Attitude, number: int) -> Levels:
+        """Draw one frame: its levels (H, W)."""
         rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
-        return shown_light(self.bench.draw(attitude.q_icrs_to_cam, number, rate).levels, self.panel)
+        return self.bench.draw(attitude.q_icrs_to_cam, number, rate).levels
 
     def exposed_e_per_s(self, slew: Slew) -> FloatArray:
         """The tracker's image (h, w) of the screen, mean over an exposure."""
@@ -166,15 +158,13 @@ class ScanningPanel:
         light = np.zeros((height, self.bench.config.monitor.resolution_px[0]))
         for number, swap_s, weight in zip(numbers, swaps_s, weights, strict=True):
             if weight.any():
-                light += weight[:, None] * self.draw(self.attitude(slew, swap_s), number)
+                light += weight[:, None] * shown_light(self.levels(self.attitude(slew, swap_s), number), self.panel)
         return self.optics.image_e_per_s(light)
 
     def cost_ms(self, slew: Slew) -> float:
         """Median time of drawing a frame, from its attitude to its codes, ms."""
         attitude = self.attitude(slew, 0.0)
-        rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
-        draw = {self.way: lambda k: self.bench.draw(attitude.q_icrs_to_cam, k, rate).levels}
-        return medians_ms(draw, COST_ROUNDS)[self.way]
+        return medians_ms({self.way: lambda number: self.levels(attitude, number)}, COST_ROUNDS)[self.way]
 
     def close(self) -> None:
         """Free the GL contexts."""
@@ -214,6 +204,11 @@ class TimingCase:
     lit: float = 1.0
 
     @property
+    def exposures(self) -> Exposures:
+        """The exposures, before a panel of 60 Hz."""
+        return Exposures(60.0, self.refreshes / 60.0, lit_s=self.lit / 60.0)
+
+    @property
     def words(self) -> str:
         """For a legend."""
         return f"{self.refreshes:g} refreshes" + ("" if self.lit == 1 else f", lit {self.lit:g} of each")
@@ -225,7 +220,7 @@ QUICK_CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4, 0.25))
 
 @dataclass(frozen=True, slots=True)
 class BeatPoint:
-    """One star of one exposure: what was seen, and foretold of an exposure that begins `phase` refreshes after its row lights.
+    """One star of one exposure, measured and foretold; the exposure begins `phase` refreshes after its row lights.
 
     `off_arcsec` is along the star's motion, `light_mag` against the mean light of the panel.
     """
@@ -242,87 +237,79 @@ class BeatPoint:
 def measure_beat(quick: bool = False) -> list[BeatPoint]:
     """Every case at 1 deg/s, by the virtual tracker."""
     slew = Slew(RATE_DEG_S)
-    with TemporaryDirectory() as folder:
-        return [point for case in (QUICK_CASES if quick else CASES) for point in _case_points(case, slew, Path(folder))]
-
-
-def _case_points(case: TimingCase, slew: Slew, folder: Path) -> Iterator[BeatPoint]:
-    opened = ScanningPanel("+ smear", folder / "beat.toml", case.refreshes / 60.0, case.lit)
-    with closing(opened) as panel, closing(TimingSky(opened)) as sky:
-        for number in range(STARTS):
-            panel.start_s = (number + 0.2) / STARTS * panel.period_s
-            yield from _exposure_points(case, panel, sky, slew)
+    points: list[BeatPoint] = []
+    for case in QUICK_CASES if quick else CASES:
+        with TemporaryDirectory() as folder, ExitStack() as stack:
+            panel = stack.enter_context(
+                closing(ScanningPanel("+ smear", Path(folder) / "beat.toml", case.refreshes / 60.0, case.lit))
+            )
+            sky = stack.enter_context(closing(TimingSky(panel)))
+            for number in range(STARTS):
+                panel.start_s = (number + 0.2) / STARTS * panel.period_s
+                points += _exposure_points(case, panel, sky, slew)
+    return points
 
 
 def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, slew: Slew) -> Iterator[BeatPoint]:
     shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
-    paths = sky.paths(slew)
-    places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
-    windows = list(lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION))
-    rows, speed_px_s = _rows_and_speeds(panel, slew, np.array([star for star, _ in windows]))
-    exposures = Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s)
-    phase = (panel.start_s / panel.period_s - rows) % 1.0
-    foretold = seen_at(exposures, phase)
+    paths, to_tracker, camera = sky.paths(slew), panel.optics.geometry.to_tracker, panel.bench.camera
+    windows = list(lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
+    # Where each star is on the monitor in the middle of the exposure, and just before and after: its row, and its speed.
+    middle = Motion(slew.at(panel.start_s + panel.exposure_s / 2), slew.rate_cam_rad_s, panel.exposure_s)
+    vectors = panel.bench.stars.vectors[[star for star, _ in windows]]
+    images = vectors @ middle.icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera).transpose(0, 2, 1)
+    before, now, after = (camera.project(image) for image in images)
+    speed_px_s = np.subtract(to_tracker(*after), to_tracker(*before)) / (2 * STEP_S)
+    phase = (panel.start_s / panel.period_s - (now[1] + 0.5) / camera.resolution_px[1]) % 1.0
+    foretold = seen_at(Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s), phase)
     for index, (_, window) in enumerate(windows):
         off_px = np.subtract(centroid_px(shown, window), centroid_px(true, window))
         speed = speed_px_s[:, index]
-        along_s = float(off_px @ speed / (speed @ speed))
-        light = float(shown[window].sum() / true[window].sum()) / case.lit
         yield BeatPoint(
             case.refreshes,
             case.lit,
             float(phase[index]),
-            along_s * RATE_DEG_S * ARCSEC_PER_DEG,
+            float(off_px @ speed / (speed @ speed)) * RATE_DEG_S * ARCSEC_PER_DEG,
             float(foretold.off_s[index]) * RATE_DEG_S * ARCSEC_PER_DEG,
-            magnitude(light),
+            magnitude(float(shown[window].sum() / true[window].sum()) / case.lit),
             magnitude(float(foretold.light[index])),
         )
-
-
-def _rows_and_speeds(panel: ScanningPanel, slew: Slew, stars: np.ndarray) -> tuple[FloatArray, FloatArray]:
-    """Each star's row on the monitor, of its height, and its speed on the detector, px/s (2, n), mid-exposure."""
-    middle = Motion(slew.at(panel.start_s + panel.exposure_s / 2), slew.rate_cam_rad_s, panel.exposure_s)
-    camera, vectors = panel.bench.camera, panel.bench.stars.vectors[stars]
-    images = vectors @ middle.icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera).transpose(0, 2, 1)
-    before, now, after = (camera.project(image) for image in images)
-    to_tracker = panel.optics.geometry.to_tracker
-    speed = np.subtract(to_tracker(*after), to_tracker(*before)) / (2 * STEP_S)
-    return (now[1] + 0.5) / panel.bench.config.monitor.resolution_px[1], speed
 
 
 def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
     """Write `beat.csv` and its chart; a line for each case. Raises InputError."""
     write_records(directory / "beat.csv", points)
-    cases = list(dict.fromkeys(TimingCase(p.refreshes, p.lit) for p in points))
-    lines = [_beat_line(case, [p for p in points if TimingCase(p.refreshes, p.lit) == case]) for case in cases]
-    off = np.array([p.off_arcsec - p.foretold_arcsec for p in points])
+    cases: dict[TimingCase, list[BeatPoint]] = {}
+    for point in points:
+        cases.setdefault(TimingCase(point.refreshes, point.lit), []).append(point)
     finding = (
         f"The beat of exposure and refresh moves a star at {RATE_DEG_S:g} deg/s as foretold from their phase,"
-        f" within {np.sqrt(np.mean(off**2)):.2g} arcsec rms"
+        f" within {_off_arcsec(points):.2g} arcsec rms"
     )
-    _draw(directory / "beat", finding, cases, points)
+    _draw(directory / "beat", finding, cases)
+    lines = []
+    for case, mine in cases.items():
+        found = beat(case.exposures)
+        lines.append(
+            f"{case.words}: up to {max(abs(p.off_arcsec) for p in mine):.3g} arcsec"
+            f" ({(found.worst_arcsec_per_deg_s or 0.0) * RATE_DEG_S:.3g} foretold over all phases) and"
+            f" {max(abs(p.light_mag) for p in mine):.2g} mag ({found.worst_mag:.2g});"
+            f" {_off_arcsec(mine):.2g} arcsec rms off that ({len(mine)} stars)"
+        )
     return [finding, *lines]
 
 
-def _beat_line(case: TimingCase, points: list[BeatPoint]) -> str:
-    found = beat(Exposures(60.0, case.refreshes / 60.0, lit_s=case.lit / 60.0))
-    seen, light = np.array([p.off_arcsec for p in points]), np.array([p.light_mag for p in points])
-    off = seen - [p.foretold_arcsec for p in points]
-    foretold_arcsec = (found.worst_arcsec_per_deg_s or 0.0) * RATE_DEG_S
-    return (
-        f"{case.words}: up to {np.abs(seen).max():.3g} arcsec ({foretold_arcsec:.3g} foretold over all phases) and"
-        f" {np.abs(light).max():.2g} mag ({found.worst_mag:.2g}); {np.sqrt(np.mean(off**2)):.2g} arcsec rms off that"
-        f" ({len(points)} stars)"
-    )
+def _off_arcsec(points: list[BeatPoint]) -> float:
+    """How far stars are from where they were foretold, rms."""
+    return float(np.sqrt(np.mean([(p.off_arcsec - p.foretold_arcsec) ** 2 for p in points])))
 
 
-def _draw(path: Path, finding: str, cases: list[TimingCase], points: list[BeatPoint]) -> None:
+def _draw(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]) -> None:
     phases = np.linspace(0, 1, 801)
     note = "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit have no beat."
     with chart(path, finding, panels=2, note=note) as (place, light):
-        for case, colour in zip(cases, SERIES, strict=False):
-            mine = [p for p in points if TimingCase(p.refreshes, p.lit) == case]
-            foretold = seen_at(Exposures(60.0, case.refreshes / 60.0, lit_s=case.lit / 60.0), phases)
+        for (case, mine), colour in zip(cases.items(), SERIES, strict=False):
+            foretold = seen_at(case.exposures, phases)
             place.plot(phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG, color=colour, label=case.words)
             light.plot(phases, [magnitude(float(part)) for part in foretold.light], color=colour, label=case.words)
             for axes, seen in ((place, "off_arcsec"), (light, "light_mag")):
@@ -351,36 +338,24 @@ class TimingOutcome:
 def compare(panel: ScanningPanel, sky: TimingSky, slew: Slew) -> TimingOutcome:
     """One compensation on one slew, against the sky."""
     shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
-    camera: Camera = panel.camera
     paths = sky.paths(slew)
     places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
-    windows = lone_windows(paths, *places, camera.resolution_px, ISOLATION)
+    windows = lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
     errors = [star_error(shown, true, window) for _, window in windows]
     flux_mag = np.array([error.flux_mag for error in errors])
-    off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / camera.focal_length_px
+    off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / panel.camera.focal_length_px
     rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
     return TimingOutcome(
         panel.way, slew.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(slew)
     )
 
 
-@contextmanager
-def _opened() -> Iterator[tuple[list[ScanningPanel], TimingSky]]:
-    with TemporaryDirectory() as folder, ExitStack() as stack:
-        panels = []
-        for number, way in enumerate(WAYS):
-            panels.append(ScanningPanel(way, Path(folder) / f"{number}.toml"))
-            stack.callback(panels[-1].close)
-        sky = TimingSky(panels[0])
-        stack.callback(sky.close)
-        yield panels, sky
-
-
 def measure(quick: bool = False) -> list[TimingOutcome]:
     """Every compensation at every rate."""
-    with _opened() as (panels, sky):
-        rates = QUICK_RATES_DEG_S if quick else RATES_DEG_S
-        return [compare(panel, sky, Slew(rate)) for rate in rates for panel in panels]
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        panels = [stack.enter_context(closing(ScanningPanel(way, Path(folder) / f"{k}.toml"))) for k, way in enumerate(WAYS)]
+        sky = stack.enter_context(closing(TimingSky(panels[0])))
+        return [compare(panel, sky, Slew(rate)) for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S) for panel in panels]
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:

@@ -30,10 +30,10 @@ def assert_same_sky(
     centroid_px: float = CENTROID_PX,
     truth: Truth | str | Path | None = None,
 ) -> SkyComparison:
-    """Assert that every star of two skies has one flux (magnitudes) and one place (px); see `compare` for what a sky is.
+    """Assert that every star of two skies has the same flux (magnitudes) and place (px). Skies are those of `compare`.
 
-    Raises AssertionError with what all stars differ by and a line for each star that differs otherwise (at most 20), and
-    InputError as `compare` does.
+    Raises AssertionError with the common difference of all stars and a line for each star that differs otherwise (at most 20).
+    Raises InputError as `compare` does.
     """
     comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
     if not comparison.same:

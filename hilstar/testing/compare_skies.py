@@ -1,7 +1,7 @@
-"""Two images of one sky, star by star: what a change of driver may change, and what it may not; and the files they come from.
+"""Two images of one sky compared star by star, within the limits of a change of driver; and the files they come from.
 
-Stars are found in the golden image and fitted in both (see star_fit). Where the rounding of the light around a star limits
-how well a fit knows it, that star's limits are wider.
+Stars are found in the golden image and fitted in both (see star_fit). Where rounding of the light around a star limits the
+fit, that star's limits are wider.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def compare_skies(
 ) -> SkyComparison:
     """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE), `truth` the golden one's.
 
-    Raises InputError for images of different size or with a pixel that is not finite, a golden one without a star, and a
-    `truth` of another sky.
+    Raises InputError for images of different size or with a pixel that is not finite, for a golden one without a star, and
+    for a `truth` of another sky.
     """
     check_skies(frame, golden)
     psf = star_psf(golden)
@@ -102,20 +102,17 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
 def _measurable(golden: FloatArray, seeds: Seeds, psf: Psf) -> tuple[Seeds, int]:
     """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many stars do not."""
     count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
-    seeds = _in_view(seeds, psf, shape)
-    seeds = _in_view(Seeds(refined(golden, seeds.places_px, psf), seeds.hip), psf, shape)
+    seeds = seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
+    seeds = Seeds(refined(golden, seeds.places_px, psf), seeds.hip)
+    seeds = seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
     templates = StarTemplates(seeds.places_px, psf, shape)
     flux = templates.fit(golden)[:, 0]
     seeds = seeds.only(flux > templates.errors(flux, PIXEL_ERROR)[0] / MAX_ERROR)
     return seeds, count - seeds.stars
 
 
-def _in_view(seeds: Seeds, psf: Psf, shape: tuple[int, int]) -> Seeds:
-    return seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
-
-
 class _SkyFit:
-    """All stars of one image, fitted at `places_px`: what they are, and the light (height, width) that they leave."""
+    """All stars of one image, fitted at `places_px`: fluxes, places, and the light (height, width) that they do not explain."""
 
     def __init__(self, image: FloatArray, places_px: FloatArray, psf: Psf) -> None:
         self.light = image
@@ -132,12 +129,13 @@ class _SkyFit:
         start = self.templates.places_px
         fit = _SkyFit(frame, start, self.psf)
         for _ in range(MOVE_STEPS):
-            shift = np.hypot(*(fit.places_px - self.places_px).T)
-            there = fit.flux > MISSING_SHARE * self.flux
-            moved = there & (shift > SMALL_MOVE_PX) & (shift <= MAX_MOVE_SIGMAS * max(self.psf.width_px))
+            move = fit.places_px - self.places_px
+            shift = np.hypot(*move.T)
+            moved = (fit.flux > MISSING_SHARE * self.flux) & (shift > SMALL_MOVE_PX)
+            moved &= shift <= MAX_MOVE_SIGMAS * max(self.psf.width_px)
             if not moved.any():
                 break
-            fit = _SkyFit(frame, start + np.where(moved[:, None], fit.places_px - self.places_px, 0.0), self.psf)
+            fit = _SkyFit(frame, start + np.where(moved[:, None], move, 0.0), self.psf)
         return fit
 
 
@@ -170,9 +168,8 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
     places = refined(light, seeds, fit.psf)
     flux = StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[:, 0]
     column, row = seeds.astype(np.intp).T
-    return places, np.maximum(
-        flux, light[row, column]
-    )  # two stars at one place: the fit may give one too much and the other less than 0
+    # Two stars at one place: the fit may give one too much and the other less than 0.
+    return places, np.maximum(flux, light[row, column])
 
 
 def read_frame_fits(path: Path) -> FloatArray:
@@ -183,7 +180,7 @@ def read_frame_fits(path: Path) -> FloatArray:
     raw = _inflated(path, read_bytes(path, wanted, MAX_FITS_BYTES), wanted)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy warns about cards; what matters is checked below
+            warnings.simplefilter("ignore")  # astropy warns about cards; those that matter are checked below
             image, header = fits.getdata(io.BytesIO(raw), header=True)
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: not a FITS image; {wanted}") from error

@@ -21,23 +21,13 @@ ROOM_PX = 3.0  # between two names
 MIN_ERROR = 1e-8  # as drawn: a tenth of float32's rounding
 STYLES = (("same", ".", MUTED), ("changed", "o", RED), ("missing", "v", PURPLE), ("extra", "^", ORANGE))
 COLUMNS = (
-    "kind",
-    "hip",
-    "x_px",
-    "y_px",
-    "flux_e_per_s",
-    "flux_error_mag",
-    "dx_px",
-    "dy_px",
-    "centroid_error_px",
-    "flux_limit_mag",
-    "centroid_limit_px",
-    "differs",  # 1 where the star differs from what is common to all
+    *("kind", "hip", "x_px", "y_px", "flux_e_per_s", "flux_error_mag", "dx_px", "dy_px", "centroid_error_px"),
+    *("flux_limit_mag", "centroid_limit_px", "differs"),  # 1 where the star differs from what is common to all
 )
 
 
 def draw(path: Path, comparison: SkyComparison) -> None:
-    """Write the chart. Raises InputError where it cannot be."""
+    """Write the chart. Raises InputError where that fails."""
     said = finding(comparison)
     while title_lines(said).count("\n") > 1 and ";" in said:
         said = said.rpartition(";")[0]
@@ -51,7 +41,17 @@ def draw(path: Path, comparison: SkyComparison) -> None:
             axis.set(yscale="log", ylabel=f"{what}{less} [{unit}]")
             axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         axes[1].set_xlabel("magnitudes below the brightest star [mag]")
-        _make_room(axes[0], names)
+        # Remove the names that overlap those of worse stars, and those that are too many.
+        if (figure := axes[0].get_figure(root=True)) is not None:
+            figure.draw_without_rendering()
+        for texts in names:  # worst first, of each panel
+            kept: list[Bbox] = []
+            for text in texts:
+                box = text.get_window_extent().padded(ROOM_PX)
+                if len(kept) == MAX_NAMES or any(box.overlaps(other) for other in kept):
+                    text.remove()
+                else:
+                    kept.append(box)
 
 
 class ChartPanel:
@@ -82,7 +82,7 @@ class ChartPanel:
         return mag, max(star.centroid_error_px, MIN_ERROR), star.limits.centroid_px
 
     def label(self, kind: str, drawn: int) -> str:
-        """How many stars are of a kind: of those that one image alone has all, as the terminal and the table count them."""
+        """How many stars are of a kind. Missing and extra ones are all counted, as on the terminal and in the table."""
         count = len(self.comparison.of(kind)) if kind in self.rows else drawn
         common = count - drawn
         return f"{kind}: {count}" + (f"\n({common} by what is common)" if common else "")
@@ -98,14 +98,13 @@ class ChartPanel:
             axis.axhline(self.common, color=GREEN, lw=1.2, label=f"in common: {self.common:.3g} {self.unit}")
         wider = [point for star in self.of("same", "changed") if (point := self.point(star))[2] > self.limit]
         if wider:
-            axis.plot(
-                [p[0] for p in wider], [p[2] for p in wider], "_", color=INK, ms=8, label=f"a star's own limit: {len(wider)}"
-            )
+            at, _, limits = zip(*wider, strict=True)
+            axis.plot(at, limits, "_", color=INK, ms=8, label=f"a star's own limit: {len(wider)}")
         axis.set_ylim(MIN_ERROR / 2, 300 * self.row)
         axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
 
     def name_stars(self, axis: Axes) -> list[Annotation]:
-        """Names of the worst stars; those that only one image has are named in the panel of flux alone."""
+        """Names of the worst stars. Missing and extra ones are named in the panel of flux alone."""
         names = []
         for star in self.worst:
             mag, error, own = self.point(star)
@@ -116,34 +115,19 @@ class ChartPanel:
         return names[:MAX_TRIED]
 
 
-def _make_room(axis: Axes, names: list[list[Annotation]]) -> None:
-    """Remove the names that overlap those of worse stars, and those that are too many."""
-    figure = axis.get_figure(root=True)
-    if figure is None:
-        return
-    figure.draw_without_rendering()
-    for texts in names:  # worst first, of each panel
-        kept: list[Bbox] = []
-        for text in texts:
-            box = text.get_window_extent().padded(ROOM_PX)
-            if len(kept) == MAX_NAMES or any(box.overlaps(other) for other in kept):
-                text.remove()
-            else:
-                kept.append(box)
-
-
 def write_report(directory: Path, comparison: SkyComparison) -> None:
     """compare.csv, a row for each star, and the chart compare, errors against magnitude, as PNG and SVG.
 
     Raises InputError where one cannot be written.
     """
     odd = {(star.hip, star.x_px, star.y_px) for star in comparison.differing}
-    rows = ((*_row(star), int((star.hip, star.x_px, star.y_px) in odd)) for star in comparison.stars)
+    rows = [
+        (
+            *(star.kind, " ".join(map(str, star.hip)), star.x_px, star.y_px, star.flux_e_per_s),
+            *(star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px),
+            *(star.limits.flux_mag, star.limits.centroid_px, int((star.hip, star.x_px, star.y_px) in odd)),
+        )
+        for star in comparison.stars
+    ]
     write_csv(directory / "compare.csv", COLUMNS, rows)
     draw(directory / "compare", comparison)
-
-
-def _row(star: StarDifference) -> tuple[object, ...]:
-    hip = " ".join(map(str, star.hip))
-    errors = star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px
-    return star.kind, hip, star.x_px, star.y_px, star.flux_e_per_s, *errors, star.limits.flux_mag, star.limits.centroid_px

@@ -1,4 +1,4 @@
-"""How two skies differ: each star, what most stars change together (shift, turn, scale, dimming), and the verdict.
+"""How two skies differ: each star, the change common to most stars (shift, turn, scale, dimming), and the verdict.
 
 The common motion is a shift, with turn and scale, or a homography, fitted so that outliers do not matter. Missing stars are
 matched with extra ones first: after a shift by more than a star's width no star is in its place.
@@ -36,34 +36,21 @@ PAIR_ROUNDS = 3
 EDGE_PX = 5.0  # a star so near to the edge, or beyond it, may come into view or leave it by a common shift
 
 
-@dataclass(frozen=True, slots=True)
-class MotionFigures:
-    """A motion in the middle of the image: shift, px, turn and scale; 0 for what moves no star by more than its limit."""
-
-    shift_px: tuple[float, float]
-    rotation_deg: float
-    scale_error: float
-
-
 def common_motion(places: FloatArray, moves: FloatArray, limits_px: FloatArray) -> Motion | None:
     """The simplest motion that explains the moves (n, 2) of stars at `places` (n, 2) from the middle; None for none."""
-    before = np.hypot(*moves.T)
-    if np.median(before) <= np.median(limits_px):
+    before, limit = np.hypot(*moves.T), np.median(limits_px)
+    if np.median(before) <= limit:
         return None
-    best = fitted_motion(places, moves, 1)
-    left = _left(best, places, moves)
-    for rank in range(2, rank_for(len(places)) + 1):
-        richer = fitted_motion(places, moves, rank)
-        then = _left(richer, places, moves)
+    best: Motion | None = None
+    left = before
+    for rank in range(1, rank_for(len(places)) + 1):
+        motion = fitted_motion(places, moves, rank)
+        then = np.hypot(*(moves - motion(places)).T)
         more = (then <= limits_px).mean() > (left <= limits_px).mean() + MORE_STARS
-        nearer = np.median(left) > np.median(limits_px) and np.median(then) < MIN_SHARE * np.median(left)
-        if more or nearer:
-            best, left = richer, then
+        nearer = np.median(left) > limit and np.median(then) < MIN_SHARE * np.median(left)
+        if rank == 1 or more or nearer:
+            best, left = motion, then
     return best if np.median(left) <= MIN_SHARE * np.median(before) else None
-
-
-def _left(motion: Motion, places: FloatArray, moves: FloatArray) -> FloatArray:
-    return np.asarray(np.hypot(*(moves - motion(places)).T))
 
 
 def rank_for(stars: int) -> int:
@@ -81,33 +68,26 @@ def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
     elif rank == 2:
         columns = [(ones, zeros), (zeros, ones), (x, y), (-y, x)]
     else:  # a homography, as of a camera that turns: u (1 + g x + h y) = a x + b y + c is linear in its eight numbers
-        columns = [
-            (ones, zeros),
-            (zeros, ones),
-            (x, zeros),
-            (y, zeros),
-            (zeros, x),
-            (zeros, y),
-            (-u * x, -v * x),
-            (-u * y, -v * y),
-        ]
+        columns = [(ones, zeros), (zeros, ones), (x, zeros), (y, zeros), (zeros, x), (zeros, y)]
+        columns += [(-u * x, -v * x), (-u * y, -v * y)]
     design = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
-    wanted = np.stack([u - x, v - y], axis=-1)
-    found = _least_absolute(design, wanted, FINEST_PX / scale)
-    return lambda at: _moved(at / scale, found) * scale
+    found = _least_absolute(design, np.stack([u - x, v - y], axis=-1), FINEST_PX / scale)
 
+    def motion(at: FloatArray) -> FloatArray:
+        x, y = at.T / scale
+        right, down, *more = found
+        if rank == 1:
+            moved = np.broadcast_to(found, at.shape)
+        elif rank == 2:
+            grow, turn = more
+            moved = np.stack([right + grow * x - turn * y, down + grow * y + turn * x], axis=-1)
+        else:
+            a, b, d, e, g, h = more
+            wide = 1 + g * x + h * y
+            moved = np.stack([(a * x + b * y + right + x) / wide - x, (d * x + e * y + down + y) / wide - y], axis=-1)
+        return np.asarray(moved * scale)
 
-def _moved(at: FloatArray, found: FloatArray) -> FloatArray:
-    """The displacements (n, 2) of places (n, 2) by a motion of 2, 4 or 8 numbers."""
-    x, y = at.T
-    if len(found) == 2:
-        return np.broadcast_to(found, at.shape).copy()
-    if len(found) == 4:
-        right, down, grow, turn = found
-        return np.stack([right + grow * x - turn * y, down + grow * y + turn * x], axis=-1)
-    c, f, a, b, d, e, g, h = found
-    wide = 1 + g * x + h * y
-    return np.stack([(a * x + b * y + c + x) / wide - x, (d * x + e * y + f + y) / wide - y], axis=-1)
+    return motion
 
 
 def _least_absolute(design: FloatArray, wanted: FloatArray, finest: float) -> FloatArray:
@@ -119,21 +99,6 @@ def _least_absolute(design: FloatArray, wanted: FloatArray, finest: float) -> Fl
         found = np.asarray(np.linalg.lstsq(weighted, (wanted * root).ravel(), rcond=None)[0], dtype=np.float64)
         weight = 1 / np.maximum(np.hypot(*(wanted - design @ found).T), finest)
     return np.asarray(found)
-
-
-def figures_of(motion: Motion, middle: FloatArray, limit_px: float) -> MotionFigures:
-    """The figures of a motion of an image whose middle is at `middle` (2,), px; a star's limit is `limit_px`."""
-    reach = float(np.hypot(*middle))
-    step = 1.0
-    here, right, down = motion(np.array([[0.0, 0.0], [step, 0.0], [0.0, step]]))
-    (xx, yx), (xy, yy) = (right - here) / step, (down - here) / step
-    turn, grow = math.atan2(yx - xy, 2 + xx + yy), math.sqrt((1 + xx) * (1 + yy) - xy * yx) - 1
-    shift = float(here[0]), float(here[1])
-    return MotionFigures(
-        shift if math.hypot(*shift) > limit_px else (0.0, 0.0),
-        math.degrees(turn) if abs(turn) * reach > limit_px else 0.0,
-        grow if abs(grow) * reach > limit_px else 0.0,
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,11 +167,6 @@ class StarDifference:
         )
 
 
-def worst_first(stars: list[StarDifference]) -> list[StarDifference]:
-    """The stars in the order in which a person looks at them; of those missing and extra the brightest first."""
-    return sorted(stars, key=lambda star: (-star.error_over_limit, -star.flux_e_per_s))
-
-
 @dataclass(frozen=True, slots=True)
 class CommonChange:
     """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes (positive: too faint).
@@ -225,7 +185,7 @@ class CommonChange:
 
     @property
     def differing(self) -> list[StarDifference]:
-        """The stars that differ from what is common."""
+        """The stars that differ beyond the common change."""
         return [star for star in self.beyond if star.kind != "same"] + self.alone
 
     def line(self) -> str:
@@ -255,16 +215,26 @@ class CommonChange:
 
 def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> CommonChange | None:
     """What most stars of images of `size_px` (width, height) differ by; None where that is nothing."""
-    both, alone = matched(stars)
-    golden = len(both) + sum(star.kind == "missing" for star in alone)
-    if len(both) < max(MIN_STARS, MIN_STAR_SHARE * golden):
+    both = [star for star in stars if star.kind in ("same", "changed")]
+    missing, extra = ([star for star in stars if star.kind == kind] for kind in ("missing", "extra"))
+    pairs = dict(_pairs(missing, extra))
+    for here, there in pairs.items():  # stars that moved far are in both images
+        old, new = missing[here], extra[there]
+        error_mag = magnitude(new.flux_e_per_s / old.flux_e_per_s)
+        both.append(replace(old, flux_error_mag=error_mag, dx_px=new.x_px - old.x_px, dy_px=new.y_px - old.y_px))
+    if len(both) < max(MIN_STARS, MIN_STAR_SHARE * (len(both) + len(missing) - len(pairs))):
         return None
     middle = (np.array(size_px) - 1) / 2
     places = _places(both) - middle
     moves = np.array([(star.dx_px, star.dy_px) for star in both])
-    limits_px = np.array([star.limits.centroid_px for star in both])
-    motion = common_motion(places, moves, limits_px)
-    flux_mag = _common_flux_mag(both)
+    limit_px = np.array([star.limits.centroid_px for star in both])
+    motion = common_motion(places, moves, limit_px)
+    # The median flux error, where it exceeds the limit and makes up more than half of the median star's error.
+    errors_mag = np.array([star.flux_error_mag for star in both])
+    flux_mag = float(np.median(errors_mag))
+    limit_mag = np.median([star.limits.flux_mag for star in both])
+    if abs(flux_mag) <= limit_mag or np.median(np.abs(errors_mag - flux_mag)) > MIN_SHARE * abs(flux_mag):
+        flux_mag = 0.0
     if motion is None and not flux_mag:
         return None
     model = motion or np.zeros_like
@@ -272,23 +242,28 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
         replace(star, flux_error_mag=star.flux_error_mag - flux_mag, dx_px=dx, dy_px=dy)
         for star, (dx, dy) in zip(both, (moves - model(places)).tolist(), strict=True)
     ]
-    left = [star for star in alone if not _by_the_edge(star, model, middle)]
-    figures = figures_of(model, middle, float(np.median(limits_px)))
-    return CommonChange(figures.shift_px, figures.rotation_deg, figures.scale_error, flux_mag, beyond, left)
-
-
-def matched(stars: list[StarDifference]) -> tuple[list[StarDifference], list[StarDifference]]:
-    """The stars of both images, those that moved far among them, and the stars that only one image has."""
-    both = [star for star in stars if star.kind in ("same", "changed")]
-    missing, extra = ([star for star in stars if star.kind == kind] for kind in ("missing", "extra"))
-    pairs = _pairs(missing, extra)
-    for here, there in pairs:
-        old, new = missing[here], extra[there]
-        error_mag = magnitude(new.flux_e_per_s / old.flux_e_per_s)
-        both.append(replace(old, flux_error_mag=error_mag, dx_px=new.x_px - old.x_px, dy_px=new.y_px - old.y_px))
-    used = {here for here, _ in pairs}, {there for _, there in pairs}
-    alone = [star for kind, taken in ((missing, used[0]), (extra, used[1])) for k, star in enumerate(kind) if k not in taken]
-    return both, alone
+    alone = [star for k, star in enumerate(missing) if k not in pairs]
+    taken = set(pairs.values())
+    alone += [star for k, star in enumerate(extra) if k not in taken]
+    left = []
+    for star in alone:  # but those that the motion brought into view or took out of it
+        place = _places([star]) - middle
+        move = model(place) if star.kind == "missing" else -model(place)
+        if not move.any() or (np.abs(place + move) <= middle - EDGE_PX).all():
+            left.append(star)
+    # The motion in the middle, and its turn and scale there: 0 for what moves no star by more than its limit.
+    limit, reach = float(np.median(limit_px)), float(np.hypot(*middle))
+    shift, right, down = model(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    (xx, yx), (xy, yy) = right - shift, down - shift
+    turn, grow = math.atan2(yx - xy, 2 + xx + yy), math.sqrt((1 + xx) * (1 + yy) - xy * yx) - 1
+    return CommonChange(
+        (float(shift[0]), float(shift[1])) if np.hypot(*shift) > limit else (0.0, 0.0),
+        math.degrees(turn) if abs(turn) * reach > limit else 0.0,
+        grow if abs(grow) * reach > limit else 0.0,
+        flux_mag,
+        beyond,
+        left,
+    )
 
 
 def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[tuple[int, int]]:
@@ -306,7 +281,10 @@ def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[t
     predicted = old + np.median(votes[winner], axis=0)
     pairs: list[tuple[int, int]] = []
     for _ in range(PAIR_ROUNDS):
-        pairs = _mutual(predicted, new)
+        # Those that are each other's nearest, within PAIR_PX.
+        distance, nearest = (np.asarray(found) for found in cKDTree(new).query(predicted))
+        back = np.asarray(cKDTree(predicted).query(new)[1])
+        pairs = [(k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k]
         here, there = (np.array([pair[k] for pair in pairs], dtype=np.intp) for k in (0, 1))
         middle = old.mean(axis=0)
         motion = fitted_motion(old[here] - middle, new[there] - old[here], rank_for(len(pairs)))
@@ -314,39 +292,19 @@ def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[t
     return pairs
 
 
-def _mutual(predicted: FloatArray, new: FloatArray) -> list[tuple[int, int]]:
-    """The pairs that are each other's nearest, within PAIR_PX."""
-    distance, nearest = (np.asarray(found) for found in cKDTree(new).query(predicted))
-    back = np.asarray(cKDTree(predicted).query(new)[1])
-    return [(k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k]
-
-
 def _places(stars: list[StarDifference]) -> FloatArray:
     return np.array([(star.x_px, star.y_px) for star in stars]).reshape(-1, 2)
 
 
-def _common_flux_mag(both: list[StarDifference]) -> float:
-    """The median flux error, where it exceeds the limit and makes up more than half of the median star's error; else 0."""
-    flux_mag = np.array([star.flux_error_mag for star in both])
-    common = float(np.median(flux_mag))
-    left = float(np.median(np.abs(flux_mag - common)))
-    limit = np.median([star.limits.flux_mag for star in both])
-    return common if abs(common) > limit and left <= MIN_SHARE * abs(common) else 0.0
-
-
-def _by_the_edge(star: StarDifference, motion: Motion, middle: FloatArray) -> bool:
-    """Whether a star that one image has is, in the other, near the edge or beyond it."""
-    here = np.array([[star.x_px, star.y_px]]) - middle
-    there = here + motion(here) if star.kind == "missing" else here - motion(here)
-    moved = bool(np.any(motion(here)))
-    return moved and bool((np.abs(there) > middle - EDGE_PX).any())
+def _worst_first(stars: list[StarDifference]) -> list[StarDifference]:
+    return sorted(stars, key=lambda star: (-star.error_over_limit, -star.flux_e_per_s))
 
 
 @dataclass(frozen=True, slots=True)
 class SkyComparison:
     """Every star compared, the missing and the extra ones; `unmeasured` stars have too little light of their own in view.
 
-    `common` is what most stars differ by together, None where there is no such thing.
+    `common` is the difference that most stars share, None without one.
     """
 
     stars: list[StarDifference]
@@ -361,12 +319,12 @@ class SkyComparison:
     @property
     def bad(self) -> list[StarDifference]:
         """The stars beyond their limits, worst first; of those missing and extra the brightest first."""
-        return worst_first(self.of("changed", "missing", "extra"))
+        return _worst_first(self.of("changed", "missing", "extra"))
 
     @property
     def differing(self) -> list[StarDifference]:
-        """The stars that are beyond their limits once what is common to all is subtracted, worst first."""
-        return self.bad if self.common is None else worst_first(self.common.differing)
+        """The stars that are beyond their limits once the common difference is subtracted, worst first."""
+        return self.bad if self.common is None else _worst_first(self.common.differing)
 
     @property
     def same(self) -> bool:
@@ -416,7 +374,7 @@ class SkyComparison:
 
 
 def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str]:
-    """A line for each star that differs from what is common to all, `max_lines` of them; `rest` says where more are."""
+    """A line for each star that differs beyond the common difference, `max_lines` of them; `rest` says where more are."""
     stars = comparison.differing
     lines = [star.line() for star in stars[:max_lines]]
     return [*lines, f"and {len(stars) - max_lines} more{rest}"] if len(stars) > max_lines else lines

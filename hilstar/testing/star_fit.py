@@ -1,9 +1,9 @@
 """Stars of a noiseless linear image: found, and fitted all at once, so that a neighbour's light causes no error.
 
 Each star is a Gaussian integrated over pixels, as the renderer draws it, with its derivatives along x and y. Fluxes and
-shifts of all stars are one linear least-squares problem: a star that is dimmed by any amount is measured exactly, a shifted
-one to first order in its shift, and what no star explains stays in the residual. The stars to fit come from a truth table or
-are found in the image; near ones are one blend.
+shifts of all stars are one linear least-squares problem. A star that is dimmed by any amount is measured exactly, a shifted one
+to first order in its shift. Light that no star explains stays in the residual. The stars to fit come from a truth table or are
+found in the image; near ones are one blend.
 """
 
 from __future__ import annotations
@@ -161,7 +161,10 @@ def around(image: FloatArray, psf: Psf) -> FloatArray:
 
 def star_psf(image: FloatArray) -> GaussianPsf:
     """The Gaussian of an image's stars: Newton's steps on the brightest, from the image's correlation of neighbours."""
-    x, y = (_first_sigma_px(image, axis) for axis in (1, 0))
+    # A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is subtracted.
+    power = np.vdot(image, image)
+    correlations = (np.vdot(image[:, 1:], image[:, :-1]) / power, np.vdot(image[1:], image[:-1]) / power)
+    x, y = (math.sqrt(max(-0.25 / math.log(np.clip(part, 0.05, 0.999)) - 1 / 12, 0.04)) for part in correlations)
     sigma, first = np.array([x, y]), GaussianPsf((x, y))
     found = bright_pixels(image, RIPPLE_SHARE * around(image, first))
     places = _apart(found, first.footprint_px, (image.shape[1], image.shape[0]))
@@ -184,13 +187,6 @@ def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) 
     edge = np.minimum(bright, np.array(size_px) - 1 - bright).min(axis=1)
     alone = ((distance < distance_px).sum(axis=1) == 1) & (edge >= distance_px / 2)
     return bright[alone if alone.any() else slice(None)][:SIGMA_STARS].copy()
-
-
-def _first_sigma_px(image: FloatArray, axis: int) -> float:
-    """A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is subtracted."""
-    ahead, behind = (np.take(image, np.arange(start, image.shape[axis] + start - 1), axis) for start in (1, 0))
-    correlation = float(np.clip(np.vdot(ahead, behind) / np.vdot(image, image), 0.05, 0.999))
-    return math.sqrt(max(-0.25 / math.log(correlation) - 1 / 12, 0.04))
 
 
 def _sigma_steps(padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray, reach_px: int) -> FloatArray:
@@ -261,7 +257,7 @@ def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
         )
     table = truth[np.argsort(-truth["electrons_per_s"], kind="stable")]
     places = _places_px(table)
-    listed = _blended(Seeds(places, [_designation(row) for row in table]), blend_px)
+    listed = _blended(Seeds(places, [_name_of(row) for row in table]), blend_px)
     # The light of a star off the image is brightest at the image's edge.
     shown = np.clip(places, 0, np.array([golden.shape[1], golden.shape[0]]) - 1)
     away = _nearest(shown, found)[0] > blend_px
@@ -290,10 +286,10 @@ def names_at(places_px: FloatArray, truth: Truth | None, blend_px: float) -> lis
     if truth is None or not len(truth) or not len(places_px):
         return [()] * len(places_px)
     distance, nearest = _nearest(_places_px(truth), places_px)
-    return [_designation(truth[k]) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)]
+    return [_name_of(truth[k]) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)]
 
 
-def _designation(row: np.void) -> tuple[int | str, ...]:
+def _name_of(row: np.void) -> tuple[int | str, ...]:
     return (str(row["name"]) or int(row["hip"]),)
 
 

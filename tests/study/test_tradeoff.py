@@ -19,12 +19,11 @@ from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
 from hilstar.study import sweep
 from hilstar.study.codes import star_field
-from hilstar.study.sweep import MAX_ROUNDS, MIN_ROUNDS, in_turn, pareto_front
+from hilstar.study.sweep import MAX_ROUNDS, MIN_ROUNDS, Figure, Trial, Trials, in_turn, measured, pareto_front
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import LIMITS_V_MAG, trapezoid
 from hilstar.study.tradeoff.places import SPRITE_PSF
 from hilstar.study.tradeoff.run import STEPS, draw, table_lines
-from hilstar.study.tradeoff.table import Figure, Trial, Trials, measured
 
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
 # A relative error in magnitudes: 2.5 / ln 10.

@@ -1,4 +1,4 @@
-"""What the study of the chain varies: five scenes, their motion and packets, the panel, and the combinations of choices.
+"""The scenes and choices of the study of the chain: five scenes, their motion and packets, the panel, and the combinations.
 
 At rest all predictions are equal, and so are points and paths: one of each is measured. Where the camera turns, a crude
 prediction or smear is combined with cut sprites only: whole sprites would add time and no accuracy. An exposure sums each row's
@@ -28,7 +28,6 @@ from hilstar.errors import InputError
 from hilstar.monitor.quantisers import Quantisation
 from hilstar.process.closing import Closing
 from hilstar.rotation import normalise, propagate
-from hilstar.scene.frame_motion import Scan
 from hilstar.sky.stars import split_by_rate
 from hilstar.study.predictors import rate_of, shaken
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -169,7 +168,7 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
 class PanelExposure:
     """An exposure before a panel: its begin and length, and the frames in it by number and moment of light, ns.
 
-    `weights` (frames, H, 1), of a panel that is turned (frames, 1, W), are what each row of a frame's light is multiplied by.
+    `weights` (frames, H, 1), of a panel that is turned (frames, 1, W), are the factors of each row of a frame's light.
     """
 
     begin_s: float
@@ -183,7 +182,7 @@ class PanelExposure:
         return round((self.begin_s + self.length_s / 2) * NS_PER_S)
 
     def mean(self, light_of: Callable[[int, int], Lit], size_px: tuple[int, int]) -> FloatArray:
-        """The mean light (H, W) of an image of `size_px` by what each frame lights, by its number and moment of light."""
+        """The mean light (H, W) of an image of `size_px`. `light_of` gives a frame's light by number and moment of light."""
         width, height = size_px
         total = np.zeros(height * width)
         for number, light_ns, weight in zip(self.numbers, self.light_ns, self.weights, strict=True):
@@ -206,44 +205,36 @@ def exposure_s(bench: Bench) -> float:
 def shortened_line(bench: Bench) -> str | None:
     """The note for an exposure that is longer than its measured part, or None."""
     whole_s, measured_s = bench.config.tracker.exposure_s, exposure_s(bench)
-    if measured_s == whole_s:
-        return None
-    return f"exposures of {MAX_FRAMES} refreshes, {measured_s:.3g} s, in the place of [tracker] exposure_s = {whole_s:g}"
+    said = f"exposures of {MAX_FRAMES} refreshes, {measured_s:.3g} s, in the place of [tracker] exposure_s = {whole_s:g}"
+    return None if measured_s == whole_s else said
 
 
 def exposure(bench: Bench, first_frame: int) -> PanelExposure:
     """An exposure that begins START_S after the first light of a frame's middle row."""
-    period_s, length_s, scan = 1 / bench.config.monitor.refresh_hz, exposure_s(bench), bench.scan
+    period_s, length_s, scan, size = (
+        1 / bench.config.monitor.refresh_hz,
+        exposure_s(bench),
+        bench.scan,
+        bench.camera.resolution_px,
+    )
     begin_s = first_frame * period_s + START_S % period_s
-    late_s = row_delays_s(scan, bench.camera.resolution_px)
     before = math.ceil((scan.scanout_s / 2 + scan.hold_s) / period_s) + 1
-    numbers = range(first_frame - before, first_frame + math.ceil(length_s / period_s) + before + 1)
-    weights = np.stack([row_share(number * period_s + late_s, scan, period_s, (begin_s, length_s)) for number in numbers])
-    used = [bool(weight.any()) for weight in weights]
-    kept = tuple(number for number, is_used in zip(numbers, used, strict=True) if is_used)
+    numbers = np.arange(first_frame - before, first_frame + math.ceil(length_s / period_s) + before + 1)
+    # How long after the middle row each row lights, (H, 1); each column of a panel that is turned, (1, W).
+    turned = bool(scan.down[0])
+    along = np.arange(size[0] if turned else size[1], dtype=np.float64)
+    middle = np.full(len(along), (size[1 if turned else 0] - 1) / 2)
+    late_s = scan.late_s(along, middle, size)[None, :] if turned else scan.late_s(middle, along, size)[:, None]
+    lit_s = numbers[:, None, None] * period_s + late_s
+    # Weights add up to 1 over a whole number of refreshes: a panel that flashes gives a refresh's light at once.
+    if scan.hold_s:
+        overlap_s = np.minimum(lit_s + scan.hold_s, begin_s + length_s) - np.maximum(lit_s, begin_s)
+        weights = np.maximum(overlap_s, 0.0) / scan.hold_s * (period_s / length_s)
+    else:
+        weights = ((lit_s >= begin_s) & (lit_s < begin_s + length_s)) * (period_s / length_s)
+    used = weights.any(axis=(1, 2))
+    kept = tuple(numbers[used].tolist())
     return PanelExposure(begin_s, length_s, kept, tuple(round(n * period_s * NS_PER_S) for n in kept), weights[used])
-
-
-def row_delays_s(scan: Scan, resolution_px: tuple[int, int]) -> FloatArray:
-    """How long after the middle row each row lights, (H, 1); each column of a panel that is turned, (1, W)."""
-    width, height = resolution_px
-    if scan.down[0]:
-        x_px = np.arange(width, dtype=np.float64)
-        return scan.late_s(x_px, np.full(width, (height - 1) / 2), resolution_px)[None, :]
-    y_px = np.arange(height, dtype=np.float64)
-    return scan.late_s(np.full(height, (width - 1) / 2), y_px, resolution_px)[:, None]
-
-
-def row_share(lit_s: FloatArray, scan: Scan, period_s: float, span_s: tuple[float, float]) -> FloatArray:
-    """What a frame's rows that light at `lit_s` add to the mean over an exposure (begin, length).
-
-    1 over all frames where the exposure is a whole number of refreshes: a panel that flashes gives a refresh's light at once.
-    """
-    begin_s, length_s = span_s
-    if not scan.hold_s:
-        return np.asarray(((lit_s >= begin_s) & (lit_s < begin_s + length_s)) * (period_s / length_s))
-    lit = np.minimum(lit_s + scan.hold_s, begin_s + length_s) - np.maximum(lit_s, begin_s)
-    return np.asarray(np.maximum(lit, 0.0) / scan.hold_s * (period_s / length_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +257,7 @@ class Parts(Closing):
             raise InputError(f"{file.path}: [tracker] exposure_s = 0 gathers no light; write a longer one")
         sky = msgspec.structs.replace(file.config.sky, bodies=SkySettings().bodies)
         config = msgspec.structs.replace(file.config, sky=sky, spacecraft=SpacecraftSettings())
-        self._file = BenchFile(file.path, file.text, config, file.sha256)
+        self._file = replace(file, config=config)
         self._benches: dict[tuple[tuple[str, Any], ...], Bench] = {}
         stars = bench_stars(config, file.folder)
         if not len(stars):
@@ -279,18 +270,6 @@ class Parts(Closing):
 
     def bench(self, combination: Combination) -> Bench:
         """The bench that draws a combination."""
-        bench = self._with(self._keys(combination))
-        if combination.faintest_v_mag >= self.faintest_v_mag:
-            return bench
-        key = id(bench), combination.faintest_v_mag
-        if key not in self._shallow:
-            sky = msgspec.structs.replace(self._file.config.sky, faintest_v_mag=combination.faintest_v_mag)
-            stars = bench_stars(msgspec.structs.replace(self._file.config, sky=sky), self._file.folder)
-            self._shallow[key] = bench.with_stars(split_by_rate(stars, bench.faintest_shown_e_per_s)[0])
-        return self._shallow[key]
-
-    def _keys(self, combination: Combination) -> dict[str, Any]:
-        """The keys of [render] of a combination."""
         render = self._file.config.render
         keys: dict[str, Any] = {
             "quantisation": combination.quantisation,
@@ -300,7 +279,15 @@ class Parts(Closing):
         }
         if combination.sprite == "coarse":
             keys |= {"tolerance_mag": COARSER * render.tolerance_mag, "tolerance_px": COARSER * render.tolerance_px}
-        return keys
+        bench = self._with(keys)
+        if combination.faintest_v_mag >= self.faintest_v_mag:
+            return bench
+        key = id(bench), combination.faintest_v_mag
+        if key not in self._shallow:
+            sky = msgspec.structs.replace(self._file.config.sky, faintest_v_mag=combination.faintest_v_mag)
+            stars = bench_stars(msgspec.structs.replace(self._file.config, sky=sky), self._file.folder)
+            self._shallow[key] = bench.with_stars(split_by_rate(stars, bench.faintest_shown_e_per_s)[0])
+        return self._shallow[key]
 
     def marks(self, movement: Movement) -> Marks:
         """What the marked combinations choose for a scene."""
@@ -330,9 +317,8 @@ class Parts(Closing):
         if key not in self._benches:
             render = msgspec.structs.replace(self._file.config.render, **keys)
             config = msgspec.structs.replace(self._file.config, render=render)
-            file = BenchFile(self._file.path, self._file.text, config, self._file.sha256)
-            bench = assembled(file, self._stars)
-            # One camera for all: what its paths need is found once for each camera.
+            bench = assembled(replace(self._file, config=config), self._stars)
+            # One camera for all: it keeps the tables of its paths.
             camera = next((other.camera for other in self._benches.values()), bench.camera)
             self._benches[key] = replace(bench, camera=camera)
         return self._benches[key]

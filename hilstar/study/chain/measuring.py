@@ -1,9 +1,9 @@
 """Measurements of the study of the chain: error over some exposures, time in turn with all other combinations, error budget.
 
 A frame goes from the sender's samples to codes; an exposure sums the light of its frames. The budget starts from a display
-that does everything exactly and adds one step at a time, in the order of the chain. Each step is charged with what it changes
-in the measured stars; the steps add up to the whole error, star by star. Cut sprites come last, because codes leave the cut
-light dark: earlier it would be charged twice.
+that does everything exactly and adds one step at a time, in the order of the chain. Each step is charged with the change of the
+measured stars; the steps add up to the whole error, star by star. Cut sprites come last, because codes leave the cut light
+dark: earlier it would be charged twice.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.bench.frame import Bench, Drawn
-from hilstar.rotation import propagate, to_matrix
+from hilstar.rotation import propagate
 from hilstar.scene.frame_motion import CameraTurn, swept_sprites
-from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars
 from hilstar.study.chain.choices import (
     ChainScene,
@@ -35,7 +34,7 @@ from hilstar.study.chain.choices import (
     filled_timeline,
     lead_ns,
 )
-from hilstar.study.chain.tracker import MeasuredStars, Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off
+from hilstar.study.chain.tracker import Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off, points
 from hilstar.study.predictors import attitude_at
 from hilstar.study.sweep import Spent, spent
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
@@ -133,11 +132,8 @@ class Stopwatch:
         light_ns = NS_PER_S + self._number * self._period_ns
         own = propagate(chain.movement.q_icrs_to_cam, NUDGE_RAD, self._number)
         samples = replace(chain.movement, q_icrs_to_cam=own).samples(light_ns - self._lead_ns)
-        return (
-            filled_timeline(samples, chain.combination.prediction, chain.bench.config.attitude),
-            light_ns,
-            self._number,
-        )
+        timeline = filled_timeline(samples, chain.combination.prediction, chain.bench.config.attitude)
+        return timeline, light_ns, self._number
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +205,7 @@ class CombinationOutcome:
 
 
 class SceneMeasurement:
-    """A scene on a study's benches: what is judged in it, and its combinations."""
+    """A scene on a study's benches: its judges, one an exposure, and its combinations."""
 
     def __init__(self, parts: Parts, tracker: StudyTracker, scene: ChainScene, plan: Rounds) -> None:
         self.parts, self.tracker, self.scene, self.plan = parts, tracker, scene, plan
@@ -218,10 +214,12 @@ class SceneMeasurement:
         found = combinations(self.movement.turns, parts.can_steal_bits, parts.faintest_v_mag)
         marked = (self.marks.default, self.marks.auto, self.marks.as_filed)
         self.combinations = list(dict.fromkeys([*found, *marked]))
-        self.judges = [
-            StarJudge(tracker, self._moved(k), exposure(parts.own, number))
-            for k, number in enumerate(FIRST_FRAMES[: plan.exposures])
-        ]
+        # At rest each exposure has its stars at other sub-pixel phases.
+        step_rad = np.zeros(3) if self.movement.turns else np.array([*PHASE_STEP_PX, 0.0]) / tracker.camera.focal_length_px
+        self.judges = []
+        for k, number in enumerate(FIRST_FRAMES[: plan.exposures]):
+            moved = replace(self.movement, q_icrs_to_cam=propagate(scene.q_icrs_to_cam, step_rad, k))
+            self.judges.append(StarJudge(tracker, moved, exposure(parts.own, number)))
 
     @property
     def star_count(self) -> int:
@@ -232,15 +230,8 @@ class SceneMeasurement:
         """A combination with the movement of one exposure."""
         return DrawingChain(combination, self.parts.bench(combination), self.judges[exposure_number].movement)
 
-    def _moved(self, number: int) -> Movement:
-        """The movement that an exposure sees: at rest each has its stars at other sub-pixel phases."""
-        if self.movement.turns:
-            return self.movement
-        step_rad = np.array([*PHASE_STEP_PX, 0.0]) / self.tracker.camera.focal_length_px
-        return replace(self.movement, q_icrs_to_cam=propagate(self.movement.q_icrs_to_cam, step_rad, number))
-
     def outcomes(self) -> tuple[list[CombinationOutcome], list[StageTime]]:
-        """Every combination's error and time, and what the stages of `auto` take."""
+        """Every combination's error and time, and the times of the stages of `auto`."""
         chains = [self.chain(combination) for combination in self.combinations]
         times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
         found = [
@@ -279,8 +270,8 @@ def pooled(found: Sequence[Off]) -> tuple[float, float]:
 
 def sprite_px(chain: DrawingChain) -> str:
     """The sides of a chain's sprites, px."""
-    sides = [side.side_px for side in chain.bench.renderer.target.sides]
-    low, high = min(sides, default=chain.bench.psf.footprint_px), max(sides, default=chain.bench.psf.footprint_px)
+    sides = [side.side_px for side in chain.bench.renderer.target.sides] or [chain.bench.psf.footprint_px]
+    low, high = min(sides), max(sides)
     return f"{low}" if low == high else f"{low} to {high}"
 
 
@@ -288,7 +279,7 @@ def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[l
     """The times of all chains, and the median times of STAGES, ms, of one of them.
 
     In rounds, each with an order of its own, so that other load on the machine affects all. A visit's first frame is not
-    counted: it fills what the chain before has emptied.
+    counted: it fills caches that the chain before has emptied.
     """
     watches = [Stopwatch(chain) for chain in chains]
     for watch in watches:
@@ -325,7 +316,10 @@ def rounded(value: float) -> float:
 
 def error_budget(scene: SceneMeasurement, combination: Combination) -> list[ErrorPart]:
     """The parts of the error of the combination that `auto` takes, by STEPS, then RSS and WHOLE."""
-    found = [[judge.sky, *_measured(scene, combination, number)] for number, judge in enumerate(scene.judges)]
+    found = [
+        [judge.sky, *(judge.measure(scene.tracker.image_e(light, judge.seen)) for light in _lights(scene, combination, number))]
+        for number, judge in enumerate(scene.judges)
+    ]
 
     def between(before: int, after: int) -> tuple[float, float]:
         return pooled([off(judge, one[after], one[before]) for judge, one in zip(scene.judges, found, strict=True)])
@@ -336,32 +330,28 @@ def error_budget(scene: SceneMeasurement, combination: Combination) -> list[Erro
     return [ErrorPart(scene.scene.name, AUTO, step, rounded(a), rounded(m)) for step, (a, m) in named]
 
 
-def _measured(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[MeasuredStars]:
-    """The stars of an exposure after each of STEPS."""
-    judge = scene.judges[number]
-    for light in _lights(scene, combination, number):
-        yield judge.measure(scene.tracker.image_e(light, judge.seen))
-
-
 def _lights(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[FloatArray]:
     """The mean light (H, W) of an exposure after each of STEPS."""
     chain, seen = scene.chain(combination, number), scene.judges[number].seen
-    movement = chain.movement
-    bench, every = chain.bench, scene.parts.own.stars
+    movement, bench, every = chain.movement, chain.bench, scene.parts.own.stars
 
     def exposed(light_of: Callable[[int, int], Lit]) -> FloatArray:
         return (seen.mean if movement.turns else seen.at_rest)(light_of, bench.camera.resolution_px)
 
+    def whole(stars: Stars, turn: CameraTurn, along_paths: bool) -> Lit:
+        if along_paths:
+            return linear_light(bench, swept_sprites(stars, turn, bench.scan, bench.camera, bench.psf))
+        return linear_light(bench, points(bench, turn.q_icrs_to_cam, stars))
+
     def true(_: int, light_ns: int) -> Lit:
-        turn = CameraTurn(movement.at(light_ns), movement.rate_rad_s(light_ns))
-        return linear_light(bench, _sprites(bench, every, turn, movement.turns))
+        return whole(every, CameraTurn(movement.at(light_ns), movement.rate_rad_s(light_ns)), movement.turns)
 
     def shown_as(stars: Stars, along_paths: bool) -> FloatArray:
         def light_of(_: int, light_ns: int) -> Lit:
             attitude = chain.attitude(light_ns)
             rate = attitude.rate_cam_rad_s
             turn = CameraTurn(attitude.q_icrs_to_cam, np.zeros(3) if rate is None else rate)
-            return linear_light(bench, _sprites(bench, stars, turn, along_paths and rate is not None))
+            return whole(stars, turn, along_paths and rate is not None)
 
         return exposed(light_of)
 
@@ -372,10 +362,3 @@ def _lights(scene: SceneMeasurement, combination: Combination, number: int) -> I
     yield shown_as(bench.shown_stars, along_paths)
     yield scene.chain(replace(combination, sprite="full"), number).exposed(seen)
     yield chain.exposed(seen)
-
-
-def _sprites(bench: Bench, stars: Stars, turn: CameraTurn, along_paths: bool) -> Sprites:
-    """Whole sprites of stars in a frame, along their paths or as points."""
-    if along_paths:
-        return swept_sprites(stars, turn, bench.scan, bench.camera, bench.psf)
-    return make_sprites(stars, bench.camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam), bench.camera, bench.psf.footprint_px)

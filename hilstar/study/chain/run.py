@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DEFAULT = "default"
-MAX_REASONS = 2
 NOT_JUDGED = "the times were taken on a busy machine: no combination is named the faster"
 COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (PURPLE, ORANGE, GREEN, BLUE), strict=True))
 PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
@@ -72,10 +72,10 @@ OUTPUTS = (
 class CombinationRow:
     """A combination in a scene; its fields are the columns of `chain.csv`.
 
-    `exposure_s` is what is measured of the tracker's exposure. `error_arcsec`, `error_mag`: rms over the `stars` of all
-    exposures, `lost` of them not found. The fronts are those of `time_ms` against `error_arcsec` and `error_mag`;
-    `on_front_as_filed` that of what effort may choose, against `error_arcsec`: the rows whose `bit_stealing`,
-    `faintest_v_mag` and `prediction` are those of the bench file.
+    `exposure_s` is the measured part of the tracker's exposure. `error_arcsec` and `error_mag` are rms over the `stars` of all
+    exposures, `lost` of them not found. `on_front` and `on_front_mag` are the fronts of `time_ms` against these two.
+    `on_front_as_filed` is the first of them among the choices of effort: rows with the `bit_stealing`, `faintest_v_mag` and
+    `prediction` of the bench file.
     """
 
     scene: str
@@ -141,22 +141,20 @@ def left_to_effort(row: CombinationRow, own: CombinationRow) -> bool:
 
 
 def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[list[CombinationRow], list[CombinationRow]]:
-    """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that effort may choose."""
+    """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that effort may choose.
+
+    Beyond it are those faster by more than three sigmas of the difference of the medians. Else this run cannot tell the times
+    apart, and which row is on the front is chance.
+    """
     own = rows[auto_of(rows)]
     kept = [row for row in rows if not as_filed or left_to_effort(row, own)]
     beats = beaten_by([row.error_arcsec for row in kept], [row.time_ms for row in kept])[kept.index(own)]
-    found = [row for row, does in zip(kept, beats, strict=True) if does]
-    beyond = [row for row in found if beyond_noise(own, row)]
-    return beyond, [row for row in found if row not in beyond]
-
-
-def beyond_noise(own: CombinationRow, other: CombinationRow) -> bool:
-    """Whether `other`, which beats `own`, is faster by more than three sigmas of the difference of their medians.
-
-    Else this run cannot tell their times apart, and which of them is on the front is chance.
-    """
-    noise_ms = 3 * math.hypot(own.noise_ms, other.noise_ms)
-    return own.time_ms - other.time_ms > noise_ms or not noise_ms
+    beyond: list[CombinationRow] = []
+    within: list[CombinationRow] = []
+    for row in (row for row, does in zip(kept, beats, strict=True) if does):
+        noise_ms = 3 * math.hypot(own.noise_ms, row.noise_ms)
+        (beyond if own.time_ms - row.time_ms > noise_ms or not noise_ms else within).append(row)
+    return beyond, within
 
 
 def _row(scene: SceneMeasurement, one: CombinationOutcome) -> CombinationRow:
@@ -202,13 +200,8 @@ def headline(rows: Sequence[CombinationRow], busy: bool = False) -> str:
     return f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
 
 
-def is_right(rows: Sequence[CombinationRow]) -> bool:
-    """Whether `auto` is on the front of what effort may choose, or within the noise of it."""
-    return not beating(rows, as_filed=True)[0]
-
-
 def standing(rows: Sequence[CombinationRow]) -> str:
-    """Whether `auto` is on the front or within its noise; else what beats it, why, and its place among effort's choices."""
+    """Whether `auto` is on the front or within its noise; else its better, the reason, and its place among effort's choices."""
     beyond, within = beating(rows)
     own = rows[auto_of(rows)]
     if not beyond:
@@ -231,7 +224,7 @@ def words(row: CombinationRow) -> str:
 
 
 def why_not(own: CombinationRow, other: CombinationRow) -> str:
-    """Why `effort = "auto"` does not take what beats it."""
+    """Why `effort = "auto"` does not take a combination that beats it."""
     reasons = []
     if other.bit_stealing != own.bit_stealing:
         reasons.append(
@@ -246,14 +239,11 @@ def why_not(own: CombinationRow, other: CombinationRow) -> str:
     if other.quantisation == "temporal":
         reasons.append("temporal is right over an exposure, and effort asks for light that is right in each frame")
     elif other.quantisation != own.quantisation:
-        reasons.append(
-            f"effort compares {own.quantisation} and {other.quantisation} by their worst star at any sub-pixel phase, not by a"
-            " field's rms"
-        )
+        compared = f"effort compares {own.quantisation} and {other.quantisation} by their worst star at any sub-pixel phase"
+        reasons.append(f"{compared}, not by a field's rms")
     if other.sprite != own.sprite:
-        reasons.append(
-            "coarse sprites are beyond the tolerance" if other.sprite == "coarse" else "cut sprites save nothing here"
-        )
+        coarse = other.sprite == "coarse"
+        reasons.append("coarse sprites are beyond the tolerance" if coarse else "cut sprites save nothing here")
     if other.smear != own.smear:
         reasons.append(f"{other.smear}s instead of {own.smear}s")
     return "; ".join(reasons)
@@ -266,7 +256,7 @@ def _nearest(rows: Sequence[CombinationRow]) -> CombinationRow:
 
 def _compared(own: CombinationRow, other: CombinationRow) -> str:
     faster = own.time_ms - other.time_ms
-    noise = (own.noise_ms**2 + other.noise_ms**2) ** 0.5
+    noise = math.hypot(own.noise_ms, other.noise_ms)
     return f"{words(other)} is {other.error_arcsec:.3g} arcsec off and {faster:.2g} ms faster (noise {noise:.2g} ms)"
 
 
@@ -274,19 +264,15 @@ def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
     """The scenes to be drawn, each with those of its rate in which `auto` is as far off."""
     kept: dict[str, list[str]] = {}
     autos: dict[str, CombinationRow] = {}
-    for scene in dict.fromkeys(row.scene for row in rows):
-        mine = [row for row in rows if row.scene == scene]
-        own = mine[auto_of(mine)]
-        like = [s for s, o in autos.items() if o.rate_deg_s == own.rate_deg_s and _alike(o.error_arcsec, own.error_arcsec)]
-        if like:
-            kept[like[0]].append(scene)
+    for own in (row for row in rows if AUTO in row.chosen):
+        for scene, other in autos.items():
+            low, high = sorted((own.error_arcsec, other.error_arcsec))
+            if other.rate_deg_s == own.rate_deg_s and high <= ALIKE * low:
+                kept[scene].append(own.scene)
+                break
         else:
-            kept[scene], autos[scene] = [], own
+            kept[own.scene], autos[own.scene] = [], own
     return kept
-
-
-def _alike(a: float, b: float) -> bool:
-    return max(a, b) <= ALIKE * min(a, b)
 
 
 def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str) -> None:
@@ -323,18 +309,12 @@ def _scatter(axes: Axes, rows: Sequence[CombinationRow]) -> None:
             last = place[1]
     for row, place in zip(rows, at, strict=True):
         if row.chosen:
-            figures = f"{two_digits(row.error_arcsec)} arcsec, {two_digits(row.time_ms)} ms"
-            named.append(
-                (f"{row.chosen.replace(' ', ', ')}: {figures}", place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT])
-            )
+            label = f"{row.chosen.replace(' ', ', ')}: {two_digits(row.error_arcsec)} arcsec, {two_digits(row.time_ms)} ms"
+            named.append((label, place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT]))
     for name, colour in COLOURS.items():
         if not any(colour == other for *_, other in named):  # the best of what has no place on the front
-            best = min(
-                (each for each in zip(rows, at, strict=True) if each[0].quantisation == name),
-                key=lambda each: each[1][1],
-                default=None,
-            )
-            named += [(short_words(best[0], own), best[1], colour)] if best else []
+            mine = [each for each in zip(rows, at, strict=True) if each[0].quantisation == name]
+            named += [(short_words(row, own), place, colour) for row, place in sorted(mine, key=lambda each: each[1][1])[:1]]
     name_at_side(axes, named)
 
 
@@ -355,16 +335,21 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
     note = "Each step is charged with what it changes when it is added to an exact display" + (
         f"; {' and '.join(none)} change nothing here." if none else "."
     )
+    said = []
+    for scene in scenes:
+        parts = [part for part in budget if part.scene == scene and part.step not in (RSS, WHOLE)]
+        largest = max(parts, key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf)
+        said.append(f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'} {scene}")
+    longest = max(stages, key=lambda one: one.time_ms)
+    finding = f"Of auto's error most is {', '.join(said)}; of its time most is {longest.stage}"
     height = TITLE_INCH + BARS_INCH * len(scenes)
-    with chart(
-        path, _budget_finding(scenes, budget, stages), len(scenes), 3, note=note, share_x=False, height_inch=height
-    ) as grid:
+    with chart(path, finding, len(scenes), 3, note=note, share_x=False, height_inch=height) as grid:
         for k, scene in enumerate(scenes):
-            parts = {part.step: part for part in budget if part.scene == scene}
+            by_step = {part.step: part for part in budget if part.scene == scene}
             place, light, times = grid[3 * k : 3 * k + 3]
             place.set_title(scene)
             for axes, error, unit in ((place, "error_arcsec", "arcsec"), (light, "error_mag", "mag")):
-                values = [getattr(parts[step], error) for step in shown]
+                values = [getattr(by_step[step], error) for step in shown]
                 colours = [RED if step == WHOLE else BLUE for step in shown]
                 value_bars(axes, [WORDS.get(step, step) for step in shown], values, colours)
                 axes.set_xlabel(f"error, rms [{unit}]" if scene == last else "")
@@ -372,22 +357,6 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
             mine = [one for one in stages if one.scene == scene]
             value_bars(times, [one.stage for one in mine], [one.time_ms for one in mine], PURPLE)
             times.set_xlabel("time of a frame [ms]" if scene == last else "")
-
-
-def _budget_finding(
-    scenes: Sequence[str] | dict[str, list[str]], budget: Sequence[ErrorPart], stages: Sequence[StageTime]
-) -> str:
-    said = []
-    for scene in scenes:
-        parts = [part for part in budget if part.scene == scene and part.step not in (RSS, WHOLE)]
-        largest = max(parts, key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf)
-        said.append(
-            f"{WORDS.get(largest.step, largest.step)} in the {scene}"
-            if "field" in scene
-            else f"{WORDS.get(largest.step, largest.step)} at {scene}"
-        )
-    longest = max(stages, key=lambda one: one.time_ms)
-    return f"Of auto's error most is {', '.join(said)}; of its time most is {longest.stage}"
 
 
 def run(
@@ -402,26 +371,20 @@ def run(
     budget: list[ErrorPart] = []
     stages: list[StageTime] = []
     lines, judged, others = [], [], OtherWork()
-    with Parts(file) as parts:
-        tracker = StudyTracker(parts.own)
-        try:
-            for number, scene in enumerate(five_scenes(parts.own)):
-                measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Rounds())
-                if not measurement.star_count:
-                    lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
-                    continue
-                outcomes, parts_of_time = measurement.outcomes()
-                own = rows_of(measurement, outcomes)
-                auto = measurement.marks.auto
-                parts_of_error = error_budget(measurement, auto)
-                judged.append((own, parts_of_error, parts_of_time))
-                rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
-                if advance is not None:
-                    advance(number + 1)
-            machine = f"{parts.own.renderer.gl_renderer}, {os.cpu_count()} cores"
-            shortened = shortened_line(parts.own)
-        finally:
-            tracker.close()
+    with Parts(file) as parts, closing(StudyTracker(parts.own)) as tracker:
+        for number, scene in enumerate(five_scenes(parts.own)):
+            measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Rounds())
+            if not measurement.star_count:
+                lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
+                continue
+            outcomes, parts_of_time = measurement.outcomes()
+            own, parts_of_error = rows_of(measurement, outcomes), error_budget(measurement, measurement.marks.auto)
+            judged.append((own, parts_of_error, parts_of_time))
+            rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
+            if advance is not None:
+                advance(number + 1)
+        machine = f"{parts.own.renderer.gl_renderer}, {os.cpu_count()} cores"
+        shortened = shortened_line(parts.own)
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
     others_cores = others.cores()
@@ -433,4 +396,4 @@ def run(
     notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([busy_line(others_cores)] if busy else [])]
     draw(directory / "chain", rows, headline(rows, busy), "; ".join(notes))
     draw_budget(directory / "chain_budget", rows, budget, stages)
-    return [*lines, *notes], None if busy else all(is_right(own) for own, _, _ in judged)
+    return [*lines, *notes], None if busy else not any(beating(own, as_filed=True)[0] for own, _, _ in judged)

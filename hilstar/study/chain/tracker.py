@@ -13,15 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.assess.bench_effects import turn_between
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame import Bench
 from hilstar.render.reference import add_stars
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import Sprites, make_sprites
+from hilstar.sky.stars import Stars
 from hilstar.study.chain.choices import PACKET_HZ, Lit, Movement, PanelExposure, lead_ns
 from hilstar.twin.optics import BenchGeometry, TwinOptics
-from hilstar.twin.verify.star_finder import MATCH_PX, Matched, StarFinder, crowded, seen_psf, shared, star_finder
+from hilstar.twin.verify.star_finder import MATCH_PX, StarFinder, crowded, seen_psf, shared, star_finder
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
 
 # Gauss-Legendre over the exposure: 1.02 nodes to a sigma of path and three more are right to 1e-6 of a star in every pixel
@@ -35,37 +37,24 @@ PATH_STEP_PX = 0.5
 OTHERS_SHARE = 1e-3  # limit for others' light on a star's path, as a share of its own: at 50 px it moves the centre by 0.05 px
 
 
-@dataclass(frozen=True, slots=True)
-class Instants:
-    """The moments (k,) of an exposure that its light is summed over, ns, and their shares."""
-
-    t_ns: tuple[int, ...]
-    share: FloatArray
-
-
-def instants(bench: Bench, movement: Movement, seen: PanelExposure) -> Instants:
-    """Enough instants to integrate every star's path exactly; one at rest."""
-    if not movement.turns:
-        return Instants((seen.middle_ns(),), np.ones(1))
-    path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
-    sigmas = path_rad * bench.camera.scales_px_rad()[1] / min(bench.psf.width_px)
-    nodes, weights = np.polynomial.legendre.leggauss(max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3))
-    t_s = seen.begin_s + seen.length_s * (nodes + 1) / 2
-    return Instants(tuple(round(t * NS_PER_S) for t in t_s), weights / 2)
-
-
-def points(bench: Bench, q_icrs_to_cam: FloatArray) -> Sprites:
-    """All of the bench's stars as whole sprites at an attitude."""
+def points(bench: Bench, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
+    """Stars, by default all of the bench's, as whole sprites at an attitude."""
     icrs_to_image = bench.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-    return make_sprites(bench.stars, icrs_to_image, bench.camera, bench.psf.footprint_px)
+    return make_sprites(bench.stars if stars is None else stars, icrs_to_image, bench.camera, bench.psf.footprint_px)
 
 
-def sky_light(bench: Bench, movement: Movement, at: Instants) -> FloatArray:
-    """The sky's own mean light (H, W) over the exposure, electrons per second."""
+def sky_light(bench: Bench, movement: Movement, seen: PanelExposure) -> FloatArray:
+    """The sky's own mean light (H, W) over an exposure, electrons per second, by enough instants for every star's path."""
+    times_s, shares = [seen.begin_s + seen.length_s / 2], [1.0]
+    if movement.turns:
+        path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
+        sigmas = path_rad * bench.camera.scales_px_rad()[1] / min(bench.psf.width_px)
+        nodes, weights = np.polynomial.legendre.leggauss(max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3))
+        times_s, shares = (seen.begin_s + seen.length_s * (nodes + 1) / 2).tolist(), (weights / 2).tolist()
     total = np.zeros(bench.camera.resolution_px[::-1])
-    for t_ns, share in zip(at.t_ns, at.share, strict=True):
-        sprites = points(bench, movement.at(t_ns))
-        add_stars(total, sprites, bench.psf, sprites.footprint_px, share=float(share))
+    for t_s, share in zip(times_s, shares, strict=True):
+        sprites = points(bench, movement.at(round(t_s * NS_PER_S)))
+        add_stars(total, sprites, bench.psf, sprites.footprint_px, share=share)
     return total
 
 
@@ -124,7 +113,7 @@ class StudyTracker:
 
 
 class StarJudge:
-    """One exposure of a scene: its stars that stand alone, and what the tracker measures of them in the sky itself."""
+    """One exposure of a scene: its stars that stand alone, as the tracker measures them in the sky itself."""
 
     def __init__(self, tracker: StudyTracker, movement: Movement, seen: PanelExposure) -> None:
         self.tracker, self.movement, self.seen = tracker, movement, seen
@@ -140,15 +129,20 @@ class StarJudge:
         self.sky = MeasuredStars(np.zeros((0, 3)), np.zeros(0))
         self.lost_arcsec = max(MATCH_PX, self._path_px) * tracker.arcsec_per_px
         places_px = self._paths() if movement.turns else (self._x_px, self._y_px)
-        inside = np.atleast_2d(self._inside(*places_px, self._margin_px())).all(axis=0)
+        # Distance from the detector's edge beyond which a star is complete.
+        radius_px = tracker.finder.settings.radius_px
+        margin_px = self._reach_px + 1 if movement.turns else radius_px + MATCH_PX
+        inside = np.atleast_2d(self._inside(*places_px, margin_px)).all(axis=0)
         if not (self._wanted & inside).any():
             return
         self._wanted &= inside
-        sky_e = tracker.image_e(sky_light(bench, movement, instants(bench, movement, seen)), seen)
+        sky_e = tracker.image_e(sky_light(bench, movement, seen), seen)
         if movement.turns:
             self._choose_paths(sky_e, *places_px)
         else:
-            self._choose_points(sky_e)
+            index = tracker.finder.match(sky_e, self._x_px, self._y_px).index
+            alone = ~shared(index) & ~crowded(self._x_px, self._y_px, self._e, radius_px, tracker.psf)
+            self.judged = np.flatnonzero(self._wanted & (index >= 0) & alone)
         self.sky = self.measure(sky_e)
 
     def __len__(self) -> int:
@@ -159,7 +153,13 @@ class StarJudge:
         if self.movement.turns:
             return self._measure_paths(image_e)
         match = self.tracker.finder.match(image_e, self._x_px, self._y_px)
-        return self._measured(match, self.judged)
+        index = match.index[self.judged]
+        found = index >= 0
+        if not found.any():
+            return MeasuredStars(np.full((len(index), 3), np.nan), np.zeros(len(index)))
+        index = np.where(found, index, 0)
+        directions = self._directions(match.found.x_px[index], match.found.y_px[index])
+        return MeasuredStars(np.where(found[:, None], directions, np.nan), np.where(found, match.found.flux[index], 0.0))
 
     def _whole(self, star: IntArray) -> BoolArray:
         """Stars bright enough for the panel's `exact` that clip at no sub-pixel phase."""
@@ -168,27 +168,6 @@ class StarJudge:
         white = bench.flux_at_white_e_per_s * bench.darkest
         clips = rates * bench.psf.peak_share > white
         return np.asarray((rates >= bench.calibration.response.half_step * white) & ~clips)
-
-    def _choose_points(self, sky_e: FloatArray) -> None:
-        tracker, radius_px = self.tracker, self.tracker.finder.settings.radius_px
-        match = tracker.finder.match(sky_e, self._x_px, self._y_px)
-        wanted = self._wanted & (match.index >= 0) & ~shared(match.index)
-        wanted &= ~crowded(self._x_px, self._y_px, self._e, radius_px, tracker.psf)
-        self.judged = np.flatnonzero(wanted)
-
-    def _measured(self, match: Matched, which: IntArray) -> MeasuredStars:
-        index = match.index[which]
-        found = index >= 0
-        index = np.where(found, index, 0)
-        if not found.any():
-            return MeasuredStars(np.full((len(which), 3), np.nan), np.zeros(len(which)))
-        places = match.found.x_px[index], match.found.y_px[index]
-        light_e = np.where(found, match.found.flux[index], 0.0)
-        return MeasuredStars(np.where(found[:, None], self._directions(*places), np.nan), light_e)
-
-    def _margin_px(self) -> float:
-        """Distance from the detector's edge beyond which a star is complete."""
-        return self._reach_px + 1 if self.movement.turns else self.tracker.finder.settings.radius_px + MATCH_PX
 
     @property
     def _reach_px(self) -> int:
@@ -277,12 +256,7 @@ def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
 def attitude_off_arcsec(shown: MeasuredStars, wanted: MeasuredStars) -> tuple[float, float]:
     """Attitude error across the boresight and about it, least squares over the found stars; NaN for fewer than two."""
     found = ~(shown.lost | wanted.lost)
-    true, seen = wanted.directions[found], shown.directions[found]
-    if len(true) < 2:
+    if found.sum() < 2:
         return math.nan, math.nan
-    # seen - true = turn x true for a small turn: a row of the cross product's matrix for each component.
-    x, y, z = true.T
-    none = np.zeros_like(x)
-    rows = [np.stack(row, axis=1) for row in ((none, z, -y), (-z, none, x), (y, -x, none))]
-    turn = np.linalg.lstsq(np.concatenate(rows), (seen - true).T.ravel(), rcond=None)[0] * ARCSEC_PER_RAD
-    return math.hypot(turn[0], turn[1]), abs(float(turn[2]))
+    x, y, z = ARCSEC_PER_RAD * turn_between(wanted.directions[found], shown.directions[found], np.ones(found.sum()))
+    return math.hypot(x, y), abs(float(z))

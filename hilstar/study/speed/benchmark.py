@@ -1,8 +1,8 @@
-"""The benchmark: a frame's time by stage, beside other methods for the same image of the same stars, timed in turn in one run.
+"""The benchmark: a frame's time by stage, beside other methods for the same image of the same stars, timed in turn.
 
-Other methods are NumPy and, where they are installed, numba, GalSim and photutils. Each is given the places and the light that
-hilstar found, so culling and projecting are not in its time; no codes are made. A cell is one image size and one number of
-stars, from the catalogue and, where it has too few, random. Import and first frame are timed in fresh processes.
+Other methods are NumPy and, where installed, numba, GalSim and photutils. Each is given the places and the light that hilstar
+found: its time has no culling and no projecting, and it makes no codes. A cell is one image size and one number of stars. They
+are the catalogue's and, where it has too few, random ones. Import and first frame are timed in fresh processes.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,7 +37,7 @@ from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.psf import SQRT2, GaussianPsf
 from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, pack_sprites
 from hilstar.sky.stars import Stars, cell_grid
-from hilstar.study.settings import Table, Value, bench_text
+from hilstar.study.settings import FULL_HD, Table, Value, bench_text
 from hilstar.study.speed.report import (
     REFERENCE_PX,
     Agreement,
@@ -102,7 +103,7 @@ class BenchmarkScene:
 
 
 def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng: np.random.Generator) -> BenchmarkScene:
-    """A scene with exactly `count` stars in view: the brightest of `every`, and past those random ones in and around the view.
+    """A scene with exactly `count` stars in view: the brightest of `every`, then random ones in and around the view.
 
     The random ones are as bright as random stars of the fainter half of `every`. Raises InputError where `every` is empty.
     """
@@ -153,17 +154,17 @@ class OtherMethod:
 
 
 def other_methods() -> tuple[list[OtherMethod], dict[str, str]]:
-    """The methods that are installed here, imported and compiled, and by name what to install for each of the others."""
+    """The methods that are installed here, imported and compiled; and by name the remedy for each of the others."""
     found, missing = [], {}
     for name, does, make in METHODS:
         try:
-            other = OtherMethod(name, does, make())
+            draw = make()
         except ImportError as error:
             missing[name] = f"not installed ({error}): {INSTALL}"
             continue
         with held():  # numba compiles, and LLVM calls Python back meanwhile: an exception there is printed, and lost
-            other.draw(FIRST, (0.85, 0.85), (8, 8))
-        found.append(other)
+            draw(FIRST, (0.85, 0.85), (8, 8))
+        found.append(OtherMethod(name, does, draw))
     return found, missing
 
 
@@ -217,14 +218,6 @@ def _make_numba() -> Draw:
     return draw
 
 
-def _stamps(sprites: Sprites) -> Iterator[tuple[float, float, float, int, int]]:
-    """Each star's x, y, light, and its footprint's first column and row."""
-    first = (sprites.data["pixel"] - (sprites.footprint_px - 1) // 2).tolist()
-    light = sprites.data["electrons_per_s"].tolist()
-    for (column, row), x, y, electrons in zip(first, sprites.x_px.tolist(), sprites.y_px.tolist(), light, strict=True):
-        yield x, y, electrons, column, row
-
-
 def _make_galsim() -> Draw:
     galsim = import_module("galsim")
 
@@ -232,7 +225,9 @@ def _make_galsim() -> Draw:
         image = galsim.ImageF(np.zeros(shape, np.float32), xmin=0, ymin=0)
         profile = galsim.Gaussian(sigma=1.0).transform(sigma_px[0], 0, 0, sigma_px[1])
         last = sprites.footprint_px - 1
-        for x, y, electrons, column, row in _stamps(sprites):
+        first = (sprites.data["pixel"] - last // 2).tolist()
+        light = sprites.data["electrons_per_s"].tolist()
+        for (column, row), x, y, electrons in zip(first, sprites.x_px.tolist(), sprites.y_px.tolist(), light, strict=True):
             bounds = galsim.BoundsI(column, column + last, row, row + last) & image.bounds
             star = profile.withFlux(electrons)
             star.drawImage(image=image[bounds], scale=1.0, center=galsim.PositionD(x, y), add_to_image=True)
@@ -272,8 +267,10 @@ def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: Size) -> ProcessSta
 
 
 def this_machine() -> Machine:
-    """The processor, and the versions of what the times depend on."""
-    names = [line.partition(":")[2].strip() for line in _cpu_lines() if line.startswith("model name")]
+    """The processor, and the versions that the times depend on."""
+    cpus = Path("/proc/cpuinfo")
+    lines = cpus.read_text(encoding="utf-8").splitlines() if cpus.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return Machine(
         cpu=next(iter(names), platform.machine()),
         cores=len(os.sched_getaffinity(0)),
@@ -281,11 +278,6 @@ def this_machine() -> Machine:
         python=platform.python_version(),
         numpy=np.__version__,
     )
-
-
-def _cpu_lines() -> list[str]:
-    path = Path("/proc/cpuinfo")
-    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
 
 
 class CellMeasurement:
@@ -304,7 +296,7 @@ class CellMeasurement:
         self.stage_ms: dict[str, list[float]] = {}
 
     def measure(self, methods: list[OtherMethod], rounds: int, budget_s: float) -> None:
-        """Time every method in turn, so that what else the machine does is in the times of all."""
+        """Time every method in turn, so that other load on the machine is in the times of all."""
         works: dict[str, Callable[[], object]] = {
             "whole_frame": lambda: self.bench.draw(self.q).levels,
             "turning": lambda: self.bench.draw(self.q, 0, TURN_RAD_S).levels,
@@ -317,7 +309,8 @@ class CellMeasurement:
             if (why := self._too_long(other, budget_s)) is not None:
                 self.result.skipped.append(Skipped(*self.cell_key, other.name, why))
                 continue
-            works[other.name] = lambda other=other: images.update({other.name: self._draw_other(other)})  # type: ignore[misc]
+            draw = partial(other.draw, self.sprites, self.sigma_px, self.shape)
+            works[other.name] = lambda name=other.name, draw=draw: images.update({name: draw()})  # type: ignore[misc]
         self._keep(interleaved(works, rounds, budget_s))
         ours = self._draw_linear()
         for name, image in images.items():
@@ -337,18 +330,17 @@ class CellMeasurement:
 
     def _too_long(self, other: OtherMethod, budget_s: float) -> str | None:
         """Why a method is skipped here: its time for all stars, estimated from that for one star and for a hundred more."""
-        few = [_first(self.sprites, count) for count in (1, 101)]
-        if len(self.sprites) <= len(few[1]):
+        if len(self.sprites) <= 101:
             return None
-        one_s, more_s = (self._minimum_s(other, part) for part in few)
-        frame_s = one_s + (more_s - one_s) / 100 * len(self.sprites)
+
+        def fastest_s(count: int) -> float:
+            few = {name: getattr(self.sprites, name)[:count] for name in ("data", "star", "x_px", "y_px")}
+            part = replace(self.sprites, **few)
+            return min(_seconds(lambda: other.draw(part, self.sigma_px, self.shape)) for _ in range(2))
+
+        one_s = fastest_s(1)
+        frame_s = one_s + (fastest_s(101) - one_s) / 100 * len(self.sprites)
         return f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s" if frame_s > budget_s else None
-
-    def _minimum_s(self, other: OtherMethod, part: Sprites) -> float:
-        return min(_seconds(lambda: other.draw(part, self.sigma_px, self.shape)) for _ in range(2))
-
-    def _draw_other(self, other: OtherMethod) -> Float32Array:
-        return other.draw(self.sprites, self.sigma_px, self.shape)
 
     def _draw_linear(self) -> Float32Array:
         self.linear.draw(self.sprites)
@@ -357,8 +349,7 @@ class CellMeasurement:
     def _draw_stages(self) -> None:
         stars, camera, footprint_px = self.bench.shown_stars, self.bench.camera, self.staged.footprint_px
         begin = time.perf_counter()
-        margin_px = footprint_px / 2 + 1
-        near, directions, rates_e_per_s = self.candidates.near(stars, self.icrs_to_image, camera, margin_px)
+        near, directions, rates_e_per_s = self.candidates.near(stars, self.icrs_to_image, camera, footprint_px / 2 + 1)
         culled = time.perf_counter()
         # make_sprites in its two halves.
         x_px, y_px = camera.project((self.icrs_to_image @ directions).T)
@@ -366,8 +357,8 @@ class CellMeasurement:
         projected = time.perf_counter()
         self.staged.draw(sprites)
         self.staged.levels()
-        cull_ms, project_ms = (culled - begin) * 1e3, (projected - culled) * 1e3
-        for kind, ms in {"cull": cull_ms, "project": project_ms, **self.staged.stage_ms}.items():
+        before = {"cull": (culled - begin) * 1e3, "project": (projected - culled) * 1e3}
+        for kind, ms in {**before, **self.staged.stage_ms}.items():
             self.stage_ms.setdefault(kind, []).append(ms)
 
     def _python(self) -> None:
@@ -410,11 +401,6 @@ def _spread(times_ms: list[float]) -> Spread:
     return Spread(float(np.median(times_ms)), min(times_ms), max(times_ms))
 
 
-def _first(sprites: Sprites, count: int) -> Sprites:
-    parts = {name: getattr(sprites, name)[:count] for name in ("data", "star", "x_px", "y_px")}
-    return replace(sprites, **parts)
-
-
 @dataclass(frozen=True, slots=True)
 class BenchmarkPlan:
     """What to measure: image sizes (px), star counts, and the maximum rounds and seconds of a method in one cell.
@@ -449,13 +435,14 @@ def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], 
                 for k, count in enumerate(plan.counts):
                     shown = scene(bench, every, q_icrs_to_cam, count, rng)
                     result.scenes.append(SceneOrigin(*size, count, shown.catalogue_count, count - shown.catalogue_count))
-                    with CellMeasurement(
-                        bench.with_stars(shown.stars), q_icrs_to_cam, Cell(*size, count), result
-                    ) as measurement:
-                        measurement.measure(methods, plan.rounds, plan.budget_s)
+                    with CellMeasurement(bench.with_stars(shown.stars), q_icrs_to_cam, Cell(*size, count), result) as cell:
+                        cell.measure(methods, plan.rounds, plan.budget_s)
                     advance(place * len(plan.counts) + k + 1)
             result.startup += [fresh_start(file.path, q_icrs_to_cam, size) for _ in range(plan.starts)]
-    _summarise_starts(result, plan.sizes)
+    size = REFERENCE_PX if REFERENCE_PX in plan.sizes else plan.sizes[0]
+    here = [start for start in result.startup if start.size == size]
+    for name in ("import_ms", "first_frame_ms", "memory_mb"):
+        setattr(result, name, float(np.median([getattr(start, name) for start in here])))
     result.others_cores = round(others.cores(), 2)
     result.aims += _aims(result)
     return result
@@ -466,21 +453,12 @@ def own_bench_file(path: Path, size_px: Size, **render: Value) -> BenchFile:
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
         "sky": {"faintest_v_mag": 14},
-        "monitor": {"resolution_px": size_px, "pixel_pitch_um": 57.65},
+        "monitor": {**FULL_HD, "resolution_px": size_px},
         "collimator": {"focal_length_mm": 200},
         "render": {"flux_at_white_e_per_s": 2e6, "quantisation": "round", **render},
     }
     path.write_text(bench_text(tables))
     return read_bench_file(path)
-
-
-def _summarise_starts(result: Result, sizes: tuple[Size, ...]) -> None:
-    """Medians at REFERENCE_PX, or at the first size."""
-    size = REFERENCE_PX if REFERENCE_PX in sizes else sizes[0]
-    here = [start for start in result.startup if start.size == size]
-    result.import_ms = float(np.median([start.import_ms for start in here]))
-    result.first_frame_ms = float(np.median([start.first_frame_ms for start in here]))
-    result.memory_mb = float(np.median([start.memory_mb for start in here]))
 
 
 def _aims(result: Result) -> list[Aim]:

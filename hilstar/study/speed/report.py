@@ -1,4 +1,4 @@
-"""What the benchmark measured: as the command's JSON object, as lines for a person, as a CSV and as a chart."""
+"""The benchmark's result: the command's JSON object, lines for a person, a CSV and a chart."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class Result:
 
 
 def lines(result: Result) -> Iterator[str]:
-    """A table for each image size: medians in ms, a column for each star count; then what else is known."""
+    """A table for each image size: medians in ms, a column for each star count; then notes."""
     machine = result.machine
     software = f"Python {machine.python}, NumPy {machine.numpy}; {result.gl_renderer}"
     yield f"{machine.cpu}, {machine.cores} cores, load {machine.load:.1f} before; {software}"

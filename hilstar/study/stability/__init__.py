@@ -1,4 +1,4 @@
-"""Where methods fail, and what hilstar does there: each case compares two methods by one measure.
+"""Where methods fail, and hilstar's way there: each case compares two methods by one measure.
 
 Cases that draw are measured by `hilstar study stability` where it runs (`image.py`). Mathematics is the same on every machine:
 tests/authority measures those cases with every commit, and the tables beside this file have their figures.

@@ -42,7 +42,7 @@ ERF_ERROR = 4.4e-7
 FLUX_ERROR = MAX_CUT + 2 * ERF_ERROR
 # The share of the peak along an axis is 1 / (sqrt(2 pi) 20) at sigma 20, and there are two axes.
 PEAK_ERROR = 2 * ERF_ERROR * float(np.sqrt(2 * np.pi)) * 20
-CENTROID_PX = 1.1e-5  # what README.md promises of the linear image
+CENTROID_PX = 1.1e-5  # README.md promises it of the linear image
 NOTHING = 0.0
 CROWD, CROWD_PX, CORNER_PX = 100_000, (1024, 1024), 128
 # Ten stars on a pixel are added in float32: half of 1.2e-7 each time, on top of each star's own error.
@@ -50,7 +50,7 @@ CROWD_ERROR = FLUX_ERROR + 10 * 6e-8
 # Popping: the demo's lens and pitch (configs/demo.toml), and a star that moves by PATH_PX in STEPS frames.
 FOCAL_LENGTH_MM, PITCH_UM, ALIGNED = 350.0, 57.65, np.array([1.0, 0.0, 0.0, 0.0])
 STEPS, PATH_PX, MOVING_PX = 1000, (3.0, 1.7), (32, 32)
-RIPPLE = 1e-4  # mag, a two-hundredth of the finest aim for codes: what ripples more is the monitor's doing
+RIPPLE = 1e-4  # mag, a two-hundredth of the finest aim for codes: larger ripples are the monitor's
 CODES_MAG_UNDER_WHITE, CODES_BITS = 6.0, 8
 POINT_SAMPLED = "the Gaussian's value at the middle of each pixel"
 
@@ -77,8 +77,6 @@ STEPS_A_STAR = 0.5
 NARROW_STEPS = 0.6
 ROUNDING = 'quantisation = "round"'
 TOGETHER = "exact chooses the codes of a star's own pixels together, for what of its light is to be seen there"
-
-Groups = tuple[slice, slice]
 
 
 def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
@@ -118,22 +116,25 @@ def point_sampled(on: Target, sprites: Sprites) -> FloatArray:
 
 def half_float(on: Target, sprites: Sprites) -> FloatArray:
     """One star by erf differences in float16, the minimum that GLES calls mediump."""
-    return _outer(on, sprites, lambda *place: _difference(lambda edge: erf(edge).astype(np.float16), *place))
+    return _by_erf(on, sprites, lambda edge: erf(edge).astype(np.float16))
 
 
 def bare_polynomial(on: Target, sprites: Sprites) -> FloatArray:
     """One star by the shader's polynomial in float32, without its max(difference, 0)."""
-    return _outer(on, sprites, lambda *place: _difference(erf_float32, *place))
+    return _by_erf(on, sprites, erf_float32)
+
+
+def _by_erf(on: Target, sprites: Sprites, erf_of: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    def shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
+        far, near = (erf_of((offset_px + side) / (sigma_px * SQRT2)) for side in (0.5, -0.5))
+        return np.asarray((far - near).astype(np.float64) / 2)
+
+    return _outer(on, sprites, shares)
 
 
 def nearest_pixel(on: Target, sprites: Sprites) -> FloatArray:
     """One star with all of its light in the nearest pixel."""
     return _outer(on, sprites, lambda offset, _: (np.arange(len(offset)) == np.abs(offset).argmin()).astype(np.float64))
-
-
-def _difference(erf_of: Callable[[FloatArray], FloatArray], offset_px: FloatArray, sigma_px: float) -> FloatArray:
-    far, near = (erf_of((offset_px + side) / (sigma_px * SQRT2)) for side in (0.5, -0.5))
-    return np.asarray((far - near).astype(np.float64) / 2)
 
 
 def erf_float32(value: FloatArray) -> FloatArray:
@@ -308,7 +309,14 @@ def many_stars() -> FailureCase:
         pack_sprites(x_px, y_px, flux, np.arange(CROWD), size, sprites.footprint_px), size, GaussianPsf((SIGMA_PX,) * 2)
     )
     pixel_error = float(np.abs(image[:CORNER_PX, :CORNER_PX] - corner).max() / corner.max())
-    error, fault = (float(abs(shown.sum() / flux.sum() - 1)) for shown in (image, _indexed_sum(sprites)))
+    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    columns, rows = (sprites.data["pixel"][:, axis, None] + steps for axis in (0, 1))
+    share_x, share_y = (
+        pixel_shares(pixel - place[:, None], SIGMA_PX) for pixel, place in ((columns, sprites.x_px), (rows, sprites.y_px))
+    )
+    light, indexed = share_y * sprites.data["electrons_per_s"][:, None], np.zeros(CROWD_PX[::-1])
+    indexed[rows[:, :, None], columns[:, None, :]] += light[:, :, None] * share_x[:, None, :]
+    error, fault = (float(abs(shown.sum() / flux.sum() - 1)) for shown in (image, indexed))
     return FailureCase(
         f"{CROWD} stars in view",
         "image[rows, columns] += light",
@@ -317,17 +325,6 @@ def many_stars() -> FailureCase:
         "the GPU blends every sprite, in float32",
         Figures(max(error, pixel_error), fault, CROWD_ERROR),
     )
-
-
-def _indexed_sum(sprites: Sprites) -> FloatArray:
-    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
-    columns, rows = (sprites.data["pixel"][:, axis, None] + steps for axis in (0, 1))
-    light = pixel_shares(rows - sprites.y_px[:, None], SIGMA_PX) * sprites.data["electrons_per_s"][:, None]
-    image = np.zeros(CROWD_PX[::-1])
-    image[rows[:, :, None], columns[:, None, :]] += (
-        light[:, :, None] * pixel_shares(columns - sprites.x_px[:, None], SIGMA_PX)[:, None, :]
-    )
-    return image
 
 
 def flux_range() -> FailureCase:
@@ -407,11 +404,11 @@ def popping() -> FailureCase:
 
 def popping_codes() -> FailureCase:
     """The same star's light through 8-bit codes."""
-    fluxes = [moving_code_fluxes("round"), moving_code_fluxes("exact")]
+    fluxes = moving_code_fluxes("round"), moving_code_fluxes("exact")
     fault, error = (magnitude(float(f.min() / f.max())) for f in fluxes)
     return FailureCase(
         f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
-        'quantisation = "round"',
+        ROUNDING,
         f"its light varies by {fault:.3f} mag",
         f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
         "round adds up the errors of its pixels; exact chooses a star's codes together",
@@ -428,12 +425,14 @@ class CodeScene:
     panel: Panel
     stars: int = 1
 
+    def linear(self) -> FloatArray:
+        """The light (h, w) of the stars."""
+        return linear_image(self.sprites, (SIDE_PX, SIDE_PX), GaussianPsf((self.sigma_px,) * 2))
+
     def wanted(self) -> FloatArray:
         """The light (h, w) that a panel of any number of levels would show."""
         even = 1.0 if self.panel.uniformity is None else self.panel.uniformity
-        return np.asarray(
-            np.minimum(linear_image(self.sprites, (SIDE_PX, SIDE_PX), GaussianPsf((self.sigma_px,) * 2)), WHITE * even)
-        )
+        return np.asarray(np.minimum(self.linear(), WHITE * even))
 
 
 def codes_of(scene: CodeScene, quantisation: Quantisation) -> Levels:
@@ -452,11 +451,11 @@ def exact_codes(scene: CodeScene) -> Levels:
 
 def error_steps(codes: Levels, scene: CodeScene) -> float:
     """The error of the groups' light, rms, in the panel's smallest steps."""
-    wanted = scene.wanted()
-    parts = [
-        image.reshape(COUNT, TILE_PX, COUNT, TILE_PX).sum(axis=(1, 3)) for image in (shown_light(codes, scene.panel), wanted)
-    ]
-    off = (parts[0] - parts[1])[parts[1] > 0]
+    shown, wanted = (
+        image.reshape(COUNT, TILE_PX, COUNT, TILE_PX).sum(axis=(1, 3))
+        for image in (shown_light(codes, scene.panel), scene.wanted())
+    )
+    off = (shown - wanted)[wanted > 0]
     return float(np.sqrt(np.mean(np.square(off))) / (scene.panel.response.light[1] * WHITE))
 
 
@@ -491,16 +490,6 @@ def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
     return CodeScene(sprites_of(*both, np.repeat(mags, len(x_px)), SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE), 2)
 
 
-def half_off() -> CodeScene:
-    """Stars whose middles lie on the screen's edges, at every phase along them and across."""
-    along = middles()[0][1 : COUNT - 1]
-    across = (np.roll(np.arange(COUNT - 2), 2) + 0.5) / (COUNT - 2) - 1.0
-    x_px = np.concatenate([across, SIDE_PX - 1 - across, along, along])
-    y_px = np.concatenate([along, along, across, SIDE_PX - 1 - across])
-    sprites = sprites_of(x_px, y_px, np.full(len(x_px), FAINT_MAG), SIGMA_PX)
-    return CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
-
-
 def _judged(case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR) -> FailureCase:
     """Rounding against `exact`, by the light of each group of stars."""
     fault, error = error_steps(codes_of(scene, "round"), scene), error_steps(exact_codes(scene), scene)
@@ -515,8 +504,14 @@ def _judged(case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: floa
 
 
 def stars_half_off() -> FailureCase:
-    """Stars cut by the screen's edge."""
-    return _judged(f"stars half off the screen, {FAINT_MAG:g} mag under white on 8 bits", half_off())
+    """Stars whose middles lie on the screen's edges, at every phase along them and across."""
+    along = middles()[0][1 : COUNT - 1]
+    across = (np.roll(np.arange(COUNT - 2), 2) + 0.5) / (COUNT - 2) - 1.0
+    x_px = np.concatenate([across, SIDE_PX - 1 - across, along, along])
+    y_px = np.concatenate([along, along, across, SIDE_PX - 1 - across])
+    sprites = sprites_of(x_px, y_px, np.full(len(x_px), FAINT_MAG), SIGMA_PX)
+    scene = CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
+    return _judged(f"stars half off the screen, {FAINT_MAG:g} mag under white on 8 bits", scene)
 
 
 def stars_a_pixel_apart() -> FailureCase:
@@ -561,10 +556,10 @@ def all_clipped() -> FailureCase:
 
 
 def _spilled(case: str, scene: CodeScene) -> FailureCase:
-    """The most light that a pixel has beyond what is wanted: what is over white there, its neighbours may be given."""
+    """The largest excess of a pixel's light: error diffusion hands light over white to neighbours."""
     wanted = scene.wanted()
-    linear = linear_image(scene.sprites, (SIDE_PX, SIDE_PX), GaussianPsf((scene.sigma_px,) * 2))[: 2 * TILE_PX, : 2 * TILE_PX]
-    diffused = diffused_light(linear, scene.panel.response) - wanted[: 2 * TILE_PX, : 2 * TILE_PX]
+    corner = slice(2 * TILE_PX), slice(2 * TILE_PX)
+    diffused = diffused_light(scene.linear()[corner], scene.panel.response) - wanted[corner]
     error, fault = float((shown_light(exact_codes(scene), scene.panel) - wanted).max()), float(diffused.max())
     return FailureCase(
         case,
@@ -577,7 +572,7 @@ def _spilled(case: str, scene: CodeScene) -> FailureCase:
 
 
 def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
-    """What a panel shows of an image (h, w) whose errors each pixel hands to the next and to those below."""
+    """A panel's light of an image (h, w) by error diffusion: each pixel hands its error to the next and to those below."""
     height, width = linear.shape
     left = np.zeros((height + 1, width + 2))
     left[:height, 1:-1] = linear / WHITE

@@ -1,4 +1,4 @@
-"""Where methods fail: each case with the failing method, its error, what hilstar does, and why; charts of curves."""
+"""Where methods fail: each case with the failing method, its error, hilstar's way and the reason; charts of curves."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def narrow_sigmas(directory: Path) -> None:
     rows = np.column_stack([sigmas_px, errors]).tolist()
     columns = ("sigma_px", "flux_error", "centroid_error_px", "sampled_flux_error", "sampled_centroid_error_px")
     write_csv(directory / "narrow_stars.csv", columns, rows)
-    sigma, flux, off_px, sampled_flux, sampled_px = np.array(rows).T
-    at = int(np.abs(sigmas_px - 0.5).argmin())
+    flux, off_px, sampled_flux, sampled_px = np.array(errors).T
+    sigma, at = sigmas_px, int(np.abs(sigmas_px - 0.5).argmin())
     finding = (
         f"At sigma {sigma[at]:.2f} px a star sampled at pixel middles is off by {100 * sampled_flux[at]:.1f} % and"
         f" {sampled_px[at]:.3f} px, integrated over pixels by {100 * flux[at]:.5f} % and {off_px[at]:.4f} px"
@@ -67,7 +67,7 @@ def narrow_sigmas(directory: Path) -> None:
 
 
 def weak_perspectives(directory: Path) -> None:
-    """What one depth for every star costs against the field angle."""
+    """The error of one depth for every star, against the field angle."""
     angle_deg, off_px, off_arcsec = _recorded_curves(directory, "weak_perspective")
     at_px, at_arcsec = (float(np.interp(10.0, angle_deg, off)) for off in (off_px, off_arcsec))
     finding = (

@@ -22,7 +22,6 @@ from hilstar.render.backend import Target
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer
 from hilstar.render.variants import SplatVariant, VariantRenderer
-from hilstar.scene.camera import Camera
 from hilstar.scene.psf import MAX_CUT
 from hilstar.scene.sprites import Sprites, make_sprites, pack_sprites
 from hilstar.sky.catalog import load_catalog
@@ -46,8 +45,8 @@ from hilstar.sky.stars import Stars
 from hilstar.study.codes import AIMS, FRAME_PX, JUDGE, STARS, WAYS, Way, code_errors, response_of, star_field
 from hilstar.study.predictors import ORION
 from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
+from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.study.tradeoff.places import NO_LIMIT_V_MAG, SPRITE_PSF, demo_config, stars_to, turn_to_image
-from hilstar.study.tradeoff.table import Figure, Trial, Trials
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.units import LIGHT_M_S, flux_ratio, magnitude
 
@@ -79,7 +78,6 @@ TABLE_SIZES = (64, 512, 4096)
 # float32 rounds a star's electrons by 6e-8, and its brightest pixels by as much again.
 ROUNDING_MAG = 1e-7
 PHASES = 32
-# float32 rounds a star's electrons by 6e-8, and its brightest pixels by as much again.
 TAKEN = "exact"  # by `auto`, the default, at this depth
 LIMITS_V_MAG = (5.0, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.0, 10.0)
 
@@ -87,15 +85,42 @@ LIMITS_V_MAG = (5.0, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.0, 10.0)
 def brightness(stack: ExitStack, quick: bool) -> Trials:
     """The integral of black bodies through a sensor: error, mag, worst over COLOURS of the catalogue and at the median one."""
     del stack, quick
-    optics, bv_mag = study_optics(SENSOR), catalogue_colours()
-    kelvin = star_temperatures_k(bv_mag, SkySettings().temperature)
-    exact = adaptive_rates(kelvin, optics)
-    works = brightness_methods(bv_mag, kelvin, optics)
-    trials = []
+    # Equal shares of the catalogue, the bluest and the reddest star among them.
+    bv_mag = np.quantile(load_catalog().bv_mag, np.linspace(0, 1, COLOURS), method="nearest")
+    optics, photometry, temperature = study_optics(SENSOR), Photometry(), SkySettings().temperature
+    kelvin = star_temperatures_k(bv_mag, temperature)
+
+    def by_rule(rule: Rule) -> FloatArray:
+        def integral(integrand: Callable[[FloatArray], FloatArray], *curves: Curve) -> FloatArray:
+            nodes_nm, weight_m = rule(*curves)
+            return np.asarray(integrand(nodes_nm) @ weight_m)
+
+        return _rates(kelvin, optics, integral)
+
+    def by_table(degree: int) -> FloatArray:
+        if degree == TABLE_DEGREE:
+            return tabulate("dgs", optics, photometry).electrons_per_s(np.zeros(COLOURS), kelvin)
+        domain = [1 / TABLE_RANGE_K[1], 1 / TABLE_RANGE_K[0]]
+        log_rate = Chebyshev.interpolate(lambda x: np.log(dgs_electrons_per_s(1 / x, optics, photometry)), degree, domain)
+        return RateTable(log_rate).electrons_per_s(np.zeros(COLOURS), kelvin)
+
+    def by_colour(size: int) -> FloatArray:
+        at_mag = np.linspace(bv_mag.min(), bv_mag.max(), size)
+        rate = dgs_electrons_per_s(star_temperatures_k(at_mag, temperature), optics, photometry)
+        return np.asarray(np.exp(np.interp(bv_mag, at_mag, np.log(rate))))
+
+    tables = {degree: f"table over 1/T, degree {degree}" for degree in DEGREES}
+    works: dict[str, Callable[[], FloatArray]] = {ADAPTIVE: partial(adaptive_rates, kelvin, optics)}
+    works |= {f"trapezoid, {h:g} nm": partial(by_rule, partial(trapezoid, h)) for h in STEPS_NM}
+    works |= {f"Gauss-Legendre, {n} per knot": partial(by_rule, partial(gauss, n)) for n in ORDERS}
+    works |= {name: partial(by_table, degree) for degree, name in tables.items()}
+    works |= {f"straight lines over B-V, {n}": partial(by_colour, n) for n in BV_TABLE_SIZES}
+    works["AGS"] = lambda: np.full(COLOURS, ags_electrons_per_s(optics, photometry))
+    exact, trials = adaptive_rates(kelvin, optics), []
     for name, work in works.items():
         error = np.abs(magnitude(work() / exact))
-        own, exact_one = name == table_name(TABLE_DEGREE), name == ADAPTIVE
-        trials.append(Trial(name, float(error.max()), float(np.median(error)), work, own, exact_one))
+        figures = float(error.max()), float(np.median(error))
+        trials.append(Trial(name, *figures, work, name == tables[TABLE_DEGREE], name == ADAPTIVE))
     return Trials(
         "brightness",
         f"{COLOURS} black bodies, tables included",
@@ -105,32 +130,6 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
         trials,
         f"a bench asks for at most {len(load_catalog())} stars, each once: this time is spent when it is loaded",
     )
-
-
-def catalogue_colours() -> FloatArray:
-    """COLOURS values of B-V, mag, at equal shares of the catalogue, the bluest and the reddest star among them."""
-    return np.quantile(load_catalog().bv_mag, np.linspace(0, 1, COLOURS), method="nearest")
-
-
-def table_name(degree: int) -> str:
-    """The name of the method with a Chebyshev table of `degree`."""
-    return f"table over 1/T, degree {degree}"
-
-
-def brightness_methods(bv_mag: FloatArray, kelvin: FloatArray, optics: Optics) -> dict[str, Callable[[], FloatArray]]:
-    """Every method by name: rates of V = 0 stars, shape (COLOURS,)."""
-    works: dict[str, Callable[[], FloatArray]] = {ADAPTIVE: partial(adaptive_rates, kelvin, optics)}
-    works |= {f"trapezoid, {h:g} nm": partial(rates_by, partial(trapezoid, h), kelvin, optics) for h in STEPS_NM}
-    works |= {f"Gauss-Legendre, {n} per knot": partial(rates_by, partial(gauss, n), kelvin, optics) for n in ORDERS}
-    works |= {table_name(degree): partial(_table_rates, degree, kelvin, optics) for degree in DEGREES}
-    works |= {f"straight lines over B-V, {n}": partial(_bv_table_rates, n, bv_mag, optics) for n in BV_TABLE_SIZES}
-    works["AGS"] = lambda: np.full(len(kelvin), ags_electrons_per_s(optics, Photometry()))
-    return works
-
-
-def rates_by(rule: Rule, kelvin: FloatArray, optics: Optics) -> FloatArray:
-    """Electron rates of V = 0 black bodies (n,) with both integrals by a rule."""
-    return _rates(kelvin, optics, lambda integrand, *curves: _by_rule(integrand, *rule(*curves)))
 
 
 def adaptive_rates(kelvin: FloatArray, optics: Optics) -> FloatArray:
@@ -163,10 +162,6 @@ def _rates(kelvin: FloatArray, optics: Optics, integral: Callable[..., FloatArra
     return np.asarray(per_spectrum * electrons * width / v_band)
 
 
-def _by_rule(integrand: Callable[[FloatArray], FloatArray], nodes_nm: FloatArray, weight_m: FloatArray) -> FloatArray:
-    return np.asarray(integrand(nodes_nm) @ weight_m)
-
-
 def trapezoid(step_nm: float, *curves: Curve) -> tuple[FloatArray, FloatArray]:
     """Nodes, nm, and weights, m, of the trapezoid rule over the curves' range in steps of at most `step_nm`."""
     knots = shared_knots(*curves)
@@ -191,22 +186,8 @@ def shared_knots(*curves: Curve) -> FloatArray:
     return np.asarray(knots[(knots >= low) & (knots <= high)])
 
 
-def _table_rates(degree: int, kelvin: FloatArray, optics: Optics) -> FloatArray:
-    if degree == TABLE_DEGREE:
-        return tabulate("dgs", optics, Photometry()).electrons_per_s(np.zeros(len(kelvin)), kelvin)
-    domain = [1 / TABLE_RANGE_K[1], 1 / TABLE_RANGE_K[0]]
-    log_rate = Chebyshev.interpolate(lambda x: np.log(dgs_electrons_per_s(1 / x, optics, Photometry())), degree, domain)
-    return RateTable(log_rate).electrons_per_s(np.zeros(len(kelvin)), kelvin)
-
-
-def _bv_table_rates(size: int, bv_mag: FloatArray, optics: Optics) -> FloatArray:
-    at_mag = np.linspace(bv_mag.min(), bv_mag.max(), size)
-    rate = dgs_electrons_per_s(star_temperatures_k(at_mag, SkySettings().temperature), optics, Photometry())
-    return np.asarray(np.exp(np.interp(bv_mag, at_mag, np.log(rate))))
-
-
 def spectrum(stack: ExitStack, quick: bool) -> Trials:
-    """What a star's colour says of its spectrum: error, mag, 95 % and median of the Pickles library bluer than V-I = 2.5."""
+    """Spectra from colours: error, mag, 95 % and median of the Pickles library bluer than V-I = 2.5."""
     del stack, quick
     library, optics = load_library(), study_optics(SENSOR)
     exact, zero = library_electrons_per_s(library, optics, Photometry()), np.zeros(len(library.spectral_type))
@@ -228,7 +209,10 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
         trial("real spectra by V-I", held_out, partial(real.electrons_per_s, *colours), ("dgs", "pickles")),
     ]
     for scale in TEMPERATURE_SCALES:
-        body = partial(_body_rates, bodies, library.bv_mag, scale)
+
+        def body(scale: str = scale) -> FloatArray:
+            return bodies.electrons_per_s(zero, star_temperatures_k(library.bv_mag, scale))
+
         trials.append(trial(f"black body, {scale}", body(), body, ("dgs", "blackbody", scale)))
     ags = partial(average.electrons_per_s, zero, np.full(len(zero), 9602.0))
     trials.append(trial("AGS, one average", ags(), ags, ("ags",)))
@@ -240,10 +224,6 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
         "a catalogue has colours and no spectra",
         trials,
     )
-
-
-def _body_rates(table: RateTable, bv_mag: FloatArray, scale: str) -> FloatArray:
-    return table.electrons_per_s(np.zeros(len(bv_mag)), star_temperatures_k(bv_mag, scale))
 
 
 def psf(stack: ExitStack, quick: bool) -> Trials:
@@ -311,7 +291,7 @@ def _exact_psf() -> Trial:
 
 
 def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[float, float]:
-    """Worst flux error, mag, and centroid error, px, of what `image` makes of stars with such footprints."""
+    """Worst flux error, mag, and centroid error, px, of stars of a footprint, as `image` draws them."""
     side = PSF_PHASES * TILE_PX
     place = (np.arange(PSF_PHASES) + 0.5) * TILE_PX + (np.arange(PSF_PHASES) + 0.5) / PSF_PHASES - 0.5
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
@@ -328,6 +308,8 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
     bits = Monitor(resolution_px=FRAME_PX, pixel_pitch_um=1.0).bits
     mag = AIMS[bits][1]
     trials = [_quantised(stack, way, bits) for way in WAYS]
+    taken = next(trial for trial in trials if trial.is_default)
+    each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
     return Trials(
         "quantisation",
         f"codes of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, light to memory",
@@ -335,24 +317,15 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
         Figure("centroid error by a PSF fit, worst", "px"),
         "it needs no more than one frame and leaves no pattern that a tracker could take for a star",
         trials,
-        _each_remark(trials),
+        f"by each centroider '{taken.method}' is off by at most: {each} px",
     )
-
-
-def _each_remark(trials: list[Trial]) -> str:
-    """The largest error of the default method by each centroider."""
-    taken = next(trial for trial in trials if trial.is_default)
-    each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
-    return f"by each centroider '{taken.method}' is off by at most: {each} px"
 
 
 def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
     response, mag = response_of(bits, way), AIMS[bits][1]
     found = code_errors(bits, way, PHASES, [mag])[0]
     renderer = stack.enter_context(Renderer(Target(FRAME_PX, SPRITE_PSF, response, WHITE, way.method)))
-    field = star_field(FRAME_PX, renderer.footprint_px)
-
-    numbers = count()
+    field, numbers = star_field(FRAME_PX, renderer.footprint_px), count()
 
     def work() -> None:
         renderer.draw(field, next(numbers))
@@ -367,20 +340,21 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
     """How deep the catalogue goes: light of the whole sky that is lost, %, and stars drawn in the field."""
     del quick
     config, camera = demo_config(), ideal_monitor(demo_config())
-    calibration, white = (
-        bench_calibration(config, Path()),
-        brightest_peak_e_per_s(stars_to(NO_LIMIT_V_MAG), SPRITE_PSF),
-    )
-    renderer = stack.enter_context(Renderer(Target(camera.resolution_px, SPRITE_PSF, calibration.response, white)))
-    everything = stars_to(NO_LIMIT_V_MAG).electrons_per_s.sum()
+    every = stars_to(NO_LIMIT_V_MAG)
+    response, white = bench_calibration(config, Path()).response, brightest_peak_e_per_s(every, SPRITE_PSF)
+    renderer = stack.enter_context(Renderer(Target(camera.resolution_px, SPRITE_PSF, response, white)))
     default, turn, trials = SkySettings().faintest_v_mag, turn_to_image(ORION, camera), []
+
+    def frame(stars: Stars) -> None:
+        renderer.draw(make_sprites(stars, turn, camera, renderer.footprint_px))
+        renderer.levels()
+
     for limit in sorted({*LIMITS_V_MAG, default, NO_LIMIT_V_MAG}):
         stars = stars_to(limit)
-        lost = 100 * (1 - stars.electrons_per_s.sum() / everything) if len(stars) < len(stars_to(NO_LIMIT_V_MAG)) else 0.0
+        lost = 100 * (1 - stars.electrons_per_s.sum() / every.electrons_per_s.sum()) if len(stars) < len(every) else 0.0
         drawn = len(make_sprites(stars, turn, camera, renderer.footprint_px))
         name = "all of Hipparcos" if limit == NO_LIMIT_V_MAG else f"V to {limit:g}"
-        work = partial(_frame, renderer, stars, turn, camera)
-        trials.append(Trial(name, lost, drawn, work, limit == default, limit == NO_LIMIT_V_MAG))
+        trials.append(Trial(name, lost, drawn, partial(frame, stars), limit == default, limit == NO_LIMIT_V_MAG))
     return Trials(
         "depth",
         f"a frame of Orion to codes, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
@@ -390,8 +364,3 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
         trials,
         "stars missing from Hipparcos are in no figure; it is complete to V = 7.3 to 9, by position and type (ESA SP-1200)",
     )
-
-
-def _frame(renderer: Renderer, stars: Stars, icrs_to_image: FloatArray, camera: Camera) -> None:
-    renderer.draw(make_sprites(stars, icrs_to_image, camera, renderer.footprint_px))
-    renderer.levels()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.build import bench_stars
 from hilstar.bench.cameras import display_psf, ideal_monitor, tracker_psf
 from hilstar.bench.config import BenchConfig, RenderSettings, read_config
@@ -38,12 +37,11 @@ from hilstar.study.predictors import (
     SLEW_DEG,
     SLEW_S,
     AttitudeAt,
-    Predictor,
     predictors,
     slew_attitude,
     slew_sample,
 )
-from hilstar.study.tradeoff.table import Figure, Trial, Trials
+from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 SPRITE_PSF = display_psf(RenderSettings())
@@ -78,21 +76,26 @@ def turn_to_image(q: FloatArray, camera: Camera) -> FloatArray:
     return np.asarray(camera.cam_to_image @ to_matrix(q))
 
 
-def random_attitudes(count: int) -> list[FloatArray]:
-    """Unit quaternions, any attitude as likely as any other; ORION is the first."""
-    drawn = np.random.default_rng(SEED).normal(size=(count - 1, 4))
-    return [ORION, *normalise(drawn)]
+def random_turns(count: int, camera: Camera) -> list[FloatArray]:
+    """ICRS to image axes, (3, 3) each, at attitudes of which any is as likely as any other; ORION is the first."""
+    drawn = normalise(np.random.default_rng(SEED).normal(size=(count - 1, 4)))
+    return [turn_to_image(q, camera) for q in (ORION, *drawn)]
 
 
 def culling(stack: ExitStack, quick: bool) -> Trials:
     """How the stars in view are found among all: stars missed over ATTITUDES fields, and stars tested that are not in view."""
     del stack
     camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
-    turns = [turn_to_image(q, camera) for q in random_attitudes(10 if quick else ATTITUDES)]
+    turns = random_turns(10 if quick else ATTITUDES, camera)
+
+    def by_angle(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
+        radius_rad = camera.field_radius_rad(SPRITE_PSF.footprint_px / 2 + 1)
+        return _project(stars, np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad)), turn, camera), len(stars)
+
     in_view = [set(stars.hip[_scan(stars, turn, camera)[0]].tolist()) for turn in turns]
     finders: dict[str, tuple[Stars, Finder]] = {
         "scan, every star projected": (stars, _scan),
-        "scan of angles": (stars, _scan_angles),
+        "scan of angles": (stars, by_angle),
         **{f"cells of {deg:g} deg": (in_cells(stars, deg), _by_cells) for deg in sorted({*CELLS_DEG, CELL_DEG})},
         "cells of 10 deg, by centres only": (in_cells(stars, 10.0, by_centres=True), _by_cells),
     }
@@ -140,11 +143,6 @@ def _scan(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int
     return _project(stars, np.arange(len(stars)), turn, camera), len(stars)
 
 
-def _scan_angles(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
-    radius_rad = camera.field_radius_rad(SPRITE_PSF.footprint_px / 2 + 1)
-    return _project(stars, np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad)), turn, camera), len(stars)
-
-
 def _project(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> IntArray:
     x_px, y_px = camera.project(stars.vectors[near] @ turn.T)
     return pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, SPRITE_PSF.footprint_px).star
@@ -153,20 +151,22 @@ def _project(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> 
 def projection(stack: ExitStack, quick: bool) -> Trials:
     """Where stars fall, by the precision of it all: error, px, worst and rms over the stars of ATTITUDES random fields."""
     del stack
-    camera, vectors = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG).vectors
-    views = [_view(q, camera) for q in random_attitudes(6 if quick else ATTITUDES)]
-    truths = [_exact_places(vectors[near], turn, camera) for near, turn in views]
+    camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
+    turns = random_turns(6 if quick else ATTITUDES, camera)
+    near = [stars.vectors[stars.grid.near(turn[2], camera.field_radius_rad(0.0))] for turn in turns]
+    truths = [_places(EXACT, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)]
     trials = []
     for name, road in ROADS.items():
-        errors = [_place_errors_px(road, vectors[near], turn, truth) for (near, turn), truth in zip(views, truths, strict=True)]
-        error, (near, turn) = np.concatenate(errors), views[0]
-        work = partial(road.pack, vectors[near], turn, camera)
+        found = [_places(road, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)]
+        error = np.hypot(*(np.concatenate(found) - np.concatenate(truths)).T).astype(np.float64)
+        error = error[np.isfinite(error)]
+        work = partial(road.pack, near[0], turns[0], camera)
         # The sprites' own layout says which of them the renderer is handed.
         figures = float(error.max()), float(np.sqrt(np.mean(error**2)))
         trials.append(Trial(name, *figures, work, road.dtype == SPRITE_DTYPE, road is EXACT))
     return Trials(
         "projection",
-        f"{len(views[0][0])} stars near the field to sprites, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
+        f"{len(near[0])} stars near the field to sprites, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
         Figure("position error, worst star", "px", ROUNDING_PX),
         Figure("rms", "px"),
         "OpenGL 3.3 takes no float64, and the error of a float32 position grows with the monitor",
@@ -174,15 +174,9 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
-def _view(q: FloatArray, camera: Camera) -> tuple[IntArray, FloatArray]:
-    """The stars near a field, as places in `stars_to(NO_LIMIT_V_MAG)`, and the turn into it."""
-    turn = turn_to_image(q, camera)
-    return stars_to(NO_LIMIT_V_MAG).grid.near(turn[2], camera.field_radius_rad(0.0)), turn
-
-
 @dataclass(frozen=True, slots=True)
 class Road:
-    """From directions to sprites: the precision of the mathematics, and the layout of what is handed on."""
+    """From directions to sprites: the precision of the mathematics, and the layout of the sprites."""
 
     kind: type[np.floating[Any]]
     dtype: np.dtype[np.void]
@@ -220,25 +214,13 @@ ROADS = {
 }
 
 
-def _exact_places(vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera) -> npt.NDArray[np.longdouble]:
-    """Places (n, 2), px; NaN for a star that is not seen."""
-    return _places(EXACT, vectors, icrs_to_image, camera)
-
-
 def _places(road: Road, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera) -> npt.NDArray[np.longdouble]:
+    """Places (n, 2), px; NaN for a star that is not seen."""
     data, star = road.pack(vectors, icrs_to_image, camera)
     places = np.full((len(vectors), 2), np.nan, dtype=np.longdouble)
     split = data.dtype == SPRITE_DTYPE
     places[star] = data["pixel"] + data["fraction_px"].astype(np.longdouble) if split else data["place_px"]
     return places
-
-
-def _place_errors_px(
-    road: Road, vectors: FloatArray, icrs_to_image: FloatArray, truth: npt.NDArray[np.longdouble]
-) -> FloatArray:
-    found = _places(road, vectors, icrs_to_image, ideal_monitor(demo_config()))
-    error = np.hypot(*(found - truth).T).astype(np.float64)
-    return np.asarray(error[np.isfinite(error)])
 
 
 TRACKER = demo_config().tracker
@@ -248,7 +230,7 @@ SIZE_PX = CAMERA.resolution_px[0]
 RATE_DEG_S = (0.7, -0.7, 5.0)
 EVENLY = (4, 8, 16, 32, 64)
 GAUSS = (8, 16, 24, 32)
-# 200 nodes on 28 sigmas at most: six times what the module's rule asks for.
+# 200 nodes on 28 sigmas at most: six times as many as the module's rule asks for.
 EXACT_NODES = 200
 # Wider than the path's own footprints, so that the steps' error is not their cut; 24 px are 21 sigma on either side.
 WIDE_PX = 24
@@ -257,45 +239,51 @@ STARS_ACROSS = 16
 ROUNDING_SHARE = 1e-7
 
 
+SpritesOf = Callable[[Stars], Sprites]
+
+
 def smear(stack: ExitStack, quick: bool) -> Trials:
     """Sprites on a turning star's path: worst pixel, share of the star's flux, and centroid, px, over a grid of stars."""
     across = STARS_ACROSS // 2 if quick else STARS_ACROSS
     motion = Motion(ORION, np.radians(np.array(RATE_DEG_S)), TRACKER.exposure_s)
     few, many = grid_stars(across, motion), grid_stars(STARS_ACROSS, motion)
     renderer = stack.enter_context(VariantRenderer(Target(TRACKER.resolution_px, TRACKER_PSF), SplatVariant()))
-    exact = _image(gauss_sprites(EXACT_NODES, few, motion))
-    trials = []
-    for name, sprites_of in smear_methods(few, motion).items():
-        image = _image(sprites_of(few, motion))
-        off_px = measure(exact, image, len(exact) // across).centroid_max_px
-        work = partial(_draw_path, renderer, sprites_of, many, motion)
-        worst, is_exact = float(np.abs(image - exact).max()), name == gauss_name(EXACT_NODES)
-        trials.append(Trial(name, worst, off_px, work, sprites_of is own_sprites, is_exact))
-    paths = path_lengths_px(many, motion)
+
+    def own(stars: Stars) -> Sprites:
+        return smeared_sprites(stars, motion, CAMERA, TRACKER_PSF)
+
+    def gauss(count: int, stars: Stars) -> Sprites:
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        return _chain(stars, motion, nodes / 2, weights / 2)
+
+    def evenly(count: int, stars: Stars) -> Sprites:
+        return _chain(stars, motion, (np.arange(count) + 0.5) / count - 0.5, np.full(count, 1 / count))
+
+    def image(sprites: Sprites) -> FloatArray:
+        return linear_image(sprites, CAMERA.resolution_px, TRACKER_PSF, WIDE_PX)
+
+    def draw(sprites_of: SpritesOf) -> None:
+        renderer.draw_and_wait(sprites_of(many))
+
+    names = {count: f"Gauss-Legendre, {count}" for count in (*GAUSS, EXACT_NODES)}
+    methods: dict[str, SpritesOf] = {f"Gauss-Legendre by length, {len(own(few)) / len(few):.0f} on average": own}
+    methods |= {name: partial(gauss, count) for count, name in names.items()}
+    methods |= {f"evenly in time, {count}": partial(evenly, count) for count in EVENLY}
+    exact, trials = image(gauss(EXACT_NODES, few)), []
+    for name, sprites_of in methods.items():
+        drawn = image(sprites_of(few))
+        worst, off_px = float(np.abs(drawn - exact).max()), measure(exact, drawn, len(exact) // across).centroid_max_px
+        trials.append(Trial(name, worst, off_px, partial(draw, sprites_of), sprites_of is own, name == names[EXACT_NODES]))
+    x_px, y_px = _places_px(many, motion, np.array([-0.5, 0.5]))
+    paths_px = np.hypot(np.diff(x_px, axis=0), np.diff(y_px, axis=0))
     return Trials(
         "smear",
-        f"linear image of {len(many)} stars, paths of {paths.min():.0f} to {paths.max():.0f} px, {SIZE_PX} px squared",
+        f"linear image of {len(many)} stars, paths of {paths_px.min():.0f} to {paths_px.max():.0f} px, {SIZE_PX} px squared",
         Figure("largest pixel error, share of its star", "1", ROUNDING_SHARE),
         Figure("centre of gravity, worst", "px"),
         "its error does not grow with the path, as that of a fixed number does",
         trials,
     )
-
-
-SpritesOf = Callable[[Stars, Motion], Sprites]
-
-
-def smear_methods(stars: Stars, motion: Motion) -> dict[str, SpritesOf]:
-    """Every method by name: sprites of stars over an exposure."""
-    mean = len(own_sprites(stars, motion)) / len(stars)
-    methods: dict[str, SpritesOf] = {f"Gauss-Legendre by length, {mean:.0f} on average": own_sprites}
-    methods |= {gauss_name(count): partial(gauss_sprites, count) for count in (*GAUSS, EXACT_NODES)}
-    return methods | {f"evenly in time, {count}": partial(even_sprites, count) for count in EVENLY}
-
-
-def gauss_name(count: int) -> str:
-    """The name of the method with `count` nodes for every star."""
-    return f"Gauss-Legendre, {count}"
 
 
 def grid_stars(across: int, motion: Motion) -> Stars:
@@ -307,28 +295,6 @@ def grid_stars(across: int, motion: Motion) -> Stars:
     zero = np.zeros(across**2)
     catalog = plain_catalog("star", across**2, {"v_mag": zero, "ra_deg": zero, "dec_deg": zero})
     return make_stars(catalog, vectors, zero, zero + 1)
-
-
-def path_lengths_px(stars: Stars, motion: Motion) -> FloatArray:
-    """How far each star moves over the exposure, px (n,), by its two ends."""
-    x_px, y_px = _places_px(stars, motion, np.array([-0.5, 0.5]))
-    return np.asarray(np.hypot(np.diff(x_px, axis=0), np.diff(y_px, axis=0))[0])
-
-
-def own_sprites(stars: Stars, motion: Motion) -> Sprites:
-    """The sprites that hilstar draws (scene/exposure_motion.py)."""
-    return smeared_sprites(stars, motion, CAMERA, TRACKER_PSF)
-
-
-def gauss_sprites(count: int, stars: Stars, motion: Motion) -> Sprites:
-    """`count` sprites for each star, at the nodes of Gauss-Legendre quadrature."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return _chain(stars, motion, nodes / 2, weights / 2)
-
-
-def even_sprites(count: int, stars: Stars, motion: Motion) -> Sprites:
-    """`count` sprites of equal weight for each star, in the middles of equal parts of the exposure."""
-    return _chain(stars, motion, (np.arange(count) + 0.5) / count - 0.5, np.full(count, 1 / count))
 
 
 def _chain(stars: Stars, motion: Motion, at: FloatArray, share: FloatArray) -> Sprites:
@@ -346,25 +312,27 @@ def _places_px(stars: Stars, motion: Motion, at: FloatArray) -> tuple[FloatArray
     return x_px.reshape(len(at), -1), y_px.reshape(len(at), -1)
 
 
-def _image(sprites: Sprites) -> FloatArray:
-    return linear_image(sprites, CAMERA.resolution_px, TRACKER_PSF, WIDE_PX)
-
-
-def _draw_path(renderer: VariantRenderer, sprites_of: SpritesOf, stars: Stars, motion: Motion) -> None:
-    renderer.draw_and_wait(sprites_of(stars, motion))
-
-
 def prediction(stack: ExitStack, quick: bool) -> Trials:
     """The attitude at the moment of light, after the newest sample: worst and rms error, arcsec, on a shaken slew."""
     del stack
     samples = [slew_sample(k * SAMPLE_MS * NS_PER_MS) for k in range((10 if quick else 60) * 1000 // SAMPLE_MS)]
-    frames_ns = np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64) + samples[-2].t_ns
-    trials = []
+    frames_ns = (np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64) + samples[-2].t_ns).tolist()
+    frame_ns, trials = NS_PER_S / FRAME_HZ, []
     for predictor in predictors():
-        error = prediction_errors_arcsec(predictor, samples)
-        attitude_at = predictor.load(samples[-1 - NEAR : len(samples) if predictor.waits else -1])
-        work = partial(_all_of, attitude_at, frames_ns.tolist())
-        trials.append(Trial(predictor.name, float(error.max()), float(np.sqrt(np.mean(error**2))), work, predictor.is_default))
+        errors = []
+        for after in range(NEAR, len(samples)):
+            attitude_at = predictor.load(samples[after - NEAR : after + 1 if predictor.waits else after])
+            first, last = (math.ceil(samples[k].t_ns / frame_ns) for k in (after - 1, after))
+            for t_ns in (round(k * frame_ns) for k in range(first, last)):
+                errors.append(angle_between_rad(slew_attitude(t_ns), attitude_at(t_ns)) * math.degrees(3600))
+
+        def work(attitude_at: AttitudeAt) -> None:
+            for t_ns in frames_ns:
+                attitude_at(t_ns)
+
+        timed = partial(work, predictor.load(samples[-1 - NEAR : len(samples) if predictor.waits else -1]))
+        rms_arcsec = float(np.sqrt(np.mean(np.square(errors))))
+        trials.append(Trial(predictor.name, max(errors), rms_arcsec, timed, predictor.is_default))
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     return Trials(
         "prediction",
@@ -377,19 +345,3 @@ def prediction(stack: ExitStack, quick: bool) -> Trials:
         f" waiting for a sample makes the attitude {SAMPLE_MS} ms older;"
         " the times of hold, of the linear predictors and of the blend include the timeline, those of the other two do not",
     )
-
-
-def prediction_errors_arcsec(predictor: Predictor, samples: Sequence[AttitudeSample]) -> FloatArray:
-    """The error at each frame, once NEAR samples are there."""
-    frame_ns, errors = NS_PER_S / FRAME_HZ, []
-    for after in range(NEAR, len(samples)):
-        attitude_at = predictor.load(samples[after - NEAR : after + 1 if predictor.waits else after])
-        first, last = (math.ceil(samples[k].t_ns / frame_ns) for k in (after - 1, after))
-        for t_ns in (round(k * frame_ns) for k in range(first, last)):
-            errors.append(angle_between_rad(slew_attitude(t_ns), attitude_at(t_ns)) * math.degrees(3600))
-    return np.array(errors)
-
-
-def _all_of(attitude_at: AttitudeAt, frames_ns: Sequence[int]) -> None:
-    for t_ns in frames_ns:
-        attitude_at(t_ns)

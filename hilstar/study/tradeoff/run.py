@@ -12,9 +12,9 @@ import numpy as np
 from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, title_lines, two_digits, write_csv
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
+from hilstar.study.sweep import Figure, Trials, measured
 from hilstar.study.tradeoff.light import brightness, depth, psf, quantisation, spectrum
 from hilstar.study.tradeoff.places import SPRITE_PSF, culling, prediction, projection, smear
-from hilstar.study.tradeoff.table import Figure, Trial, Trials, measured
 from hilstar.tracker.centroiders import FAMILY
 
 LABEL_COLUMNS = 40  # characters along an axis as high as a panel
@@ -30,7 +30,7 @@ COLUMNS = (
     *("step", "work", "method", "error", "error_unit", "error_is", "second", "second_unit", "second_is"),
     *("time_ms", "quartile_1_ms", "quartile_3_ms", "default", "exact", "front", "beaten_by"),
 )
-# Columns of the step `quantisation` alone: what centroiders of every kind find.
+# Columns of the step `quantisation` alone: the error by centroiders of every kind.
 MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
 
 
@@ -42,9 +42,17 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         with ExitStack() as stack:
             steps.append(measured(plan(stack, quick), QUICK_BUDGET_S if quick else BUDGET_S))
         draw(directory / f"tradeoff_{steps[-1].name}", steps[-1], machine)
-    write_csv(
-        directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), [cells(step, row) for step in steps for row in step.trials]
-    )
+    rows = [
+        (
+            *(step.name, step.work, row.method, row.error, step.error.unit, step.error.name),
+            *(row.second, step.second.unit, step.second.name, row.time_ms, *row.quartiles_ms),
+            *(row.is_default, row.is_exact, row.on_front, row.beaten),
+            *(row.more.get(name, "") for name in MORE_COLUMNS),
+        )
+        for step in steps
+        for row in step.trials
+    ]
+    write_csv(directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), rows)
     head = f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast; > hilstar's default"
     return [head, *(line for step in steps for line in table_lines(step))]
 
@@ -53,14 +61,6 @@ def this_machine() -> str:
     """The machine and GL that the times hold for."""
     with Renderer(Target((8, 8), SPRITE_PSF)) as renderer:
         return f"{renderer.gl_renderer}, {os.cpu_count()} cores"
-
-
-def cells(step: Trials, row: Trial) -> tuple[str | float | bool, ...]:
-    """A row of the CSV: COLUMNS and MORE_COLUMNS."""
-    error, second = (row.error, step.error.unit, step.error.name), (row.second, step.second.unit, step.second.name)
-    marks = row.is_default, row.is_exact, row.on_front, row.beaten
-    more = (row.more.get(name, "") for name in MORE_COLUMNS)
-    return step.name, step.work, row.method, *error, *second, row.time_ms, *row.quartiles_ms, *marks, *more
 
 
 def table_lines(step: Trials) -> list[str]:
@@ -77,7 +77,7 @@ def table_lines(step: Trials) -> list[str]:
 
 
 def finding(step: Trials) -> str:
-    """What a chart says in its title."""
+    """The title of a step's chart."""
     own, exact = step.default, next((row for row in step.trials if row.is_exact), None)
     off = "has no error" if own.error <= step.error.floor else f"is off by {said(own.error, step.error)}"
     text = f"{'PSF' if step.name == 'psf' else step.name}: '{own.method}' {off}"
@@ -94,14 +94,10 @@ def draw(path: Path, step: Trials, machine: str) -> None:
     """Draw error against time on logarithmic axes: the front as a line, the default ringed, every method named at the side."""
     floor, own = step.error.floor, step.default
     shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.trials}
+    dotted = f" Dotted: {said(floor, step.error)}, no error below it." if floor else ""
     note = f"{capital(step.work)}. Blue: the front, which nothing else is as right and as fast as. Ring: hilstar's default."
-    note += (
-        f" Bars: quartiles. Dotted: {said(floor, step.error)}, no error below it. {machine}."
-        if floor
-        else f" Bars: quartiles. {machine}."
-    )
     height = max(4.2, 1.9 + 0.17 * len(step.trials))
-    with chart(path, finding(step), note=note, height_inch=height) as (axes,):
+    with chart(path, finding(step), note=f"{note} Bars: quartiles.{dotted} {machine}.", height_inch=height) as (axes,):
         front = [shown[row.method] for row in step.trials if row.on_front]
         if len(front) > 1:
             axes.step(*np.array(front).T, where="post", color=BLUE, lw=1.4)
@@ -115,7 +111,7 @@ def draw(path: Path, step: Trials, machine: str) -> None:
             xscale="log",
             yscale="log",
             xlabel="median time [ms]",
-            ylabel=title_lines(f"{step.error.name} [{unit_of(step.error)}]", LABEL_COLUMNS),
+            ylabel=title_lines(f"{step.error.name} [{step.error.unit.replace('1', 'share')}]", LABEL_COLUMNS),
         )
         axes.margins(0.06, 0.08)
         if any(row.error < floor for row in step.trials):
@@ -123,8 +119,3 @@ def draw(path: Path, step: Trials, machine: str) -> None:
         falling = sorted(step.trials, key=lambda row: (-shown[row.method][1], row.time_ms))
         colours = [RED if row is own else BLUE if row.on_front else MUTED for row in falling]
         name_at_side(axes, [(row.method, shown[row.method], colour) for row, colour in zip(falling, colours, strict=True)])
-
-
-def unit_of(figure: Figure) -> str:
-    """A figure's unit as an axis has it."""
-    return "share" if figure.unit == "1" else figure.unit

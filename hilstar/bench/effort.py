@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from hilstar.monitor.quantisers import BY_COST, QUANTISERS, Quantisation
 from hilstar.monitor.response import Response
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, level_cost
 from hilstar.scene.psf import MAX_CUT, Psf
+from hilstar.scene.sprites import Sprites
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge
 from hilstar.units import flux_ratio
@@ -192,9 +194,9 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
     in_time = best_ms <= IN_TIME_SHARE * light.refresh_ms or cheap_ms > IN_TIME_SHARE * light.refresh_ms
     wanted = (BY_COST if in_time else BY_COST[:1]) if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
-    stars = _CodeStars(render, light)
+    stars = _code_stars(render, light)
     for method in wanted:
-        errors = stars.errors(method, math.inf if method == wanted[-1] else limits[0])
+        errors = _code_errors(stars, method, math.inf if method == wanted[-1] else limits[0])
         within = errors.within(*limits)
         if within:
             break
@@ -221,34 +223,57 @@ def _by_whom(errors: CodeErrors, light: Light) -> str:
     return f"as `{errors.centroider}` finds stars{worst}, from white to the faintest star"
 
 
+@dataclass(frozen=True, slots=True)
 class _CodeStars:
-    """Stars at every sub-pixel phase, from full scale to the faintest of a bench, and the tracker that looks at them."""
+    """Stars at every sub-pixel phase, from full scale to the faintest of a bench, and the tracker that looks at them.
 
-    def __init__(self, render: RenderSettings, light: Light) -> None:
-        psf, seen = display_psf(render), light.seen
-        self._frames, self._balance, self._kinds = light.exposure_frames, Balance(psf, seen), light.judges
-        self._panel = Panel(light.response, WHITE)
-        self._sprites, _ = phase_grid(PHASES, psf, UNLIKE)
-        self._bright = phase_image(self._sprites, psf)
-        self._judge = Judge(self._bright, line_places(self._sprites), psf.width_px, seen.blur_px, seen.pixel_px)
-        faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
-        deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / psf.peak_share / faintest))
-        self._mags = np.linspace(0.0, deepest, MAGNITUDES).tolist()
+    `tables` are the response's arrays, by whose content two benches' stars are the same.
+    """
 
-    def errors(self, method: Quantisation, limit_mag: float) -> CodeErrors:
-        """The maximum errors of a method over phases and magnitudes; where its light is beyond a limit, of its light alone."""
-        flux_mag, shown = 0.0, []
-        for mag in reversed(self._mags):  # the faintest are off the furthest
-            linear = (self._bright * flux_ratio(mag)).astype(np.float32)
-            image = shown_by(method, self._frames, self._panel, linear, fainter(self._sprites, mag), self._balance)
-            flux_mag = max(flux_mag, self._judge.errors(image, flux_ratio(mag), ()).flux_max_mag)
-            if flux_mag > limit_mag:
-                return CodeErrors(flux_mag, math.inf, None)
-            shown.append(image.copy())
-        found = [self._judge.errors(image, flux_ratio(mag), self._kinds) for image in shown]
-        worst = max(found, key=lambda errors: errors.max_px(errors.worst()))
-        kind = worst.worst()
-        return CodeErrors(flux_mag, worst.max_px(kind), kind)
+    psf: Psf
+    seen: Seen
+    frames: int
+    kinds: tuple[Centroider, ...]
+    mags: tuple[float, ...]
+    tables: tuple[bytes, ...]
+    response: Response = field(compare=False)
+
+
+def _code_stars(render: RenderSettings, light: Light) -> _CodeStars:
+    psf, response = display_psf(render), light.response
+    faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
+    deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / psf.peak_share / faintest))
+    mags = tuple(np.linspace(0.0, deepest, MAGNITUDES).tolist())
+    arrays = (response.light, response.threshold, *(() if response.rgb is None else (response.rgb,)))
+    tables = tuple(array.tobytes() for array in arrays)
+    return _CodeStars(psf, light.seen, light.exposure_frames, light.judges, mags, tables, response)
+
+
+@lru_cache(maxsize=4)
+def _looked_at(psf: Psf, seen: Seen) -> tuple[Sprites, FloatArray, Judge]:
+    """The stars as bright as white, their light, and the tracker that looks at them."""
+    sprites, _ = phase_grid(PHASES, psf, UNLIKE)
+    bright = phase_image(sprites, psf)
+    return sprites, bright, Judge(bright, line_places(sprites), psf.width_px, seen.blur_px, seen.pixel_px)
+
+
+@lru_cache(maxsize=16)  # the benches of a campaign, a verdict or a study have few monitors, and this is half of loading one
+def _code_errors(stars: _CodeStars, method: Quantisation, limit_mag: float) -> CodeErrors:
+    """The maximum errors of a method over phases and magnitudes; where its light is beyond a limit, of its light alone."""
+    sprites, bright, judge = _looked_at(stars.psf, stars.seen)
+    panel, balance = Panel(stars.response, WHITE), Balance(stars.psf, stars.seen)
+    flux_mag, shown = 0.0, []
+    for mag in reversed(stars.mags):  # the faintest are off the furthest
+        linear = (bright * flux_ratio(mag)).astype(np.float32)
+        image = shown_by(method, stars.frames, panel, linear, fainter(sprites, mag), balance)
+        flux_mag = max(flux_mag, judge.errors(image, flux_ratio(mag), ()).flux_max_mag)
+        if flux_mag > limit_mag:
+            return CodeErrors(flux_mag, math.inf, None)
+        shown.append(image.copy())
+    found = [judge.errors(image, flux_ratio(mag), stars.kinds) for image in shown]
+    worst = max(found, key=lambda errors: errors.max_px(errors.worst()))
+    kind = worst.worst()
+    return CodeErrors(flux_mag, worst.max_px(kind), kind)
 
 
 def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> ChosenSides:

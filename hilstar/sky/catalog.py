@@ -172,11 +172,20 @@ def load_catalog(source: str | Path = "hipparcos") -> Catalog:
     Raises InputError when the file is missing or is not a Hipparcos main catalogue.
     """
     if str(source) == "hipparcos":
-        with np.load(PACKAGED_CATALOG) as packed:
-            return unpack({name: packed[name] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"]))
+        return _packaged()
     path = Path(source)
     columns, rows_read = read_hip_main(path)
     return unpack(columns, rows_read)
+
+
+@cache
+def _packaged() -> Catalog:
+    """The packaged catalogue in read-only arrays, read once: a verdict, a campaign and a study open several benches."""
+    with np.load(PACKAGED_CATALOG) as packed:
+        catalog = unpack({name: packed[name] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"]))
+    for name in column_names():
+        getattr(catalog, name).setflags(write=False)
+    return catalog
 
 
 def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:

@@ -109,20 +109,12 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
             f"{pairs.source}: half or more of the reported attitudes are wild: {used.sum()} of {len(pairs)} agree; look for"
             " lost stars, and rows of other times"
         )
-    kept = Pairs(
-        pairs.source,
-        pairs.line[used],
-        pairs.commanded[used],
-        pairs.reported[used],
-        pairs.skipped,
-        None if pairs.rate_rad_s is None else pairs.rate_rad_s[used],
-        pairs.names,
-    )
+    rate_rad_s = None if pairs.rate_rad_s is None else pairs.rate_rad_s[used]
     x, y, z = (ARCSEC_PER_RAD * fit.sigma_rad(groups_of(pairs.commanded))).tolist()
     return Aligned(
         pairs=pairs,
         fit=fit,
-        residual=residual_of(kept, fit.residual_rad[used], fit.q),
+        residual=residual_of(pairs.commanded[used], rate_rad_s, fit.residual_rad[used], fit.q),
         camera=camera,
         q_cam_to_mon=corrected(from_matrix(camera.cam_to_image), fit.q),
         sigma_arcsec=(x, y, z),
@@ -144,27 +136,23 @@ def groups_of(commanded: FloatArray) -> IntArray:
     return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1]).reshape(-1)
 
 
-def residual_of(pairs: Pairs, residual_rad: FloatArray, q: FloatArray) -> Residual:
+def residual_of(commanded: FloatArray, rate_rad_s: FloatArray | None, residual_rad: FloatArray, q: FloatArray) -> Residual:
     """Judge the residuals (n, 3), rad, of pairs without wild ones; `q` is the fitted rotation."""
-    group = groups_of(pairs.commanded)
+    group = groups_of(commanded)
     cross, roll = residual_rad[:, :2], residual_rad[:, 2:]
-    judged = [_against_repeats(part, group) for part in (cross, roll)]
-    dof = max(1.0 - 1.0 / len(pairs), 0.5)
+    dof = max(1.0 - 1.0 / len(group), 0.5)
     rms = AxesArcsec(*(ARCSEC_PER_RAD * float(np.sqrt((part**2).mean() / dof)) for part in (cross, roll)))
-    found = [each for each in judged if each is not None]
     repeat = unexplained = None
-    if len(found) == 2:
-        repeat = AxesArcsec(found[0][0], found[1][0])
-        unexplained = AxesArcsec(found[0][1], found[1][1])
-    return Residual(rms, repeat, unexplained, int(group.max()) + 1, _causes(pairs, residual_rad, q, group))
+    if len(group) - group.max() - 1 >= MIN_REPEATS:
+        judged = (_against_repeats(part, group) for part in (cross, roll))
+        repeat, unexplained = (AxesArcsec(*of_axes) for of_axes in zip(*judged, strict=True))
+    return Residual(rms, repeat, unexplained, int(group.max()) + 1, _causes(commanded, rate_rad_s, residual_rad, q, group))
 
 
-def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float] | None:
-    """The scatter of repeats, and the excess scatter of the attitudes' means over it, arcsec; None for too few repeats."""
+def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
+    """The scatter of repeats, and the excess scatter of the attitudes' means over it, arcsec."""
     count = np.bincount(group)
     pairs, groups, axes = len(group), len(count), part.shape[1]
-    if pairs - groups < MIN_REPEATS:
-        return None
     means = _means(part, group)
     within = float(((part - means[group]) ** 2).sum()) / (axes * (pairs - groups))
     repeat = ARCSEC_PER_RAD * float(np.sqrt(within))
@@ -178,28 +166,30 @@ def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float] |
     return repeat, ARCSEC_PER_RAD * float(np.sqrt((between - within) / usual))
 
 
-def _causes(pairs: Pairs, residual_rad: FloatArray, q: FloatArray, group: IntArray) -> tuple[str, ...]:
+def _causes(
+    commanded: FloatArray, rate_rad_s: FloatArray | None, residual_rad: FloatArray, q: FloatArray, group: IntArray
+) -> tuple[str, ...]:
     """Causes that explain most of the residual: a turned reference frame, a clock's offset, a drift.
 
     They are fitted to the mean of each attitude's pairs, so that an attitude counts once however often it was repeated.
     """
-    row = np.linspace(-0.5, 0.5, len(pairs))[:, None]
+    row = np.linspace(-0.5, 0.5, len(group))[:, None]
     if group.max() == 0:
-        group = np.arange(len(pairs))
+        group = np.arange(len(group))
     if group.max() + 1 < MIN_ATTITUDES:
         return ()
     means = _means(residual_rad, group)
     causes = []
     # A turn n of the reference frame: C R(n) C* is a turn by C n in cam.
-    frames = np.stack([to_matrix(each) for each in pairs.commanded[np.unique(group, return_index=True)[1]]])
+    frames = np.stack([to_matrix(each) for each in commanded[np.unique(group, return_index=True)[1]]])
     turn = _explained(means, frames)
     if turn is not None:
         size = ARCSEC_PER_RAD * float(np.linalg.norm(turn))
         causes.append(
             f"a reference frame turned by {size:.3g} arcsec explains most of it: does the tracker report in ICRS, not of date?"
         )
-    if pairs.rate_rad_s is not None:
-        late = _explained(means, -_means(pairs.rate_rad_s @ to_matrix(q).T, group)[:, :, None])
+    if rate_rad_s is not None:
+        late = _explained(means, -_means(rate_rad_s @ to_matrix(q).T, group)[:, :, None])
         if late is not None:
             causes.append(f"times that are {late[0]:+.4f} s off explain most of it: add that to --offset-s")
     drift = _explained(means, _means(row, group)[:, :, None] * np.eye(3))
@@ -247,7 +237,21 @@ def write_alignment(path: Path, found: Aligned, file: BenchFile) -> None:
         camera = load_geometry(file.folder / name, found.camera.resolution_px)
         notes = load_notes(file.folder / name)
         lens_of = f"{Path(name).name}, {notes.made.when or 'no date'}"
-    write_geometry(path, camera, found.q_cam_to_mon, _notes(found, notes, lens_of))
+    axes = ("rotation_x_arcsec", "rotation_y_arcsec", "rotation_z_arcsec")
+    made = MadeTable(
+        by=f"hilstar {hilstar.__version__}",
+        when=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        poses=notes.made.poses,
+        pairs=len(found.pairs),
+        pairs_used=int(found.fit.used.sum()),
+        wild_rows=list(found.wild),
+        rotation_arcsec=found.rotation_arcsec,
+        lens_of=lens_of,
+    )
+    rms = found.residual.rms
+    error = replace(notes.error, alignment_cross_arcsec=rms.cross, alignment_roll_arcsec=rms.roll)
+    sigma = notes.sigma | dict(zip(axes, found.sigma_arcsec, strict=True))
+    write_geometry(path, camera, found.q_cam_to_mon, Notes(sigma, error, made))
 
 
 def summary_of(found: Aligned) -> dict[str, Any]:
@@ -274,28 +278,9 @@ def summary_of(found: Aligned) -> dict[str, Any]:
     }
 
 
-def _notes(found: Aligned, lens: Notes, lens_of: str) -> Notes:
-    """The notes of the present lens, with the alignment's own."""
-    axes = ("rotation_x_arcsec", "rotation_y_arcsec", "rotation_z_arcsec")
-    made = MadeTable(
-        by=f"hilstar {hilstar.__version__}",
-        when=datetime.datetime.now(datetime.UTC).date().isoformat(),
-        poses=lens.made.poses,
-        pairs=len(found.pairs),
-        pairs_used=int(found.fit.used.sum()),
-        wild_rows=list(found.wild),
-        rotation_arcsec=found.rotation_arcsec,
-        lens_of=lens_of,
-    )
-    rms = found.residual.rms
-    error = replace(lens.error, alignment_cross_arcsec=rms.cross, alignment_roll_arcsec=rms.roll)
-    return Notes(lens.sigma | dict(zip(axes, found.sigma_arcsec, strict=True)), error, made)
-
-
 def remarks_of(found: Aligned) -> tuple[str, ...]:
     """What the figures alone do not say."""
-    residual = found.residual
-    remarks = []
+    residual, remarks = found.residual, []
     unexplained = residual.unexplained
     if residual.attitudes == 1:
         remarks.append(ONE_ATTITUDE)

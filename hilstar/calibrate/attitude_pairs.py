@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -111,7 +112,8 @@ def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
     moments = run.commanded.at(t_s)
     known = moments.known
     if not known.any():
-        said, lit = (_span(times + run.zero_ns / NS_PER_S) for times in (t_s, run.commanded.t_s))
+        spans = (times + run.zero_ns / NS_PER_S for times in (t_s, run.commanded.t_s))
+        said, lit = (f"{span.min():.3f} to {span.max():.3f} s" for span in spans)
         raise InputError(
             f"{path}: its times, {said}, meet no frame of {ledger}, lit from {lit} on the sender's clock; write t_s"
             " on that clock, or add --offset-s"
@@ -127,16 +129,9 @@ def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
     )
 
 
-def _span(t_s: FloatArray) -> str:
-    return f"{t_s.min():.3f} to {t_s.max():.3f} s"
-
-
 @dataclass(frozen=True, slots=True)
 class RotationFit:
-    """The rotation (4,), and each pair's residual (n, 3), rad, and weight (n,).
-
-    A weight of 0 is a wild pair.
-    """
+    """The rotation (4,), and each pair's residual (n, 3), rad, and weight (n,), 0 for a wild pair."""
 
     q: FloatArray
     residual_rad: FloatArray
@@ -211,15 +206,6 @@ def _weights(residual: FloatArray, near: npt.NDArray[np.bool_], cut: float) -> F
     return weight if weight.any() else near.astype(np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class Convention:
-    """A change that may have been made to the commanded and to the reported quaternions, and its cure."""
-
-    commanded: Change
-    reported: Change
-    cure: str
-
-
 def _as_is(q: FloatArray) -> FloatArray:
     return q
 
@@ -228,34 +214,24 @@ def _scalar_last(q: FloatArray) -> FloatArray:
     return np.roll(q, 1, axis=-1)  # (x, y, z, w) read as (w, x, y, z)
 
 
-def _inverse_last(q: FloatArray) -> FloatArray:
-    return conjugate(_scalar_last(q))
-
-
-def _flipped(kept: int) -> Change:
-    signs = np.array([1.0, -1.0, -1.0, -1.0])
-    signs[kept] = 1.0
-    return lambda q: q * signs
-
-
-def _conventions(names: tuple[str, ...]) -> Iterator[Convention]:
-    """The usual mistakes, the most usual first."""
+def _conventions(names: tuple[str, ...]) -> Iterator[tuple[Change, Change, str]]:
+    """The usual mistakes, the most usual first: the changes of commanded and of reported quaternions, and the cure."""
     w, x, y, z = names
-    these = ",".join(names)
+    tracker = f"the tracker's quaternions ({','.join(names)})"
     inverse = f"are the inverse (cam to ICRS); write {w},-{x},-{y},-{z}"
     last = f"have the scalar last; write it first, as {w}"
-    yield Convention(_as_is, conjugate, f"the tracker's quaternions ({these}) {inverse}")
-    yield Convention(_as_is, _scalar_last, f"the tracker's quaternions ({these}) {last}")
-    yield Convention(_as_is, _inverse_last, f"the tracker's quaternions ({these}) {last}; and they {inverse}")
-    for axis, kept in zip("xyz", (1, 2, 3), strict=True):
+    yield _as_is, conjugate, f"{tracker} {inverse}"
+    yield _as_is, _scalar_last, f"{tracker} {last}"
+    yield _as_is, lambda q: conjugate(_scalar_last(q)), f"{tracker} {last}; and they {inverse}"
+    for axis, signs in (("x", (1, 1, -1, -1)), ("y", (1, -1, 1, -1)), ("z", (1, -1, -1, 1))):
         cure = f"are mirrored in {axis}: write them for right-handed axes, x right and y down in the image"
-        yield Convention(_as_is, _flipped(kept), f"the tracker's quaternions ({these}) {cure}")
+        yield _as_is, partial(np.multiply, np.array(signs, dtype=np.float64)), f"{tracker} {cure}"
     both = (
         "either both quaternions are the inverse (cam to ICRS) or have the scalar last, or the tracker's reference frame is not"
     )
-    yield Convention(conjugate, conjugate, f"{both} ICRS; write q_icrs_to_cam, scalar first, in ICRS")
-    yield Convention(_scalar_last, _as_is, "the commanded quaternions have the scalar last; write w first")
-    yield Convention(_scalar_last, conjugate, f"the commanded quaternions have the scalar last, and the tracker's {inverse}")
+    yield conjugate, conjugate, f"{both} ICRS; write q_icrs_to_cam, scalar first, in ICRS"
+    yield _scalar_last, _as_is, "the commanded quaternions have the scalar last; write w first"
+    yield _scalar_last, conjugate, f"the commanded quaternions have the scalar last, and the tracker's {inverse}"
 
 
 def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
@@ -268,10 +244,10 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
     rotation, spread = _spread(commanded, reported)
     out_of_view = _boresight_rad(rotation) > field_radius_rad
     found = []
-    for convention in _conventions(pairs.names):
-        other, reach = _spread(convention.commanded(commanded), convention.reported(reported))
+    for change_commanded, change_reported, cure in _conventions(pairs.names):
+        other, reach = _spread(change_commanded(commanded), change_reported(reported))
         if reach <= AGREE_RAD and _boresight_rad(other) <= field_radius_rad:
-            found.append((reach, convention.cure))
+            found.append((reach, cure))
     best = min((reach for reach, _ in found), default=np.inf)
     cure = next((cure for reach, cure in found if reach <= SIMPLER * best), "")
     agrees = spread <= AGREE_RAD

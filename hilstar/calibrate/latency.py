@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError, shortened
 from hilstar.files import make_directory, write_whole
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
-from hilstar.run.record.ledger_records import NO_FRAMES, FrameRecord, RunRecord, config_of, read_head, run_records
+from hilstar.run.record.ledger_records import NO_FRAMES, FrameRecord, config_of, read_head, run_records
 from hilstar.run.sync import beat, exposures_of
 from hilstar.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
@@ -40,35 +39,27 @@ class Edges:
     level: IntArray
 
 
-def parse_edges(lines: Iterable[tuple[int, bytes]], name: str) -> Edges:
-    """Edges from a device's lines and their host times of arrival, ns (see DEVICE_FORM); other lines are skipped.
+def capture_edges(port: str, baud: int, seconds: float) -> Edges:
+    """Record the edges that a device on a serial port reports within `seconds` (see DEVICE_FORM); other lines are skipped.
 
     Device times are converted to the host's clock by the lower hull of their delays, so the minimum delay stays in the latency.
     Raises InputError where there are too few.
     """
+    lines = read_lines(port, baud, seconds)
     found = [(host_ns, match) for host_ns, line in lines if (match := re.fullmatch(rb"([01])(?:,(\d{1,18}))?", line))]
     if len(found) < MIN_EDGES:
-        raise InputError(f"{name}: {len(found)} edges came, and at least {MIN_EDGES} are needed; {DEVICE_FORM}")
+        raise InputError(f"serial:{port}@{baud}: {len(found)} edges came, and at least {MIN_EDGES} are needed; {DEVICE_FORM}")
     host_ns = np.array([host for host, _ in found], dtype=np.int64)
     level = np.array([int(match[1]) for _, match in found], dtype=np.int64)
     if all(match[2] is not None for _, match in found):
-        host_ns = _by_device(host_ns, np.array([int(match[2]) * NS_PER_US for _, match in found], dtype=np.int64))
+        device_ns = [int(match[2]) * NS_PER_US for _, match in found]
+        clock = OneWayFilter()
+        for host, device in zip(host_ns.tolist(), device_ns, strict=True):
+            clock.observe(host, host - device)
+        if clock.line is not None:
+            offset_ns = [round(clock.line.at(host)) for host in host_ns.tolist()]
+            host_ns = np.array(device_ns, dtype=np.int64) + offset_ns
     return Edges(host_ns, level)
-
-
-def _by_device(host_ns: IntArray, device_ns: IntArray) -> IntArray:
-    clock = OneWayFilter()
-    for host, device in zip(host_ns.tolist(), device_ns.tolist(), strict=True):
-        clock.observe(host, host - device)
-    line = clock.line
-    if line is None:
-        return host_ns
-    return np.array([d + round(line.at(h)) for h, d in zip(host_ns.tolist(), device_ns.tolist(), strict=True)])
-
-
-def capture_edges(port: str, baud: int, seconds: float) -> Edges:
-    """Record the edges that a device on a serial port reports within `seconds`. Raises InputError."""
-    return parse_edges(read_lines(port, baud, seconds), f"serial:{port}@{baud}")
 
 
 def read_edges(path: Path) -> Edges:
@@ -91,27 +82,6 @@ def read_edges(path: Path) -> Edges:
 def save_edges(path: Path, edges: Edges) -> None:
     """Write edges as `read_edges` reads them. Raises InputError where that cannot be done."""
     write_csv(path, ("host_ns", "level"), zip(edges.host_ns.tolist(), edges.level.tolist(), strict=True))
-
-
-def square_edges(records: Iterable[RunRecord]) -> Edges:
-    """Swap times and levels of the frames of a run whose photodiode square differs from the frame before.
-
-    Raises InputError for a run without a frame, or without a square.
-    """
-    swap_ns, level = array("q"), array("b")
-    seen = False
-    for record in records:
-        if not isinstance(record, FrameRecord):
-            continue
-        seen = True
-        if record.marker is not None:
-            swap_ns.append(record.swap_ns)
-            level.append(record.marker)
-    if not seen:
-        raise InputError(f"the run {NO_FRAMES}")
-    if not level:
-        raise InputError("the run has no photodiode square; set [monitor] photodiode_px and run it on a screen")
-    return edges_of(np.array(swap_ns, dtype=np.int64), np.array(level, dtype=np.int64))
 
 
 def edges_of(swap_ns: IntArray, level: IntArray) -> Edges:
@@ -252,7 +222,18 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> dict[
     config = config_of(read_head(ledger))
     if config is None:
         raise InputError(f"{ledger}: its header has no bench file that can be read; record the run again")
-    shown = square_edges(run_records(ledger))
+    swap_ns, level, seen = array("q"), array("b"), False
+    for record in run_records(ledger):
+        if isinstance(record, FrameRecord):
+            seen = True
+            if record.marker is not None:
+                swap_ns.append(record.swap_ns)
+                level.append(record.marker)
+    if not seen:
+        raise InputError(f"the run {NO_FRAMES}")
+    if not level:
+        raise InputError("the run has no photodiode square; set [monitor] photodiode_px and run it on a screen")
+    shown = edges_of(np.array(swap_ns, dtype=np.int64), np.array(level, dtype=np.int64))
     if not len(shown.host_ns):
         raise InputError(f"{ledger}: its photodiode square never changed; record a longer run")
     paired = pair(edges, shown, NS_PER_S / config.monitor.refresh_hz)

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -78,10 +79,7 @@ class MeasuredLevels:
         return np.asarray(np.sqrt(variance / self.count), dtype=np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """One line of the file."""
-
+class _Row(NamedTuple):
     code: int
     channel: str
     value: float
@@ -103,9 +101,7 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     bits = bits or next(usual for usual in USUAL_BITS if codes.max() < 2**usual)
     if codes.max() >= 2**bits:
         raise InputError(f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say --bits")
-    channel = np.array([row.channel for row in rows])
-    reading = np.array([row.value for row in rows])
-    exposure_s = np.array([row.exposure_s for row in rows])
+    _, channel, reading, exposure_s, _ = (np.array(column) for column in zip(*rows, strict=True))
     given = [row.t_s for row in rows if row.t_s is not None]
     if given and len(given) < len(rows):
         raise InputError(f"{path}: t_s is empty in some rows; give it in every row or leave the column out")
@@ -191,19 +187,14 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
     code, place, count = np.unique(measured.code[chosen], return_inverse=True, return_counts=True)
     mean = np.asarray(np.bincount(place, value) / count, dtype=np.float64)
     squares = np.asarray(np.bincount(place, (value - mean[place]) ** 2), dtype=np.float64)
-    relative = _pooled(squares, mean, count, mean > np.median(mean), BRIGHT_DOF)
-    return MeasuredLevels(
-        code.astype(np.intp), mean, count.astype(np.intp), relative, _additive(squares, mean, count, relative)
-    )
-
-
-def _pooled(squares: FloatArray, mean: FloatArray, count: IntArray, bright: npt.NDArray[np.bool_], fewest: int) -> float:
-    """The relative noise of the bright half, where the instrument's floor is negligible; of all levels if too few repeat."""
-    for chosen in (bright, mean > 0):
-        dof = int((count[chosen] - 1).sum())
-        if dof >= fewest:
-            return max(math.sqrt(float((squares[chosen] / mean[chosen] ** 2).sum()) / dof), NOISE_FLOOR)
-    return math.nan
+    # The relative noise of the bright half, where the instrument's floor is negligible; of all levels if too few repeat.
+    relative = math.nan
+    for part in (mean > 0, mean > np.median(mean)):
+        dof = int((count[part] - 1).sum())
+        if dof >= BRIGHT_DOF:
+            relative = max(math.sqrt(float((squares[part] / mean[part] ** 2).sum()) / dof), NOISE_FLOOR)
+    additive = _additive(squares, mean, count, relative)
+    return MeasuredLevels(code.astype(np.intp), mean, count.astype(np.intp), relative, additive)
 
 
 def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: float) -> float:

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -41,9 +41,6 @@ from hilstar.errors import InputError
 from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, write_calibration
 from hilstar.monitor.response import srgb_light
 from hilstar.units import MAG_PER_RELATIVE
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Curve = Callable[[FloatArray], FloatArray]
 
@@ -72,18 +69,10 @@ class Shape:
     log_term: bool
 
 
-def _power(signal: FloatArray) -> FloatArray:
-    return np.asarray(signal**2.2, dtype=np.float64)
-
-
-def _signal(signal: FloatArray) -> FloatArray:
-    return signal
-
-
 SHAPES = (
-    Shape("power", _power, np.log, 2, False),
+    Shape("power", lambda signal: signal**2.2, np.log, 2, False),
     Shape("srgb", srgb_light, np.log, 2, False),
-    Shape("smooth", _power, _signal, 3, True),
+    Shape("smooth", lambda signal: signal**2.2, lambda signal: signal, 3, True),
 )
 
 
@@ -235,7 +224,9 @@ def _spline(place: FloatArray, knots: FloatArray, derivative: int = 0) -> FloatA
 def _solve(shape: Shape, problem: _Problem) -> _Solution:
     """Gauss-Newton steps; each of the first ones takes the stiffness with the largest evidence."""
     black, stiffness = problem.black, math.nan
-    theta = _start(problem)
+    start = np.maximum(problem.light - problem.black, 0.05 * np.maximum(problem.light, BLACK_FLOOR))
+    normal = problem.at_levels.T @ problem.at_levels + 1e-6 * (problem.prior + problem.penalty)
+    theta = np.asarray(np.linalg.solve(normal, problem.at_levels.T @ (np.log(start) - problem.log_base_levels)))
     for step in range(MAX_STEPS):
         above = np.exp(np.clip(problem.log_base_levels + problem.at_levels @ theta, -60, 10))
         misfit = (problem.light - black - above) / problem.sigma
@@ -253,12 +244,6 @@ def _solve(shape: Shape, problem: _Problem) -> _Solution:
         if moved < SETTLED and step >= 2:
             break
     return _Solution(problem, shape, theta, black, evidence, np.asarray(covariance), design, misfit, above)
-
-
-def _start(problem: _Problem) -> FloatArray:
-    above = np.maximum(problem.light - problem.black, 0.05 * np.maximum(problem.light, BLACK_FLOOR))
-    normal = problem.at_levels.T @ problem.at_levels + 1e-6 * (problem.prior + problem.penalty)
-    return np.asarray(np.linalg.solve(normal, problem.at_levels.T @ (np.log(above) - problem.log_base_levels)))
 
 
 def _evidence(problem: _Problem, design: FloatArray, target: FloatArray, stiffness: float) -> tuple[float, FloatArray]:
@@ -301,16 +286,18 @@ class Provenance:
 def calibrate_photometric(
     measured: Path, output: Path, provenance: Provenance | None = None, bits: int | None = None
 ) -> dict[str, Any]:
-    """Fit a response to MEASURED.csv and write MONITOR.toml with its CSV beside it; the figures of what was found.
+    """Fit a response to MEASURED.csv, write MONITOR.toml with its CSV beside it, and return the figures by the keys of --json.
 
-    They are each channel's under `channels`, and those of the first in the calibration file among the others.
-
+    `channels` has each channel's; those of the first one in the calibration file stand at the top level, too.
     Raises InputError for files that cannot be read or written, and for data that are too few, saturated, falling or drifting.
     """
     data = read_measurements(measured, bits)
     fits = fit_all(data)
     drift = check_drift(data)
-    columns = response_columns(fits)
+    # For the calibration file: r, g and b where known, else w, all with the mean black.
+    names = PRIMARIES if "r" in fits else ("w",)
+    black = float(np.mean([fits[name].black for name in names]))
+    columns = {name: black + fits[name].white * fits[name].light for name in names}
     noise = max(fits[name].noise_relative for name in columns)
     drift_note = "not known: nothing was repeated" if math.isnan(drift) else f"{100 * drift:+.2f} % over the run"
     text = f"fitted to {measured.name}, sha256 {data.sha256}"
@@ -322,11 +309,14 @@ def calibrate_photometric(
     head = CalibrationHead(kind="photometric", bits=data.bits, response=output.with_suffix(".csv").name, **stated)
     table = write_calibration(output, head, columns, noise, NotesTable(drift=drift_note, text=text))
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
+    additivity = None  # of r + g + b to w at white, above black
+    if len(fits) == len(CHANNELS):
+        additivity = 100 * (sum(fits[name].white for name in PRIMARIES) / fits["w"].white - 1)
     return channels[next(iter(columns))] | {
         "bits": data.bits,
         "channels": channels,
         "noise_relative": noise,
-        "additivity_percent": additivity_percent(fits),
+        "additivity_percent": additivity,
         "drift_percent": None if math.isnan(drift) else 100 * drift,
         "written": [str(output), str(table)],
         "sha256": load_calibration(output, data.bits).sha256,
@@ -341,20 +331,6 @@ def fit_all(data: Measurements) -> dict[str, ChannelFit]:
     if len(channels) not in {1, 3, 4}:
         raise InputError(f"{data.source}: channels {', '.join(channels)}; measure w alone, or all of r, g and b")
     return {name: fit_channel(data, name) for name in channels}
-
-
-def response_columns(fits: dict[str, ChannelFit]) -> dict[str, FloatArray]:
-    """Light (2^bits,) by channel for the calibration file: r, g and b where known, else w, all with the mean black."""
-    names = PRIMARIES if "r" in fits else ("w",)
-    black = float(np.mean([fits[name].black for name in names]))
-    return {name: black + fits[name].white * fits[name].light for name in names}
-
-
-def additivity_percent(fits: dict[str, ChannelFit]) -> float | None:
-    """The difference of r + g + b from w at white, above black, in % of w; None where not all were measured."""
-    if len(fits) < len(CHANNELS):
-        return None
-    return 100 * (sum(fits[name].white for name in PRIMARIES) / fits["w"].white - 1)
 
 
 def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
@@ -403,28 +379,19 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
     note = "Lines: the fit. Dots: measured above, held out of the fit below. Dotted: black. Bands: the fit's error."
     with chart(path, finding, panels=2, note=note) as (response, residual):
         for name, fit in fits.items():
-            _draw_response(response, name, fit)
-            _draw_residuals(residual, name, fit)
+            colour, code, white = COLOURS[name], fit.levels.code[1:], fit.white
+            level, black = (fit.levels.mean[1:] - fit.black) / white, max(fit.black / white, MIN_DRAWN_LIGHT)
+            codes = np.arange(len(fit.light))
+            response.plot(codes[1:], np.maximum(fit.light[1:], MIN_DRAWN_LIGHT), color=colour, label=NAMES[name])
+            kept = level > MIN_DRAWN_LIGHT
+            response.plot(code[kept], level[kept], "o", color=colour, markersize=4, label="_measured")
+            response.axhline(black, color=colour, linewidth=0.8, linestyle=":", label="_black")
+            shown, held = fit.light >= 1e-3, fit.light[code] >= 1e-3
+            error = 100 * fit.error[shown]
+            residual.fill_between(codes[shown], -error, error, color=colour, alpha=0.15, lw=0)
+            residual.plot(code[held], 100 * fit.residual[held], "o", color=colour, markersize=4)
         response.set(yscale="log", ylim=(1e-5, 2), ylabel="light over white [share]")
         residual.axhline(0, color=MUTED, linewidth=0.8)
         residual.set(ylabel="held-out residual [%]", xlabel="code")
         label_ends(response)
     return finding
-
-
-def _draw_response(axes: Axes, name: str, fit: ChannelFit) -> None:
-    codes = np.arange(1, len(fit.light))
-    level = (fit.levels.mean[1:] - fit.black) / fit.white
-    seen = np.maximum(fit.light[1:], MIN_DRAWN_LIGHT)
-    axes.plot(codes, seen, color=COLOURS[name], label=NAMES[name])
-    kept = level > MIN_DRAWN_LIGHT
-    axes.plot(fit.levels.code[1:][kept], level[kept], "o", color=COLOURS[name], markersize=4, label="_measured")
-    axes.axhline(max(fit.black / fit.white, MIN_DRAWN_LIGHT), color=COLOURS[name], linewidth=0.8, linestyle=":", label="_black")
-
-
-def _draw_residuals(axes: Axes, name: str, fit: ChannelFit) -> None:
-    shown = fit.light >= 1e-3
-    codes, error = np.arange(len(fit.light))[shown], 100 * fit.error[shown]
-    axes.fill_between(codes, -error, error, color=COLOURS[name], alpha=0.15, lw=0)
-    held = fit.light[fit.levels.code[1:]] >= 1e-3
-    axes.plot(fit.levels.code[1:][held], 100 * fit.residual[held], "o", color=COLOURS[name], markersize=4)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -109,6 +109,7 @@ def is_filled_in(path: Path) -> bool:
     return any(line.strip() and not line.rstrip().endswith(",") for line in lines[1:])
 
 
+Level = TypeVar("Level", bound=np.unsignedinteger)
 KEY_POLL_S = 0.02
 PATCH_SHARE = 1 / 3  # relative to the screen's smaller side
 log = logging.getLogger(__name__)
@@ -121,11 +122,16 @@ def patch_image(patch: Patch, resolution_px: tuple[int, int], bits: int) -> npt.
     top, left = (height - side) // 2, (width - side) // 2
     grey = np.zeros((height, width), dtype=code_dtype(bits))
     grey[top : top + side, left : left + side] = patch.code
-    if patch.channel == "w":
-        return grey
-    image = np.zeros((height, width, 3), dtype=grey.dtype)
-    image[..., PRIMARIES.index(patch.channel)] = grey
-    return image
+    return in_channel(grey, patch.channel)
+
+
+def in_channel(codes: npt.NDArray[Level], channel: str) -> npt.NDArray[Level]:
+    """Codes (h, w) in one primary (h, w, 3); unchanged for w."""
+    if channel == "w":
+        return codes
+    colours = np.zeros((*codes.shape, 3), dtype=codes.dtype)
+    colours[..., PRIMARIES.index(channel)] = codes
+    return colours
 
 
 def write_patches(folder: Path, planned: Sequence[Patch], resolution_px: tuple[int, int], bits: int) -> None:

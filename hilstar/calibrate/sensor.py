@@ -42,23 +42,19 @@ class Quantity(NamedTuple):
     units: dict[str, Callable[[float], float]]
 
 
-def _same(value: float) -> float:
-    return value
-
-
 QUANTITIES = (
     Quantity(("k", "overall system gain"), "gain_e_per_dn", {"dn/e-": lambda value: 1 / value}),
-    Quantity(("1/k", "inverse of overall system gain"), "gain_e_per_dn", {"e-/dn": _same}),
-    Quantity(("sigma_d", "temporal dark noise"), "read_noise_e", {"e-": _same}),
-    Quantity(("mu_e.sat", "saturation capacity"), "full_well_e", {"e-": _same}),
-    Quantity(("dsnu1288", "dsnu"), "dsnu_e", {"e-": _same}),
-    Quantity(("prnu1288", "prnu"), "prnu", {"%": lambda value: value / 100, "1": _same}),
-    Quantity(("mu_i", "mu_i.mean", "dark current"), "dark_e_per_s", {"e-/s": _same}),
-    Quantity(("mu_y.dark", "dark signal"), "offset_dn", {"dn": _same}),
+    Quantity(("1/k", "inverse of overall system gain"), "gain_e_per_dn", {"e-/dn": float}),
+    Quantity(("sigma_d", "temporal dark noise"), "read_noise_e", {"e-": float}),
+    Quantity(("mu_e.sat", "saturation capacity"), "full_well_e", {"e-": float}),
+    Quantity(("dsnu1288", "dsnu"), "dsnu_e", {"e-": float}),
+    Quantity(("prnu1288", "prnu"), "prnu", {"%": lambda value: value / 100, "1": float}),
+    Quantity(("mu_i", "mu_i.mean", "dark current"), "dark_e_per_s", {"e-/s": float}),
+    Quantity(("mu_y.dark", "dark signal"), "offset_dn", {"dn": float}),
     Quantity(("bits", "bit depth"), "bits", {"bit": round}),
-    Quantity(("temperature",), "temperature_k", {"k": _same, "degc": lambda value: value + ICE_K}),
-    Quantity(("t_d", "doubling temperature"), "doubling_k", {"k": _same, "degc": _same}),
-    Quantity(("eta", "quantum efficiency"), "eta", {"%": lambda value: value / 100, "1": _same}),
+    Quantity(("temperature",), "temperature_k", {"k": float, "degc": lambda value: value + ICE_K}),
+    Quantity(("t_d", "doubling temperature"), "doubling_k", {"k": float, "degc": float}),
+    Quantity(("eta", "quantum efficiency"), "eta", {"%": lambda value: value / 100, "1": float}),
 )
 
 

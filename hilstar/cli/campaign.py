@@ -60,6 +60,7 @@ def campaign(
     as_json: Json = False,
 ) -> None:
     """Run a plan's cases over every core, or a cluster, into one Parquet table, a row a case."""
+    from hilstar.campaign.cluster import Scheduler
     from hilstar.campaign.run import Asked, Campaign
     from hilstar.campaign.store import Directory
     from hilstar.files import check_directory
@@ -67,7 +68,11 @@ def campaign(
     check_directory("-o", output)
     if scheduler is not None and (workers is not None or memory is not None):
         raise InputError("campaign --scheduler: the cluster's workers are its own; leave out --workers and --memory")
-    cluster = _scheduler(scheduler, tls_ca_file, tls_cert, tls_key)
+    cluster = None if scheduler is None else Scheduler(scheduler, tls_ca_file, tls_cert, tls_key)
+    if cluster is not None:
+        cluster.check()
+    elif tls_ca_file or tls_cert or tls_key:
+        raise InputError("campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it")
     memory_bytes = None if memory is None else parse_memory(memory)
     this = Campaign(plan, output, Asked(solver, solver_timeout, images is not None))
     directory = Directory(output)
@@ -84,19 +89,6 @@ def campaign(
         print_json(summary)
         return
     typer.echo("\n".join(lines_of(summary)))
-
-
-def _scheduler(address: str | None, *tls: Path | None) -> Scheduler | None:
-    """The requested scheduler, checked; None without --scheduler. Raises InputError."""
-    from hilstar.campaign.cluster import Scheduler
-
-    if address is None:
-        if any(tls):
-            raise InputError("campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it")
-        return None
-    found = Scheduler(address, *tls)
-    found.check()
-    return found
 
 
 def run_cases(

@@ -27,12 +27,8 @@ def convert(
     from hilstar.attitude.logs.log_file import open_log, write_log
 
     options.check_files([log], [output])
-    read = open_log(
-        log,
-        Stated(
-            options.parse_mounting(mounting), tuple(kernel or ()), topic, body, reference, epoch_utc, options.parse_place(place)
-        ),
-    )
+    mounted, at = options.parse_mounting(mounting), options.parse_place(place)
+    read = open_log(log, Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, at))
     for _, line in read.told:
         say(line)
     write_log(output, read.samples, read.conventions.scale)

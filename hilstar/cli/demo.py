@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from hilstar.console.listener import PageListener
     from hilstar.run.pacer import FrameSink
     from hilstar.run.serve import Outlet
-    from hilstar.run.summary import RunSummary
 
 HZ = 60  # the demo bench's refresh
 
@@ -61,20 +60,15 @@ def demo(
     if not as_json:
         typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
     if result.summary.stale_frames and caught() is None:
-        _refuse_stale(result.summary, as_json)
-
-
-def _refuse_stale(summary: RunSummary, as_json: bool) -> NoReturn:
-    """Print the last line of a demo whose sky stood still, and exit with code 1."""
-    line = (
-        f"{summary.stale_frames} of {summary.frames} frames show an old sky: no attitude came in time; "
-        "the machine is busy, so close other programs and run it again"
-    )
-    if as_json:
-        say(f"hilstar: {line}")
-    else:
-        typer.echo(f"{'stale sky':20}{line}")
-    raise typer.Exit(1)
+        line = (
+            f"{result.summary.stale_frames} of {result.summary.frames} frames show an old sky: no attitude came in time; "
+            "the machine is busy, so close other programs and run it again"
+        )
+        if as_json:
+            say(f"hilstar: {line}")
+        else:
+            typer.echo(f"{'stale sky':20}{line}")
+        raise typer.Exit(1)
 
 
 @contextmanager

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
 
-from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
+from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files, parse_diode
 from hilstar.cli.running import Console, ConsoleName, Control, Token, page_listener
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError, did_you_mean
@@ -26,17 +25,6 @@ if TYPE_CHECKING:
 
 PATCHES = 96
 EXAMPLE_TRUTH = "truth-example.toml"  # in configs
-
-
-@dataclass(frozen=True, slots=True)
-class _Sources:
-    """The options that choose the source of images."""
-
-    grab: str | None
-    virtual: Path | None
-    dark: Path | None
-    diode: str | None
-    seed: int
 
 
 def first_light(
@@ -104,7 +92,7 @@ def first_light(
     readings = (0 if by_hand else PATCHES) if patches is None else patches
     with (
         page_listener(console, control, token, console_name) as listener,
-        closing(_image_source(file, _Sources(grab, virtual, dark, diode, seed))) as source,
+        closing(_image_source(file, grab, virtual, dark, diode, seed)) as source,
         alone_in(make_directory(output)),
         _shown(listener, control, file) as (tell, watch),
     ):
@@ -143,23 +131,21 @@ def _shown(
         yield tell, feed.show
 
 
-def _image_source(file: files.BenchFile, sources: _Sources) -> ImageSource:
+def _image_source(
+    file: files.BenchFile, grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
+) -> ImageSource:
     """The source of images. Raises InputError for options that exclude each other."""
-    from hilstar.attitude.wire.serial_link import serial_target
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode
     from hilstar.calibrate.first_light.virtual import VirtualBench
     from hilstar.calibrate.geometric.observed import read_image
 
-    if sources.virtual is not None:
-        for name in ("grab", "dark", "diode"):
-            if getattr(sources, name) is not None:
+    if virtual is not None:
+        for name, given in (("grab", grab), ("dark", dark), ("diode", diode)):
+            if given is not None:
                 raise InputError(f"--{name} and --virtual: a virtual bench has its own; leave one of them out")
-        return VirtualBench(file, read_bench_file(sources.virtual), sources.seed)
-    if sources.dark is not None:
-        read_image(sources.dark, file.config.tracker.resolution_px)
-    port = None if sources.diode is None else serial_target(sources.diode)
-    if sources.diode is not None and port is None:
-        raise InputError(f"--diode {sources.diode}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
-    diode = None if port is None else SerialDiode(*port)
-    return ByHand(sources.dark, diode) if sources.grab is None else GrabCommand(sources.grab, sources.dark, diode)
+        return VirtualBench(file, read_bench_file(virtual), seed)
+    if dark is not None:
+        read_image(dark, file.config.tracker.resolution_px)
+    recorder = None if diode is None else SerialDiode(*parse_diode(diode))
+    return ByHand(dark, recorder) if grab is None else GrabCommand(grab, dark, recorder)

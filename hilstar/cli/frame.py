@@ -97,9 +97,9 @@ def frame(
 
 def clipped_text(loss_mag: dict[int | str, float]) -> str:
     """ "HIP 24436 by 0.12 mag, 27989 by 0.50 mag, Moon by 9.81 mag"."""
-    stars = [f"{hip} by {mag:.2f} mag" for hip, mag in loss_mag.items() if isinstance(hip, int)]
+    stars = ", ".join(f"{hip} by {mag:.2f} mag" for hip, mag in loss_mag.items() if isinstance(hip, int))
     bodies = [f"{name} by {mag:.2f} mag" for name, mag in loss_mag.items() if isinstance(name, str)]
-    return ", ".join([*(["HIP " + ", ".join(stars)] if stars else []), *bodies])
+    return ", ".join([*([f"HIP {stars}"] if stars else []), *bodies])
 
 
 def left_out(truth: Any) -> dict[str, float | int]:

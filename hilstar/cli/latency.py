@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from hilstar.cli.options import Json, Overwrite, RunFile, check_files
+from hilstar.cli.options import Json, Overwrite, RunFile, check_files, parse_diode
 from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
 from hilstar.files import CSV, check_directory, check_ending
@@ -30,7 +30,6 @@ def latency(
     as_json: Json = False,
 ) -> None:
     """Measure the latency from swap to light, by a photodiode over the screen's square and the run's ledger."""
-    from hilstar.attitude.wire.serial_link import serial_target
     from hilstar.calibrate.latency import (
         capture_edges,
         latency_lines,
@@ -48,10 +47,7 @@ def latency(
     if diode is None:
         found = read_edges(edges or Path())
     else:
-        port = serial_target(diode)
-        if port is None:
-            raise InputError(f"--diode {diode}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
-        found = capture_edges(*port, duration)
+        found = capture_edges(*parse_diode(diode), duration)
         time.sleep(LEDGER_BEHIND_S)
     if save is not None:
         save_edges(save, found)

@@ -186,13 +186,6 @@ def parse_radec(text: str) -> tuple[float, float, float]:
     return ra_deg, dec_deg, roll_deg
 
 
-def parse_rate(text: str) -> FloatArray:
-    """A rate in rad/s, cam components (3,), of "X,Y,Z" in deg/s."""
-    import numpy as np
-
-    return np.radians(parse_numbers(text, 3, "--rate", "X,Y,Z in deg/s"))
-
-
 def parse_spin(text: str) -> FloatArray:
     """The rate in rad/s, cam components (3,), of "AXIS,DEG_PER_S"."""
     import numpy as np
@@ -230,6 +223,16 @@ def parse_mounting(text: str | None) -> Mounting:
     if abs(math.hypot(w, x, y, z) - 1) > NORM_TOLERANCE:
         raise InputError(f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion W,X,Y,Z")
     return Mounting((w, x, y, z))
+
+
+def parse_diode(text: str) -> tuple[str, int]:
+    """The port and the baud rate of `--diode`. Raises InputError."""
+    from hilstar.attitude.wire.serial_link import serial_target
+
+    port = serial_target(text)
+    if port is None:
+        raise InputError(f"--diode {text}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
+    return port
 
 
 def parse_share(text: str, option: str) -> float:

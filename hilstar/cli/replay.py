@@ -77,16 +77,12 @@ def replay(
     ):
         running.say_of_light(bench)
         if explain:
-            running.explain_source(play.conventions, mounting)
-            running.explain_bench(bench)
-
+            running.explain_bench(bench, of_source=play.conventions.lines(mounting))
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
         status = RunStatus(RunSource(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)
-
         page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
-        parts = PageParts(
-            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, running.fault_schedule(wrong)
-        )
+        schedule = getattr(wrong, "schedule", None)  # nobody starts a fault in a run that is replayed
+        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule)
         with (
             on_terminal(status),
             running.followed(listener, control, page, parts, status, record) as (sink, follower, requests),

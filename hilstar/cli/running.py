@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,13 +19,11 @@ from hilstar.process.programs import Service
 from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from hilstar.attitude.wire.source import Conventions, Mounting
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.cameras import FieldsOfView
-    from hilstar.bench.fault_schedule import FaultSchedule
     from hilstar.bench.scenario import Scenario
     from hilstar.console.listener import PageListener
-    from hilstar.console.publisher import FramePublisher, PageParts, RunDescription
+    from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.faults import AnyFaults, Recording
     from hilstar.run.frame_pulse import FramePulse
     from hilstar.run.operator import SwitchRequests
@@ -78,28 +76,22 @@ ConsoleName = Annotated[
 ]
 
 
-def explain_bench(bench: Any, t_ns: int | None = None) -> None:
-    """Explain the source of the stars, the choices within the tolerance, and which bodies are discs at a time."""
+def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
+    """Explain the attitudes' source, that of the stars, the choices within the tolerance, and bodies that are discs then."""
     from hilstar.bench.effort import explain
     from hilstar.bench.moving import observer_lines, satellite_lines, wide_bodies
     from hilstar.frame.diffuse import DiffuseLayer
 
-    for note in bench.stars.catalog.notes:
-        say(note)
     moving = bench.moving
     for line in [
+        *of_source,
+        *bench.stars.catalog.notes,
         *explain(bench.effort, bench.config.render),
         *observer_lines(bench.config),
         *wide_bodies(moving, bench.camera, t_ns),
         *satellite_lines(moving, t_ns),
         *(layer.line() for layer in bench.layers if isinstance(layer, DiffuseLayer)),
     ]:
-        say(line)
-
-
-def explain_source(conventions: Conventions, mounting: Mounting) -> None:
-    """Explain the conventions of a source, with an attitude to compare."""
-    for line in conventions.lines(mounting):
         say(line)
 
 
@@ -233,11 +225,6 @@ def refuse_lost_gpu(notices: Notices) -> None:
         raise MachineError(f"{lost}; begin it again, and see dmesg where that happens again")
 
 
-def fault_schedule(faults: AnyFaults | None) -> FaultSchedule | None:
-    """The schedule at which the page requests faults; None for a run without faults, or with those of an earlier run."""
-    return getattr(faults, "schedule", None)
-
-
 @contextmanager
 def page_listener(
     console: str | None, control: bool, token: str | None, names: list[str] | None
@@ -271,23 +258,15 @@ def followed(
         if listener is None:
             yield _all_of(sinks), status.follow, None
             return
-        with _page(listener, control, description, parts, status) as (feed, follow, requests):
+        from hilstar.console.publisher import opened_page
+
+        with opened_page(listener, control, description, parts) as (feed, requests):
+
+            def follow(running: Running) -> None:
+                status.follow(running)
+                feed.follow(running)
+
             yield _all_of([*sinks, feed.see]), follow, requests
-
-
-@contextmanager
-def _page(
-    listener: PageListener, control: bool, description: RunDescription, parts: PageParts, status: RunStatus
-) -> Iterator[tuple[FramePublisher, Follower, SwitchRequests]]:
-    from hilstar.console.publisher import opened_page
-
-    with opened_page(listener, control, description, parts) as (feed, requests):
-
-        def follow(running: Running) -> None:
-            status.follow(running)
-            feed.follow(running)
-
-        yield feed, follow, requests
 
 
 def _all_of(sinks: list[FrameSink]) -> FrameSink:

@@ -65,20 +65,17 @@ def send(
     from hilstar.run.send_log import send as send_samples
     from hilstar.run.sender import open_sender
 
-    shares = (
-        options.parse_share(lose, "--lose"),
-        options.parse_share(corrupt, "--corrupt"),
-        options.parse_share(reorder, "--reorder"),
-    )
-    if sum(shares) > 1:
+    named = (("--lose", lose), ("--corrupt", corrupt), ("--reorder", reorder))
+    lost, corrupted, reordered = (options.parse_share(text, option) for option, text in named)
+    if lost + corrupted + reordered > 1:
         raise InputError("send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller fractions")
     samples, total = wanted_samples(log, spin, rate, radec, mounting)
     if duration is not None:
-        samples = until(samples, duration)
+        samples = takewhile(lambda sample: sample.t_ns < duration * NS_PER_S, samples)
     stop = threading.Event()
     keys = CurveKeys(secret_key, server_key, allowed_clients)
     with open_sender(to, connect=connect, keys=keys) as link, stop_on_signal(stop):
-        cable = BadCable(Faults(*shares, jitter / 1000), np.random.default_rng(seed), link.put)
+        cable = BadCable(Faults(lost, corrupted, reordered, jitter / 1000), np.random.default_rng(seed), link.put)
         say(f"waiting for a listener on {link.endpoint}")
         if not heard(link, wait, stop):
             say("no listener yet; sending anyway")
@@ -88,7 +85,7 @@ def send(
 
 
 def in_time(advance: Callable[[int], None]) -> Callable[[int], None]:
-    """`advance` in a process that is woken on time: it stands for another machine, which no display delays."""
+    """`advance`, which keeps this process prompt, too: it stands for another machine, which no display here delays."""
     if not is_command():
         return advance
     priority = PromptWhileLight()
@@ -121,23 +118,11 @@ def wanted_samples(
     return log_samples(recorded, rate), len(recorded) if rate is None else math.inf
 
 
-def until(samples: Any, duration_s: float) -> Any:
-    """The samples of the first `duration_s`."""
-    return takewhile(lambda sample: sample.t_ns < duration_s * NS_PER_S, samples)
-
-
 def tell(tally: Any, link: Any, as_json: bool) -> None:
     """Print what was sent and what was lost."""
-    told = {
-        "packets": tally.total,
-        "sent": tally.total - tally.lost,
-        "lost": tally.lost,
-        "corrupted": tally.corrupted,
-        "reordered": tally.reordered,
-    }
-    for name in ("requests", "statuses", "unsent"):
-        if hasattr(link, name):
-            told[name] = getattr(link, name)
+    told = {"packets": tally.total, "sent": tally.total - tally.lost}
+    told |= {name: getattr(tally, name) for name in ("lost", "corrupted", "reordered")}
+    told |= {name: getattr(link, name) for name in ("requests", "statuses", "unsent") if hasattr(link, name)}
     told["link"] = {"endpoint": link.endpoint} | link.link_counts.summary()
     if as_json:
         print_json(told)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from hilstar.attitude.wire.links import Pictures
     from hilstar.attitude.wire.zmq_links import ZmqReceiver
     from hilstar.bench.bench_file import BenchFile as ReadFile
-    from hilstar.bench.bench_file import HeadsFile
     from hilstar.bench.frame import Bench
+    from hilstar.run.heads import HeadsRun
     from hilstar.run.open_link import AnyLink
 
 NO_ATTITUDE = 4
@@ -35,44 +35,35 @@ HeadOf = Annotated[Path | None, typer.Option("--head-of", hidden=True)]
 FedBy = Annotated[str | None, typer.Option("--fed-by", hidden=True)]
 
 
-@dataclass(frozen=True, slots=True)
-class HeadsAsked:
-    """The options of `serve` for all heads. The page of head k is at the port of `console` plus k."""
+def serve_heads(asked: HeadsRun, console: str | None, overwrite: bool, as_json: bool) -> None:
+    """Serve every head until its end, and print what each reported; exit code 4 if none ever had an attitude.
 
-    duration_s: float | None
-    frames: int | None
-    ledger: Path | None
-    ledger_split: str | None
-    scenario: Path | None
-    switches: dict[str, bool]
-    console: str | None
-    token: str | None
-
-    def options(self) -> tuple[str, ...]:
-        """The options as words of each head's command line."""
-        valued = {"--frames": self.frames, "--ledger-split": self.ledger_split, "--scenario": self.scenario}
-        given = [word for name, value in valued.items() if value is not None for word in (name, str(value))]
-        return (*given, *(name for name, on in self.switches.items() if on))
-
-
-def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
-    """Serve every head until its end, and print what each reported; exit code 4 if none ever had an attitude."""
-    from hilstar.run.heads import HeadsRun, head_ledger, run_heads, source_config
+    The page of head k is at the port of `console` plus k.
+    """
+    from hilstar.run.heads import head_ledger, run_heads, source_config
     from hilstar.run.open_link import open_link
 
-    if asked.ledger is not None and not asked.switches.get("--overwrite"):
+    heads = asked.heads
+    if asked.ledger is not None and not overwrite:
         taken = [file for name in heads.names if (file := head_ledger(asked.ledger, name)).exists()]
         if taken:
             raise InputError(f"--ledger {asked.ledger}: {taken[0]} exists; give another name, or --overwrite")
     notices = Notices()
-    consoles = _consoles(asked, heads)
+    asked = replace(asked, consoles=_consoles(console, asked.token, len(heads.names)))
     with open_link(source_config(heads), heads.folder, notices, apart=True) as link:
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
         assert not link.steps  # read_heads refuses lockstep
-        run = HeadsRun(heads, asked.options(), asked.duration_s, asked.ledger, consoles, asked.token)
-        told = run_heads(run, link, say)
-    _report(told, as_json)
+        told = run_heads(asked, link, say)
+    if as_json:
+        typer.echo(msgspec.json.encode({"heads": told}).decode())
+    else:
+        for name, head in told.items():
+            summary = head["summary"]
+            frames = summary.get("frames") if isinstance(summary, dict) else None
+            counted = "no summary" if frames is None else f"{frames} frames"
+            again = f", started again {head['restarts']} times" if head["restarts"] else ""
+            typer.echo(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
     codes = [head["exit_code"] for head in told.values()]
     if all(code == NO_ATTITUDE for code in codes):
         raise typer.Exit(NO_ATTITUDE)
@@ -81,33 +72,21 @@ def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
         raise typer.Exit(failed[0] if 0 < failed[0] <= NO_ATTITUDE else 1)
 
 
-def _consoles(asked: HeadsAsked, heads: HeadsFile) -> tuple[str, ...]:
+def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, ...]:
     """The address of each head's page. Raises InputError where one is taken, before a head is started."""
     from hilstar.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
 
-    if asked.console is None:
+    if console is None:
         return ()
-    first, count = parse_address(asked.console), len(heads.names)
+    first = parse_address(console)
     if first.port and first.port + count - 1 > MAX_PORT:
-        raise InputError(f"--console {asked.console}: {count} pages need as many ports from there; choose a lower one")
+        raise InputError(f"--console {console}: {count} pages need as many ports from there; choose a lower one")
     addresses = [ListenAddress(first.host, first.port + k if first.port else 0) for k in range(count)]
     with ExitStack() as doors:
         for address in addresses:
-            doors.enter_context(PageListener(address, asked.token))
+            doors.enter_context(PageListener(address, token))
     host = f"[{first.host}]" if ":" in first.host else first.host
     return tuple(f"{host}:{address.port}" for address in addresses)
-
-
-def _report(told: dict[str, dict[str, object]], as_json: bool) -> None:
-    if as_json:
-        typer.echo(msgspec.json.encode({"heads": told}).decode())
-        return
-    for name, head in told.items():
-        summary = head["summary"]
-        frames = summary.get("frames") if isinstance(summary, dict) else None
-        counted = "no summary" if frames is None else f"{frames} frames"
-        again = f", started again {head['restarts']} times" if head["restarts"] else ""
-        typer.echo(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
 
 
 def fed_link(file: ReadFile, fed_by: str, notices: Notices) -> ZmqReceiver:
@@ -148,10 +127,15 @@ def serve(
 
     file = read_bench_or_heads(bench_file) if head_of is None else as_head(bench_file, head_of)
     if isinstance(file, HeadsFile):
+        from hilstar.run.heads import HeadsRun
+
+        valued = {"--frames": frames, "--ledger-split": ledger_split, "--scenario": scenario}
         switches = {"--headless": headless, "--windowed": windowed, "--force": force, "--control": control}
         switches |= {"--overwrite": overwrite, "--explain": explain}
-        asked = HeadsAsked(duration, frames, running.dated_ledger(ledger), ledger_split, scenario, switches, console, token)
-        serve_heads(file, asked, as_json)
+        words = [word for name, value in valued.items() if value is not None for word in (name, str(value))]
+        words += [name for name, on in switches.items() if on]
+        asked = HeadsRun(file, tuple(words), duration, running.dated_ledger(ledger), token=token)
+        serve_heads(asked, console, overwrite, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.cameras import fields_of_view
@@ -177,11 +161,9 @@ def serve(
         running.run_with_faults(bench, faults, notices, kept) as wrong,
     ):
         if explain:
-            running.explain_source(link.conventions, Mounting(file.config.tracker.q_body_to_cam))
-            running.explain_bench(bench)
+            running.explain_bench(bench, of_source=link.conventions.lines(Mounting(file.config.tracker.q_body_to_cam)))
         refresh_hz = bench.config.monitor.refresh_hz
-        slots = math.inf if duration is None else round(duration * refresh_hz)
-        limit = Limit(slots, math.inf if frames is None else frames)
+        limit = Limit(math.inf if duration is None else round(duration * refresh_hz), math.inf if frames is None else frames)
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         say(fields.line())
@@ -190,12 +172,10 @@ def serve(
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
         told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
-        page = RunDescription(
-            "serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock"
-        )
-        parts = PageParts(
-            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, running.fault_schedule(wrong)
-        )
+        source = file.config.attitude
+        page = RunDescription("serve", source.source, link.endpoint, "asked" if source.lockstep else "clock")
+        schedule = getattr(wrong, "schedule", None)
+        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule)
         with on_terminal(status), running.followed(listener, control, page, parts, status) as (sink, follower, requests):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse)
             summary = serve_stream(bench, link, limit, sink, outlet)

@@ -106,7 +106,10 @@ def install(
         write_whole(path, text)
         tokens = path.with_suffix(".env")
         if console is not None and not console.is_loopback and not tokens.exists():
-            write_token(tokens)
+            import secrets  # hashes and random numbers, which no other command needs
+
+            with os.fdopen(os.open(tokens, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(f"HILSTAR_TOKEN={secrets.token_urlsafe(TOKEN_BYTES)}\n")
             say(f"the token of the operator's page is in {tokens}")
     except OSError as error:
         raise cannot_write(path, error) from error
@@ -122,7 +125,6 @@ def uninstall(
     ],
 ) -> None:
     """Stop a service, and delete its unit and its token."""
-
     bare = name.removesuffix(".toml").removesuffix(".service").removeprefix("hilstar-")
     path = units_folder() / unit_name(bare)
     if not os.path.lexists(path):
@@ -235,11 +237,3 @@ def _quoted(word: str) -> str:
     """A word of a unit's command line."""
     text = _literal(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
     return text if re.fullmatch(r"[A-Za-z0-9_@%+=:,./{}-]+", text) else f'"{text}"'
-
-
-def write_token(path: Path) -> None:
-    """Write a new token into a file that only this user can read. Raises OSError where there is one."""
-    import secrets  # hashes and random numbers, which no other command needs
-
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        file.write(f"HILSTAR_TOKEN={secrets.token_urlsafe(TOKEN_BYTES)}\n")

@@ -64,11 +64,10 @@ def simulate(
     file = read_bench_file(bench_file)
     wrong = optional_scenario(scenario)
     options.check_files([scenario], targets, file)
-    q, t_ns = (
-        options.parse_attitude("simulate", radec, quaternion),
-        options.parse_at("simulate", at, file.config, wrong is not None),
-    )
-    file, rate_rad_s = at_moment(file, t_ns), options.parse_rate(rate) if rate else np.zeros(3)
+    q = options.parse_attitude("simulate", radec, quaternion)
+    t_ns = options.parse_at("simulate", at, file.config, wrong is not None)
+    file = at_moment(file, t_ns)
+    rate_rad_s = np.radians(options.parse_numbers(rate, 3, "--rate", "X,Y,Z in deg/s")) if rate else np.zeros(3)
     with Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
         view = simulator.view(q, rate_rad_s, t_ns)

@@ -12,6 +12,7 @@ import typer
 
 from hilstar.cli.options import Json, check_files
 from hilstar.console.terminal import print_json, progress
+from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
 
 Study = Literal[
@@ -44,23 +45,16 @@ def study(
 ) -> None:
     """Draw charts and tables of what each choice costs in accuracy and in time, and of where methods fail."""
     check_directory("-o", output)
-    check_bench(what, bench)
+    if what == "chain" and bench is None:
+        raise InputError("study chain: is of a bench; write hilstar study chain BENCH.toml -o DIR")
+    if what != "chain" and bench is not None:
+        raise InputError(f"study {what}: has benches of its own; leave out {bench}")
     with progress(f"study {what}", math.inf if bench is None else CHAIN_SCENES) as advance:
         lines, right = study_lines(what, output, quick) if bench is None else chain_lines(bench, output, quick, advance)
     if as_json:
         print_json({"study": what, "right": right, "findings": lines, "directory": str(output)})
     else:
         typer.echo("\n".join([*lines, f"figures and tables in {output}"]))
-
-
-def check_bench(what: str, bench: Path | None) -> None:
-    """Refuse (InputError) a bench file for a study that brings its own, and `chain` without one."""
-    from hilstar.errors import InputError
-
-    if what == "chain" and bench is None:
-        raise InputError("study chain: is of a bench; write hilstar study chain BENCH.toml -o DIR")
-    if what != "chain" and bench is not None:
-        raise InputError(f"study {what}: has benches of its own; leave out {bench}")
 
 
 def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:

@@ -55,16 +55,12 @@ def parse_address(text: str) -> ListenAddress:
     if port and not (port.isdecimal() and port.isascii() and len(port) <= 5 and int(port) <= MAX_PORT):
         raise wrong
     host = host or HOST
-    if not _is_host(host):
-        raise wrong
+    if NAME.fullmatch(host) is None or ":" in host or re.fullmatch(r"[\d.]+", host):
+        try:
+            ipaddress.ip_address(host)
+        except ValueError:
+            raise wrong from None
     return ListenAddress(host, int(port) if port else PORT)
-
-
-def _is_host(text: str) -> bool:
-    with contextlib.suppress(ValueError):
-        ipaddress.ip_address(text)
-        return True
-    return NAME.fullmatch(text) is not None and ":" not in text and not re.fullmatch(r"[\d.]+", text)
 
 
 class PageListener(Closing):
@@ -102,7 +98,12 @@ class PageListener(Closing):
         host = self.host
         with contextlib.suppress(ValueError):
             if ipaddress.ip_address(host).is_unspecified:
-                host = _own_address(self.socket.family)
+                # This machine's address on its route out, by which others most likely reach it. Nothing is sent.
+                is_v6 = self.socket.family == socket.AF_INET6
+                beyond, host = ("2001:db8::1", "::1") if is_v6 else ("192.0.2.1", HOST)  # documentation: RFC 3849, RFC 5737
+                with contextlib.suppress(OSError), socket.socket(self.socket.family, socket.SOCK_DGRAM) as probe:
+                    probe.connect((beyond, 9))
+                    host = str(probe.getsockname()[0])
         return f"http://{_bracketed(host)}:{self.port}/" + (f"#token={self.token}" if self.made else "")
 
     def close(self) -> None:
@@ -132,12 +133,3 @@ def _listen(address: ListenAddress) -> socket.socket:
         raise InputError(f"--console {where}: cannot listen there ({reason}); choose another port, or 0 for any") from error
     listener.setblocking(False)
     return listener
-
-
-def _own_address(family: socket.AddressFamily) -> str:
-    """This machine's address on its route out, by which others most likely reach it. Nothing is sent."""
-    beyond = "2001:db8::1" if family == socket.AF_INET6 else "192.0.2.1"  # for documentation: RFC 5737, RFC 3849
-    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
-        probe.connect((beyond, 9))
-        return str(probe.getsockname()[0])
-    return "::1" if family == socket.AF_INET6 else HOST

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import msgspec
 
@@ -20,12 +20,15 @@ from hilstar.console.protocol import (
 )
 
 FRAME = struct.Struct("<12qI")
-_PICTURE = struct.Struct("<3q4I4d")
+PICTURE = struct.Struct("<3q4I4d")
 STALE, MISSING, BLANK, HAS_AGE = 1, 2, 4, 8
 
 
 class FrameNumbers(NamedTuple):
-    """One frame and the counts up to it; host times, ns. `flags` combines STALE, MISSING, BLANK and HAS_AGE."""
+    """One frame and the counts up to it, as FRAME packs them; host times, ns.
+
+    `flags` combines STALE, MISSING, BLANK and HAS_AGE.
+    """
 
     number: int
     draw_ns: int
@@ -41,18 +44,9 @@ class FrameNumbers(NamedTuple):
     refused: int
     flags: int
 
-    def pack(self) -> bytes:
-        """Its bytes in the shared memory."""
-        return FRAME.pack(*self)
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Self:
-        """Those bytes read."""
-        return cls(*FRAME.unpack(data))
-
 
 class PictureHead(NamedTuple):
-    """The head of a picture: its frame, its swap (host time, ns), and its attitude `q_w` to `q_z`, NaN without one.
+    """The head of a picture, as PICTURE packs it: frame, swap (host time, ns), attitude `q_w` to `q_z`, NaN without one.
 
     Levels of `item_bytes` each follow, `width` by `height`, then `sprites` records of `shared_memory.SPRITE`.
     """
@@ -68,15 +62,6 @@ class PictureHead(NamedTuple):
     q_x: float = math.nan
     q_y: float = math.nan
     q_z: float = math.nan
-
-    def pack(self) -> bytes:
-        """Its bytes in the shared memory."""
-        return _PICTURE.pack(*self)
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Self:
-        """Those bytes read."""
-        return cls(*_PICTURE.unpack_from(data))
 
 
 class RunState(msgspec.Struct, frozen=True, kw_only=True):

@@ -46,11 +46,15 @@ class CameraMarks:
         lines: list[GridLine] = []
         if grid and q_icrs_to_cam is not None:
             lines = list(self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)))
+        # The tracker's outline on the monitor.
+        rays = self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))
+        x_px, y_px = self.monitor.project_outward(rays @ self.monitor.cam_to_image.T)
+        known = np.isfinite(x_px) & np.isfinite(y_px)
         return Truth(
             frame=frame,
             stars=stars,
             boresight_px=[round(at, PX_DIGITS) for at in self.monitor.boresight_px],
-            tracker_px=self._tracker_px(),
+            tracker_px=[[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()],
             grid=lines if grid else UNSET,
         )
 
@@ -60,13 +64,6 @@ class CameraMarks:
         with np.errstate(invalid="ignore"):  # NaN: behind the camera, or beyond the lens
             inside = np.abs(x_px - (width - 1) / 2) <= width * (0.5 + beyond)
             return np.asarray(inside & (np.abs(y_px - (height - 1) / 2) <= height * (0.5 + beyond)))
-
-    def _tracker_px(self) -> list[list[float]]:
-        """The tracker's outline on the monitor."""
-        rays = self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))
-        x_px, y_px = self.monitor.project_outward(rays @ self.monitor.cam_to_image.T)
-        known = np.isfinite(x_px) & np.isfinite(y_px)
-        return [[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()]
 
     def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[GridLine]:
         """Lines of RA and of Dec that cross the image."""
@@ -81,9 +78,8 @@ class CameraMarks:
             ra_step_deg = _step(RA_STEPS_DEG, wide_deg / LINES_ACROSS)
         reach = np.linspace(-wide_deg, wide_deg, LINE_PLACES * (4 if wide_deg > 90 else 1))
         for dec in _multiples(low_deg, high_deg, step_deg):
-            yield from self._line(
-                f"Dec {dec:+.{_digits(step_deg)}f}\N{DEGREE SIGN}", ra_deg + reach, np.full_like(reach, dec), turn
-            )
+            label = f"Dec {dec:+.{_digits(step_deg)}f}\N{DEGREE SIGN}"
+            yield from self._line(label, ra_deg + reach, np.full_like(reach, dec), turn)
         up = np.linspace(low_deg, high_deg, LINE_PLACES)
         for ra in _multiples(ra_deg - wide_deg, ra_deg + wide_deg - 1e-9, ra_step_deg):
             yield from self._line(f"RA {ra % 360:.{_digits(ra_step_deg)}f}\N{DEGREE SIGN}", np.full_like(up, ra), up, turn)
@@ -127,12 +123,9 @@ class Overlay:
     def _places(self, which: np.ndarray[Any, Any]) -> list[SkyPlace]:
         x, y, z = self.stars.directions(which).T
         ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
-        columns = (
-            ra_deg.round(SKY_DIGITS).tolist(),
-            dec_deg.round(SKY_DIGITS).tolist(),
-            self.stars.v_mag[which].round(2).tolist(),
-        )
-        return [SkyPlace(*row) for row in zip(*columns, self._labels(which, ""), strict=True)]
+        v_mag = self.stars.v_mag[which].round(2).tolist()
+        places = ra_deg.round(SKY_DIGITS).tolist(), dec_deg.round(SKY_DIGITS).tolist()
+        return [SkyPlace(*row) for row in zip(*places, v_mag, self._labels(which, ""), strict=True)]
 
     def _labels(self, which: np.ndarray[Any, Any], none: str | None = None) -> list[str]:
         """A star's label: a body's name, else its designation, else its HIP number, or `none` where that is given."""

@@ -67,7 +67,9 @@ class PageProcess:
 
     def __init__(self, setup: Setup, memory: SharedMemory, listener: socket.socket, watched: PageSubject, do: Do) -> None:
         self._memory, self._listener, self._watched, self._do = memory, listener, watched, do
-        self._setup_fd = _memory_of(msgspec.msgpack.encode(setup))
+        self._setup_fd = os.memfd_create("hilstar-console-setup")
+        with os.fdopen(os.dup(self._setup_fd), "wb") as file:
+            file.write(msgspec.msgpack.encode(setup))
         self._events: deque[Notice] = deque(maxlen=1000)
         watched.listen(self._events.append)
         self._stop = threading.Event()
@@ -99,12 +101,24 @@ class PageProcess:
                 next_s = now_s + TICK_S
                 self._tick(now_s)
             self._listen(max(next_s - time.monotonic(), 0.0))
-        self._end_page()
+        page, self._page = self._page, None
+        if page is None:
+            return
+        page.channel.close()  # which tells it to end
+        try:
+            page.process.wait(END_WAITS_S)
+        except subprocess.TimeoutExpired:
+            page.process.kill()
+            page.process.wait()
 
     def _tick(self, now_s: float) -> None:
         try:
             self._memory.states.put(msgspec.json.encode(self._watched.now()))
-            self._write_events()
+            ahead_s = time.time() - time.monotonic_ns() * 1e-9
+            while self._events:
+                notice = self._events.popleft()
+                event = RunEvent(round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail)
+                self._memory.events.put(msgspec.json.encode(event))
         except Exception as error:  # such as a container that changed while it was read: the next tick reads it again
             self._memory.states.put(msgspec.json.encode(RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
         page = self._page
@@ -114,15 +128,9 @@ class PageProcess:
         elif page.process.poll() is not None:
             self._lost(page, now_s)
 
-    def _write_events(self) -> None:
-        ahead_s = time.time() - time.monotonic_ns() * 1e-9
-        while self._events:
-            notice = self._events.popleft()
-            event = RunEvent(round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail)
-            self._memory.events.put(msgspec.json.encode(event))
-
     def _start_page(self, now_s: float) -> None:
         channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        environment = {name: value for name, value in os.environ.items() if name not in OF_THE_RUN}
         given = (self._setup_fd, self._memory.fd, its_end.fileno(), self._listener.fileno())
         try:
             process = subprocess.Popen(
@@ -130,7 +138,7 @@ class PageProcess:
                 pass_fds=given,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                env=_environment(),
+                env=environment | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)},
             )
         except OSError as error:
             channel.close()
@@ -164,12 +172,10 @@ class PageProcess:
         with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError):
             data = page.channel.recv(MAX_ORDER_BYTES)
             if data:
-                self._take(msgspec.json.decode(data, type=Order))
-            else:  # its end is told by the next tick
+                order = msgspec.json.decode(data, type=Order)
+                self._workers.submit(self._do, order).add_done_callback(self._answer)
+            else:  # the page has ended, which the next tick reports
                 self._stop.wait(seconds)
-
-    def _take(self, order: Order) -> None:
-        self._workers.submit(self._do, order).add_done_callback(self._answer)
 
     def _answer(self, done: Future[OrderAnswer]) -> None:
         page = self._page
@@ -177,28 +183,3 @@ class PageProcess:
             return
         with contextlib.suppress(OSError):  # it has gone meanwhile
             page.channel.send(msgspec.json.encode(done.result()))
-
-    def _end_page(self) -> None:
-        page, self._page = self._page, None
-        if page is None:
-            return
-        page.channel.close()  # which tells it to end
-        try:
-            page.process.wait(END_WAITS_S)
-        except subprocess.TimeoutExpired:
-            page.process.kill()
-            page.process.wait()
-
-
-def _environment() -> dict[str, str]:
-    """This process's environment with its module path, without the variables meant for the run alone."""
-    own = {name: value for name, value in os.environ.items() if name not in OF_THE_RUN}
-    return own | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)}
-
-
-def _memory_of(data: bytes) -> int:
-    """A file descriptor of memory with these bytes, for a child process to read."""
-    fd = os.memfd_create("hilstar-console-setup")
-    with os.fdopen(os.dup(fd), "wb") as file:
-        file.write(data)
-    return fd

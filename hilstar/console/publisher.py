@@ -23,6 +23,7 @@ from hilstar.console.messages import (
     FRAME,
     HAS_AGE,
     MISSING,
+    PICTURE,
     STALE,
     Order,
     OrderAnswer,
@@ -53,7 +54,6 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 from hilstar.version import __version__
 
 if TYPE_CHECKING:
-    from hilstar.attitude.clock.sender_clock import ClockSummary
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.fault_schedule import FaultSchedule
     from hilstar.calibrate.first_light.image_sources import Pattern
@@ -62,7 +62,6 @@ if TYPE_CHECKING:
     from hilstar.run.record.ledger import Ledger, LedgerSwitch
     from hilstar.run.screen.screen import Screen
     from hilstar.run.serve import Running
-    from hilstar.scene.sprites import Sprites
 
 MIN_PICTURE_NS = NS_PER_S // 10
 
@@ -128,18 +127,14 @@ class FramePublisher:
         ring.begin()
         room = ring.room(whole)
         q = () if shown.attitude is None else shown.attitude.q_icrs_to_cam.tolist()
-        head = PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q).pack()
+        head = PICTURE.pack(*PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q))
         room[: len(head)] = head
         np.copyto(np.frombuffer(room[start:end], dtype=levels.dtype).reshape(height, width), levels)
         if sprites is not None and count:
-            _copy_sprites(np.frombuffer(room[end:], dtype=SPRITE), sprites)
+            target, kept = np.frombuffer(room[end:], dtype=SPRITE), brightest(sprites.data["electrons_per_s"], MAX_SPRITES)
+            which = slice(None) if kept is None else kept
+            target["star"], target["x_px"], target["y_px"] = sprites.star[which], sprites.x_px[which], sprites.y_px[which]
         ring.end(whole, 0)
-
-
-def _copy_sprites(target: np.ndarray, sprites: Sprites) -> None:
-    kept = brightest(sprites.data["electrons_per_s"], MAX_SPRITES)
-    which = slice(None) if kept is None else kept
-    target["star"], target["x_px"], target["y_px"] = sprites.star[which], sprites.x_px[which], sprites.y_px[which]
 
 
 MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
@@ -184,13 +179,22 @@ class WatchedRun:
         if running is None:
             return RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
         tally, aids, packets = running.loop.tally, running.loop.pacer.operator.aids, running.packets
-        screen, faults = self._parts.screen, self._parts.faults
+        screen, faults, newest = self._parts.screen, self._parts.faults, NewestFrame()
+        if shown is not None:
+            newest = NewestFrame(
+                number=shown.number,
+                missing=shown.missing,
+                stale=shown.stale,
+                blank=shown.attitude is None,
+                stars=shown.drawn.star_count,
+                clipped=list(shown.drawn.clipped_hip[:MAX_CLIPPED]),
+            )
         return RunState(
             host_ns=time.monotonic_ns(),
             alive_ns=running.loop.watch.alive_ns,
-            frame=NewestFrame() if shown is None else _newest(shown),
+            frame=newest,
             attitude=_attitude(shown),
-            clock=None if running.clock is None else _clock(running.clock()),
+            clock=_clock(running),
             counts=RunCounts(
                 frames=tally.frames,
                 missed=tally.missed_frames,
@@ -220,18 +224,6 @@ class WatchedRun:
         return LedgerState(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
 
 
-def _newest(shown: Shown) -> NewestFrame:
-    drawn = shown.drawn
-    return NewestFrame(
-        number=shown.number,
-        missing=shown.missing,
-        stale=shown.stale,
-        blank=shown.attitude is None,
-        stars=drawn.star_count,
-        clipped=list(drawn.clipped_hip[:MAX_CLIPPED]),
-    )
-
-
 def _attitude(shown: Shown | None) -> ShownAttitude | None:
     attitude = None if shown is None else shown.attitude
     if attitude is None:
@@ -249,8 +241,9 @@ def _attitude(shown: Shown | None) -> ShownAttitude | None:
     )
 
 
-def _clock(clock: ClockSummary) -> ShownClock | None:
-    if clock.mode == "none":
+def _clock(running: Running) -> ShownClock | None:
+    clock = None if running.clock is None else running.clock()
+    if clock is None or clock.mode == "none":
         return None
     return ShownClock(
         offset_ms=clock.offset_ms,
@@ -284,18 +277,14 @@ class OrderHandler:
     def do(self, order: Order) -> OrderAnswer:
         """Carry out an order; the answer says what went wrong."""
         who = one_line(order.who)[:MAX_WHO_CHARACTERS]
+        doers = {"ledger": self._switch_ledger, "mark": self._mark, "fault": self._fault} | dict.fromkeys(
+            SWITCHES, self._switch
+        )
         try:
-            status, line = self._done(order, who)
+            status, line = doers[order.name](order, who)
         except HilstarError as error:
             status, line = 409, one_line(str(error))
         return OrderAnswer(id=order.id, status=status, line=printable(line))  # a ledger may be called anything
-
-    def _done(self, order: Order, who: str) -> Done:
-        if order.name in SWITCHES:
-            return self._switch(order, who)
-        if order.name == "ledger":
-            return self._switch_ledger(order, who)
-        return self._mark(order, who) if order.name == "mark" else self._fault(order, who)
 
     def _switch(self, order: Order, who: str) -> Done:
         if order.name == "patch" and order.on and order.level not in PATCHES:
@@ -431,19 +420,13 @@ def opened_page(
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
     memory = SharedMemory.make(picture_bytes)
     feed, requests = FramePublisher(memory), SwitchRequests()
-    setup, orders = setup_of(listener, control, description, parts, picture_bytes), OrderHandler(requests, feed, parts)
-    with PageProcess(setup, memory, listener.socket, WatchedRun(feed, parts), orders.do):
-        yield feed, requests
-
-
-def setup_of(listener: PageListener, control: bool, description: RunDescription, parts: PageParts, picture_bytes: int) -> Setup:
-    """What the page's process is given at its start."""
-    bench = parts.bench
+    bench, orders = parts.bench, OrderHandler(requests, feed, parts)
     setup = setup_for(listener, control, description, bench.file, picture_bytes)
     setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
     setup.hello.faults = [] if parts.faults is None else parts.faults.names()
     setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
-    return setup
+    with PageProcess(setup, memory, listener.socket, WatchedRun(feed, parts), orders.do):
+        yield feed, requests
 
 
 CODE = np.dtype("<u2")
@@ -469,7 +452,7 @@ class SessionPublisher:
         self._patterns += 1
         ring.begin()
         room = ring.room(whole)
-        head = PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, CODE.itemsize, 0).pack()
+        head = PICTURE.pack(*PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, CODE.itemsize, 0))
         room[: len(head)] = head
         np.copyto(np.frombuffer(room[PICTURE_HEAD_BYTES:], dtype=CODE).reshape(height, width), codes)
         ring.end(whole, 0)
@@ -502,9 +485,8 @@ class SessionPublisher:
     def do(self, order: Order) -> OrderAnswer:
         """Record a mark; a session takes no other order."""
         if order.name != "mark" or not order.text.strip():
-            return OrderAnswer(
-                id=order.id, status=409, line="a session of first light takes marks with a text, and no other order"
-            )
+            line = "a session of first light takes marks with a text, and no other order"
+            return OrderAnswer(id=order.id, status=409, line=line)
         self.tell("mark", f"mark, by {one_line(order.who)}: {one_line(order.text)}")
         return OrderAnswer(id=order.id, status=200, line="mark told; a session has no ledger")
 

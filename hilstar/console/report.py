@@ -9,7 +9,7 @@ import re
 import zlib
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,16 +18,15 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.mcap_log import NO_END, unfinished_part
 from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.build import open_bench
-from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
 from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.errors import InputError, MachineError, printable
 from hilstar.files import make_directory, write_whole
 from hilstar.frame.fault_kinds import Freeze
 from hilstar.notices import Notices
-from hilstar.run.faults import Recording, read_recording
+from hilstar.run.faults import read_recording
 from hilstar.run.pacer import Shown
-from hilstar.run.record.ledger_records import EventRecord, FrameRecord, config_of, wrong_in_frame
+from hilstar.run.record.ledger_records import EventRecord, config_of, wrong_in_frame
 from hilstar.run.record.report import COUNTS, METRICS, RunFigures, RunReport, figures_of, summarise, table_rows
 from hilstar.run.replay import played_again, replay
 from hilstar.run.serve import Outlet
@@ -71,10 +70,6 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _base64(data: bytes) -> str:
-    return base64.b64encode(data).decode()
-
-
 def report_page(data: dict[str, Any]) -> str:
     """The page with a run's data (see `run_data`), as HTML that needs no other file and no network."""
     html = (PAGE_DIR / "index.html").read_text(encoding="utf-8")
@@ -83,12 +78,12 @@ def report_page(data: dict[str, Any]) -> str:
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; img-src data:; base-uri 'none'; "
         "form-action 'none'"
     )
-    icon = _base64((PAGE_DIR / "icon.svg").read_bytes())
+    icon = base64.b64encode((PAGE_DIR / "icon.svg").read_bytes()).decode()
     head = (
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         f'<link rel="icon" href="data:image/svg+xml;base64,{icon}">\n<style>{style}</style>\n'
     )
-    packed = _base64(zlib.compress(msgspec.json.encode(data), 9))
+    packed = base64.b64encode(zlib.compress(msgspec.json.encode(data), 9)).decode()
     tail = f'<script type="text/plain" id="run-data">{packed}</script>\n<script type="module">{script}</script>\n'
     html = LINKS.sub("", html).replace('data-mode="live"', 'data-mode="report"')
     # The data come before the script that reads them, and both after the page's own text.
@@ -145,7 +140,9 @@ def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> 
     """Pictures of the chosen frames, replayed with the faults that they had."""
     recording = read_recording(ledger)
     frames = run.keyframes.chosen(run.last)
-    chosen = [(record, why) for record, why in frames if not (_stays(record, recording) or wrong_in_frame(record))]
+    # Where a fault froze the sky, the picture is an earlier frame's.
+    frozen = {number for number, fault in recording.faults.items() if isinstance(fault, Freeze)}
+    chosen = [(record, why) for record, why in frames if not (frozen & set(record.faults) or wrong_in_frame(record))]
     found: list[dict[str, Any]] = []
 
     def take(shown: Shown) -> None:
@@ -156,25 +153,12 @@ def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> 
         found.append(picture | told | {"t_s": round(t_s, 3)})
 
     if chosen:
-        replay(
-            bench,
-            played_again([record for record, _ in chosen], 0, False, recording),
-            take,
-            Outlet(notices=_Unreported()),
-        )
-    return _within(found, MAX_BYTES)
-
-
-def _stays(record: FrameRecord, recording: Recording) -> bool:
-    """Whether a fault held an earlier frame's picture."""
-    return any(isinstance(recording.faults.get(number), Freeze) for number in record.faults)
-
-
-def _within(pictures: list[dict[str, Any]], size: int) -> list[dict[str, Any]]:
-    """As many pictures, evenly over the run, as fit into `size` bytes."""
-    while len(pictures) > 1 and sum(len(picture["data"]) for picture in pictures) > size:
-        pictures = pictures[::2]
-    return pictures
+        play = played_again([record for record, _ in chosen], 0, False, recording)
+        replay(bench, play, take, Outlet(notices=_Unreported()))
+    # As many pictures, evenly over the run, as fit.
+    while len(found) > 1 and sum(len(picture["data"]) for picture in found) > MAX_BYTES:
+        found = found[::2]
+    return found
 
 
 def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
@@ -215,36 +199,9 @@ DISTRIBUTIONS = {
 
 def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
     """The figures of a run for the page: lists of numbers, None for no value; times in s from the first swap."""
-    with np.errstate(all="ignore"):  # absurd figures of a foreign file become no value
-        return _run_data(name, run, summary)
-
-
-def _run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
-    config = config_of(run.head)
-    rows = table_rows(summary)
-    return {
-        "about": _about(name, run, config),
-        "verdict": verdict(summary, run.late),
-        "summary": rows[:-3],
-        "facts": rows[-3:],
-        "bench_text": run.head.get("bench_text", ""),
-        "duration_s": summary.duration_s,
-        "spans": _spans(run),
-        "packets": _packets(run),
-        "process": _process(run),
-        "motion": _motion(run.path.rows),
-        "path": _path(run.path.rows),
-        "histograms": _histograms(run),
-        "stride": run.samples.stride,
-        "refused": {reason: count for reason, count in summary.packets.items() if reason != "accepted"},
-        "events": [_event(each, run) for each in (*run.first_events, *run.last_events)],
-        "events_total": sum(run.events.values()),
-    }
-
-
-def _about(name: str, run: RunFigures, config: BenchConfig | None) -> dict[str, Any]:
+    config, rows = config_of(run.head), table_rows(summary)
     monitor = None if config is None else config.monitor
-    return {
+    about = {
         "run": name,
         "bench": run.head.get("bench_file", ""),
         "version": __version__,
@@ -253,6 +210,25 @@ def _about(name: str, run: RunFigures, config: BenchConfig | None) -> dict[str, 
         "resolution_px": None if monitor is None else monitor.resolution_px,
         "bits": None if monitor is None else monitor.bits,
     }
+    with np.errstate(all="ignore"):  # absurd figures of a foreign file become no value
+        return {
+            "about": about,
+            "verdict": verdict(summary, run.late),
+            "summary": rows[:-3],
+            "facts": rows[-3:],
+            "bench_text": run.head.get("bench_text", ""),
+            "duration_s": summary.duration_s,
+            "spans": _spans(run),
+            "packets": _packets(run),
+            "process": _process(run),
+            "motion": _motion(run.path.rows),
+            "path": _path(run.path.rows),
+            "histograms": _histograms(run),
+            "stride": run.samples.stride,
+            "refused": {reason: count for reason, count in summary.packets.items() if reason != "accepted"},
+            "events": [_event(each, run) for each in (*run.first_events, *run.last_events)],
+            "events_total": sum(run.events.values()),
+        }
 
 
 def verdict(found: RunReport, late: int) -> dict[str, Any]:
@@ -328,9 +304,8 @@ def _histograms(run: RunFigures) -> list[dict[str, Any]]:
         low, high = np.percentile(values, [100 - HISTOGRAM_SPREAD, HISTOGRAM_SPREAD])
         narrowest = max(MIN_RANGE_MS, NARROWEST * max(abs(low), abs(high)))
         counts, edges = np.histogram(values, BINS, (low, max(high, low + narrowest)))
-        found.append(
-            {"name": name, "title": title, "from_ms": float(edges[0]), "to_ms": float(edges[-1]), "counts": counts.tolist()}
-        )
+        ends = {"from_ms": float(edges[0]), "to_ms": float(edges[-1])}
+        found.append({"name": name, "title": title, "counts": counts.tolist()} | ends)
     return found
 
 
@@ -360,10 +335,14 @@ def _motion(rows: FloatArray) -> dict[str, Any] | None:
     """Three angles about their mean, and the turns about the camera's axes minus a steady motion."""
     if not len(rows):
         return None
-    turned_rad = rows[:, 6:9]
+    turned_rad, at = rows[:, 6:9], rows[:, 1] - rows[:, 1].mean()
     angles, names = _angles(rows[:, 2:6], turned_rad)
     about = _curves(angles - angles.mean(axis=0), names)
-    return {"t_s": _numbers(rows[:, 0], S_DIGITS), "about_mean": about, "beside_steady": _curves(beside_steady(rows), AXES)}
+    # A line is fitted to each turn over the attitude's time.
+    spread = float((at * at).sum())
+    slope = (at @ turned_rad) / spread if spread > 0 else np.zeros(3)
+    beside = np.degrees(turned_rad - turned_rad.mean(axis=0) - at[:, None] * slope)
+    return {"t_s": _numbers(rows[:, 0], S_DIGITS), "about_mean": about, "beside_steady": _curves(beside, AXES)}
 
 
 def _curves(angles_deg: FloatArray, names: tuple[str, str, str]) -> dict[str, Any]:
@@ -377,39 +356,18 @@ def _curves(angles_deg: FloatArray, names: tuple[str, str, str]) -> dict[str, An
 
 def _angles(q: FloatArray, turned_rad: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
     """Three angles of the camera's motion, deg (n, 3), and their names."""
-    ra_deg, dec_deg, roll_deg = _radec_roll_deg(q)
-    if np.abs(dec_deg).max() > POLE_DEG:
-        return np.degrees(turned_rad), AXES
-    ra_deg, roll_deg = (np.degrees(np.unwrap(np.radians(part))) for part in (ra_deg, roll_deg))
-    return np.column_stack(((ra_deg - ra_deg.mean()) * np.cos(np.radians(dec_deg)), dec_deg, roll_deg)), NAMES
-
-
-class RadecRoll(NamedTuple):
-    """Pointings, deg, (n,) each."""
-
-    ra_deg: FloatArray
-    dec_deg: FloatArray
-    roll_deg: FloatArray
-
-
-def _radec_roll_deg(q: FloatArray) -> RadecRoll:
-    """As `rotation.to_radec_roll_deg`, for an array (n, 4)."""
+    # As `rotation.to_radec_roll_deg`, for an array.
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     boresight = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    dec = np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1]))
+    dec_deg = np.degrees(np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1])))
+    if np.abs(dec_deg).max() > POLE_DEG:
+        return np.degrees(turned_rad), AXES
     ra = np.arctan2(boresight[1], boresight[0])
     right = (1 - 2 * (y * y + z * z)), 2 * (x * y - w * z)
     down = 2 * (x * y + w * z), (1 - 2 * (x * x + z * z))
     east = tuple(-np.sin(ra) * axis[0] + np.cos(ra) * axis[1] for axis in (right, down))
-    return RadecRoll(np.degrees(ra), np.degrees(dec), np.degrees(np.arctan2(east[1], -east[0])))
-
-
-def beside_steady(rows: FloatArray) -> FloatArray:
-    """The turns of a path's rows minus a line fitted to each over the attitude's time, deg (n, 3)."""
-    turned_rad, at = rows[:, 6:9], rows[:, 1] - rows[:, 1].mean()
-    spread = float((at * at).sum())
-    slope = (at @ turned_rad) / spread if spread > 0 else np.zeros(3)
-    return np.asarray(np.degrees(turned_rad - turned_rad.mean(axis=0) - at[:, None] * slope))
+    ra_deg, roll_deg = (np.degrees(np.unwrap(part)) for part in (ra, np.arctan2(east[1], -east[0])))
+    return np.column_stack(((ra_deg - ra_deg.mean()) * np.cos(np.radians(dec_deg)), dec_deg, roll_deg)), NAMES
 
 
 def report(path: Path, directory: Path) -> RunReport:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from hilstar.run.pacer import Shown
     from hilstar.run.record.ledger import LedgerSwitch
     from hilstar.run.serve import Running
-    from hilstar.run.summary import RunTally
 
 LIVE_EACH_S = 0.5
 PLAIN_EACH_S = 10.0
@@ -97,22 +96,20 @@ class RunStatus:
         then_ns, frames, received = self._before
         self._before = (now_ns, tally.frames, packets.received)
         seconds = max(now_ns - then_ns, 1) / NS_PER_S
+        total = "" if math.isinf(self._source.frames) else f" of {self._source.frames:.0f}"
+        text = f"{tally.frames}{total} ({(tally.frames - frames) / seconds:.1f}/s), {tally.missed_frames} missed"
+        frames_line = StatusLine("frames", f"{text}, {tally.stale_frames} stale", not tally.missed_frames)
+        still_ns = now_ns - shown.swap_ns
+        if still_ns > STANDS_STILL_NS:
+            frames_line = StatusLine("frames", f"{frames_line.text}; none for {still_ns / NS_PER_S:.1f} s", False)
         refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
         told = f"{packets.received} received ({(packets.received - received) / seconds:.1f}/s), {packets.refused} refused"
         return [
             _attitude_line(shown),
-            self._frames_line(shown, tally, (tally.frames - frames) / seconds, now_ns),
+            frames_line,
             StatusLine("packets", told + (f" ({refused})" if refused else ""), not refused),
             *self._about(),
         ]
-
-    def _frames_line(self, shown: Shown, tally: RunTally, per_s: float, now_ns: int) -> StatusLine:
-        total = "" if math.isinf(self._source.frames) else f" of {self._source.frames:.0f}"
-        text = f"{tally.frames}{total} ({per_s:.1f}/s), {tally.missed_frames} missed, {tally.stale_frames} stale"
-        still_ns = now_ns - shown.swap_ns
-        if still_ns > STANDS_STILL_NS:
-            return StatusLine("frames", f"{text}; none for {still_ns / NS_PER_S:.1f} s", False)
-        return StatusLine("frames", text, not tally.missed_frames)
 
     def _about(self) -> Iterator[StatusLine]:
         ledger = None if self._ledger is None else self._ledger.current
@@ -127,9 +124,7 @@ class RunStatus:
 def _attitude_line(shown: Shown) -> StatusLine:
     attitude = shown.attitude
     if attitude is None:
-        return StatusLine(
-            "attitude", "none yet: the frames are blank" if shown.missing else "hidden: the frames are blank", False
-        )
+        return StatusLine("attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False)
     from hilstar.rotation import to_radec_roll_deg  # with NumPy 0.1 s, which Tab and --help do not need
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)

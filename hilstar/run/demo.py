@@ -45,7 +45,7 @@ LISTENER_WITHIN_S = 120.0
 
 @dataclass(frozen=True, slots=True)
 class Demo:
-    """The result of the demo: its summary, and the codes of a few frames by their numbers, of so many bits."""
+    """The result of the demo: its summary, and the codes of a few frames, of `bits` each, by frame number."""
 
     summary: RunSummary
     kept: dict[int, Codes]
@@ -53,13 +53,14 @@ class Demo:
 
 
 def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
-    """A rest-to-rest slew through WAYPOINTS_DEG at SEND_HZ, then REST_S at rest.
-
-    It is quintic in angle, with correlated pointing jitter.
-    """
+    """A rest-to-rest slew through WAYPOINTS_DEG at SEND_HZ, quintic in angle, with jitter, then REST_S at rest."""
     count = round((duration_s + REST_S) * SEND_HZ) + 1
     times_s = np.arange(count) / SEND_HZ
-    jitter = _jitter_rad(count, rng)
+    # Jitter about cam axes: first-order Gauss-Markov noise.
+    keep = np.exp(-1.0 / (SEND_HZ * JITTER_SECONDS))
+    jitter = rng.normal(size=(count, 3)) * np.array(JITTER_ARCSEC) / ARCSEC_PER_RAD
+    for k in range(1, count):
+        jitter[k] = keep * jitter[k - 1] + np.sqrt(1 - keep**2) * jitter[k]
     points = [from_radec_roll_deg(*waypoint) for waypoint in WAYPOINTS_DEG]
     attitudes = [propagate(_on_path(points, min(t / duration_s, 1.0)), jitter[k], -1.0) for k, t in enumerate(times_s)]
     samples = []
@@ -75,15 +76,6 @@ def _on_path(points: list[FloatArray], progress: float) -> FloatArray:
     leg = min(int(progress * legs), legs - 1)
     s = min((progress * legs - leg) / (1 - SETTLE_FRACTION), 1.0)
     return slerp(points[leg], points[leg + 1], s**3 * (10 - 15 * s + 6 * s * s))
-
-
-def _jitter_rad(count: int, rng: np.random.Generator) -> FloatArray:
-    """First-order Gauss-Markov noise (n, 3) about cam axes."""
-    keep = np.exp(-1.0 / (SEND_HZ * JITTER_SECONDS))
-    noise = rng.normal(size=(count, 3)) * np.array(JITTER_ARCSEC) / ARCSEC_PER_RAD
-    for k in range(1, count):
-        noise[k] = keep * noise[k - 1] + np.sqrt(1 - keep**2) * noise[k]
-    return np.asarray(noise)
 
 
 Watching = Callable[[Bench, str], AbstractContextManager[tuple[FrameSink, Outlet]]]

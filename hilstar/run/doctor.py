@@ -13,10 +13,9 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Self
 
 from hilstar.attitude.wire.serial_link import adapters, serial_ports
 from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
@@ -25,7 +24,7 @@ from hilstar.bench.bench_file import BenchFile, read_bench_or_heads
 from hilstar.bench.build import bench_calibration, bench_optics
 from hilstar.bench.cameras import FieldsOfView, fields_of_view
 from hilstar.errors import HilstarError, MachineError
-from hilstar.monitor.window.output_settings import OutputState, findings
+from hilstar.monitor.window.output_settings import findings
 from hilstar.monitor.window.randr import lit_outputs
 from hilstar.monitor.window.window import displays, window_renderer
 from hilstar.monitor.window.x11 import server_of
@@ -62,11 +61,6 @@ class OutputReport:
     faults: list[str]
     state: dict[str, object]
 
-    @classmethod
-    def of(cls, state: OutputState) -> Self:
-        """The report of an output that is to show codes of 8 bits."""
-        return cls(state.line(), [finding.text for finding in findings(state, USUAL_BITS)], state.fields())
-
 
 @dataclass(frozen=True, slots=True)
 class Examination:
@@ -80,8 +74,17 @@ class Examination:
 def examine() -> Examination:
     """Check everything that hilstar uses on this machine."""
     checks = [_check(name, look) for name, look in LOOKS.items()]
-    checks += [_gpus(), _displays(), _serial()]
-    outputs = [OutputReport.of(state) for state in lit_outputs()]
+    shown = _check("display", lambda: "; ".join(display.line() for display in displays()) or NOT_THERE)
+    ports = serial_ports()
+    checks += [
+        _gpus(),
+        replace(shown, ok=shown.ok and shown.detail != NOT_THERE, required=False),
+        Check("serial", bool(ports), ", ".join(ports) or "no serial port", required=False),
+    ]
+    outputs = [
+        OutputReport(state.line(), [finding.text for finding in findings(state, USUAL_BITS)], state.fields())
+        for state in lit_outputs()
+    ]
     return Examination(all(check.ok for check in checks if check.required), checks, outputs)
 
 
@@ -103,10 +106,6 @@ def _check(name: str, look: Callable[[], str]) -> Check:
         return Check(name, True, look())
     except (HilstarError, OSError) as error:
         return Check(name, False, str(error))
-
-
-def _python() -> str:
-    return f"Python {platform.python_version()}, {sys.executable}"
 
 
 def _gl() -> str:
@@ -143,11 +142,6 @@ def _catalogue() -> str:
     return f"Hipparcos, {len(catalog)} of {catalog.rows_read} stars, loaded in {(time.perf_counter() - begin) * 1e3:.0f} ms"
 
 
-def _files() -> str:
-    names = [resource_path("shaders", "splat.frag"), resource_path("configs", "demo.toml")]
-    return ", ".join(str(path) for path in names)
-
-
 def _gpus() -> Check:
     """Which GPUs draw headless and in a window."""
     found = gpus()
@@ -163,25 +157,12 @@ def _gpus() -> Check:
     return Check("gpu", any(gpu.renderer for gpu in found), detail, required=False)
 
 
-def _displays() -> Check:
-    try:
-        found = displays()
-    except MachineError as error:
-        return Check("display", False, str(error), required=False)
-    return Check("display", bool(found), "; ".join(display.line() for display in found) or "none", required=False)
-
-
-def _serial() -> Check:
-    ports = serial_ports()
-    return Check("serial", bool(ports), ", ".join(ports) or "no serial port", required=False)
-
-
 LOOKS: dict[str, Callable[[], str]] = {
-    "python": _python,
+    "python": lambda: f"Python {platform.python_version()}, {sys.executable}",
     "opengl": _gl,
     "zeromq": _zeromq,
     "catalogue": _catalogue,
-    "files": _files,
+    "files": lambda: f"{resource_path('shaders', 'splat.frag')}, {resource_path('configs', 'demo.toml')}",
 }
 
 
@@ -214,8 +195,11 @@ def read_edid(data: bytes) -> Edid | None:
 
 def row() -> dict[str, str]:
     """This machine's cells by their columns; the last is for who measured."""
-    cells = (_hilstar(), _machine(), _opengl(), _display_server(), _monitors(), _links(), TO_FILL)
-    return dict(zip(COLUMNS, map(_cell, cells), strict=True))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("moderngl", "glfw"))
+    own = f"{__version__}; Python {platform.python_version()}, ZeroMQ {zmq_version()}, {packages}"
+    links = "; ".join(["ZeroMQ and UDP over loopback", *(f"serial {words}" for words in adapters())])
+    cells = (own, _machine(), _opengl(), _display_server(), _monitors(), links, TO_FILL)
+    return {name: " ".join(text.split()).replace("|", "/") for name, text in zip(COLUMNS, cells, strict=True)}
 
 
 def table(cells: dict[str, str]) -> str:
@@ -224,32 +208,17 @@ def table(cells: dict[str, str]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "/")
-
-
-def _hilstar() -> str:
-    packages = ", ".join(f"{name} {version(name)}" for name in ("moderngl", "glfw"))
-    return f"{__version__}; Python {platform.python_version()}, ZeroMQ {zmq_version()}, {packages}"
-
-
 def _machine() -> str:
-    model = _text(SYS / "firmware/devicetree/base/model") or _cpu()  # a Raspberry Pi or a Jetson
+    model = _text(SYS / "firmware/devicetree/base/model")  # a Raspberry Pi or a Jetson
+    if not model:
+        cpu = re.search(r"^(?:model name|Hardware)\s*:\s*(.+)$", _text(PROC / "cpuinfo"), re.MULTILINE)
+        model = cpu[1] if cpu else "processor not named"
+    system = platform.system()
     with contextlib.suppress(OSError):
-        system = platform.freedesktop_os_release()["PRETTY_NAME"]
-        return f"{model}, {os.cpu_count()} cores, {platform.machine()}; {system}, Linux {_version(platform.release())}"
-    return f"{model}, {os.cpu_count()} cores, {platform.machine()}; {platform.system()} {_version(platform.release())}"
-
-
-def _version(release: str) -> str:
-    """The numbers of a kernel's release: what follows them may have been chosen by somebody, and name somebody."""
-    found = re.match(r"\d+(\.\d+)*", release)
-    return found[0] if found else ""
-
-
-def _cpu() -> str:
-    found = re.search(r"^(?:model name|Hardware)\s*:\s*(.+)$", _text(PROC / "cpuinfo"), re.MULTILINE)
-    return found[1] if found else "processor not named"
+        system = f"{platform.freedesktop_os_release()['PRETTY_NAME']}, Linux"
+    # The numbers of the kernel's release alone: what follows them may name somebody.
+    release = re.match(r"(?:\d+(?:\.\d+)*)?", platform.release())
+    return f"{model}, {os.cpu_count()} cores, {platform.machine()}; {system} {release[0] if release else ''}"
 
 
 def _opengl() -> str:
@@ -276,34 +245,22 @@ def _cards() -> Iterator[str]:
 
 def _display_server() -> str:
     session = os.environ.get("XDG_SESSION_TYPE", "")
-    found = _told(server_of)
+    found = ""
+    with contextlib.suppress(OSError):
+        found = server_of()
     wayland = "a Wayland session" if os.environ.get("WAYLAND_DISPLAY") or session == "wayland" else ""
     return ", ".join(part for part in (found, wayland) if part) or NOT_THERE
 
 
 def _monitors() -> str:
+    shown: list[str] = []
     with contextlib.suppress(MachineError):
-        shown = [re.sub(r"^\d+: ", "", display.line()) for display in displays()]
-        return "; ".join([*shown, *(f"EDID {edid.line()}" for edid in _edids())]) or NOT_THERE
-    return "; ".join(f"EDID {edid.line()}" for edid in _edids()) or NOT_THERE
-
-
-def _edids() -> Iterator[Edid]:
+        shown += [re.sub(r"^\d+: ", "", display.line()) for display in displays()]
     for path in sorted((SYS / "class/drm").glob("card*-*/edid")):
         with contextlib.suppress(OSError):
             if (edid := read_edid(path.read_bytes())) is not None:
-                yield edid
-
-
-def _links() -> str:
-    return "; ".join(["ZeroMQ and UDP over loopback", *(f"serial {words}" for words in adapters())])
-
-
-def _told(ask: Callable[[], str]) -> str:
-    try:
-        return ask()
-    except OSError:
-        return ""
+                shown.append(f"EDID {edid.line()}")
+    return "; ".join(shown) or NOT_THERE
 
 
 def _text(path: Path) -> str:

@@ -30,6 +30,7 @@ from hilstar.frame.stray_light import map_sha256
 from hilstar.notices import Notices
 from hilstar.reading import NOT_JSON
 from hilstar.run.loop import FaultyFrames
+from hilstar.run.open_link import link_keys
 from hilstar.run.record.ledger import Allowance, LedgerSwitch
 from hilstar.run.record.ledger_records import FaultRecord, FrameRecord, fault_records
 from hilstar.units import NS_PER_S
@@ -230,8 +231,7 @@ class RunFaults:
         if settings.endpoint is None:
             yield ""
             return
-        names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
-        keys = CurveKeys(*(None if name is None else folder / name for name in names))
+        keys = link_keys(settings, folder)
         self._stream = FaultStream(self.schedule, settings.endpoint, bind=settings.bind, keys=keys, notices=self._notices)
         try:
             yield self._stream.endpoint

@@ -25,10 +25,6 @@ END_S = 1.0
 LAST_S = 0.25  # for the last pulse of a run: what follows has a second, after a signal
 
 
-def _nobody_counts(what: str) -> None:
-    """The counter of pulses in a run without a ledger."""
-
-
 class FramePulse(Closing):
     """Raises a line at every `every_frames`th frame for `pulse_ms`, and never keeps a frame waiting. End it with `close`.
 
@@ -47,7 +43,7 @@ class FramePulse(Closing):
         self._ends = False
         self._delay_ms, self._line_ms = RunningStatistics(), RunningStatistics()
         self._counts: Counter[str] = Counter()
-        self.counted: Callable[[str], None] = _nobody_counts
+        self.counted: Callable[[str], None] = lambda what: None
         self._retry_s, self._back_off_s = 0.0, MIN_BACK_OFF_S
         self._thread = threading.Thread(target=self._run, name="hilstar-pulse", daemon=True)
         self._thread.start()

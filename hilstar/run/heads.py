@@ -150,7 +150,8 @@ class HeadProcess:
         if 0 <= code <= 4 and (self._ready or code != 0):
             self.code = code
             return False
-        self._say(f"{self.name}: its process ended ({_how(code)}); it is started again")
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        self._say(f"{self.name}: its process ended ({how}); it is started again")
         self._wait_to_begin(now_s)
         return True
 
@@ -182,10 +183,6 @@ class HeadProcess:
             for reader in self._readers:
                 reader.join(1.0)
         self._socket.close()
-
-
-def _how(code: int) -> str:
-    return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,8 +266,7 @@ def _hand_on(link: StreamLink, feed: Feed, processes: list[HeadProcess], stop: t
 
 
 def _told(process: HeadProcess) -> dict[str, Any]:
-    try:
+    summary = None
+    with contextlib.suppress(*NOT_JSON):
         summary = msgspec.json.decode(process.output) if process.output.strip() else None
-    except NOT_JSON:
-        summary = None
     return {"exit_code": process.code, "restarts": process.restarts, "summary": summary}

@@ -108,10 +108,6 @@ class FaultyFrames:
         return now
 
 
-def nothing_on_frame(number: int, frame_ns: int) -> None:
-    """For a loop whose frames nobody waits for."""
-
-
 class FrameLoop:
     """Draws frames; a slow frame is missed, and never delays those after it.
 
@@ -136,7 +132,7 @@ class FrameLoop:
         self._blank_when_stale = settings.on_stale == "blank"
         self.pacer = Pacer(self._period_ns) if pacer is None else pacer
         self._moving = (motion == "on" or (motion == "auto" and self.pacer.moves_stars)) if moving is None else moving
-        self.on_frame: Callable[[int, int], None] = nothing_on_frame
+        self.on_frame: Callable[[int, int], None] = lambda number, frame_ns: None
         self.stop = self.pacer.stop
         self.tally = RunTally()
         self.gate = StaleGate(policy_of(settings).stale_after_ns)
@@ -168,8 +164,11 @@ class FrameLoop:
         begun_ns = self.pacer.clock.now_ns()
         stale, missing = self.gate.update(attitude), attitude is None
         self._presence.see(attitude, stale)
-        on_screen = self.pacer.operator.look()
-        attitude = self._shown_attitude(t_ns, attitude, stale)
+        operator = self.pacer.operator
+        on_screen = operator.look()
+        attitude = operator.attitude(t_ns, attitude)
+        if stale and self._blank_when_stale and not operator.aids.paused:
+            attitude = None
         effects, faults, stays = None, self._faults, None
         if faults is not None:
             effects = faults.at(t_ns, attitude)
@@ -206,12 +205,6 @@ class FrameLoop:
         self._sink(shown)
         return shown
 
-    def _shown_attitude(self, t_ns: int, attitude: Attitude | None, stale: bool) -> Attitude | None:
-        """The attitude after the operator's keys and the bench file's rule for stale attitudes."""
-        operator = self.pacer.operator
-        attitude = operator.attitude(t_ns, attitude)
-        return None if stale and self._blank_when_stale and not operator.aids.paused else attitude
-
     def _light(self, attitude: Attitude | None, t_ns: int, faults: FaultLayer | None) -> Sprites | None:
         if attitude is None:
             return None
@@ -228,9 +221,8 @@ class FrameLoop:
         if late_ns <= GIVEN_UP_PERIODS * self._period_ns or not moment.may_be_given_up:
             return False
         self.tally.given_up_frames += 1
-        self.notices.tell(
-            "frame-given-up", f"frame {number} was {late_ns / NS_PER_MS:.0f} ms late before it was drawn: given up"
-        )
+        line = f"frame {number} was {late_ns / NS_PER_MS:.0f} ms late before it was drawn: given up"
+        self.notices.tell("frame-given-up", line)
         return True
 
     def _count(self, shown: Shown, on_screen: OnScreen) -> None:
@@ -239,20 +231,16 @@ class FrameLoop:
         self.tally.add(shown.swap_ns - shown.draw_ns, age_ns, drawn.star_count, drawn.clipped_hip)
         self.tally.stale_frames += shown.stale
         if drawn.capped:
-            self._count_capped(shown.number, drawn.capped)
+            if not self.tally.capped_frames:
+                line = (
+                    f"frame {shown.number}: the turn is too fast for full paths; {drawn.capped} stars are drawn coarser, with"
+                )
+                self.notices.tell("capped", f"{line} all their light (further such frames are only counted)")
+            self.tally.capped_frames += 1
         if shown.predicted_swap_ns is not None:
             received_ns = None if attitude is None else attitude.received_ns
             self.tally.swaps.add(shown.swap_ns, shown.predicted_swap_ns, shown.missed_before, received_ns)
         self.pacer.operator.count(on_screen, shown.swap_ns)
-
-    def _count_capped(self, number: int, stars: int) -> None:
-        if not self.tally.capped_frames:
-            self.notices.tell(
-                "capped",
-                f"frame {number}: the turn is too fast for full paths; {stars} stars are drawn coarser, with all their light"
-                " (further such frames are only counted)",
-            )
-        self.tally.capped_frames += 1
 
     def idle(self) -> None:
         """Keep the window alive while no frame is due."""
@@ -277,7 +265,8 @@ class FrameLoop:
                 if last is not None:
                     missed = self._missed_between(last, moment.slot, gave_up, limit)
                     moment = replace(moment, missed_before=missed, may_be_given_up=not gave_up)
-                if not self._goes_on(moment.slot, limit) or self.pacer.clock.wait_until(moment.begin_ns, self.stop):
+                over = moment.slot >= limit.slots or self.tally.frames >= limit.frames or self.stop.is_set()
+                if over or self.pacer.clock.wait_until(moment.begin_ns, self.stop):
                     return
                 gave_up = draw_slot(moment) is None
                 last = moment
@@ -292,9 +281,6 @@ class FrameLoop:
                 draw_blank(moment)
                 self._gpu.look()
         self.tally = RunTally()
-
-    def _goes_on(self, slot: int, limit: Limit) -> bool:
-        return slot < limit.slots and self.tally.frames < limit.frames and not self.stop.is_set()
 
     def _missed_between(self, last: Moment, slot: int, gave_up: bool, limit: Limit) -> int:
         """The number of slots just before `slot` without a frame of their own; counts those since `last` as missed."""

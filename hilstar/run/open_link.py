@@ -16,7 +16,7 @@ from hilstar.attitude.wire.udp import UdpLink
 from hilstar.attitude.wire.vizard import DifferenceRates, Follower, StateUse, VizardLive, vizard_broadcast
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqLockstep, ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
-from hilstar.bench.config.attitude import nasa42_road, udp_road
+from hilstar.bench.config.attitude import FaultSettings, nasa42_road, udp_road
 from hilstar.bench.config.bench_config import from_source
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -26,7 +26,7 @@ AnyLink = StreamLink | LockstepLink
 POLL_MS = 50
 
 
-def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
+def link_keys(settings: AttitudeSettings | FaultSettings, folder: Path) -> CurveKeys:
     """The CURVE key files that the bench file names; paths are relative to it."""
     names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
     return CurveKeys(*(None if name is None else folder / name for name in names))

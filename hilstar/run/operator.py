@@ -145,7 +145,13 @@ class Operator:
     def look(self) -> OnScreen:
         """State of the switches and the window now, once what was requested is done. Reports what has changed."""
         while self._requests:
-            self._act(self._requests.popleft())
+            request = self._requests.popleft()
+            if not request.called_off:
+                self.aids.set(request.name, request.on, request.share)
+                shown = self.aids.text
+                self._told = replace(self._told, operator=shown)
+                self._notices.tell("operator", f"{request.text}, by {request.who}: {shown or SKY_AGAIN}", request.who)
+                request.done = True
         now = OnScreen(self.aids.text, self._hidden(), self.aids.shows_sky)
         if now != self._told:
             before, self._told = self._told, now
@@ -156,15 +162,6 @@ class Operator:
             elif before.hidden and not now.hidden:
                 self._notices.tell("visible", "the window is visible again")
         return now
-
-    def _act(self, request: SwitchRequest) -> None:
-        if request.called_off:
-            return
-        self.aids.set(request.name, request.on, request.share)
-        shown = self.aids.text
-        self._told = replace(self._told, operator=shown)
-        self._notices.tell("operator", f"{request.text}, by {request.who}: {shown or SKY_AGAIN}", request.who)
-        request.done = True
 
     def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
         """Attitude to show: during a pause the one of its start, with a growing age; None where no sky is shown."""

@@ -19,7 +19,7 @@ from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
 from hilstar.attitude.logs.mcap_log import holds_ros, is_mcap, read_attitudes
 from hilstar.attitude.receiver import PacketCounts
-from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
+from hilstar.attitude.wire.packet import rate_refusal
 from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
@@ -137,7 +137,10 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
             return _plan_run(log, wanted, factor, frames)
     read = open_log(log, stated)
     samples = read.samples
-    _check_rates(log, samples, math.radians(config.attitude.max_rate_deg_s))
+    for number, sample in enumerate(samples, start=1):  # what a stream would refuse
+        refusal = rate_refusal(sample, math.radians(config.attitude.max_rate_deg_s))
+        if refusal is not None:
+            raise InputError(f"{log}: attitude {number}: {refusal.detail}")
     start_s, stop_s = _span(log, wanted, (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S)
     step_s = (1.0 if math.isinf(factor) else factor) / config.monitor.refresh_hz
     if wanted.step_s is not None:
@@ -159,14 +162,6 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     return replace(play, told=[*read.told, *joins.told], conventions=read.conventions)
 
 
-def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float) -> None:
-    """Refuse (InputError) in a log what is refused in a stream."""
-    for number, sample in enumerate(samples, start=1):
-        refusal = rate_refusal(sample, max_rate_rad_s)
-        if refusal is not None:
-            raise InputError(f"{log}: attitude {number}: {refusal.detail}")
-
-
 def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord]) -> Play:
     if wanted.step_s is not None or factor not in {1.0, math.inf}:
         raise InputError(f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no --step")
@@ -176,28 +171,19 @@ def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord
     if not kept:
         raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
     play = played_again(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor), read_recording(log))
-    return replace(play, zero_ns=frames[0].t_ns, drawn_by=_drawn_by(log))
-
-
-def _drawn_by(log: Path) -> DrawnBy | None:
-    """Who drew a ledger's run; None where its head does not say all."""
-    head = read_head(log)
-    if not {"gl_renderer", "gl_version", "render_path"} <= head.keys():
-        return None
-    return DrawnBy(printable(head["gl_renderer"]), printable(head["gl_version"]), printable(head["render_path"]))
+    head, names = read_head(log), ("gl_renderer", "gl_version", "render_path")
+    drawn_by = DrawnBy(*(printable(head[name]) for name in names)) if set(names) <= head.keys() else None
+    return replace(play, zero_ns=frames[0].t_ns, drawn_by=drawn_by)
 
 
 def _tell_other_renderer(before: DrawnBy | None, bench: Bench, notices: Notices) -> None:
     """Say where another renderer drew the run, and how far its codes may be from these."""
     renderer = bench.renderer
     now = DrawnBy(printable(renderer.gl_renderer), printable(renderer.gl_version), renderer.path)
-    if before is None or before == now:
-        return
-    share = before.other_codes(now, renderer.target.quantisation)
-    notices.tell(
-        "other-renderer",
-        f"the run was drawn by {before}, and is now by {now}: at most {share:.2g} of a frame's lit pixels may be one code off",
-    )
+    if before is not None and before != now:
+        share = before.other_codes(now, renderer.target.quantisation)
+        line = f"the run was drawn by {before}, and is now by {now}: at most {share:.2g} of a frame's lit pixels"
+        notices.tell("other-renderer", f"{line} may be one code off")
 
 
 def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
@@ -264,9 +250,8 @@ class FrameImages:
         """Write one frame. A blank one has no quaternion."""
         if self._directory is None:
             return
-        write_codes_png(
-            self._directory / f"frame_{shown.number:06d}.png", self._bench.code_values(shown.drawn.levels), self._bits
-        )
+        path = self._directory / f"frame_{shown.number:06d}.png"
+        write_codes_png(path, self._bench.code_values(shown.drawn.levels), self._bits)
         q = ["", "", "", ""] if shown.attitude is None else [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
         row = [shown.number, f"{shown.t_ns / 1e9:.9f}", *q, shown.drawn.star_count, len(shown.drawn.clipped_hip)]
         with self._said():

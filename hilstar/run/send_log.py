@@ -114,7 +114,9 @@ def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterato
 
     Nothing is known within a gap: before it there is no such rate, and the sample after it is a discontinuity.
     """
-    samples = _broken_at_gaps(samples)
+    joins = log_joins(samples)
+    after_gap = {after.t_ns for before, after in pairwise(samples) if before.t_ns in joins.held_ns}
+    samples = [replace(sample, discontinuity=True) if sample.t_ns in after_gap else sample for sample in samples]
     if rate_hz is not None:
         samples = _resampled(samples, rate_hz)
     first_ns = samples[0].t_ns
@@ -125,12 +127,6 @@ def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterato
             seconds = (after.t_ns - sample.t_ns) / NS_PER_S
             rate = rate_between_rad_s(sample.q_icrs_to_cam, after.q_icrs_to_cam, seconds)
         yield AttitudeSample(sample.t_ns - first_ns, sample.q_icrs_to_cam, rate, k, sample.discontinuity)
-
-
-def _broken_at_gaps(samples: list[AttitudeSample]) -> list[AttitudeSample]:
-    joins = log_joins(samples)
-    after_gap = {after.t_ns for before, after in pairwise(samples) if before.t_ns in joins.held_ns}
-    return [replace(sample, discontinuity=True) if sample.t_ns in after_gap else sample for sample in samples]
 
 
 def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSample]:

@@ -52,10 +52,6 @@ class Running:
 Follower = Callable[[Running], None]  # called once, when a run begins
 
 
-def nobody_follows(running: Running) -> None:
-    """The follower of a run without an audience."""
-
-
 @dataclass(frozen=True, slots=True)
 class Outlet:
     """Where frames go besides their sink (a screen, a ledger), where events are reported, and who follows the run.
@@ -68,7 +64,7 @@ class Outlet:
     ledger: LedgerSwitch = field(default_factory=LedgerSwitch)
     notices: Notices = field(default_factory=Notices)
     pictures: Pictures | None = None
-    follower: Follower = nobody_follows
+    follower: Follower = lambda running: None
     requests: SwitchRequests | None = None
     faults: AnyFaults | None = None
     pulse: FramePulse | None = None
@@ -76,17 +72,16 @@ class Outlet:
     def loop(self, bench: Bench, sink: FrameSink, moving: bool | None = None) -> FrameLoop:
         """The frame loop of a run, paced by the screen or else at the bench's own rate; its frames start the pulse."""
         faults = None if self.faults is None else self.faults.frames
-        loop = FrameLoop(bench, sink, self._pacer(bench), moving, self.notices, faults)
+        if self.screen is not None:
+            pacer: Pacer = DisplayPacer(self.screen, self.notices, requests=self.requests)
+        else:
+            operator = Operator(Aids(), self.notices, requests=self.requests, levels=aid_levels_of(bench))
+            pacer = Pacer(NS_PER_S / bench.config.monitor.refresh_hz, operator=operator)
+        loop = FrameLoop(bench, sink, pacer, moving, self.notices, faults)
         if self.pulse is not None:
             loop.on_frame = self.pulse.frame
             self.pulse.counted = self.ledger.pulse
         return loop
-
-    def _pacer(self, bench: Bench) -> Pacer:
-        if self.screen is not None:
-            return DisplayPacer(self.screen, self.notices, requests=self.requests)
-        operator = Operator(Aids(), self.notices, requests=self.requests, levels=aid_levels_of(bench))
-        return Pacer(NS_PER_S / bench.config.monitor.refresh_hz, operator=operator)
 
     def record(self, bench: Bench, loop: FrameLoop, shown: Shown, light_ns: int) -> None:
         """Record a frame in the ledger, if there is one; `light_ns` is on the sender's clock."""
@@ -113,24 +108,13 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
             outlet.notices.tell(kind, line)
     with stop_on_signal(loop.stop), loop.watch:
         if link.steps:
-            summary = _serve_lockstep(bench, link, limit, loop, outlet)
+            bench.warm_up()
+            summary = LockstepRun(bench, limit, loop, outlet).serve(link)
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
     outlet.notices.sum_up()
     told: dict[str, str | int] = {"endpoint": link.endpoint}
     return replaced(outlet.complete(summary, loop), link=told | link.link_counts.summary())
-
-
-def _serve_lockstep(bench: Bench, link: LockstepLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
-    bench.warm_up()
-    steps = LockstepRun(bench, limit, loop, outlet)
-    outlet.follower(Running(loop, steps.counts))
-    tracker = bench.config.tracker
-    height_mm = tracker.resolution_px[1] * tracker.pixel_pitch_um * 1e-3
-    field_deg = 2 * math.degrees(math.atan(height_mm / (2 * tracker.focal_length_mm)))
-    camera = TrackerCamera(Mounting(tracker.q_body_to_cam).q_body_to_cam, tracker.resolution_px, field_deg)
-    link.show_camera(camera, outlet.pictures)
-    return steps.serve(link)
 
 
 def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
@@ -195,6 +179,12 @@ class LockstepRun:
     def serve(self, link: LockstepLink) -> RunSummary:
         """Answer requests up to the limit, or until a signal; returns the summary. A refused request leaves the last frame."""
         loop, statuses, turn_ms = self._loop, StatusMaker(self._outlet.ledger), RunningStatistics()
+        self._outlet.follower(Running(loop, self.counts))
+        tracker = self._bench.config.tracker
+        height_mm = tracker.resolution_px[1] * tracker.pixel_pitch_um * 1e-3
+        field_deg = 2 * math.degrees(math.atan(height_mm / (2 * tracker.focal_length_mm)))
+        camera = TrackerCamera(Mounting(tracker.q_body_to_cam).q_body_to_cam, tracker.resolution_px, field_deg)
+        link.show_camera(camera, self._outlet.pictures)
         begin_ns = self._clock.now_ns()
         end_ns = begin_ns + self._limit.slots / self._bench.config.monitor.refresh_hz * NS_PER_S
         while loop.tally.frames < self._limit.frames and self._clock.now_ns() < end_ns and not loop.stop.is_set():
@@ -220,7 +210,18 @@ class LockstepRun:
             if self.counts.refused_by[refusal.reason] == 1:
                 line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
                 self._loop.notices.mention("refused", line)
-        shown = None if refusal is not None or sample is None else self._show(sample, host_ns)
+        shown = None
+        if refusal is None and sample is not None:
+            attitude = Attitude(
+                sample.q_icrs_to_cam,
+                0,
+                False,
+                sample.sequence,
+                host_ns,
+                velocity_km_s=sample.velocity_km_s,
+                place_km=sample.place_km,
+            )
+            shown = self._loop.draw(self._loop.tally.frames, sample.t_ns, attitude)
         self._outlet.ledger.packet(host_ns, raw, sample, refusal)
         if shown is not None:  # where a fault drops a frame, the previous one stays
             self._last = shown
@@ -234,18 +235,6 @@ class LockstepRun:
             self._rates.see(event)
             return rate_refusal(self._rates.believed(event), self._max_rate_rad_s)
         return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
-
-    def _show(self, sample: AttitudeSample, host_ns: int) -> Shown | None:
-        attitude = Attitude(
-            sample.q_icrs_to_cam,
-            0,
-            False,
-            sample.sequence,
-            host_ns,
-            velocity_km_s=sample.velocity_km_s,
-            place_km=sample.place_km,
-        )
-        return self._loop.draw(self._loop.tally.frames, sample.t_ns, attitude)
 
 
 class StatusMaker:

@@ -135,12 +135,10 @@ class RunTally:
             self._clipped_max = max(self._clipped_max, len(clipped_hip))
             self.clipped_hip.update(clipped_hip)
 
-    def _clipped(self) -> ClippedSummary:
-        stars = sorted(star for star in self.clipped_hip if isinstance(star, int))
-        return ClippedSummary(self._clipped_max, stars, sorted(body for body in self.clipped_hip if isinstance(body, str)))
-
     def summary(self, duration_s: float, counts: PacketCounts, renderer: Backend) -> RunSummary:
         """What all kinds of run say; figures without a sample are None."""
+        stars = sorted(star for star in self.clipped_hip if isinstance(star, int))
+        bodies = sorted(body for body in self.clipped_hip if isinstance(body, str))
         refused_by = {name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS}
         return RunSummary(
             frames=self.frames,
@@ -150,7 +148,7 @@ class RunTally:
             attitude_age_ms=self._age_ms.percentiles(),
             packets=PacketSummary(counts.received, counts.received - counts.refused, counts.refused, refused_by),
             stars_drawn=StarSummary(self._stars.mean, int(self._stars.max) if self.frames else None),
-            clipped=self._clipped(),
+            clipped=ClippedSummary(self._clipped_max, stars, bodies),
             missed_frames=self.missed_frames,
             stale_frames=self.stale_frames,
             capped=self.capped_frames,

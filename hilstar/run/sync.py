@@ -61,6 +61,11 @@ class Exposures:
         return self.refresh_hz * self.exposure_s
 
     @property
+    def every_hz(self) -> float:
+        """How often the tracker exposes."""
+        return 1 / self.exposure_s if self.frame_hz is None else self.frame_hz
+
+    @property
     def lit(self) -> float:
         """The part of a refresh for which a row stays lit."""
         return 1.0 if self.lit_s is None else min(max(self.lit_s * self.refresh_hz, SHORTEST_LIT), 1.0)
@@ -127,31 +132,20 @@ def beat(exposures: Exposures) -> Beat:
         return Beat(length, None, None)
     if exposures.triggered:
         return Beat(length, None, 0.0)
-    seen = seen_at(exposures, _phases(exposures))
+    # Phases all over a refresh, and to either side of those at which an exposure begins or ends with a row's light.
+    edges = np.array([0.0, exposures.lit, -length, exposures.lit - length])
+    phases = np.concatenate([np.arange(PHASES) / PHASES, *(edges + side for side in (-EDGE, 0.0, EDGE))])
+    seen = seen_at(exposures, phases)
     arcsec = float(np.nanmax(np.abs(seen.off_s))) * ARCSEC_PER_DEG
     dim, bright = float(seen.light.min()), float(seen.light.max())
     mag = math.inf if dim <= 0 else 2.5 * max(math.log10(bright), -math.log10(dim))
     if abs(length - round(length)) < NO_BEAT and exposures.lit == 1.0:
         return Beat(length, None, 0.0)
-    return Beat(length, _period_s(exposures), arcsec, mag)
-
-
-def _phases(exposures: Exposures) -> FloatArray:
-    """Phases all over a refresh, and to either side of those at which an exposure begins or ends with a row's light."""
-    length, lit = exposures.refreshes, exposures.lit
-    edges = np.array([0.0, lit, -length, lit - length])
-    return np.concatenate([np.arange(PHASES) / PHASES, *(edges + side for side in (-EDGE, 0.0, EDGE))])
-
-
-def _period_s(exposures: Exposures) -> float | None:
-    """The time after which exposures begin at the same phase again; None where all begin at one phase.
-
-    The refresh as the tracker's frames sample it: the difference from the nearest multiple of their rate.
-    """
-    frame_hz = 1 / exposures.exposure_s if exposures.frame_hz is None else exposures.frame_hz
+    # The refresh as the tracker's frames sample it: the difference from the nearest multiple of their rate.
+    frame_hz = exposures.every_hz
     rest = exposures.refresh_hz / frame_hz
     rest -= round(rest)
-    return None if abs(rest) < NO_BEAT else 1 / (abs(rest) * frame_hz)
+    return Beat(length, None if abs(rest) < NO_BEAT else 1 / (abs(rest) * frame_hz), arcsec, mag)
 
 
 class BeatProposal(msgspec.Struct, frozen=True, kw_only=True):
@@ -206,18 +200,14 @@ def exposures_of(config: BenchConfig, refresh_hz: float | None = None) -> Exposu
     return Exposures(hz, tracker.exposure_s, tracker.frame_hz, lit_s, tracker.trigger == "external")
 
 
-def tolerance_of(config: BenchConfig) -> Tolerance:
-    """What a bench tolerates, its pixels as angles."""
-    pixel_arcsec = config.monitor.pixel_pitch_um * MM_PER_UM / config.collimator.focal_length_mm * ARCSEC_PER_RAD
-    return Tolerance(config.sync.turn_deg_s, config.render.tolerance_px * pixel_arcsec, config.render.tolerance_mag)
-
-
 def beat_of(config: BenchConfig, refresh_hz: float | None = None, modes_hz: Sequence[float] = ()) -> BeatSummary:
     """The beat of a bench, and what to write instead where it costs too much. Raises InputError.
 
     `refresh_hz` is that of the display where it was measured, `modes_hz` are those that the display has.
     """
-    exposures, tolerance = exposures_of(config, refresh_hz), tolerance_of(config)
+    exposures, render = exposures_of(config, refresh_hz), config.render
+    pixel_arcsec = config.monitor.pixel_pitch_um * MM_PER_UM / config.collimator.focal_length_mm * ARCSEC_PER_RAD
+    tolerance = Tolerance(config.sync.turn_deg_s, render.tolerance_px * pixel_arcsec, render.tolerance_mag)
     found = beat(exposures)
     matters = tolerance.is_broken_by(found)
     arcsec = found.worst_arcsec_per_deg_s
@@ -243,34 +233,22 @@ def propose(exposures: Exposures, tolerance: Tolerance, modes_hz: Sequence[float
     """
     whole = max(round(exposures.refreshes), 1)
     rates_hz = [hz for hz in modes_hz if hz > 0] or [whole / exposures.exposure_s]
-    refresh = [hz for hz in sorted(rates_hz, key=lambda hz: abs(hz - exposures.refresh_hz)) if _is_near(hz, exposures)]
-    refresh = [hz for hz in refresh if not tolerance.is_broken_by(beat(replace(exposures, refresh_hz=hz)))]
-    exposure_s = _longest_whole(exposures, whole)
+    low_hz = max(MIN_REFRESH_HZ, exposures.refresh_hz / MAX_CHANGE)
+    high_hz = min(MAX_REFRESH_HZ, exposures.refresh_hz * MAX_CHANGE)
+    near_hz = sorted((hz for hz in rates_hz if low_hz <= hz <= high_hz), key=lambda hz: abs(hz - exposures.refresh_hz))
+    refresh = [hz for hz in near_hz if not tolerance.is_broken_by(beat(replace(exposures, refresh_hz=hz)))]
+    # So many refreshes, or as many fewer as the tracker's frames have room for.
+    if exposures.frame_hz is not None:
+        whole = min(whole, math.floor(exposures.refresh_hz / exposures.frame_hz + NO_BEAT))
+    exposure_s = whole / exposures.refresh_hz if whole else None
     cured = exposure_s is not None and not tolerance.is_broken_by(beat(replace(exposures, exposure_s=exposure_s)))
+    # The nearest rate of exposures that begins each at one phase.
+    parts = max(round(exposures.refresh_hz / exposures.every_hz), math.ceil(exposures.refreshes - NO_BEAT), 1)
     return BeatProposal(
         refresh_hz=refresh[0] if refresh else None,
         exposure_s=exposure_s if cured else None,
-        frame_hz=None if cured else _standing_hz(exposures),
+        frame_hz=None if cured else exposures.refresh_hz / parts,
     )
-
-
-def _is_near(hz: float, exposures: Exposures) -> bool:
-    ratio = hz / exposures.refresh_hz
-    return MIN_REFRESH_HZ <= hz <= MAX_REFRESH_HZ and 1 / MAX_CHANGE <= ratio <= MAX_CHANGE
-
-
-def _longest_whole(exposures: Exposures, whole: int) -> float | None:
-    """So many refreshes, or as many fewer as the tracker's frames have room for; None where they have not room for one."""
-    if exposures.frame_hz is not None:
-        whole = min(whole, math.floor(exposures.refresh_hz / exposures.frame_hz + NO_BEAT))
-    return whole / exposures.refresh_hz if whole else None
-
-
-def _standing_hz(exposures: Exposures) -> float | None:
-    """The nearest rate of exposures that begins each at one phase; None where the exposures are longer."""
-    frame_hz = 1 / exposures.exposure_s if exposures.frame_hz is None else exposures.frame_hz
-    parts = max(round(exposures.refresh_hz / frame_hz), math.ceil(exposures.refreshes - NO_BEAT), 1)
-    return exposures.refresh_hz / parts
 
 
 def beat_line(found: BeatSummary) -> str | None:
@@ -289,19 +267,18 @@ def beat_line(found: BeatSummary) -> str | None:
     subject = (
         f"exposures of {found.exposure_s:g} s are {found.refreshes_per_exposure:.4g} refreshes of {found.refresh_hz:.6g} Hz"
     )
-    return f"{subject}: a star is off by up to {' and '.join(costs)}, {how}; {_cure(found.proposal or BeatProposal())}"
-
-
-def _cure(proposal: BeatProposal) -> str:
-    ways = []
+    proposal, ways = found.proposal or BeatProposal(), []
     if proposal.refresh_hz is not None:
         ways.append(f"[monitor] refresh_hz = {proposal.refresh_hz:.6g}")
     if proposal.exposure_s is not None:
         ways.append(f"[tracker] exposure_s = {proposal.exposure_s:.6g}")
     if ways:
-        return f"without a beat: {' or '.join(ways)}"
-    stands = "" if proposal.frame_hz is None else f"; at [tracker] frame_hz = {proposal.frame_hz:.6g} its phase stands still"
-    return f"no rate is without it: trigger the tracker ([sync] port, [tracker] trigger){stands}"
+        cure = f"without a beat: {' or '.join(ways)}"
+    else:
+        cure = "no rate is without it: trigger the tracker ([sync] port, [tracker] trigger)"
+        if proposal.frame_hz is not None:
+            cure += f"; at [tracker] frame_hz = {proposal.frame_hz:.6g} its phase stands still"
+    return f"{subject}: a star is off by up to {' and '.join(costs)}, {how}; {cure}"
 
 
 class SyncSummary(msgspec.Struct, frozen=True, kw_only=True):

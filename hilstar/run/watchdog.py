@@ -151,7 +151,10 @@ class GpuWatch:
         fault = self._backend.fault()
         before_ns, self._asleep_ns = self._asleep_ns, self._clock.asleep_ns()
         if not fault and (slept_ns := self._asleep_ns - before_ns) > SLEPT_NS:
-            fault = self._after_sleep(slept_ns / NS_PER_S)
+            self._notices.tell("resumed", f"the machine slept for {slept_ns / NS_PER_S:.1f} s; the GPU's tables are compared")
+            changed = self._backend.changed_tables()
+            self._backend.forget_images()
+            fault = f"the GPU's memory was lost in sleep, {changed} of the tables that make codes" if changed else ""
         if fault:
             self.lost(fault)
 
@@ -159,9 +162,3 @@ class GpuWatch:
         """Stop the run."""
         self._notices.begin(GPU_LOST, f"{fault}: the run ends")
         self._stop.set()
-
-    def _after_sleep(self, slept_s: float) -> str:
-        self._notices.tell("resumed", f"the machine slept for {slept_s:.1f} s; the GPU's tables are compared")
-        changed = self._backend.changed_tables()
-        self._backend.forget_images()
-        return f"the GPU's memory was lost in sleep, {changed} of the tables that make codes" if changed else ""

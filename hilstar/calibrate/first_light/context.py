@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +24,6 @@ from hilstar.twin.optics import BenchGeometry
 MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
 HOT_FILL = 0.5  # a pixel that is fuller in the dark is hot, and tells nothing
 LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
-
-
-def nobody_watches(pattern: Pattern) -> None:
-    """The watcher of a session that nobody follows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +55,7 @@ class StepContext:
     known: dict[str, Figure]
     kept: Mapping[str, Path]
     patches: int
-    watch: Callable[[Pattern], object] = nobody_watches
+    watch: Callable[[Pattern], object] = lambda pattern: None
 
     @property
     def resolution_px(self) -> tuple[int, int]:
@@ -88,10 +84,6 @@ class StepContext:
     def real_geometry(self) -> BenchGeometry:
         """Monitor and tracker with the measured lens."""
         return BenchGeometry(bench_camera(self.file.config, self.file.folder), self.geometry().tracker)
-
-    def with_file(self, file: BenchFile) -> StepContext:
-        """A copy with another bench file."""
-        return replace(self, file=file)
 
     def names(self, table: str, key: str, path: Path) -> tuple[KeyChange, ...]:
         """The change of a key of the bench file that names a file of the session; none where it does already."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from operator import ne
 from pathlib import Path
 from typing import NamedTuple
@@ -14,12 +14,10 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.config import Monitor
 from hilstar.calibrate.first_light.context import DarkSubtracted, StepContext
 from hilstar.calibrate.first_light.image_sources import Pattern, black
 from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, with_changes
 from hilstar.calibrate.geometric.calibration import (
-    Calibrated,
     calibrate_files,
     notes_for_a_person,
     parameters_of,
@@ -33,11 +31,7 @@ from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_bac
 from hilstar.twin.optics import BenchGeometry
 
 FIGURE_REACH = 0.25  # half the figure's side, relative to the smaller side of what both screen and tracker have
-
-
 SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
-
-
 SQUARES = (3, 2, 1)  # sides of the squares at the corner, to its right and below it, in those of the smallest
 
 
@@ -98,18 +92,13 @@ NOT_SEEN = "show the monitor to the whole of the tracker's field, expose longer,
 
 @dataclass(frozen=True, slots=True)
 class SeenFigure:
-    """How the tracker saw the figure: its orientation (a 2 x 2 matrix, row by row), its scale, and the remaining turn."""
+    """The figure in the tracker's image: its orientation (a 2 x 2 matrix, row by row), scale, remaining turn and squares."""
 
     way: tuple[int, int, int, int]
     scale: float
     turn_deg: float
     x_px: FloatArray
     y_px: FloatArray
-
-    @property
-    def words(self) -> str:
-        """The orientation in words."""
-        return WAYS[self.way]
 
 
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
@@ -169,15 +158,6 @@ class ScreenMounting:
         turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), self.rotate_deg // 90)
         return np.asarray(np.diag([-1.0 if self.flip_x else 1.0, -1.0 if self.flip_y else 1.0]) @ turn)
 
-    def changed(self, other: ScreenMounting) -> int:
-        """The number of keys that differ."""
-        return sum(map(ne, astuple(self), astuple(other)))
-
-
-def mounting_of(monitor: Monitor) -> ScreenMounting:
-    """The mounting in a bench file."""
-    return ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
-
 
 def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> ScreenMounting:
     """The mounting that turns an image seen in orientation `way` upright, with the fewest keys changed."""
@@ -185,7 +165,7 @@ def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> Scree
     flips = (False, True)
     all_ways = [ScreenMounting(x, y, turn) for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270))]
     right = [each for each in all_ways if np.allclose(each.matrix, wanted)]
-    return min(right, key=lambda each: (each.changed(mounting), each.flip_y, each.rotate_deg))
+    return min(right, key=lambda each: (sum(map(ne, astuple(each), astuple(mounting))), each.flip_y, each.rotate_deg))
 
 
 MIN_DOTS = 5
@@ -274,45 +254,38 @@ BLURRED_BY_PX = 0.1
 
 def orientation(context: StepContext) -> StepOutcome:
     """Find how the screen is mounted, set the bench file's keys, and check that the figure is upright. Raises InputError."""
-    before = mounting_of(context.file.config.monitor)
-    seen = first = _way(context, "figure_000")
-    changes = _mounting_changes(context.file, before, corrected(before, first.way))
+    monitor = context.file.config.monitor
+    before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
+    first, measured = _way(context, "figure_000")
+    changes = _mounting_changes(context.file, before, corrected(before, first))
     if changes:
-        turned = context.with_file(with_changes(context.file, changes))
-        seen = _way(turned, "figure_001")
-        if seen.way != UPRIGHT:
+        now, measured = _way(replace(context, file=with_changes(context.file, changes)), "figure_001")
+        if now != UPRIGHT:
             made = "; ".join(change.line for change in changes)
-            raise InputError(f"after {made} the figure is {WAYS[seen.way]}; is it the same screen?")
-    way = f"first {WAYS[first.way]}, now upright" if changes else "upright"
-    if seen.measured is None:
-        figures: dict[str, Figure] = {"seen": WAYS[first.way], "told_by": "a key"}
+            raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
+    way = f"first {WAYS[first]}, now upright" if changes else "upright"
+    if measured is None:
+        figures: dict[str, Figure] = {"seen": WAYS[first], "told_by": "a key"}
         return StepOutcome("done", f"{way}, as a person saw it", figures, changes=changes)
-    found, looked = seen.measured
+    found, looked = measured
     picture = context.session / "orientation.png"
     draw_spots(picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}")
-    figures = {"seen": WAYS[first.way], "scale": found.scale, "turn_deg": found.turn_deg}
+    figures = {"seen": WAYS[first], "scale": found.scale, "turn_deg": found.turn_deg}
     line = f"{way}, {found.scale:.4f} of the expected size, turned by {found.turn_deg:+.2f} deg"
     return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes)
 
 
-@dataclass(frozen=True, slots=True)
-class _SeenWay:
+def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
     """The figure's orientation, and its measurement; None where a person pressed a key instead."""
-
-    way: tuple[int, int, int, int]
-    measured: tuple[SeenFigure, DarkSubtracted] | None
-
-
-def _way(context: StepContext, name: str) -> _SeenWay:
     geometry = context.geometry()
     figure = figure_for(geometry)
     pattern, keys = figure.pattern(name, context.resolution_px, context.white), keys_of_ways()
     told = context.take_or_key(pattern, {key: look_of(way) for key, way in keys.items()})
     if isinstance(told, str):
-        return _SeenWay(keys[told], None)
+        return keys[told], None
     looked = context.looked(told, context.read(context.dark()))
     found = see_figure(looked.image, figure, geometry)
-    return _SeenWay(found.way, (found, looked))
+    return found.way, (found, looked)
 
 
 def _mounting_changes(file: BenchFile, before: ScreenMounting, after: ScreenMounting) -> tuple[KeyChange, ...]:
@@ -337,11 +310,13 @@ def focus(context: StepContext) -> StepOutcome:
     """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises InputError."""
     code, found, looked = sharp_dots(context)
     wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
-    picture = context.session / "focus.png"
-    sigma = found.psf_sigma_px
-    draw_focus(
-        picture, found, f"PSF sigma {sigma:.3f} px (median of {len(found.x_px)} dots), [tracker] psf_sigma_px is {wanted:g}"
-    )
+    picture, sigma = context.session / "focus.png", found.psf_sigma_px
+    finding = f"PSF sigma {sigma:.3f} px (median of {len(found.x_px)} dots), [tracker] psf_sigma_px is {wanted:g}"
+    with chart(picture, finding, height_inch=6.0) as (axes,):
+        dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
+        axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
+        axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
+        axes.invert_yaxis()
     figures = {
         "psf_sigma_px": sigma,
         "dot_sigma_px": float(np.median(found.sigma_px)),
@@ -395,17 +370,7 @@ def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray
                 name, (x, y), (away, 16), textcoords="offset points", ha=side, color=DARK[ORANGE], size=TEXT_PT + 1, bbox=plate
             )
         axes.grid(visible=False)
-        axes.set_xlabel("tracker x [px]")
-        axes.set_ylabel("tracker y [px]")
-
-
-def draw_focus(path: Path, found: Sharpness, finding: str) -> None:
-    """Draw the PSF's sigma at each dot over the tracker's field."""
-    with chart(path, finding, height_inch=6.0) as (axes,):
-        dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
-        axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
-        axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
-        axes.invert_yaxis()
+        axes.set(xlabel="tracker x [px]", ylabel="tracker y [px]")
 
 
 def geometry(context: StepContext) -> StepOutcome:
@@ -423,28 +388,24 @@ def geometry(context: StepContext) -> StepOutcome:
     found = calibrate_files(context.file, paths, context.folder / "plan.csv", dark, tracker_is_ideal=ideal)
     output, picture = context.session / "geometry.toml", context.session / "geometry.png"
     write_calibrated(output, found, picture)
-    figures = _geometry_figures(found)
-    line = (
-        f"{found.chosen.name}: held-out dots {figures['held_out_rms_arcsec']:.2f} arcsec rms,"
-        f" {figures['held_out_max_arcsec']:.2f} max; a star's place is known to {figures['error_rms_arcsec']:.2f} arcsec rms"
-    )
-    files = (output, picture, context.folder / "plan.csv", dark, *paths)
-    return StepOutcome("done", line, figures, files, (picture,), context.names("collimator", "geometry", output))
-
-
-def _geometry_figures(found: Calibrated) -> dict[str, Figure]:
-    parameters = {name: each.value for name, each in parameters_of(found).items() if "rotation" not in name}
-    return {
-        "model": found.chosen.name,
-        "held_out_rms_arcsec": found.chosen.rms_arcsec,
-        "held_out_max_arcsec": found.chosen.max_arcsec,
-        "error_rms_arcsec": found.uncertainty.rms_arcsec,
-        "error_max_arcsec": found.uncertainty.max_arcsec,
+    chosen, error = found.chosen, found.uncertainty
+    figures: dict[str, Figure] = {
+        "model": chosen.name,
+        "held_out_rms_arcsec": chosen.rms_arcsec,
+        "held_out_max_arcsec": chosen.max_arcsec,
+        "error_rms_arcsec": error.rms_arcsec,
+        "error_max_arcsec": error.max_arcsec,
         "noise_px": found.problem.noise_px,
         "dots_recognised": found.recognised,
         "dots_planned": len(found.plan),
         "centroids_lost": int(found.lost),
         "centroids_false": int(found.false),
-        **parameters,
+        **{name: each.value for name, each in parameters_of(found).items() if "rotation" not in name},
         "notes": "; ".join(notes_for_a_person(found)) or "none",
     }
+    line = (
+        f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f} max;"
+        f" a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
+    )
+    files = (output, picture, context.folder / "plan.csv", dark, *paths)
+    return StepOutcome("done", line, figures, files, (picture,), context.names("collimator", "geometry", output))

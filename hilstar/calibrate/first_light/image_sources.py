@@ -8,10 +8,10 @@ import shlex
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,6 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench, orientation_of
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of
-from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.process.closing import Closing
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
@@ -61,15 +60,6 @@ def black(resolution_px: tuple[int, int]) -> CodeImage:
     return np.zeros((height, width), dtype=np.uint16)
 
 
-def in_channel(codes: CodeImage, channel: str) -> CodeImage:
-    """Codes (h, w) in one primary (h, w, 3); unchanged for w."""
-    if channel == "w":
-        return codes
-    colours = np.zeros((*codes.shape, 3), dtype=np.uint16)
-    colours[..., PRIMARIES.index(channel)] = codes
-    return colours
-
-
 def on_screen(codes: CodeImage, orientation: Orientation) -> CodeImage:
     """Turn an image as the screen is mounted, as shaders/present.frag does."""
     screen = np.rot90(codes, -orientation.quarter_turns)
@@ -92,31 +82,34 @@ class NoImage(InputError):
     """An image did not come. Those taken before it are good and need not be taken again."""
 
 
-class ImageSource(Protocol):
-    """Shows patterns to the tracker and returns its images."""
+class ImageSource:
+    """Shows patterns to the tracker and returns its images; by default without a display, a dark image or a photodiode.
 
-    @property
-    def identity(self) -> str:
-        """A text that identifies the source; it changes when the source does."""
+    `identity` is a text that changes when the source does; `sets_exposure` says whether `look` may ask for another exposure
+    than the bench file's.
+    """
+
+    identity: str
+    sets_exposure: bool
 
     def gate(self, file: BenchFile) -> Timing | None:
         """The display's timing, None where this program has no display. Raises MachineError."""
-
-    @property
-    def sets_exposure(self) -> bool:
-        """Whether `look` may ask for another exposure than the bench file's."""
+        return None
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Show a pattern as the bench file's screen is mounted; the tracker's image, `stem` with an ending.
 
         Raises NoImage where none comes.
         """
+        raise NotImplementedError
 
     def unlit(self, stem: Path) -> Path | None:
         """The tracker's image with the monitor switched off, at the bench file's exposure; None where there is none."""
+        return None
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
         """Record the display's square by a photodiode; None where there is none. Raises InputError, MachineError."""
+        return None
 
     def close(self) -> None:
         """Let go of the display."""
@@ -156,14 +149,9 @@ class SerialDiode:
                 listening.append(pool.submit(capture_edges, self.port, self.baud, seconds))
                 return listening[0].done
 
-            shown = display.blink(with_code(file), begin)
+            monitor = replace(file.config.monitor, photodiode=KIND)
+            shown = display.blink(dataclasses.replace(file, config=replace(file.config, monitor=monitor)), begin)
             return DiodeRecording(shown, listening[0].result())
-
-
-def with_code(file: BenchFile) -> BenchFile:
-    """The bench with a photodiode square that encodes the frame's number."""
-    monitor = replace(file.config.monitor, photodiode=KIND)
-    return dataclasses.replace(file, config=replace(file.config, monitor=monitor))
 
 
 POLL_S = 0.02
@@ -286,10 +274,10 @@ class PatternDisplay(Closing):
 GRAB_TIMEOUT_S = 120.0
 
 
-class _ShownHere:
+class _ShownHere(ImageSource):
     """An image source before this program's own display; `dark` is the tracker's image with the monitor switched off."""
 
-    def __init__(self, dark: Path | None, diode: SerialDiode | None) -> None:
+    def __init__(self, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
         self._display, self._dark, self._diode = PatternDisplay(), dark, diode
 
     def gate(self, file: BenchFile) -> Timing | None:
@@ -336,8 +324,9 @@ class GrabCommand(_ShownHere):
         """Run the command while the pattern is shown. Raises NoImage with the last line of its stderr where it fails."""
         output = stem.with_name(stem.name + ".png")
         shown = stem.parent / PATTERN_FILE
-        values = {"{output}": str(output), "{pattern}": str(shown), "{exposure_s}": f"{exposure_s:.9g}"}
-        words = [_filled(word, values) for word in self._words]
+        words = self._words
+        for name, value in (("output", str(output)), ("pattern", str(shown)), ("exposure_s", f"{exposure_s:.9g}")):
+            words = [word.replace(f"{{{name}}}", value) for word in words]
         output.unlink(missing_ok=True)  # an interrupted attempt may have left one, and a command that writes nothing must fail
         if self._shows and pattern.later:
             raise InputError("a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show them here")
@@ -350,12 +339,6 @@ class GrabCommand(_ShownHere):
         return output
 
 
-def _filled(word: str, values: Mapping[str, str]) -> str:
-    for name, value in values.items():
-        word = word.replace(name, value)
-    return word
-
-
 def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]], None]) -> None:
     started: list[Child] = []
     end_s = time.monotonic() + GRAB_TIMEOUT_S
@@ -363,17 +346,15 @@ def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]
     def done() -> bool:
         # The command starts at the first call: by then the panel shows the pattern.
         if not started:
-            started.append(ended.enter_context(_start(words)))
+            try:
+                started.append(ended.enter_context(Child(words, keeps_stdout=False)))
+            except OSError as error:
+                raise NoImage(f"--grab: {words[0]} cannot be run ({error.strerror}); write a command that can") from error
         return started[0].poll() is not None or time.monotonic() > end_s
 
     with ExitStack() as ended:
         meanwhile(done)
         child, code = started[0], started[0].poll()
-    _check(words, output, child, code)
-
-
-def _check(words: list[str], output: Path, child: Child, code: int | None) -> None:
-    """Raise NoImage for a command that did not end, failed, or wrote no image."""
     command = shortened(shlex.join(words))
     if child.too_much:
         raise NoImage(f"--grab: {command} printed more than {MAX_OUTPUT_BYTES // 1_000_000} MB on stderr; let it say less")
@@ -385,13 +366,6 @@ def _check(words: list[str], output: Path, child: Child, code: int | None) -> No
         raise NoImage(f"--grab: {command} ended with code {code}{why}")
     if not output.is_file() or not output.stat().st_size:
         raise NoImage(f"--grab: {command} wrote no image; it has to write {{output}}, as PNG or FITS")
-
-
-def _start(words: list[str]) -> Child:
-    try:
-        return Child(words, keeps_stdout=False)
-    except OSError as error:
-        raise NoImage(f"--grab: {words[0]} cannot be run ({error.strerror}); write a command that can") from error
 
 
 def _wait(done: Callable[[], bool]) -> None:
@@ -408,9 +382,6 @@ class ByHand(_ShownHere):
 
     identity = "by hand"
     sets_exposure = True
-
-    def __init__(self, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
-        super().__init__(dark, diode)
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Wait for a complete image of the pattern."""
@@ -452,12 +423,9 @@ def _once_asked(words: str, done: Callable[[], bool]) -> Callable[[], bool]:
 
 def _saved(stem: Path) -> Path | None:
     """The image, once it is complete."""
-    return next((path for path in (stem.with_name(stem.name + end) for end in ENDINGS) if _is_complete(path)), None)
-
-
-def _is_complete(path: Path) -> bool:
-    try:
-        status = path.stat()
-    except OSError:
-        return False
-    return status.st_size > 0 and time.time() - status.st_mtime > STILL_S
+    for path in (stem.with_name(stem.name + end) for end in ENDINGS):
+        with suppress(OSError):
+            status = path.stat()
+            if status.st_size > 0 and time.time() - status.st_mtime > STILL_S:
+                return path
+    return None

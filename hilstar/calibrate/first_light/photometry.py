@@ -15,11 +15,11 @@ from scipy.special import ndtr
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
-from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black, in_channel
+from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.calibrate.first_light.records import Figure, StepOutcome
 from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
-from hilstar.calibrate.plan import Patch, PlanSettings, plan_patches
+from hilstar.calibrate.plan import Patch, PlanSettings, in_channel, plan_patches
 from hilstar.charts import INK, MUTED, chart
 from hilstar.errors import InputError
 from hilstar.files import write_whole
@@ -76,19 +76,16 @@ def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple
     if cells < MIN_DOTS:
         raise InputError("the tracker sees too little of the monitor for the response; look at focal lengths and pixel pitches")
     (x,), (y,) = geometry.to_monitor(*(np.array([(size - 1) / 2]) for size in geometry.tracker.resolution_px))
-    places = zip((x, y), geometry.monitor.resolution_px, strict=True)
-    left, top = (_within(middle, cells * sparsest, size) for middle, size in places)
+    corner = []  # of a square about the middle of what is seen, kept on the screen
+    for middle, size in zip((x, y), geometry.monitor.resolution_px, strict=True):
+        wanted = middle if math.isfinite(middle) else (size - 1) / 2
+        corner.append(int(np.clip(round(wanted - (cells * sparsest - 1) / 2), 0, size - cells * sparsest)))
+    left, top = corner
     margin = MARGIN_PX + MARGIN_SIGMAS * math.hypot(sigma_px, ratio / math.sqrt(12))
     rows, columns = _seen(geometry, (left, top), cells * sparsest, margin)
     area = (rows.stop - rows.start) * (columns.stop - columns.start)
     periods = tuple(2**power for power in range(int(math.log2(sparsest)) + 1))
     return DotField(left, top, cells * sparsest, rows, columns, area / ratio**2), periods
-
-
-def _within(middle: float, side: int, size: int) -> int:
-    """The first pixel of a side centred on what is seen, kept on the screen."""
-    wanted = middle if math.isfinite(middle) else (size - 1) / 2
-    return int(np.clip(round(wanted - (side - 1) / 2), 0, size - side))
 
 
 def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: float) -> tuple[slice, slice]:
@@ -207,7 +204,8 @@ class Photometer:
 
     def _expose(self) -> float:
         """Choose an exposure in which white does not saturate, first the bench file's; returns a white dot's peak, DN."""
-        white = self._brightest()
+        brightest = max(self.assumed.light, key=lambda name: float(self.assumed.light[name][-1]))
+        white = Patch(self.context.white, brightest)
         for probe in range(MAX_PROBES):
             fill = self._look(f"white_{probe:02}", self.periods[-1], white)[1]
             if fill <= MAX_FILL:
@@ -226,10 +224,6 @@ class Photometer:
         bright = self._part(self._take("white", self.periods[-1], white))
         share = float(self.assumed.light[white.channel][white.code])
         return float((bright - dark)[self._cold].max(initial=1.0)) / share
-
-    def _brightest(self) -> Patch:
-        """White of the brightest channel."""
-        return Patch(self.context.white, max(self.assumed.light, key=lambda name: float(self.assumed.light[name][-1])))
 
     def _period(self, patch: Patch, white_dn: float) -> int:
         """The period of a patch's densest lattice that does not saturate, by the bench file's response."""
@@ -311,7 +305,10 @@ def photometry(context: StepContext) -> StepOutcome:
     sigma_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.tracker_psf.width_px)))
     channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing else "w"
     planned = plan_for(monitor.bits, context.patches, channels)
-    readings = Photometer(context, sigma_px, _assumed(context, assumed, channels)).read(planned)
+    by_channel = {"w": assumed.response.light}
+    if channels != "w":
+        by_channel = dict(zip(channels, primary_lights(calibration_source(context.file), monitor.bits), strict=True))
+    readings = Photometer(context, sigma_px, Assumed(by_channel, assumed.response.black)).read(planned)
     measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
     readings.write(measured)
     instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
@@ -326,29 +323,25 @@ def photometry(context: StepContext) -> StepOutcome:
     if written.weights is not None:
         figures["shares_of_white"] = ", ".join(f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True))
     off = f"{figures['bench_file_off_rms_mag']:.3f} mag rms, {figures['bench_file_off_max_mag']:.3f} max"
-    draw_response_error(before, now, response_error_mag(assumed.response, now), f"The bench file's response is off by {off}")
+    off_mag = response_error_mag(assumed.response, now)
+    with chart(before, f"The bench file's response is off by {off}") as (axes,):
+        axes.plot(now.light[-len(off_mag) :], off_mag, color=INK)
+        axes.axhline(0, color=MUTED, linewidth=0.8)
+        axes.set_xscale("log")
+        axes.set(xlabel="measured light over white [share]", ylabel="fainter than in the bench file [mag]")
+        axes.invert_yaxis()
     return _judged(context, figures, tuple(dict.fromkeys(files)), (picture, before))
-
-
-def _assumed(context: StepContext, calibration: Calibration, channels: str) -> Assumed:
-    """The bench file's light of each channel."""
-    if channels == "w":
-        return Assumed({"w": calibration.response.light}, calibration.response.black)
-    lights = primary_lights(calibration_source(context.file), context.file.config.monitor.bits)
-    return Assumed(dict(zip(channels, lights, strict=True)), calibration.response.black)
 
 
 def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
     """The plan with the most levels that has at most `patches` patches. Raises InputError where they are too few."""
-    best: list[Patch] = []
-    for levels in range(MIN_LEVELS, min(patches, 2**bits) + 1):
-        planned = plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
-        if len(planned) <= patches:
-            best = planned
-    if not best:
-        fewest = len(plan_patches(PlanSettings(bits, MIN_LEVELS, 1, channels), np.random.default_rng(SEED)))
-        raise InputError(f"--patches {patches}: a response needs {fewest} or more; write that, or 0 for none")
-    return best
+    plans = [
+        plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
+        for levels in range(MIN_LEVELS, max(MIN_LEVELS, min(patches, 2**bits)) + 1)
+    ]
+    if len(plans[0]) > patches:
+        raise InputError(f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for none")
+    return [planned for planned in plans if len(planned) <= patches][-1]
 
 
 def calibration_of(context: StepContext) -> Calibration:
@@ -431,13 +424,3 @@ def exponent(response: Response) -> float:
     used = light >= DIM_LIGHT
     signal = np.arange(1, len(response.light))[used] / response.white
     return float(np.polyfit(np.log(signal), np.log(light[used]), 1)[0])
-
-
-def draw_response_error(path: Path, response: Response, off_mag: FloatArray, finding: str) -> None:
-    """How much fainter the brightest codes are than assumed (n,), magnitudes, over their measured light."""
-    with chart(path, finding) as (axes,):
-        axes.plot(response.light[-len(off_mag) :], off_mag, color=INK)
-        axes.axhline(0, color=MUTED, linewidth=0.8)
-        axes.set_xscale("log")
-        axes.set(xlabel="measured light over white [share]", ylabel="fainter than in the bench file [mag]")
-        axes.invert_yaxis()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -12,6 +12,7 @@ from typing import Literal
 import msgspec
 
 from hilstar.bench.bench_file import BenchFile, read_bench_file, with_key
+from hilstar.bench.config import parse_config
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.html_pages import Markup, escaped, page_of, picture_of, table_of
@@ -93,10 +94,6 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     unfinished: dict[str, str] = {}
     beat: BeatSummary | None = None
 
-    def step(self, name: str) -> StepRecord | None:
-        """A step's record, None before it ran."""
-        return next((record for record in self.steps if record.name == name), None)
-
 
 def read_session(folder: Path) -> SessionFile | None:
     """The session in a directory, None where there is none. Raises InputError for a file that is no session."""
@@ -125,21 +122,11 @@ def sha256_of(path: Path) -> str:
 INSTEAD_OF = {"flux_at_white_e_per_s": ("brightest_v_mag",)}
 
 
-def with_changes(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
-    """The bench file with the changes, without writing it.
-
-    Raises InputError where a key cannot be set in this file.
-    """
+def with_changes(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
+    """The bench file with the changes, without writing it. Raises InputError where a key cannot be set in this file."""
     text = file.text
     for change in changes:
         text = with_key(text, change.table, change.key, change.after, INSTEAD_OF.get(change.key, ()))
-    return _checked(file, text, changes)
-
-
-def _checked(file: BenchFile, text: str, changes: Iterable[KeyChange]) -> BenchFile:
-    """The bench file of `text`. Raises InputError where a change is not in it."""
-    from hilstar.bench.config import parse_config
-
     config = parse_config(file.path, text)
     for change in changes:
         now = getattr(getattr(config, change.table), change.key)
@@ -148,9 +135,8 @@ def _checked(file: BenchFile, text: str, changes: Iterable[KeyChange]) -> BenchF
     return BenchFile(file.path, text, config, file.sha256)
 
 
-def rewrite(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
-    """Write the changed bench file over the old one. Raises InputError."""
-    changes = tuple(changes)
+def rewrite(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
+    """Write the changed bench file over the old one, and read it. Raises InputError."""
     if not changes:
         return file
     write_whole(file.path, with_changes(file, changes).text)
@@ -165,6 +151,8 @@ COLOURS = {"done": "#2e7d32", "skipped": "#8a6d00", "failed": "#c62828"}
 def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
     """Write the page of a session, with its bench file as it was and as it is. Raises InputError where it cannot be written."""
     bench = Path(session.bench)
+    old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, bench))
+    difference = "\n".join(difflib.unified_diff(old, new, "before", "now", lineterm=""))
     beats = None if session.beat is None else beat_line(session.beat)
     overview = [(Markup(f"<a href='#{each.name}'>{each.name}</a>"), _badge(each), each.line) for each in session.steps]
     body = [
@@ -174,7 +162,7 @@ def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
         *(part for record in session.steps for part in _step(folder, record)),
         "<h2>The bench file</h2>",
         f"<p>{escaped(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",
-        f"<pre>{escaped(_difference(before, bench))}</pre>",
+        f"<pre>{escaped(difference or 'nothing was changed')}</pre>",
     ]
     path = folder / PAGE_FILE
     write_whole(path, page_of(f"First light of {bench.name}", body))
@@ -205,10 +193,3 @@ def _picture(path: Path) -> str:
         return picture_of(read_bytes(path, "", MAX_PICTURE_BYTES), "png", path.stem)
     except InputError as error:
         return f"<p>{escaped(error)}</p>"
-
-
-def _difference(before: Path, after: Path) -> str:
-    """The bench file's changed lines with their context."""
-    old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, after))
-    lines = list(difflib.unified_diff(old, new, "before", "now", lineterm=""))
-    return "\n".join(lines) or "nothing was changed"

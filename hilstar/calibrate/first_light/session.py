@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from hilstar.bench.bench_file import BenchFile
-from hilstar.calibrate.first_light.context import StepContext, nobody_watches
+from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.geometry import focus, geometry, orientation
 from hilstar.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
 from hilstar.calibrate.first_light.photometry import photometry
@@ -62,22 +62,10 @@ def latency(context: StepContext) -> StepOutcome:
     draw_latency(picture, paired, found)
     delay_ms = checked_delay_ms(0.0 if -AGREE_MS < found["panel_delay_ms"] < 0 else found["panel_delay_ms"])
     error_ms = ERROR_OF_MEDIAN * found["jitter_ms"] / math.sqrt(found["edges"])
-    figures = _figures(context, found, delay_ms, error_ms)
-    line = (
-        f"panel_delay_ms {delay_ms:g} +- {error_ms:.3f}, the bench file has {monitor.panel_delay_ms:g}; a swap is light at the"
-        f" square after {found['latency_ms']['p50']:.2f} ms, jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
-    )
-    if abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms):
-        return StepOutcome("done", line, figures, (picture,), (picture,))
-    change = KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms)
-    return StepOutcome("done", line, figures, (picture,), (picture,), (change,))
-
-
-def _figures(context: StepContext, found: dict[str, Any], delay_ms: float, error_ms: float) -> dict[str, Figure]:
     figures: dict[str, Figure] = {
         "panel_delay_ms": delay_ms,
         "error_ms": error_ms,
-        "in_bench_file_ms": context.file.config.monitor.panel_delay_ms,
+        "in_bench_file_ms": monitor.panel_delay_ms,
         "swap_to_light_p50_ms": found["latency_ms"]["p50"],
         "swap_to_light_p99_ms": found["latency_ms"]["p99"],
         "swap_to_square_ms": found["swap_to_square_ms"],
@@ -88,7 +76,13 @@ def _figures(context: StepContext, found: dict[str, Any], delay_ms: float, error
     figures |= {name: found[name] for name in ("rise_ms", "fall_ms") if found[name] is not None}
     if context.truth is not None:
         figures["truth_panel_delay_ms"] = context.truth.config.monitor.panel_delay_ms
-    return figures
+    line = (
+        f"panel_delay_ms {delay_ms:g} +- {error_ms:.3f}, the bench file has {monitor.panel_delay_ms:g}; a swap is light at the"
+        f" square after {found['latency_ms']['p50']:.2f} ms, jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
+    )
+    agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
+    change = KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms)
+    return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else (change,))
 
 
 MS_PER_S = 1000.0
@@ -164,7 +158,6 @@ STEPS = (
         "an image of each",
         uniformity,
         needs=("geometry",),
-        tables=("monitor", "collimator", "tracker"),
         writes=("monitor.calibration",),
     ),
     SessionStep(
@@ -218,7 +211,7 @@ class FirstLightSession:
         file: BenchFile,
         source: ImageSource,
         patches: int,
-        watch: Callable[[Pattern], object] = nobody_watches,
+        watch: Callable[[Pattern], object] = lambda pattern: None,
     ) -> None:
         self._watch = watch
         self.folder, self.file, self.source, self.patches = folder, file, source, patches
@@ -244,7 +237,7 @@ class FirstLightSession:
                 continue
             record = self._run(number, step.name in again, say)
             self.records[step.name] = record
-            self._write(None)
+            write_session(self.folder, self.as_file())
             say(f"{step.name:12} {record.verdict}: {record.line}")
         return max(record.exit_code for record in self.records.values())
 
@@ -258,7 +251,8 @@ class FirstLightSession:
             return False  # it lacked a step that has been done by now
         if record.state_sha256 != self._state(number):
             return False
-        return all(_is_same(self.folder / name, digest) for name, digest in record.files.items())
+        paths = ((self.folder / name, digest) for name, digest in record.files.items())
+        return all(_is_file(path) and sha256_of(path) == digest for path, digest in paths)
 
     def _unmet(self, step: SessionStep) -> str | None:
         """The first missing step that this one needs."""
@@ -276,9 +270,11 @@ class FirstLightSession:
         else:
             if step.shows or step.wants:
                 say(f"{step.name:12} shows {step.shows or 'nothing'}; wants {step.wants}")
-            context = self._context(step, self._begun(number) and not afresh)
+            # An interrupted attempt's images can be used where nothing they depend on has changed.
+            goes_on = not afresh and self.unfinished.get(step.name) == self._attempt(number)
+            context = self._context(step, goes_on)
             self.unfinished[step.name] = self._attempt(number)
-            self._write(step.name)
+            write_session(self.folder, self.as_file(step.name))
             outcome, exit_code = self._tried(step, context)
         return StepRecord(
             name=step.name,
@@ -310,10 +306,6 @@ class FirstLightSession:
         del self.unfinished[step.name]
         return outcome, 1 if outcome.verdict == "failed" else 0
 
-    def _begun(self, number: int) -> bool:
-        """Whether an interrupted attempt's images can be used: nothing they depend on has changed."""
-        return self.unfinished.get(STEPS[number].name) == self._attempt(number)
-
     def _attempt(self, number: int) -> str:
         # Every pattern depends on the collimator, even where the step's result does not.
         return f"{self._state(number, (*STEPS[number].tables, 'collimator'))} {self.patches}"
@@ -341,9 +333,6 @@ class FirstLightSession:
         named = {text: sha256_of(self.file.folder / text) for text in _texts(kept) if _is_file(self.file.folder / text)}
         seen_by = self.source.identity if step.tables else platform.python_version()
         return hashlib.sha256(msgspec.json.encode([__version__, seen_by, kept, named], order="sorted")).hexdigest()
-
-    def _write(self, running: str | None) -> None:
-        write_session(self.folder, self.as_file(running))
 
     def as_file(self, running: str | None = None) -> SessionFile:
         """The contents of session.json."""
@@ -387,10 +376,6 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):
         return False
-
-
-def _is_same(path: Path, digest: str) -> bool:
-    return _is_file(path) and sha256_of(path) == digest
 
 
 @contextmanager

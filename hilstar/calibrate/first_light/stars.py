@@ -6,7 +6,6 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -144,8 +143,10 @@ def _explained(off: FloatArray, *shapes: FloatArray) -> float:
 def see_stars(context: StepContext) -> StarsSeen:
     """Show the bench's own fields of stars and measure them. Raises InputError where too few stars can be compared."""
     with open_bench(context.file) as bench:
-        shown = []
-        for frame in _fullest(bench):
+        rng, shown = np.random.default_rng(SEED), []
+        attitudes = [q / np.linalg.norm(q) for q in rng.normal(size=(ATTITUDES, 4))]
+        fullest = sorted(attitudes, key=lambda q: -len(bench.sprites(q)))[:FIELDS]
+        for frame in [bench.frame(q) for q in fullest]:
             levels = _levels(bench, frame)
             codes = tuple(bench.code_values(each).astype(np.uint16) for each in levels)
             shown.append((codes, _alone(bench, context, frame, levels)))
@@ -155,7 +156,12 @@ def see_stars(context: StepContext) -> StarsSeen:
         _compared(context, context.look(Pattern(f"stars_{number:03}", frames[0], frames[1:]), dark), wanted)
         for number, (frames, wanted) in enumerate(shown)
     ]
-    seen = _together(fields, dark_path)
+    arrays = [field.name for field in dataclasses.fields(StarsSeen) if field.name not in {"lost", "images"}]
+    seen = StarsSeen(
+        **{name: np.concatenate([getattr(each, name) for each in fields]) for name in arrays},
+        lost=sum(each.lost for each in fields),
+        images=(dark_path, *(path for each in fields for path in each.images)),
+    )
     if len(seen.dn) < MIN_STARS:
         raise InputError(
             f"{len(seen.dn)} bright stars are where the sky has them and {MIN_STARS} are needed; {seen.lost} bright ones are"
@@ -170,23 +176,6 @@ def _levels(bench: Bench, frame: Frame) -> tuple[Levels, ...]:
     if len(exposed) == 1:
         return (frame.levels,)
     return tuple(Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in exposed)
-
-
-def _together(fields: list[StarsSeen], dark: Path) -> StarsSeen:
-    arrays = [field.name for field in dataclasses.fields(StarsSeen) if field.name not in {"lost", "images"}]
-    return StarsSeen(
-        **{name: np.concatenate([getattr(each, name) for each in fields]) for name in arrays},
-        lost=sum(each.lost for each in fields),
-        images=(dark, *(path for each in fields for path in each.images)),
-    )
-
-
-def _fullest(bench: Bench) -> list[Frame]:
-    """The frames with the most stars among random attitudes."""
-    rng = np.random.default_rng(SEED)
-    attitudes = [q / np.linalg.norm(q) for q in rng.normal(size=(ATTITUDES, 4))]
-    fullest = sorted(attitudes, key=lambda q: -len(bench.sprites(q)))[:FIELDS]
-    return [bench.frame(q) for q in fullest]
 
 
 def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...]) -> ExpectedStars:
@@ -288,7 +277,17 @@ GRID = 21  # places along each side of the screen at which a truth is compared
 def verify(context: StepContext) -> StepOutcome:
     """Show stars with the calibrated bench, compare them with the sky, and run the twin. Raises InputError."""
     seen = see_stars(context)
-    figures, reasons = _star_figures(context, seen), []
+    off_px = np.hypot(*seen.residual_px.T)
+    rms_px = float(np.sqrt((off_px**2).mean()))
+    figures: dict[str, Figure] = {
+        "stars": len(off_px),
+        "lost": seen.lost,
+        "star_rms_px": rms_px,
+        "star_p95_px": float(np.percentile(off_px, 95)),
+        "star_max_px": float(off_px.max()),
+        "star_rms_arcsec": rms_px * ARCSEC_PER_RAD / context.geometry().tracker.focal_length_px,
+    }
+    reasons: list[str] = []
     picture, light = context.session / "verify.png", context.session / "verify-light.png"
     rms = f"{figures['star_rms_px']:.3f} px ({figures['star_rms_arcsec']:.2f} arcsec) rms"
     width_px = context.file.config.tracker.resolution_px[0]
@@ -306,7 +305,13 @@ def verify(context: StepContext) -> StepOutcome:
     reasons += _star_reasons(context, figures)
     twin = summarise(run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED)))
     reasons += [f"the twin: {reason}" for reason in twin["reasons"]]
-    figures |= _twin_figures(twin)
+    figures |= {
+        "twin_passed": str(twin["passed"]).lower(),
+        "twin_stars": twin["stars"],
+        "twin_zero_point_mag": "not known" if twin["zero_point_mag"] is None else twin["zero_point_mag"],
+        "twin_flux_p95_mag": twin["flux_error_mag"].p95 or 0.0,
+        "twin_centroid_p95_px": twin["centroid_error_px"].p95 or 0.0,
+    }
     if context.truth is not None:
         figures |= _against_truth(context)
         line += (
@@ -324,12 +329,10 @@ def _twin_file(context: StepContext) -> BenchFile:
     if truth is None:
         return file
     monitor, collimator, folder = truth.config.monitor, truth.config.collimator, truth.folder.resolve()
-    with open_bench(truth) as bench:
-        white = bench.flux_at_white_e_per_s
     named = monitor.calibration in BUILT_IN
     calibration = monitor.calibration if named else str(folder / monitor.calibration)
     limits = {name: getattr(file.config.verify, name) for name in LIMITS}
-    known = Verify(**limits, true_calibration=calibration, true_flux_at_white_e_per_s=white)
+    known = Verify(**limits, true_calibration=calibration, true_flux_at_white_e_per_s=_white_e_per_s(truth))
     if collimator.geometry is not None:
         known = replace(known, true_geometry=str(folder / collimator.geometry))
     else:
@@ -340,17 +343,6 @@ def _twin_file(context: StepContext) -> BenchFile:
             true_q_cam_to_mon=collimator.q_cam_to_mon,
         )
     return dataclasses.replace(file, config=replace(file.config, verify=known))
-
-
-def _twin_figures(twin: dict[str, Any]) -> dict[str, Figure]:
-    """The twin's figures."""
-    spreads = {"flux": (twin["flux_error_mag"], "mag"), "centroid": (twin["centroid_error_px"], "px")}
-    return {
-        "twin_passed": str(twin["passed"]).lower(),
-        "twin_stars": twin["stars"],
-        "twin_zero_point_mag": "not known" if twin["zero_point_mag"] is None else twin["zero_point_mag"],
-        **{f"twin_{name}_p95_{unit}": spread.p95 or 0.0 for name, (spread, unit) in spreads.items()},
-    }
 
 
 def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tuple[dict[str, Figure], str]:
@@ -394,20 +386,6 @@ def _star_reasons(context: StepContext, figures: dict[str, Figure]) -> list[str]
     return found
 
 
-def _star_figures(context: StepContext, seen: StarsSeen) -> dict[str, Figure]:
-    off = np.hypot(*seen.residual_px.T)
-    tracker = context.geometry().tracker
-    rms = float(np.sqrt((off**2).mean()))
-    return {
-        "stars": len(off),
-        "lost": seen.lost,
-        "star_rms_px": rms,
-        "star_p95_px": float(np.percentile(off, 95)),
-        "star_max_px": float(off.max()),
-        "star_rms_arcsec": rms * ARCSEC_PER_RAD / tracker.focal_length_px,
-    }
-
-
 def _against_truth(context: StepContext) -> dict[str, Figure]:
     """The error of the directions of places on the screen against the truth.
 
@@ -428,8 +406,6 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
 
 
 AGREE_SIGMAS = 3.0  # less is no reason to change the bench file
-
-
 # Error of full scale beside the stars' scatter: nine sessions on six planted benches were 0.002 mag rms from the truth.
 SYSTEMATIC_MAG = 0.002
 
@@ -448,55 +424,44 @@ def scale(context: StepContext) -> StepOutcome:
     ratios = seen.dn[used] * context.file.config.tracker.detector.gain_e_per_dn / (wanted * context.exposure_s)
     found = MeasuredScale(white * float(np.median(ratios)), white, ratios)
     scatter = seen.scatter(np.asarray(magnitude(ratios)), used)
-    figures = _scale_figures(context, found, wanted) | {"scatter_error_mag": scatter.error_mag}
-    by_mag, error_mag = float(figures["off_mag"]), float(figures["error_mag"])
+    by_mag = float(magnitude(found.flux_at_white_e_per_s / white))
+    error_mag = float(np.hypot(ERROR_OF_MEDIAN * found.scatter_mag / np.sqrt(len(ratios)), SYSTEMATIC_MAG))
+    trend_mag, trend_error_mag = trend(wanted, np.asarray(magnitude(ratios)))
+    figures: dict[str, Figure] = {
+        "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
+        "in_bench_file_e_per_s": white,
+        "off_mag": by_mag,
+        "error_mag": error_mag,
+        "scatter_mag": found.scatter_mag,
+        "trend_mag": trend_mag,
+        "trend_error_mag": trend_error_mag,
+        "stars": len(ratios),
+    }
+    if context.truth is not None:
+        figures["truth_off_mag"] = magnitude(found.flux_at_white_e_per_s / _white_e_per_s(context.truth))
+    figures["scatter_error_mag"] = scatter.error_mag
     brighter = f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than the bench file has it"
     line = f"white is worth {found.flux_at_white_e_per_s:.4g} e-/s, {brighter}, by {len(ratios)} stars"
     picture = context.session / "scale.png"
     draw_light(picture, wanted, magnitude(ratios), noise_mag, f"{line}; they agree to {found.scatter_mag:.3f} mag")
-    files, wrong = (picture, *seen.images), _disagreement(figures)
+    files = (picture, *seen.images)
+    wrong = [f"they disagree by {found.scatter_mag:.3f} mag"] if found.scatter_mag > UNSURE_MAG else []
+    if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * trend_error_mag):
+        wrong.append(f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +- {trend_error_mag:.3f} mag")
     if wrong:
         why = "the response is not as the bench file has it (photometry), or the background is not dark; nothing was changed"
-        return StepOutcome("failed", f"{line}, but {wrong}: {why}", figures, files, (picture,))
+        return StepOutcome("failed", f"{line}, but {' and '.join(wrong)}: {why}", figures, files, (picture,))
     verdict: Verdict = "failed" if scatter.finding else "done"
     line += f", but {scatter.finding}" if scatter.finding else ""
-    if abs(by_mag) < AGREE_SIGMAS * error_mag:
-        return StepOutcome(verdict, line, figures, files, (picture,))
-    key, value = "flux_at_white_e_per_s", float(f"{found.flux_at_white_e_per_s:.6g}")
-    change = KeyChange(table="render", key=key, before=context.file.config.render.flux_at_white_e_per_s, after=value)
-    return StepOutcome(verdict, line, figures, files, (picture,), (change,))
+    key, before = "flux_at_white_e_per_s", context.file.config.render.flux_at_white_e_per_s
+    change = KeyChange(table="render", key=key, before=before, after=float(f"{found.flux_at_white_e_per_s:.6g}"))
+    agrees = abs(by_mag) < AGREE_SIGMAS * error_mag
+    return StepOutcome(verdict, line, figures, files, (picture,), () if agrees else (change,))
 
 
 def _white_e_per_s(file: BenchFile) -> float:
     with open_bench(file) as bench:
         return bench.flux_at_white_e_per_s
-
-
-def _scale_figures(context: StepContext, found: MeasuredScale, e_per_s: FloatArray) -> dict[str, Figure]:
-    off_mag = np.asarray(magnitude(found.ratios))
-    trend_mag, trend_error_mag = trend(e_per_s, off_mag)
-    figures: dict[str, Figure] = {
-        "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
-        "in_bench_file_e_per_s": found.assumed_e_per_s,
-        "off_mag": magnitude(found.flux_at_white_e_per_s / found.assumed_e_per_s),
-        "error_mag": float(np.hypot(ERROR_OF_MEDIAN * found.scatter_mag / np.sqrt(len(off_mag)), SYSTEMATIC_MAG)),
-        "scatter_mag": found.scatter_mag,
-        "trend_mag": trend_mag,
-        "trend_error_mag": trend_error_mag,
-        "stars": len(off_mag),
-    }
-    if context.truth is not None:
-        figures["truth_off_mag"] = magnitude(found.flux_at_white_e_per_s / _white_e_per_s(context.truth))
-    return figures
-
-
-def _disagreement(figures: dict[str, Figure]) -> str:
-    """Why the stars do not agree on one scale; "" where they do."""
-    scatter, trend_mag, error = (float(figures[name]) for name in ("scatter_mag", "trend_mag", "trend_error_mag"))
-    wrong = [f"they disagree by {scatter:.3f} mag"] if scatter > UNSURE_MAG else []
-    if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * error):
-        wrong.append(f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +- {error:.3f} mag")
-    return " and ".join(wrong)
 
 
 def trend(e_per_s: FloatArray, off_mag: FloatArray) -> tuple[float, float]:
@@ -522,10 +487,7 @@ def draw_light(
     finding: str,
     from_middle: FloatArray | None = None,
 ) -> None:
-    """Draw how much too faint stars are (n,), magnitudes, over the light asked for (n,), electrons per second.
-
-    With `from_middle` (n,), in half sides of the screen, a second panel shows it over that.
-    """
+    """Draw how much too faint stars are (n,) over the light asked for (n,), and over `from_middle` (n,), half sides."""
     panels = [("light asked for [e-/s]", e_per_s)]
     panels += [] if from_middle is None else [("from the middle of the screen [half sides]", from_middle)]
     with chart(path, finding, panels=len(panels), share_x=False) as drawn:

@@ -84,7 +84,7 @@ def uniformity(context: StepContext) -> StepOutcome:
     picture = context.session / "uniformity.png"
     line = f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by {found.left_mag:.4f} mag"
     line += f" (noise {dots.noise_mag:.4f})"
-    draw_uniformity(picture, np.stack([dots.x, dots.y], axis=1)[found.used].astype(np.float64), _mag(found, dots), line)
+    draw_uniformity(picture, dots, found, line)
     files: list[Path] = [picture, *images]
     changes: tuple[KeyChange, ...] = ()
     if against.is_even:
@@ -110,12 +110,6 @@ def _said(found: UniformityMap, assumed: bool) -> str:
     return f"the darkest place has {seen.min() / seen.max():.1%} of the brightest's light, in a map of {rows} x {columns}"
 
 
-def _mag(found: UniformityMap, dots: DotLight) -> tuple[FloatArray, FloatArray]:
-    """How much fainter each used dot is than the brightest place, and than the map, magnitudes."""
-    light, mapped = (dots.light / np.median(dots.light))[found.used], found.at_dots[found.used]
-    return np.asarray(magnitude(light / mapped.max())), np.asarray(magnitude(light / mapped))
-
-
 def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap) -> dict[str, Figure]:
     seen = found.at_dots[found.used]
     figures: dict[str, Figure] = {
@@ -131,7 +125,7 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
     if context.truth is not None:
         monitor = context.truth.config.monitor
         true = load_calibration(calibration_source(context.truth), monitor.bits).uniformity_map(monitor.resolution_px)
-        if context.truth.config.monitor.resolution_px == context.resolution_px:
+        if monitor.resolution_px == context.resolution_px:
             its = np.ones(len(dots.light)) if true is None else true[dots.y, dots.x].astype(np.float64)
             figures["truth_rms_mag"] = float(np.std(magnitude(found.at_dots / its)))
     return figures
@@ -288,16 +282,18 @@ def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: Bool
     return squares
 
 
-def draw_uniformity(path: Path, place: FloatArray, mag: tuple[FloatArray, FloatArray], finding: str) -> None:
-    """Draw dots at (n, 2) on the screen: how much fainter each is than the brightest place, and than the map (n,)."""
-    names = "fainter than the brightest place [mag]", "fainter than the map has it [mag]"
+def draw_uniformity(path: Path, dots: DotLight, found: UniformityMap, finding: str) -> None:
+    """Draw how much fainter each used dot is than the brightest place, and than the map, over the screen."""
+    x, y, light, mapped = (each[found.used] for each in (dots.x, dots.y, dots.light / np.median(dots.light), found.at_dots))
+    panels = {
+        "fainter than the brightest place [mag]": np.asarray(magnitude(light / mapped.max())),
+        "fainter than the map has it [mag]": np.asarray(magnitude(light / mapped)),
+    }
     with chart(path, finding, panels=2) as both:
-        for axes, off_mag, name in zip(both, mag, names, strict=True):
+        for axes, (name, off_mag) in zip(both, panels.items(), strict=True):
             low, high = (float(value) for value in np.percentile(off_mag, (0.5, 99.5)))
-            dots = axes.scatter(
-                place[:, 0], place[:, 1], c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4)
-            )
-            axes.figure.colorbar(dots, ax=axes, label=name)
+            shown = axes.scatter(x, y, c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4))
+            axes.figure.colorbar(shown, ax=axes, label=name)
             axes.set(aspect="equal", ylabel="monitor y [px]")
             axes.invert_yaxis()
         both[-1].set_xlabel("monitor x [px]")

@@ -13,12 +13,19 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera, tracker_psf
-from hilstar.calibrate.first_light.image_sources import KIND, CodeImage, DiodeRecording, Pattern, off_screen, on_screen
+from hilstar.calibrate.first_light.image_sources import (
+    KIND,
+    CodeImage,
+    DiodeRecording,
+    ImageSource,
+    Pattern,
+    off_screen,
+    on_screen,
+)
 from hilstar.calibrate.latency import Edges, edges_of, swap_to_square_ms
 from hilstar.errors import InputError
 from hilstar.files import written
 from hilstar.monitor.calibration import BUILT_IN, primary_lights
-from hilstar.run.screen.gate import Timing
 from hilstar.run.screen.screen import marker_light
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import BenchGeometry, TwinOptics
@@ -29,7 +36,7 @@ SWAP_JITTER_NS, DIODE_JITTER_NS = 20_000, 100_000
 MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 
 
-class VirtualBench:
+class VirtualBench(ImageSource):
     """A bench as a truth file describes it: lens, mounting, light, and the tracker's focus and noise.
 
     Free it with `close`. Raises InputError for a truth that cannot stand in for the bench.
@@ -53,10 +60,6 @@ class VirtualBench:
         self._units: dict[bytes, FloatArray] = {}
         if bench.config.render.bit_stealing:
             _ = self._primaries  # refused now where they are not known
-
-    def gate(self, file: BenchFile) -> Timing | None:
-        """None: there is no display."""
-        return None
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """The tracker's image of a pattern: a PNG of 16 bits."""

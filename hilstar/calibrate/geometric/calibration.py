@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import hilstar
-from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.arrays import BoolArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.cameras import ideal_monitor, tracker_camera
 from hilstar.calibrate.geometric.dots import DotPlan, read_plan
@@ -63,7 +63,6 @@ MISFIT_FLOOR_ARCSEC = 1.0
 class Calibrated:
     """The result of a geometric calibration: the fit, the models compared, its uncertainty, and the centroids' fate."""
 
-    plan: DotPlan
     problem: Problem
     data: MatchedDots
     fit: Fit
@@ -74,6 +73,11 @@ class Calibrated:
     tracker_known: bool
 
     @property
+    def plan(self) -> DotPlan:
+        """The dots that were shown."""
+        return self.problem.plan
+
+    @property
     def recognised(self) -> int:
         """Dots that were recognised."""
         return len(np.unique(self.data.dot))
@@ -81,7 +85,8 @@ class Calibrated:
     @property
     def lost(self) -> int:
         """Lit dots in the tracker's field that have no centroid."""
-        return _expected(self.plan, self.problem, self.fit) - len(self.data)
+        expected = sum(int(self.plan.lit[inside].sum()) for inside in _in_view(self.problem, self.fit))
+        return expected - len(self.data)
 
     @property
     def false(self) -> int:
@@ -108,7 +113,9 @@ def calibrate_files(
     monitor = ideal_monitor(config)
     nominal = Nominal(monitor, np.array(config.collimator.q_cam_to_mon), tracker_camera(config.tracker, file.folder))
     dots = read_plan(plan)
-    _refuse_other_screen(plan, dots, monitor.resolution_px)
+    width, height = monitor.resolution_px
+    if dots.x_px.max() > width - 1 or dots.y_px.max() > height - 1:
+        raise InputError(f"{plan}: has dots off this monitor of {width} x {height} px; plan them anew")
     if observed[0].suffix.lower() == ".csv":
         if len(observed) > 1:
             raise InputError(f"{observed[1]}: one table is read; write all centroids into {observed[0]}")
@@ -117,11 +124,6 @@ def calibrate_files(
         seen = measure_images(observed, dark, config.tracker.resolution_px)
     known = tracker_is_ideal or config.tracker.distortion is not None
     return calibrate_geometry(dots, nominal, seen, np.random.default_rng(SEED), tracker_known=known)
-
-
-def _refuse_other_screen(plan: Path, dots: DotPlan, resolution_px: tuple[int, int]) -> None:
-    if dots.x_px.max() > resolution_px[0] - 1 or dots.y_px.max() > resolution_px[1] - 1:
-        raise InputError(f"{plan}: has dots off this monitor of {resolution_px[0]} x {resolution_px[1]} px; plan them anew")
 
 
 def calibrate_geometry(
@@ -149,19 +151,22 @@ def calibrate_geometry(
     models = candidates(problem, data, tracker_names)
     chosen = best_of(models)
     final = bounded_to_field(problem, fit(problem, chosen.model, chosen.field_degree, data))
-    calibrated = Calibrated(
-        plan, problem, data, final, models, chosen, uncertainty_of(problem, final, data), len(seen), tracker_known
-    )
+    uncertainty = uncertainty_of(problem, final, data)
+    calibrated = Calibrated(problem, data, final, models, chosen, uncertainty, len(seen), tracker_known)
     _refuse_gaps(calibrated)
-    _refuse_misfit(calibrated)
+    expected, error = calibrated.held_out_noise_arcsec, chosen.rms_arcsec
+    if error > max(MAX_MISFIT * expected, expected + MISFIT_FLOOR_ARCSEC):
+        raise InputError(
+            f"dots held out of the fit are {error:.3g} arcsec rms off, where the noise of the centroids makes {expected:.2g}:"
+            " something moved between the frames, or the tracker's flight model is wrong"
+        )
     return calibrated
 
 
 def bounded_to_field(problem: Problem, fit: Fit) -> Fit:
     """The fit with its lens limited to the tracker's field, where part of the screen lies outside of it."""
-    geometry, plan = fit.geometry, problem.plan
-    monitor = geometry.monitor
-    if monitor.lens is None or all(inside.all() for inside in _in_view(plan, problem, fit)):
+    geometry, monitor = fit.geometry, fit.geometry.monitor
+    if monitor.lens is None or all(inside.all() for inside in _in_view(problem, fit)):
         return fit
     width, height = geometry.tracker.resolution_px
     corners = np.array([-0.5, width - 0.5, -0.5, width - 0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
@@ -184,7 +189,9 @@ def matched(
     refuse_motion(data)
     for _ in range(MATCH_ROUNDS):
         problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or DEFAULT_NOISE_PX)
-        model = Model(_names_for(len(data)), tracker_names if len(data) > 2 * len(BROWN_CONRADY) else (), len(look.q_poses))
+        # The largest model that so many centroids can determine.
+        names = next((names for names in (BROWN_CONRADY, RADIAL) if len(data) > 2 * len(names)), PINHOLE)
+        model = Model(names, tracker_names if names is BROWN_CONRADY else (), len(look.q_poses))
         rough = fit(problem, model, 0, data)
         reach_px = max(REACH_PX, REACH_SIGMAS * problem.noise_px) * problem.monitor_px_per_px
         data = match_by_geometry(plan, seen, rough.geometry, reach_px)
@@ -193,23 +200,10 @@ def matched(
     return Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or DEFAULT_NOISE_PX), data
 
 
-def _names_for(centroids: int) -> tuple[str, ...]:
-    """The largest model that so many centroids can determine."""
-    for names in (BROWN_CONRADY, RADIAL):
-        if centroids > 2 * len(names):
-            return names
-    return PINHOLE
-
-
-def _expected(plan: DotPlan, problem: Problem, fit: Fit) -> int:
-    """The number of centroids if none were lost."""
-    return sum(int(plan.lit[inside].sum()) for inside in _in_view(plan, problem, fit))
-
-
-def _in_view(plan: DotPlan, problem: Problem, fit: Fit) -> list[BoolArray]:
+def _in_view(problem: Problem, fit: Fit) -> list[BoolArray]:
     """For each pose, a mask of the dots (n,) in the tracker's field."""
     geometry = fit.geometry
-    directions = geometry.monitor.rays(plan.x_px, plan.y_px)
+    directions = geometry.monitor.rays(problem.plan.x_px, problem.plan.y_px)
     width, height = geometry.tracker.resolution_px
     found = []
     for q in geometry.q_poses:
@@ -221,7 +215,7 @@ def _in_view(plan: DotPlan, problem: Problem, fit: Fit) -> list[BoolArray]:
 def _refuse_gaps(calibrated: Calibrated) -> None:
     """Refuse (InputError) a part of the screen in the tracker's field whose dots were not seen."""
     plan, problem = calibrated.plan, calibrated.problem
-    wanted = np.any(_in_view(plan, problem, calibrated.fit), axis=0)
+    wanted = np.any(_in_view(problem, calibrated.fit), axis=0)
     found = np.zeros(len(plan), dtype=bool)
     found[np.unique(calibrated.data.dot)] = True
     width, height = problem.nominal.monitor.resolution_px
@@ -235,16 +229,6 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
                     f"only {found[here].sum()} of {here.sum()} dots were recognised in the {part} of the screen: look for what"
                     " covers or dims it, and take new frames"
                 )
-
-
-def _refuse_misfit(calibrated: Calibrated) -> None:
-    expected = calibrated.held_out_noise_arcsec
-    error = calibrated.chosen.rms_arcsec
-    if error > max(MAX_MISFIT * expected, expected + MISFIT_FLOOR_ARCSEC):
-        raise InputError(
-            f"dots held out of the fit are {error:.3g} arcsec rms off, where the noise of the centroids makes {expected:.2g}:"
-            " something moved between the frames, or the tracker's flight model is wrong"
-        )
 
 
 ONE_POSE = "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file holds both"
@@ -315,38 +299,29 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
     }
     for name, value in zip(("k1", "k2", "k3", "p1", "p2"), (*lens.radial, *lens.tangential), strict=True):
         values[name] = (value, sigma.get(name, 0.0))
-    for name in found.fit.model.tracker_names:
-        values[name] = (_tracker_value(found, name), sigma[name])
+    own = found.fit.geometry.tracker.lens or Lens()
+    for name, value in zip(TRACKER_STEPS, (*own.radial[:2], *own.tangential), strict=True):
+        if name in found.fit.model.tracker_names:
+            values[name] = (value, sigma[name])
     return {name: FittedParameter(float(value), float(s)) for name, (value, s) in values.items()}
 
 
-def _tracker_value(found: Calibrated, name: str) -> float:
-    lens = found.fit.geometry.tracker.lens or Lens()
-    k1, k2, _ = lens.radial
-    p1, p2 = lens.tangential
-    return {"tracker_k1": k1, "tracker_k2": k2, "tracker_p1": p1, "tracker_p2": p2}[name]
-
-
-def notes_of(found: Calibrated) -> Notes:
-    """The geometry file's notes: its errors, and how it was made."""
+def write_calibrated(path: Path, found: Calibrated, plot: Path | None) -> list[str]:
+    """Write the geometry file with its errors, and its chart if `plot`; their names. Raises InputError."""
+    geometry, chosen, uncertainty = found.fit.geometry, found.chosen, found.uncertainty
     error = ErrorTable(
-        model=found.chosen.name,
-        held_out_rms_arcsec=found.chosen.rms_arcsec,
-        held_out_max_arcsec=found.chosen.max_arcsec,
+        model=chosen.name,
+        held_out_rms_arcsec=chosen.rms_arcsec,
+        held_out_max_arcsec=chosen.max_arcsec,
         noise_px=found.problem.noise_px,
-        rms_arcsec=found.uncertainty.rms_arcsec,
-        max_arcsec=found.uncertainty.max_arcsec,
-        map_arcsec=[[round(float(value), 4) for value in row] for row in np.nan_to_num(found.uncertainty.map_arcsec, nan=-1.0)],
+        rms_arcsec=uncertainty.rms_arcsec,
+        max_arcsec=uncertainty.max_arcsec,
+        map_arcsec=[[round(float(value), 4) for value in row] for row in np.nan_to_num(uncertainty.map_arcsec, nan=-1.0)],
     )
     sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
     when = datetime.datetime.now(datetime.UTC).date().isoformat()
-    return Notes(sigma, error, MadeTable(by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses)))
-
-
-def write_calibrated(path: Path, found: Calibrated, plot: Path | None) -> list[str]:
-    """Write the geometry file, and its chart where one is wanted; their names. Raises InputError where that cannot be done."""
-    geometry = found.fit.geometry
-    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, notes_of(found))
+    made = MadeTable(by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses))
+    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, Notes(sigma, error, made))
     if plot is not None:
         draw_geometry(plot, found)
     return [str(each) for each in (path, plot) if each is not None]
@@ -370,13 +345,14 @@ def lines_of(found: Calibrated) -> list[str]:
 
 def draw_geometry(path: Path, found: Calibrated) -> None:
     """Draw the error of a star's place over the screen, and the dots' residuals as arrows."""
-    error, width = found.uncertainty.map_arcsec, found.problem.nominal.monitor.resolution_px[0]
-    height = found.problem.nominal.monitor.resolution_px[1]
+    error, (width, height) = found.uncertainty.map_arcsec, found.problem.nominal.monitor.resolution_px
     finding = (
         f"By {found.chosen.name} a star's place is known to {found.uncertainty.rms_arcsec:.2g} arcsec rms,"
         f" {found.uncertainty.max_arcsec:.2g} at most; held-out dots {found.chosen.rms_arcsec:.2g} rms"
     )
-    dot, right, down = _mean_residuals(found)
+    dot, place, count = np.unique(found.data.dot, return_inverse=True, return_counts=True)
+    residual = residuals_px(found.problem, found.fit.geometry, found.data)
+    right, down = (np.bincount(place, part) / count for part in residual)
     to_arcsec = ARCSEC_PER_RAD / found.problem.nominal.tracker.focal_length_px
     median = max(float(np.median(np.hypot(right, down))), 1e-9)
     with chart(path, finding, panels=2, height_inch=1.4 + 2 * WIDE_INCH * height / width) as (places, residuals):
@@ -393,17 +369,3 @@ def draw_geometry(path: Path, found: Calibrated) -> None:
         for axes in (places, residuals):
             axes.set_ylabel("monitor y [px]")
             axes.grid(visible=False)
-
-
-class MeanResiduals(NamedTuple):
-    """Dots that were seen, and the mean residual of each along x and y, tracker px; (n,) each."""
-
-    dot: IntArray
-    right_px: FloatArray
-    down_px: FloatArray
-
-
-def _mean_residuals(found: Calibrated) -> MeanResiduals:
-    right, down = residuals_px(found.problem, found.fit.geometry, found.data)
-    dots, place, count = np.unique(found.data.dot, return_inverse=True, return_counts=True)
-    return MeanResiduals(dots, np.bincount(place, right) / count, np.bincount(place, down) / count)

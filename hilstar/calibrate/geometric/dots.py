@@ -9,12 +9,11 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.arrays import BoolArray, FloatArray
 from hilstar.bench.config import Monitor
 from hilstar.charts import write_csv
 from hilstar.csv_tables import read_rows
@@ -115,35 +114,23 @@ def write_plan(path: Path, plan: DotPlan) -> None:
     write_csv(path, PLAN_COLUMNS, ((frame, dot, *places[dot]) for frame, dot in lit))
 
 
-class _PlanRow(NamedTuple):
-    frame: int
-    dot: int
-    x_px: float
-    y_px: float
-
-
 def read_plan(path: Path) -> DotPlan:
     """Read plan.csv. Raises InputError with the line that is wrong."""
-    rows: list[_PlanRow] = []
+    rows: list[tuple[int, int, float, float]] = []
     for line, cells in read_rows(path, PLAN_COLUMNS, PLAN_ADVICE, MAX_PLAN_BYTES, ()):
         try:
-            row = _PlanRow(int(cells[0]), int(cells[1]), float(cells[2]), float(cells[3]))
-            if min(row.frame, row.dot) < 0 or max(row.frame, row.dot) > 10**6:
+            frame, dot, x, y = int(cells[0]), int(cells[1]), float(cells[2]), float(cells[3])
+            if min(frame, dot) < 0 or max(frame, dot) > 10**6:
                 raise ValueError
         except ValueError as error:
             wanted = "whole numbers frame and dot, and x_px and y_px are wanted"
             raise InputError(f"{path}:{line}: {','.join(cells)[:80]!r}; {wanted}") from error
-        rows.append(row)
+        rows.append((frame, dot, x, y))
     if not rows:
         raise InputError(f"{path}: has no dot; {PLAN_ADVICE}")
-    return _plan_of(path, rows)
-
-
-def _plan_of(path: Path, rows: list[_PlanRow]) -> DotPlan:
-    dots: IntArray = np.array(sorted({row.dot for row in rows}), dtype=np.intp)
-    place = {int(dot): k for k, dot in enumerate(dots)}
-    x_px, y_px = np.full(len(dots), np.nan), np.full(len(dots), np.nan)
-    lit = np.zeros((len(dots), max(row.frame for row in rows) + 1), dtype=bool)
+    place = {dot: k for k, dot in enumerate(sorted({dot for _, dot, _, _ in rows}))}
+    x_px, y_px = np.full(len(place), np.nan), np.full(len(place), np.nan)
+    lit = np.zeros((len(place), max(frame for frame, *_ in rows) + 1), dtype=bool)
     for frame, dot, x, y in rows:
         k = place[dot]
         if lit[k].any() and (x_px[k], y_px[k]) != (x, y):

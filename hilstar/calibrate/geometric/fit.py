@@ -83,30 +83,23 @@ def geometry_of(model: Model, nominal: Nominal, q_poses: FloatArray, numbers: Fl
     turn = np.array([values["rotation_x"], values["rotation_y"], values["rotation_z"]]) + follow
     q = multiply(from_rotation_vector(turn), nominal.q_cam_to_mon)
     cx, cy = nominal.monitor.principal_point_px
+    tilt = (values["tilt_x"], values["tilt_y"])
+    lens = Lens((values["k1"], values["k2"], values["k3"]), (values["p1"], values["p2"]), tilt)
     monitor = Camera(
         nominal.monitor.resolution_px,
         nominal.monitor.focal_length_px * float(np.exp(values["log_focal"])),
         (cx + values["centre_x"], cy + values["centre_y"]),
         to_matrix(q),
-        _lens_of(values) if "k1" in model.names else None,
+        lens if "k1" in model.names else None,
     )
-    rest = numbers[len(model.names) :]
-    tracker = _tracker_of(model, nominal.tracker, rest)
+    tracker, rest = nominal.tracker, numbers[len(model.names) :]
+    if model.tracker_names:
+        own = {name: TRACKER_STEPS[name] * float(n) for name, n in zip(model.tracker_names, rest, strict=False)}
+        round_, skew = (own["tracker_k1"], own["tracker_k2"], 0.0), (own["tracker_p1"], own["tracker_p2"])
+        tracker = replace(tracker, lens=Lens(round_, skew))
     steps = POSE_STEP_RAD * rest[len(model.tracker_names) :].reshape(-1, 3)
     turned = [multiply(from_rotation_vector(step), pose) for step, pose in zip(steps, q_poses[1:], strict=True)]
     return Geometry(monitor, q, tracker, np.array([q_poses[0], *turned]))
-
-
-def _lens_of(values: dict[str, float]) -> Lens:
-    return Lens((values["k1"], values["k2"], values["k3"]), (values["p1"], values["p2"]), (values["tilt_x"], values["tilt_y"]))
-
-
-def _tracker_of(model: Model, tracker: Camera, numbers: FloatArray) -> Camera:
-    if not model.tracker_names:
-        return tracker
-    values = {name: TRACKER_STEPS[name] * float(n) for name, n in zip(model.tracker_names, numbers, strict=False)}
-    lens = Lens((values["tracker_k1"], values["tracker_k2"], 0.0), (values["tracker_p1"], values["tracker_p2"]))
-    return replace(tracker, lens=lens)
 
 
 def directions_in_cam(geometry: Geometry, pose: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
@@ -172,10 +165,10 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class _Loss:
-    """The function that is minimised: Huber's loss of the residuals plus a weak prior, over the model's parameters and the
-    residual field's coefficients together.
+    """The function that is minimised: Huber's loss of the residuals plus a weak prior.
 
-    Fitted alone, a lens would lean towards what only the field can follow, and leave it more than there was.
+    It is over the model's parameters and the residual field's coefficients together: a lens fitted alone would follow what
+    only the field can follow.
     """
 
     problem: Problem
@@ -189,7 +182,9 @@ class _Loss:
         if not self.field_degree:
             return geometry
         x, y = field.reshape(2, -1)
-        return _with_field(geometry, ResidualField.of_terms(x, y, self.field_degree, geometry.monitor.resolution_px))
+        camera = geometry.monitor
+        residual = ResidualField.of_terms(x, y, self.field_degree, camera.resolution_px)
+        return replace(geometry, monitor=replace(camera, lens=replace(camera.lens or Lens(), field=residual)))
 
     def residuals(self, numbers: FloatArray) -> FloatArray:
         return self._off(self.geometry(numbers))
@@ -279,11 +274,6 @@ def _places_px(geometry: Geometry, data: MatchedDots) -> tuple[FloatArray, Float
     """Places of the centroids (n,) on the monitor by a geometry, px."""
     directions = directions_in_cam(geometry, data.seen.pose, data.seen.x_px, data.seen.y_px)
     return geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
-
-
-def _with_field(geometry: Geometry, field: ResidualField) -> Geometry:
-    camera = geometry.monitor
-    return replace(geometry, monitor=replace(camera, lens=replace(camera.lens or Lens(), field=field)))
 
 
 def noise_of_repeats(data: MatchedDots) -> float | None:
@@ -382,11 +372,10 @@ MAP_PLACES = (17, 11)
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """One sigma of each parameter and of a star's place: `map_arcsec` (rows, columns) covers the screen, edges included, with
-    NaN where the tracker saw no dots.
+    """One sigma of each parameter, and of a star's place over the screen, edges included: `map_arcsec` (rows, columns).
 
-    From the covariance of the fit, scaled up where its residuals exceed the centroids' noise. Errors that no parameter can
-    follow are not in it; they are in the error of held-out dots.
+    The map is NaN where the tracker saw no dots. From the covariance of the fit, scaled up where its residuals exceed the
+    centroids' noise. Errors that no parameter can follow show in the error of held-out dots alone.
     """
 
     sigma: dict[str, float]
@@ -418,15 +407,11 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     spread = scale * np.sqrt(np.diag(covariance))
     names = (*fit.model.names, *fit.model.tracker_names)
     sigma = {name: float(step * s) for name, step, s in zip(names, steps, spread, strict=False)}
-    place_x, place_y = _slopes_of_places(problem, fit, *_map_px(monitor))
+    along = (np.linspace(-0.5, size - 0.5, n) for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True))
+    place_x, place_y = _slopes_of_places(problem, fit, *(part.ravel() for part in np.meshgrid(*along)))
     variance = sum(np.einsum("ni,ij,nj->n", part, covariance, part) for part in (place_x, place_y))
     arcsec = scale * np.sqrt(variance) * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px
     return Uncertainty(sigma, arcsec.reshape(MAP_PLACES[::-1]))
-
-
-def _map_px(monitor: Camera) -> tuple[FloatArray, FloatArray]:
-    x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, n) for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True)))
-    return x.ravel(), y.ravel()
 
 
 def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:

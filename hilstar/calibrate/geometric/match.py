@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.dots import DotPlan
@@ -45,7 +45,13 @@ class Decoded:
 
 def decode(plan: DotPlan, seen: Observed) -> Decoded:
     """The dots of one pose whose code is close to one dot's and clearly farther from every other's; each dot once."""
-    group = _groups(seen, plan)
+    # Centroids close to each other are one dot's, and share a group.
+    places = np.column_stack([seen.x_px, seen.y_px])
+    area = float(np.prod(np.ptp(places, axis=0))) if len(places) else 0.0
+    link_px = min(MAX_LINK_PX, LINK_SHARE * np.sqrt(area / max(len(plan), 1)))
+    pairs = cKDTree(places).query_pairs(link_px, output_type="ndarray")
+    linked = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
+    group = np.asarray(connected_components(linked, directed=False)[1], dtype=np.intp)
     pattern = np.zeros((int(group.max()) + 1 if len(group) else 0, plan.frames), dtype=bool)
     inside = seen.frame < plan.frames
     pattern[group[inside], seen.frame[inside]] = True
@@ -65,16 +71,6 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
     means = [(seen.x_px[group == k].mean(), seen.y_px[group == k].mean()) for _, k in kept]
     x_px, y_px = np.array(means).reshape(-1, 2).T
     return Decoded(np.array([dot for dot, _ in kept], dtype=np.intp), x_px, y_px)
-
-
-def _groups(seen: Observed, plan: DotPlan) -> IntArray:
-    """A group number for each centroid; centroids close to each other share one."""
-    places = np.column_stack([seen.x_px, seen.y_px])
-    area = float(np.prod(np.ptp(places, axis=0))) if len(places) else 0.0
-    link_px = min(MAX_LINK_PX, LINK_SHARE * np.sqrt(area / max(len(plan), 1)))
-    pairs = cKDTree(places).query_pairs(link_px, output_type="ndarray")
-    linked = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
-    return np.asarray(connected_components(linked, directed=False)[1], dtype=np.intp)
 
 
 def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -107,44 +103,6 @@ def mapped(matrix: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray
         return x / w, y / w
 
 
-@dataclass(frozen=True, slots=True)
-class FirstMap:
-    """A projective map (3, 3) from tangents of tracker directions to monitor px, and which of the decoded dots it fits."""
-
-    matrix: FloatArray
-    inlier: npt.NDArray[np.bool_]
-
-
-def first_map(
-    tangents: tuple[FloatArray, FloatArray], dots_px: tuple[FloatArray, FloatArray], width_px: float, rng: np.random.Generator
-) -> FirstMap | None:
-    """The map that most decoded dots fit (RANSAC with samples of four, Fischler and Bolles 1981); None where few fit any."""
-    (u, v), (x, y) = tangents, dots_px
-    if len(u) < MIN_DECODED:
-        return None
-    best = np.zeros(len(u), dtype=bool)
-    for _ in range(TRIALS):
-        four = rng.choice(len(u), 4, replace=False)
-        try:
-            inlier = _inliers(homography(u[four], v[four], x[four], y[four]), tangents, dots_px, width_px)
-        except np.linalg.LinAlgError:
-            continue
-        if inlier.sum() > best.sum():
-            best = inlier
-    if best.sum() < max(MIN_DECODED, len(u) / 3):
-        return None
-    matrix = homography(u[best], v[best], x[best], y[best])
-    return FirstMap(matrix, _inliers(matrix, tangents, dots_px, width_px))
-
-
-def _inliers(
-    matrix: FloatArray, tangents: tuple[FloatArray, FloatArray], dots_px: tuple[FloatArray, FloatArray], width_px: float
-) -> npt.NDArray[np.bool_]:
-    x, y = mapped(matrix, *tangents)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.hypot(x - dots_px[0], y - dots_px[1]) < INLIER_SHARE * width_px)
-
-
 FIRST_REACH = 0.03  # relative to the screen's width; the first map knows no lens
 MIN_MOTION_PX = 0.05  # tracker px
 POLISH_ROUNDS = 10
@@ -174,31 +132,51 @@ class FirstLook:
 
     maps: tuple[FloatArray, ...]
     q_poses: FloatArray
-    decoded: int
 
 
 def first_look(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FirstLook:
     """The maps of all poses. Raises InputError for codes that match nothing, and for an image that is mirrored or turned."""
-    maps, decoded = [], 0
+    maps = []
     for pose in range(int(seen.pose.max()) + 1):
         part = seen.at(np.flatnonzero(seen.pose == pose))
         found = _map_of(plan, nominal, part, rng)
         if found is None:
             raise InputError(_why_no_map(plan, nominal, part, pose, rng))
-        maps.append(found.matrix)
-        decoded += int(found.inlier.sum())
+        maps.append(found)
     _refuse_orientation(nominal, maps[0])
-    corners = _corners(nominal)
-    first = _rays(np.linalg.inv(maps[0]), *corners)
-    q_poses = [from_matrix(_rotation_between(first, _rays(np.linalg.inv(matrix), *corners))) for matrix in maps]
-    return FirstLook(tuple(maps), np.array(q_poses), decoded)
+    width, height = nominal.monitor.resolution_px
+    x, y = np.meshgrid(np.linspace(0.2, 0.8, 4) * width, np.linspace(0.2, 0.8, 4) * height)
+    rays = []
+    for matrix in maps:
+        u, v = mapped(np.asarray(np.linalg.inv(matrix), dtype=np.float64), x.ravel(), y.ravel())
+        ray = np.column_stack([u, v, np.ones_like(u)])
+        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    turns = [Rotation.align_vectors(each, rays[0])[0] for each in rays]
+    return FirstLook(tuple(maps), np.array([from_matrix(turn.as_matrix()) for turn in turns]))
 
 
-def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FirstMap | None:
-    found: Decoded = decode(plan, seen)
-    tangents = nominal.tracker.tangents(found.x_px, found.y_px)
-    width_px = nominal.monitor.resolution_px[0]
-    return first_map(tangents, (plan.x_px[found.dot], plan.y_px[found.dot]), width_px, rng)
+def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FloatArray | None:
+    """The projective map (3, 3) from tracker tangents to monitor px that most decoded dots fit; None where few fit any.
+
+    RANSAC with samples of four (Fischler and Bolles 1981).
+    """
+    found = decode(plan, seen)
+    u, v = nominal.tracker.tangents(found.x_px, found.y_px)
+    x, y = plan.x_px[found.dot], plan.y_px[found.dot]
+    best = np.zeros(len(u), dtype=bool)
+    for _ in range(TRIALS if len(u) >= MIN_DECODED else 0):
+        four = rng.choice(len(u), 4, replace=False)
+        try:
+            seen_x, seen_y = mapped(homography(u[four], v[four], x[four], y[four]), u, v)
+        except np.linalg.LinAlgError:
+            continue
+        with np.errstate(invalid="ignore"):
+            inlier = np.hypot(seen_x - x, seen_y - y) < INLIER_SHARE * nominal.monitor.resolution_px[0]
+        if inlier.sum() > best.sum():
+            best = inlier
+    if best.sum() < max(MIN_DECODED, len(u) / 3):
+        return None
+    return homography(u[best], v[best], x[best], y[best])
 
 
 def _why_no_map(plan: DotPlan, nominal: Nominal, seen: Observed, pose: int, rng: np.random.Generator) -> str:
@@ -214,36 +192,14 @@ def _why_no_map(plan: DotPlan, nominal: Nominal, seen: Observed, pose: int, rng:
     )
 
 
-def _corners(nominal: Nominal) -> tuple[FloatArray, FloatArray]:
-    width, height = nominal.monitor.resolution_px
-    x, y = np.meshgrid(np.linspace(0.2, 0.8, 4) * width, np.linspace(0.2, 0.8, 4) * height)
-    return x.ravel(), y.ravel()
-
-
-def _rays(matrix: npt.NDArray[np.floating[Any]], x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    rays = np.column_stack([*mapped(np.asarray(matrix, dtype=np.float64), x_px, y_px), np.ones_like(x_px)])
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-
-
-def _rotation_between(before: FloatArray, after: FloatArray) -> FloatArray:
-    """The rotation (3, 3) that brings directions (n, 3) nearest to others (Kabsch 1976)."""
-    u, _, vt = np.linalg.svd(after.T @ before)
-    return np.asarray(u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt)
-
-
 def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
     """Refuse (InputError) an image that is mirrored, swapped or turned by a right angle against what the bench file says."""
-    step = 1e-4
-    u, v = np.array([0.0, step, 0.0]), np.array([0.0, 0.0, step])
-    seen_x, seen_y = mapped(matrix, u, v)
+    u, v = np.array([0.0, 1e-4, 0.0]), np.array([0.0, 0.0, 1e-4])
     rays = np.column_stack([u, v, np.ones_like(u)]) @ nominal.monitor.cam_to_image.T
-    told_x, told_y = nominal.monitor.project(rays)
-    seen = np.array([np.diff(seen_x[[0, 1]]), np.diff(seen_x[[0, 2]]), np.diff(seen_y[[0, 1]]), np.diff(seen_y[[0, 2]])])
-    told = np.array([np.diff(told_x[[0, 1]]), np.diff(told_x[[0, 2]]), np.diff(told_y[[0, 1]]), np.diff(told_y[[0, 2]])])
-    relative = seen.reshape(2, 2) @ np.linalg.inv(told.reshape(2, 2))
+    seen, told = np.stack(mapped(matrix, u, v)), np.stack(nominal.monitor.project(rays))
+    relative = (seen[:, 1:] - seen[:, :1]) @ np.linalg.inv(told[:, 1:] - told[:, :1])
     relative /= np.sqrt(abs(np.linalg.det(relative)))
-    a, b, c, d = relative.ravel()
-    nearest = max(ORIENTATIONS, key=lambda o: float(np.dot(o, (a, b, c, d))))
+    nearest = max(ORIENTATIONS, key=lambda o: float(np.dot(o, relative.ravel())))
     words = ORIENTATIONS[nearest]
     if words is not None:
         raise InputError(f"the tracker sees the monitor {words}, show the dots again, and take new frames")

@@ -75,6 +75,7 @@ FITS_ENDINGS = (".fits", ".fit", ".fts")
 FITS_MAGIC = b"SIMPLE  ="
 MAX_IMAGE_BYTES = 500_000_000
 SATURATED_SHARE = 1e-5  # share of pixels at the image's largest possible value: a few hot pixels do not matter
+FULL_DN = {2.0**bits - 1 for bits in (8, 10, 12, 14, 16)}
 THRESHOLD_SIGMA = 8.0
 IMAGE_ADVICE = "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
 NUMBER = re.compile(r"(\d+)(?!.*\d)")
@@ -88,7 +89,10 @@ def measure_images(paths: Sequence[Path], dark: Path | None, resolution_px: tupl
     """
     numbered: dict[tuple[int, int], Path] = {}
     for path in paths:  # all names before the first image, which takes a second
-        frame, pose = _numbers_of(path)
+        number, pose_number = NUMBER.search(path.stem), POSE.search(str(path.parent.name))
+        if number is None or int(number[1]) > 10**6:
+            raise InputError(f"{path}: its name has no frame number; {IMAGE_ADVICE}")
+        frame, pose = int(number[1]), int(pose_number[1]) if pose_number else 0
         if (frame, pose) in numbered:
             raise InputError(f"{path}: is frame {frame} of pose {pose}, and so is {numbered[frame, pose]}; {IMAGE_ADVICE}")
         numbered[frame, pose] = path
@@ -103,21 +107,17 @@ def measure_images(paths: Sequence[Path], dark: Path | None, resolution_px: tupl
 
 
 def _centroids(path: Path, resolution_px: tuple[int, int], under: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """The centroids of an image above its dark frame, if there is one, px (n,). Raises InputError."""
+    """The centroids of an image above its dark frame, if any, px (n,). Raises InputError, also for saturated dots."""
     image = read_image(path, resolution_px)
-    _refuse_saturated(path, image)
+    top = float(image.max())
+    saturated = int((image == top).sum())
+    if top in FULL_DN and saturated > max(20, SATURATED_SHARE * image.size):
+        raise InputError(f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker")
     above = image if under is None else image - under
     settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
     found = find_stars(above, settings, noisiest_background(above))
     kept = ~found.at_edge
     return found.x_px[kept], found.y_px[kept]
-
-
-def _numbers_of(path: Path) -> tuple[int, int]:
-    found, pose = NUMBER.search(path.stem), POSE.search(str(path.parent.name))
-    if found is None or int(found[1]) > 10**6:
-        raise InputError(f"{path}: its name has no frame number; {IMAGE_ADVICE}")
-    return int(found[1]), int(pose[1]) if pose else 0
 
 
 def read_image(path: Path, resolution_px: tuple[int, int] | None = None) -> FloatArray:
@@ -129,9 +129,7 @@ def read_image(path: Path, resolution_px: tuple[int, int] | None = None) -> Floa
     if image.ndim != 2:
         raise InputError(f"{path}: is no grey image of one plane; {IMAGE_ADVICE}")
     if resolution_px is not None and (image.shape[1], image.shape[0]) != resolution_px:
-        sizes = (
-            f"is {image.shape[1]} x {image.shape[0]} px, and [tracker] resolution_px is {resolution_px[0]} x {resolution_px[1]}"
-        )
+        sizes = "is {1} x {0} px, and [tracker] resolution_px is {2} x {3}".format(*image.shape, *resolution_px)
         raise InputError(f"{path}: {sizes}; give whole images, or set the key")
     return np.asarray(image, dtype=np.float64)
 
@@ -163,13 +161,3 @@ def _picture(path: Path, data: bytes) -> npt.NDArray[Any]:
             return np.asarray(picture)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: cannot be read as a picture ({error}); {IMAGE_ADVICE}") from error
-
-
-def _refuse_saturated(path: Path, image: FloatArray) -> None:
-    """Refuse (InputError) an image in which many pixels share the highest value: its dots are saturated."""
-    top = float(image.max())
-    ends = {float(2**bits - 1) for bits in (8, 10, 12, 14, 16)}
-    if top in ends and (image == top).mean() > SATURATED_SHARE and (image == top).sum() > 20:
-        raise InputError(
-            f"{path}: {int((image == top).sum())} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker"
-        )

@@ -118,12 +118,6 @@ def _split(host: str) -> tuple[str, str]:
     return name, port if port or not colon else "x"
 
 
-def headers_of(host: str) -> dict[str, str]:
-    """The headers of every answer, by the host name of an allowed request; "" for a refused one."""
-    sockets = f" ws://{host} wss://{host}" if host else ""
-    return HEADERS | {"Content-Security-Policy": POLICY.format(sockets=sockets)}
-
-
 class RunCollector(Collector):
     """Makes a run's metrics on request."""
 
@@ -139,67 +133,50 @@ class RunCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metrics with their current values."""
-        hello, seen = self._reader.setup.hello, self._reader.seen or RunState(host_ns=0)
+        hello, seen, health = self._reader.setup.hello, self._reader.seen or RunState(host_ns=0), self._reader.health
         info = {key: str(getattr(hello, key)) for key in ("version", "command", "bench", "renderer")}
         yield InfoMetricFamily("hilstar_run", "What runs.", value=info)
-        yield _gauge("hilstar_healthy", "1 while the sky is right, as GET /health has it.", float(self._reader.health.ok))
-        yield _gauge("hilstar_health_since_timestamp_seconds", "Since when that is so.", self._reader.health.since_s)
-        yield _counter("hilstar_frames", "Frames shown.", seen.counts.frames)
-        yield _counter("hilstar_frames_missed", "Refresh periods without a frame of their own.", seen.counts.missed)
-        yield _counter("hilstar_frames_stale", "Frames shown with a stale attitude.", seen.counts.stale)
-        yield _counter("hilstar_frames_given_up", "Frames given up because their moment had passed.", seen.counts.given_up)
-        yield _counter("hilstar_packets_received", "Attitude packets received.", seen.counts.received)
+        counts, clock, ledger, pacing = seen.counts, seen.clock, seen.ledger, self._reader.pacing
+        age_ms = None if seen.attitude is None else seen.attitude.age_ms
+        for name, words, count in (
+            ("frames", "Frames shown.", counts.frames),
+            ("frames_missed", "Refresh periods without a frame of their own.", counts.missed),
+            ("frames_stale", "Frames shown with a stale attitude.", counts.stale),
+            ("frames_given_up", "Frames given up because their moment had passed.", counts.given_up),
+            ("packets_received", "Attitude packets received.", counts.received),
+        ):
+            yield CounterMetricFamily(f"hilstar_{name}", words, value=count)
         refused = CounterMetricFamily("hilstar_packets_refused", "Attitude packets refused.", labels=["reason"])
-        for reason, count in seen.counts.refused.items():
+        for reason, count in counts.refused.items():
             refused.add_metric([reason], count)
         yield refused
-        yield from self._of_attitude(seen)
-        yield from self._of_rest(seen)
-
-    def _of_attitude(self, seen: RunState) -> Iterator[Metric]:
-        yield _gauge("hilstar_attitude_missing", "1 until an attitude has come.", float(seen.frame.missing))
-        yield _gauge("hilstar_attitude_stale", "1 while the attitude is stale.", float(seen.frame.stale))
-        if seen.attitude is not None:
-            yield _gauge(
-                "hilstar_attitude_age_seconds", "Age of the attitude of the newest frame.", seen.attitude.age_ms * 1e-3
-            )
-        clock = seen.clock
-        if clock is None:
-            return
-        for name, words, value, scale in (
-            ("offset_seconds", "Host time minus the sender's.", clock.offset_ms, 1e-3),
-            ("uncertainty_seconds", "Of the offset.", clock.sigma_ms, 1e-3),
-            ("drift_ratio", "How much faster the sender's clock runs.", clock.drift_ppm, 1e-6),
-        ):
+        gauges: list[tuple[str, str, float | None, float]] = [  # in units of the last; None is left out
+            ("healthy", "1 while the sky is right, as GET /health has it.", health.ok, 1),
+            ("health_since_timestamp_seconds", "Since when that is so.", health.since_s, 1),
+            ("attitude_missing", "1 until an attitude has come.", seen.frame.missing, 1),
+            ("attitude_stale", "1 while the attitude is stale.", seen.frame.stale, 1),
+            ("attitude_age_seconds", "Age of the attitude of the newest frame.", age_ms, 1e-3),
+            ("clock_offset_seconds", "Host time minus the sender's.", None if clock is None else clock.offset_ms, 1e-3),
+            ("clock_uncertainty_seconds", "Of the offset.", None if clock is None else clock.sigma_ms, 1e-3),
+            ("clock_drift_ratio", "How much faster the sender's clock runs.", None if clock is None else clock.drift_ppm, 1e-6),
+            ("stars", "Stars in the newest frame.", seen.frame.stars, 1),
+            ("stars_clipped", "Those brighter than the monitor's white.", len(seen.frame.clipped), 1),
+            ("display_lost", "1 where the display has gone.", bool(seen.display_lost), 1),
+            ("operator_override", "1 while an operator changes the sky.", bool(seen.operator_text), 1),
+            ("ledger_bytes", "Size of the ledger.", None if ledger is None else ledger.bytes, 1),
+            ("ledger_failing", "1 while it cannot be written.", None if ledger is None else bool(ledger.failing), 1),
+            ("frame_interval_sd_seconds", "Standard deviation of it.", None if pacing is None else pacing.sd_ms, 1e-3),
+            ("console_clients", "Pages that are open.", self.clients, 1),
+        ]
+        for name, words, value, unit in gauges:
             if value is not None:
-                yield _gauge(f"hilstar_clock_{name}", words, value * scale)
-
-    def _of_rest(self, seen: RunState) -> Iterator[Metric]:
-        yield _gauge("hilstar_stars", "Stars in the newest frame.", seen.frame.stars)
-        yield _gauge("hilstar_stars_clipped", "Those brighter than the monitor's white.", len(seen.frame.clipped))
-        yield _gauge("hilstar_display_lost", "1 where the display has gone.", float(bool(seen.display_lost)))
-        yield _gauge("hilstar_operator_override", "1 while an operator changes the sky.", float(bool(seen.operator_text)))
-        if seen.ledger is not None:
-            yield _gauge("hilstar_ledger_bytes", "Size of the ledger.", seen.ledger.bytes)
-            yield _gauge("hilstar_ledger_failing", "1 while it cannot be written.", float(bool(seen.ledger.failing)))
-        pacing = self._reader.pacing
+                yield GaugeMetricFamily(f"hilstar_{name}", words, value=float(value * unit))
         if pacing is not None:
-            intervals = GaugeMetricFamily(
-                "hilstar_frame_interval_seconds", "Between frames, over the last minute.", labels=["quantile"]
-            )
+            words = "Between frames, over the last minute."
+            intervals = GaugeMetricFamily("hilstar_frame_interval_seconds", words, labels=["quantile"])
             for quantile, interval_ms in (("0.5", pacing.p50_ms), ("0.99", pacing.p99_ms)):
                 intervals.add_metric([quantile], interval_ms * 1e-3)
             yield intervals
-            yield _gauge("hilstar_frame_interval_sd_seconds", "Standard deviation of it.", pacing.sd_ms * 1e-3)
-        yield _gauge("hilstar_console_clients", "Pages that are open.", self.clients)
-
-
-def _gauge(name: str, words: str, value: float) -> GaugeMetricFamily:
-    return GaugeMetricFamily(name, words, value=value)
-
-
-def _counter(name: str, words: str, value: float) -> CounterMetricFamily:
-    return CounterMetricFamily(name, words, value=value)
 
 
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
@@ -207,7 +184,6 @@ TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".s
 MAX_BODY_BYTES = 4_000
 MAX_DRAINED_BYTES = 64_000_000  # a body that is too long is read this far, so that its sender comes to read why
 BODY_S = 5.0
-OPEN_PATHS = ("/", "/static/")  # the page itself has no secret; it brings the token that its address has
 STATE_S = 0.5  # maximum wait for the state after an order; there are ten a second
 ORDERED_S = 30.0  # a ledger on a slow disk
 
@@ -275,9 +251,12 @@ class Page:
             body = msgspec.json.decode(data or b"{}", type=OrderBody)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return _refusal(400, f"not the JSON of a control: {error}")
-        answer = await self.give(
-            Order(id=0, name=name, who=_who(request), on=body.on, level=body.level, text=body.text, fault=body.name)
-        )
+        # The operator's name as the page gives it, with the address unless that is this machine.
+        who = urllib.parse.unquote(request.headers.get("x-operator", "")[:400], errors="replace").strip()
+        address = request.client.host if request.client else ""
+        who = (who or "somebody at the page") + ("" if address in {"127.0.0.1", "::1", ""} else f" ({address})")
+        order = Order(id=0, name=name, who=who, on=body.on, level=body.level, text=body.text, fault=body.name)
+        answer = await self.give(order)
         await self._state_after(time.monotonic_ns())
         key = "line" if answer.status < 400 else "error"
         return JSONResponse({key: answer.line}, answer.status)
@@ -325,14 +304,6 @@ def _refused(_: Request, error: Exception) -> Response:
     return _refusal(error.status, error.line) if isinstance(error, Refused) else _refusal(500, "")
 
 
-def _who(request: Request) -> str:
-    """The operator's name as the page gives it, with the address unless that is this machine."""
-    name = urllib.parse.unquote(request.headers.get("x-operator", "")[:400], errors="replace").strip()
-    address = request.client.host if request.client else ""
-    place = "" if address in {"127.0.0.1", "::1", ""} else f" ({address})"
-    return (name or "somebody at the page") + place
-
-
 def _refusal(status: int, line: str) -> JSONResponse:
     headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {"Connection": "close"} if status in {408, 413} else None
     return JSONResponse({"error": line}, status, headers)
@@ -355,28 +326,24 @@ class Guarded:
             self._guard.check_host(headers.get("host", ""))
             host = headers["host"]
             self._guard.check_origin(headers)
-            if scope["type"] == "websocket" or not _is_open(scope["path"]):
+            # The page itself has no secret; it brings the token that its address has.
+            if scope["type"] == "websocket" or not (scope["path"] == "/" or scope["path"].startswith("/static/")):
                 self._guard.check_token(headers, scope.get("subprotocols", ()))
             await self._app(scope, receive, _with_headers(send, host))
         except Refused as refused:
-            await _refuse(refused, scope, receive, _with_headers(send, host))
-
-
-def _is_open(path: str) -> bool:
-    return path == OPEN_PATHS[0] or path.startswith(OPEN_PATHS[1])
-
-
-async def _refuse(refused: Refused, scope: Scope, receive: Receive, send: Send) -> None:
-    answer = _refusal(refused.status, refused.line)
-    if scope["type"] == "websocket":
-        await WebSocket(scope, receive, send).send_denial_response(answer)
-    else:
-        with contextlib.suppress(RuntimeError):
-            await answer(scope, receive, send)
+            answer, send = _refusal(refused.status, refused.line), _with_headers(send, host)
+            if scope["type"] == "websocket":
+                await WebSocket(scope, receive, send).send_denial_response(answer)
+            else:
+                with contextlib.suppress(RuntimeError):
+                    await answer(scope, receive, send)
 
 
 def _with_headers(send: Send, host: str) -> Send:
-    extra = [(name.lower().encode(), value.encode("latin-1")) for name, value in headers_of(host).items()]
+    """Add the headers of every answer; `host` is the name in an allowed request, "" in a refused one."""
+    sockets = f" ws://{host} wss://{host}" if host else ""
+    headers = HEADERS | {"Content-Security-Policy": POLICY.format(sockets=sockets)}
+    extra = [(name.lower().encode(), value.encode("latin-1")) for name, value in headers.items()]
 
     async def sending(message: Any) -> None:
         if message["type"] in {"http.response.start", "websocket.http.response.start"}:

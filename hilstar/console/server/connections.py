@@ -147,14 +147,6 @@ WISHES_S = 2.0
 TRY_AGAIN, POLICY = 1013, 1008  # close codes of RFC 6455 and its registry
 
 
-def wants_of(text: str) -> PageWants | None:
-    """The request in a page's message; None for nonsense."""
-    try:
-        return msgspec.json.decode(text, type=PageMessage).want
-    except (msgspec.MsgspecError, ValueError, RecursionError):  # not its JSON, no UTF-8, deeper than any
-        return None
-
-
 class OpenPage:
     """One page."""
 
@@ -231,11 +223,12 @@ class OpenPage:
                 self.close(POLICY)
                 return
             self._wishes_s.append(now_s)
-            want = wants_of(message.get("text") or "")
-            if want is None:
+            try:
+                self.want = msgspec.json.decode(message.get("text") or "", type=PageMessage).want
+            except (msgspec.MsgspecError, ValueError, RecursionError):  # not its JSON, no UTF-8, deeper than any
                 self.close(POLICY)
                 return
-            self.want, self.asked = want, True
+            self.asked = True
 
 
 class OpenPages:

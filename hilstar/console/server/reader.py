@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 import msgspec
 import numpy as np
 
-from hilstar.console.messages import HAS_AGE, FrameNumbers, Pace, PictureHead, RunEvent, RunState, Setup
+from hilstar.console.messages import FRAME, HAS_AGE, PICTURE, FrameNumbers, Pace, PictureHead, RunEvent, RunState, Setup
 from hilstar.console.overlay import MAX_STARS, OverlayScene
 from hilstar.console.protocol import (
     HISTORY_S,
@@ -64,18 +64,13 @@ def reasons(seen: RunState | None, now_ns: int, lately: RecentFrames, refresh_hz
         return [f"the run's process has been silent for {_s(now_ns - seen.host_ns)}"]
     if pace == "session":
         return seen.failed
-    of_display, of_attitude = _of_display(seen, now_ns, refresh_hz), _of_attitude(seen, now_ns, lately, pace)
-    return [*of_display, *of_attitude, *_of_rest(seen, lately)]
-
-
-def _of_display(seen: RunState, now_ns: int, refresh_hz: float) -> Iterator[str]:
-    if seen.display_lost:
-        yield f"the display is lost: {seen.display_lost}"
+    found = [f"the display is lost: {seen.display_lost}"] if seen.display_lost else []
     limit_ns = max(HUNG_NS, HUNG_PERIODS / refresh_hz * NS_PER_S)
     if not seen.alive_ns:
-        yield "the run is being prepared"
+        found.append("the run is being prepared")
     elif seen.host_ns - seen.alive_ns > limit_ns:
-        yield f"the frame loop has hung for {_s(now_ns - seen.alive_ns)}"
+        found.append(f"the frame loop has hung for {_s(now_ns - seen.alive_ns)}")
+    return [*found, *_of_attitude(seen, now_ns, lately, pace), *_of_rest(seen, lately)]
 
 
 def _of_attitude(seen: RunState, now_ns: int, lately: RecentFrames, pace: Pace) -> Iterator[str]:
@@ -165,9 +160,6 @@ class RunReader:
         lately = RecentFrames(0 if self._last is None else self._last.swap_ns, self._missed_share())
         self.health.update(reasons(self.seen, now_ns, lately, self.setup.hello.refresh_hz, self.setup.pace), unix_s)
         self._memory.wrong_since_s = 0.0 if self.health.ok else self.health.since_s
-        return self._new_events()
-
-    def _new_events(self) -> list[EventLine]:
         new = []
         for number, data in self._memory.events.after(self._event_at):
             self._event_at = number
@@ -182,8 +174,14 @@ class RunReader:
         point = ChartPoint(t_s=round((now_ns - self._begun_ns) / NS_PER_S, 3))
         for number, data in self._memory.frames.after(self._frame_at):
             self._frame_at = number
-            self._add(point, FrameNumbers.unpack(data))
-        point.packets_hz = self._rate_hz(now_ns)
+            self._add(point, FrameNumbers._make(FRAME.unpack(data)))
+        if self.seen is not None:
+            self._received.append((now_ns, self.seen.counts))
+            while len(self._received) > 1 and now_ns - self._received[0][0] > NS_PER_S:
+                self._received.popleft()
+            first_ns, first = self._received[0]
+            if now_ns > first_ns:
+                point.packets_hz = round((self.seen.counts.received - first.received) / (now_ns - first_ns) * NS_PER_S, 2)
         return point
 
     def _add(self, point: ChartPoint, frame: FrameNumbers) -> None:
@@ -199,16 +197,6 @@ class RunReader:
         point.refused += frame.refused - last.refused
         if not frame.missed_before:
             self._intervals_ms.append((frame.swap_ns, interval_ms))
-
-    def _rate_hz(self, now_ns: int) -> float | None:
-        seen = self.seen
-        if seen is None:
-            return None
-        self._received.append((now_ns, seen.counts))
-        while len(self._received) > 1 and now_ns - self._received[0][0] > NS_PER_S:
-            self._received.popleft()
-        first_ns, first = self._received[0]
-        return round((seen.counts.received - first.received) / (now_ns - first_ns) * NS_PER_S, 2) if now_ns > first_ns else None
 
     def _missed_share(self) -> float:
         if len(self._received) < 2:
@@ -273,7 +261,7 @@ class PicturePacker:
         if found is None or found[0] <= after:
             return None
         number, data = found
-        head = PictureHead.unpack(data)
+        head = PictureHead._make(PICTURE.unpack_from(data))
         levels, sprites = _parts(head, data)
         if self._scene is not None and seen is not None and seen.overlay and not self._scene.aids_in_levels:
             levels = self._scene.aids.laid_over(levels, seen.overlay, seen.patch_share)
@@ -307,20 +295,17 @@ def _message(head: PictureHead, levels: Levels) -> bytes:
 
 def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) -> list[StarMark]:
     """Where the stars of a picture were drawn, the brightest first."""
-    stars, x_px, y_px = _one_each(sprites)
+    # A moving star has several sprites along its path: the mean place of each.
+    stars, which = np.unique(sprites["star"], return_inverse=True)
+    count = np.bincount(which, minlength=len(stars))
+    x_px, y_px = (np.bincount(which, sprites[axis], len(stars)) / np.maximum(count, 1) for axis in ("x_px", "y_px"))
     clipped = set() if seen is None else set(seen.frame.clipped)
     marks = []
     for k in np.argsort(scene.v_mag[stars], kind="stable")[:MAX_STARS].tolist():
         star, v_mag = int(stars[k]), float(scene.v_mag[stars[k]])
         hip, label = int(scene.hip[star]), scene.label(star)
         known_mag = round(v_mag, 2) if math.isfinite(v_mag) else None
-        marks.append(StarMark(round(x_px[k], 2), round(y_px[k], 2), known_mag, hip, label, int((hip or label) in clipped)))
+        marks.append(
+            StarMark(round(float(x_px[k]), 2), round(float(y_px[k]), 2), known_mag, hip, label, int((hip or label) in clipped))
+        )
     return marks
-
-
-def _one_each(sprites: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
-    """The stars of sprites, and the mean place of each: a moving star has several sprites along its path."""
-    stars, which = np.unique(sprites["star"], return_inverse=True)
-    count = np.bincount(which, minlength=len(stars))
-    x_px, y_px = (np.bincount(which, sprites[axis], len(stars)) / np.maximum(count, 1) for axis in ("x_px", "y_px"))
-    return stars, x_px.tolist(), y_px.tolist()

@@ -240,7 +240,20 @@ class Ledger(Closing):
         self.failure: str | None = None
         self._notices = Notices() if notices is None else notices
         self._overwrite, self._split = overwrite, split
-        self._head = _head_of(bench) | {"run_id": uuid.uuid4().hex}
+        self._head = {
+            "bench_sha256": bench.file.sha256,
+            "bench_file": printable(str(bench.file.path)),
+            "bench_text": bench.file.text,
+            "calibration": bench.calibration.name,
+            "calibration_sha256": bench.calibration.sha256,
+            "gl_renderer": bench.renderer.gl_renderer,
+            "gl_version": bench.renderer.gl_version,
+            "render_path": bench.renderer.path,
+            "output": json.dumps(bench.output),
+            "monotonic_ns": str(time.monotonic_ns()),
+            "unix_ns": str(time.time_ns()),
+            "run_id": uuid.uuid4().hex,
+        }
         self._queue, self._filter = LedgerQueue(), FloodFilter()
         self._lost = self._counted = 0
         self._thin = False
@@ -346,8 +359,14 @@ class Ledger(Closing):
             self._lose("frame", 1)
             return
         content, at_ns = entry.content, entry.time_ns
-        data = _packet_message(at_ns, content) if isinstance(content, ReceivedPacket) else msgspec.json.encode(content)
-        self._add(entry.kind, entry.time_ns, data, entry.sequence)
+        if not isinstance(content, ReceivedPacket):
+            data = msgspec.json.encode(content)
+        elif content.refusal is not None or content.sample is None:
+            refusal = content.refusal or Refusal("format", "")
+            data = refused_message(refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS], at_ns, content.raw)
+        else:
+            data = attitude_message(content.sample, at_ns, content.raw)
+        self._add(entry.kind, at_ns, data, entry.sequence)
 
     def _add(self, key: str, time_ns: int, data: bytes, sequence: int = 0) -> None:
         self._writer.add(key, log_time_ns(time_ns), data, sequence)
@@ -377,14 +396,15 @@ class Ledger(Closing):
             self._renew(harm, last)
 
     def _renew(self, harm: str, last: bool) -> None:
-        if self._renewed_s > 0:  # whoever does this again and again does not fill the disk with files
+        if self._renewed_s > 0:  # repeated damage must not fill the disk with files
             self._rest_s = min(2 * self._rest_s, MAX_REST_S)
         self._renewed_s = time.monotonic()
         before, lost, part = part_path(self.path, self._part), self._writer.written, self._part
         self.failure = f"{before} was {harm} while it was written"
         self._part = 0
+        names = (self._asked.with_name(f"{self._asked.stem}.next{k}{self._asked.suffix}") for k in itertools.count(1))
+        path = next(name for name in names if not os.path.lexists(name))
         try:
-            path = _free_path(self._asked)
             file, writer = self._begin(path, overwrite=False)
         except InputError as error:
             self._part = part
@@ -498,48 +518,16 @@ class Ledger(Closing):
         return told
 
 
-def _free_path(path: Path) -> Path:
-    """RUN.next1.mcap, or the first such name that nothing has."""
-    names = (path.with_name(f"{path.stem}.next{k}{path.suffix}") for k in itertools.count(1))
-    return next(name for name in names if not os.path.lexists(name))
-
-
-def _topic(name: str, schema_name: str, record: type[msgspec.Struct]) -> JsonTopic:
-    return JsonTopic(name, schema_name, schema_of(record, schema_name))
-
-
-TOPICS = {
-    "packet": ATTITUDE_TOPIC_OF_RUN,
-    "frame": _topic(FRAME_TOPIC, "hilstar.Frame", FrameRecord),
-    "event": _topic(EVENT_TOPIC, "hilstar.Event", EventRecord),
-    "process": _topic(PROCESS_TOPIC, "hilstar.Process", ProcessRecord),
-    "count": _topic(COUNT_TOPIC, "hilstar.Count", CountRecord),
-    "fault": _topic(FAULT_TOPIC, "hilstar.Fault", FaultRecord),
+TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
+    key: JsonTopic(topic, f"hilstar.{key.title()}", schema_of(record, f"hilstar.{key.title()}"))
+    for key, topic, record in (
+        ("frame", FRAME_TOPIC, FrameRecord),
+        ("event", EVENT_TOPIC, EventRecord),
+        ("process", PROCESS_TOPIC, ProcessRecord),
+        ("count", COUNT_TOPIC, CountRecord),
+        ("fault", FAULT_TOPIC, FaultRecord),
+    )
 }
-
-
-def _head_of(bench: Bench) -> dict[str, str]:
-    return {
-        "bench_sha256": bench.file.sha256,
-        "bench_file": printable(str(bench.file.path)),
-        "bench_text": bench.file.text,
-        "calibration": bench.calibration.name,
-        "calibration_sha256": bench.calibration.sha256,
-        "gl_renderer": bench.renderer.gl_renderer,
-        "gl_version": bench.renderer.gl_version,
-        "render_path": bench.renderer.path,
-        "output": json.dumps(bench.output),
-        "monotonic_ns": str(time.monotonic_ns()),
-        "unix_ns": str(time.time_ns()),
-    }
-
-
-def _packet_message(host_ns: int, packet: ReceivedPacket) -> bytes:
-    sample, refusal = packet.sample, packet.refusal
-    if refusal is not None or sample is None:
-        reason, detail = ("format", "") if refusal is None else (refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS])
-        return refused_message(reason, detail, host_ns, packet.raw)
-    return attitude_message(sample, host_ns, packet.raw)
 
 
 class LedgerSwitch:

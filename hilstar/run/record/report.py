@@ -277,7 +277,11 @@ class RunFigures:
         if isinstance(record, FrameRecord):
             self._add_frame(record)
         elif isinstance(record, ProcessRecord):
-            self._add_process(record)
+            first = self.first_process = self.first_process or record
+            if self.warm is None and (record.host_ns - first.host_ns) / NS_PER_S >= WARM_UP_S:
+                self.warm = record
+            self.last_process = record
+            self.process.add((record.host_ns / NS_PER_S, record.resident_bytes / MEGABYTE, record.cpu_s))
         elif isinstance(record, EventRecord):
             kind = record.kind[:MAX_REASON_CHARACTERS]
             if kind in self.events or len(self.events) < MAX_REASONS:
@@ -328,14 +332,6 @@ class RunFigures:
             self._q = frame.q
             self._first_t_ns = frame.t_ns if self._first_t_ns is None else self._first_t_ns
             self.path.add((run_s, (frame.t_ns - self._first_t_ns) / NS_PER_S, *frame.q, *self._turned))
-
-    def _add_process(self, process: ProcessRecord) -> None:
-        first = self.first_process = self.first_process or process
-        run_s = (process.host_ns - first.host_ns) / NS_PER_S
-        if self.warm is None and run_s >= WARM_UP_S:
-            self.warm = process
-        self.last_process = process
-        self.process.add((process.host_ns / NS_PER_S, process.resident_bytes / MEGABYTE, process.cpu_s))
 
 
 def _times_ms(frame: FrameRecord, before: FrameRecord | None) -> tuple[float, ...]:
@@ -429,14 +425,6 @@ def summarise(run: RunFigures) -> RunReport:
     )
 
 
-def pulses_line(pulses: dict[str, int]) -> str:
-    """The pulses of a run as a line of text."""
-    if not pulses:
-        return "none"
-    lost = f", the line lost {pulses['lost']} times" if pulses["lost"] else ""
-    return f"{pulses['sent']} at their frames, {pulses['skipped']} skipped{lost}"
-
-
 def table_rows(found: RunReport) -> list[tuple[str, str]]:
     """The figures as rows of text: name and value."""
     refused = sum(count for reason, count in found.packets.items() if reason != "accepted")
@@ -448,6 +436,10 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
     def number(value: float | None, unit: str) -> str:
         return "-" if value is None else f"{value:.2f} {unit}"
 
+    pulses = "none"
+    if found.pulses:
+        lost = f", the line lost {found.pulses['lost']} times" if found.pulses["lost"] else ""
+        pulses = f"{found.pulses['sent']} at their frames, {found.pulses['skipped']} skipped{lost}"
     frames = f"{found.frames} in {found.duration_s:.1f} s, {found.missed_frames} missed"
     return [
         ("frames", f"{frames}, {found.stale_frames} stale, {found.blank_frames} blank"),
@@ -463,7 +455,7 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ("packet to swap", three(found.packet_to_swap_ms)),
         ("packets", f"{found.packets.get('accepted', 0)} accepted, {refused} refused"),
         ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
-        ("pulses", pulses_line(found.pulses)),
+        ("pulses", pulses),
         ("stars", f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint"),
         ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
         ("bench file", f"SHA-256 {found.bench_sha256}"),

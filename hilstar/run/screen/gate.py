@@ -86,10 +86,13 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
     """
     window, monitor = screen.window, screen.bench.config.monitor
     screen.bench.draw(None)
-    swaps_ns = np.array([_swapped_ns(screen, number) for number in range(GATE_FRAMES + 1)])
+    swaps_ns = []
+    for number in range(GATE_FRAMES + 1):
+        screen.present(number)
+        swaps_ns.append(screen.swap())
     timing = timing_of(np.diff(swaps_ns) / NS_PER_MS, monitor, 0 if window.display is None else window.display.refresh_hz)
     timing = replace(timing, modes_hz=window.modes_hz)
-    screen.keep_time(timing.period_ms, timing.paced_by_screen, int(swaps_ns[-1]))
+    screen.keep_time(timing.period_ms, timing.paced_by_screen, swaps_ns[-1])
     if timing.paced_by_screen and window.gone is None:
         queued, variable = queue_of(screen, clock)
         timing = replace(timing, queued=queued, variable=variable)
@@ -102,34 +105,28 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
     if window.gone is not None:
         raise MachineError(window.gone)
     screen.output = window.output
+    _look_for_faults(screen, timing, force)
+    return timing
+
+
+def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
+    """Log what may be wrong with a display, and refuse (MachineError) one that is; with `force` that is only logged, too."""
+    window, monitor = screen.window, screen.bench.config.monitor
     changed = screen.bench.renderer.changed_codes()
     if changed:
         changed += "; switch dithering, colour transforms and antialiasing off in the display's driver"
     told = () if screen.output is None else tuple(findings(screen.output, monitor.bits, monitor.pixel_pitch_um))
-    _warn(window, [finding.text for finding in told if not finding.refused])
+    doubts = [finding.text for finding in told if not finding.refused]
+    if window.others:
+        others = f"the X screen has other displays, {', '.join(window.others)}: frames may be copied instead of flipped, or"
+        doubts.insert(0, f"{others} follow another's refresh; switch them off, or give this one an X screen of its own")
+    for doubt in doubts:
+        log.warning("%s", doubt)
     wrong = [finding.text for finding in told if finding.refused]
     for fault in (*wrong, *faults(window, monitor, timing), *[changed] * bool(changed)):
         if not force:
             raise MachineError(f"{fault}; or add --force")
         log.warning("%s: shown anyway (--force)", fault)
-    return timing
-
-
-def _warn(window: Window, doubts: list[str]) -> None:
-    """Say what may be wrong with a display."""
-    if window.others:
-        log.warning(
-            "the X screen has other displays, %s: frames may be copied instead of flipped, or follow another's refresh; "
-            "switch them off, or give this one an X screen of its own",
-            ", ".join(window.others),
-        )
-    for doubt in doubts:
-        log.warning("%s", doubt)
-
-
-def _swapped_ns(screen: Screen, number: int) -> int:
-    screen.present(number)
-    return screen.swap()
 
 
 def burst_periods(screen: Screen, clock: HostClock) -> float:
@@ -177,18 +174,16 @@ def needed_guard_ms(screen: Screen, clock: HostClock) -> float:
     for guard_ms in GUARDS_MS:
         if guard_ms * NS_PER_MS > screen.clock.period_ns / 2:
             break
-        late = [_flips_late(screen, clock, guard_ms * NS_PER_MS) for _ in range(GUARD_TRIALS)]
-        if not any(late):
+        late = 0
+        for _ in range(GUARD_TRIALS):
+            period_ns = screen.clock.period_ns
+            due_ns = screen.clock.next_after(clock.now_ns() + period_ns)
+            screen.present(0)
+            clock.wait_until(round(due_ns - guard_ms * NS_PER_MS), threading.Event())
+            late += screen.swap() - due_ns > period_ns / 2
+        if not late:
             return guard_ms
     return screen.clock.period_ns / 2 / NS_PER_MS
-
-
-def _flips_late(screen: Screen, clock: HostClock, guard_ns: float) -> bool:
-    period_ns = screen.clock.period_ns
-    due_ns = screen.clock.next_after(clock.now_ns() + period_ns)
-    screen.present(0)
-    clock.wait_until(round(due_ns - guard_ns), threading.Event())
-    return screen.swap() - due_ns > period_ns / 2
 
 
 def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timing:

@@ -195,14 +195,11 @@ class Screen:
             self.clock.update(swap_ns)
         self.window.look_at_events()
         while self.window.keys:
-            self._press(self.window.keys.popleft())
+            match self.window.keys.popleft():
+                case "q" | "escape":
+                    self._quit = True
+                case "h" | "f1":
+                    log.warning(HELP)
+                case key if key in KEYS:
+                    self.aids.toggle(KEYS[key])
         return swap_ns
-
-    def _press(self, key: str) -> None:
-        match key:
-            case "q" | "escape":
-                self._quit = True
-            case "h" | "f1":
-                log.warning(HELP)
-            case _ if key in KEYS:
-                self.aids.toggle(KEYS[key])

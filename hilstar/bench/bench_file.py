@@ -16,6 +16,7 @@ import hashlib
 import json
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,14 @@ def dated(file: BenchFile, scale: str | None, first_ns: int) -> BenchFile:
         raise InputError(f"{file.path}: {error}") from error
 
 
+def with_codes_ms(file: BenchFile, codes_ms: tuple[float, float] | None) -> BenchFile:
+    """The file for frames of a run that measured what codes cost: it chooses as that run did. The hash stays that of `file`."""
+    if codes_ms is None or file.config.render.codes_ms is not None:
+        return file
+    render = msgspec.structs.replace(file.config.render, codes_ms=codes_ms)
+    return replace(file, config=msgspec.structs.replace(file.config, render=render))
+
+
 def at_moment(file: BenchFile, t_ns: int | None) -> BenchFile:
     """The file for a moment that a person names: its stars are those of that day where t_ns counts from 1970."""
     return file if t_ns is None or file.config.sky.epoch_utc != UNIX else dated(file, None, t_ns)
@@ -104,27 +113,13 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     named: tuple[str | float | None, ...] = (*curves, *files, *true, orbit, bodies.satellites, bodies.satellite_magnitudes)
     for name in named:
         if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos", GAUSSIAN):
-            digest.update(_named_bytes(folder / name))
+            with suppress(InputError):  # its own reader explains better why a file cannot be read
+                digest.update(read_bytes(folder / name, "", MAX_NAMED_BYTES))
     for large in (config.sky.catalogue, config.sky.diffuse.map):
         if large not in ("hipparcos", None):
-            digest.update(_large_bytes(folder / large))
+            with suppress(InputError):
+                digest.update(file_sha256(folder / large, "").encode())
     return digest.hexdigest()
-
-
-def _large_bytes(path: Path) -> bytes:
-    """The SHA-256 of a catalogue's or a map's file, which may be large; nothing where it cannot be read."""
-    try:
-        return file_sha256(path, "").encode()
-    except InputError:
-        return b""
-
-
-def _named_bytes(path: Path) -> bytes:
-    """The content of a file that the bench file names; empty where it cannot be read, which its own reader explains better."""
-    try:
-        return read_bytes(path, "", MAX_NAMED_BYTES)
-    except InputError:
-        return b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,19 +175,15 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     if twice is not None:
         raise InputError(f"{path}: heads: two are called {twice}; give each a file of its own name")
     files = tuple(_head(head, tables.get("attitude", {})) for head in paths)
-    _refuse_one_twice(path, paths)
+    # Two names of one file, by a link, would show one bench twice and write over each other's ledger.
+    places = [place_of(head) for head in paths]
+    for k, place in enumerate(places):
+        if place in places[:k]:
+            first = paths[places.index(place)]
+            raise InputError(f"{path}: heads: {paths[k].name} is the same file as {first.name}; give each a file of its own")
     if files[0].config.attitude.lockstep:
         raise InputError(f"{path}: [attitude] lockstep = true: several heads follow a stream that runs freely; take it out")
     return HeadsFile(path, names, files)
-
-
-def _refuse_one_twice(path: Path, heads: list[Path]) -> None:
-    """Two names of one file, by a link, would show one bench twice and write over each other's ledger."""
-    places = [place_of(head) for head in heads]
-    for k, place in enumerate(places):
-        if place in places[:k]:
-            first = heads[places.index(place)]
-            raise InputError(f"{path}: heads: {heads[k].name} is the same file as {first.name}; give each a file of its own")
 
 
 def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:

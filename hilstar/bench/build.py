@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -14,11 +16,11 @@ from msgspec.structs import replace
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.cameras import bench_camera, display_psf, tracker_camera, tracker_psf
-from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, RenderSettings, Tracker
+from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, Tracker
 from hilstar.bench.config.bench_config import epoch_utc_ns, has_observer, sky_jd
 from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
-from hilstar.bench.effort import Effort, Light, plan_effort
+from hilstar.bench.effort import BEST, CHEAP, HYSTERESIS, IN_TIME_SHARE, Effort, FieldCost, Light, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
@@ -26,10 +28,10 @@ from hilstar.frame.truth import StarInView, brightest_in_view
 from hilstar.frame.view import Canvas, View
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
-from hilstar.monitor.quantise import Panel
-from hilstar.monitor.quantisers import QUANTISERS
+from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.render.backend import Target, level_cost
 from hilstar.render.numpy_backend import headless_context, open_backend
+from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Orientation, Scan
 from hilstar.scene.psf import Psf
@@ -39,13 +41,17 @@ from hilstar.sky.spectral_types import star_types, tabulate_types
 from hilstar.sky.spectrum import Curve, load_curve
 from hilstar.sky.star_table import TableChoice, choose_catalog
 from hilstar.sky.stars import Stars, aberrate, make_stars, split_by_rate, total_and_colours, unit_vectors_icrs
+from hilstar.units import NS_PER_MS, NS_PER_S
 
 if TYPE_CHECKING:
     from hilstar.render.context import Context
     from hilstar.sky.bodies.moving import MovingSky
-    from hilstar.sky.diffuse import TangentImage
 
 S_PER_MS = 1e-3
+# Codes are timed in fields that are spread evenly over the sky, turning at 1 deg/s: twice each, within these times.
+TIMED_FIELDS = [from_radec_roll_deg(*place, 0.0) for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
+TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])
+TIMED_EXACT_S, TIMED_ROUND_S = 0.1, 0.05
 
 
 def load(path: str | Path) -> Bench:
@@ -53,69 +59,137 @@ def load(path: str | Path) -> Bench:
     return open_bench(read_bench_file(Path(path)))
 
 
-def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
-    """Assemble the bench of a file, in a `context` if one is given; NumPy draws where OpenGL is missing. Raises InputError."""
+def open_bench(file: BenchFile, context: Context | None = None, *, timed: bool = False) -> Bench:
+    """Assemble the bench of a file, in a `context` if one is given; NumPy draws where OpenGL is missing. Raises InputError.
+
+    `timed` is for runs that a clock paces: where `quantisation = "auto"` depends on what codes cost, that is measured here.
+    """
     sources = bench_sources(file.config, file.folder)
-    return assembled(file, bench_stars(file.config, file.folder, sources.moving), context, sources)
+    return assembled(file, bench_stars(file.config, file.folder, sources.moving), context, sources, timed=timed)
 
 
-def assembled(file: BenchFile, stars: Stars, context: Context | None = None, sources: Sources = NO_SOURCES) -> Bench:
+def assembled(
+    file: BenchFile, stars: Stars, context: Context | None = None, sources: Sources = NO_SOURCES, *, timed: bool = False
+) -> Bench:
     """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError."""
     if context is not None:  # a window's context, which the window frees
-        return _assembled(file, stars, context, sources)
+        return _assembled(file, stars, context, sources, timed)
     context = headless_context(file.config.render.gpu)
     try:
-        return _assembled(file, stars, context, sources)
+        return _assembled(file, stars, context, sources, timed)
     except BaseException:
         if context is not None:
             context.release()
         raise
 
 
-def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: Sources) -> Bench:
-    calibration = bench_calibration(file.config, file.folder)
-    white_e_per_s = _white_e_per_s(file.config.render, stars)
+def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: Sources, timed: bool) -> Bench:
+    render, calibration = file.config.render, bench_calibration(file.config, file.folder)
+    psf = display_psf(render)
+    white_e_per_s = render.flux_at_white_e_per_s or brightest_peak_e_per_s(stars, psf, render.brightest_v_mag)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())
-    # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
-    finer = calibration.can_steal_bits and not file.config.render.bit_stealing
     camera = bench_camera(file.config, file.folder)
-    sky_share, refresh_hz = _sky_share(camera), file.config.monitor.refresh_hz
     light = Light(
         response=calibration.response,
+        # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
         white_e_per_s=white_e_per_s * darkest,
         rates_e_per_s=stars.electrons_per_s,
-        can_steal_bits=finer,
-        sky_share=sky_share,
-        refresh_hz=refresh_hz,
+        can_steal_bits=calibration.can_steal_bits and not render.bit_stealing,
+        sky_share=math.prod(camera.resolution_px) / math.prod(camera.scales_px_rad()) / (4 * math.pi),  # about
+        refresh_hz=file.config.monitor.refresh_hz,
         seen=seen_by(file, camera),
         centroider=file.config.verify.centroider,
         exposure_frames=file.config.exposure_frames,
         cost=partial(level_cost, context=context),
     )
-    effort = _effort(file.config.render, light)
-    config = _chosen(file.config, effort)
-    target = _target(config, Panel(calibration.response, white_e_per_s, uniformity), effort, light.seen)
-    faintest = QUANTISERS[target.quantisation].faintest_e_per_s(light.panel, target.psf)
-    shown, faint = split_by_rate(stars, faintest)
-    return Bench(
-        file=file,
-        config=config,
-        effort=effort,
-        camera=camera,
-        scan=scan_of(config.monitor),
-        calibration=calibration,
-        uniformity=uniformity,
-        darkest=darkest,
-        flux_at_white_e_per_s=white_e_per_s,
-        faintest_shown_e_per_s=faintest,
-        stars=moved(stars, sources.moving),
-        shown_stars=moved(shown, sources.moving),
-        faint_stars=faint,
-        sources=sources,
-        tracker_psf=tracker_psf(config.tracker, file.folder),
-        renderer=open_backend(target, context),
-    )
+
+    def bench_by(effort: Effort | None) -> Bench:
+        config, codes = file.config, render.quantisation
+        if effort is not None:
+            codes = effort.quantisation
+            chosen = replace(render, quantisation=codes, motion_above_px=effort.motion_above_px)
+            config = replace(config, render=chosen)
+        if codes == "auto":
+            raise AssertionError("the effort's plan has chosen")
+        target = Target(
+            resolution_px=config.monitor.resolution_px,
+            psf=psf,
+            response=calibration.response,
+            flux_at_white_e_per_s=white_e_per_s,
+            quantisation=codes,
+            uniformity=uniformity,
+            sides=() if effort is None else effort.sides,
+            seen=light.seen,
+        )
+        faintest = QUANTISERS[codes].faintest_e_per_s(light.panel, psf)
+        shown, faint = split_by_rate(stars, faintest)
+        return Bench(
+            file=file,
+            config=config,
+            effort=effort,
+            camera=camera,
+            scan=scan_of(config.monitor),
+            calibration=calibration,
+            uniformity=uniformity,
+            darkest=darkest,
+            flux_at_white_e_per_s=white_e_per_s,
+            faintest_shown_e_per_s=faintest,
+            stars=moved(stars, sources.moving),
+            shown_stars=moved(shown, sources.moving),
+            faint_stars=faint,
+            sources=sources,
+            tracker_psf=tracker_psf(config.tracker, file.folder),
+            renderer=open_backend(target, context),
+        )
+
+    chooses = render.effort == "auto" or render.quantisation == "auto"
+    bench = bench_by(plan_effort(render, light) if chooses else None)
+    if not timed or bench.effort is None or not bench.effort.by_cost or render.codes_ms is not None:
+        return bench
+    # The one that is not taken stays in the GL context until that is freed.
+    benches: dict[Quantisation, Bench] = {bench.effort.quantisation: bench}
+
+    def frame_ms(method: Quantisation, for_s: float) -> float:
+        if method not in benches:
+            benches[method] = bench_by(plan_effort(replace(render, quantisation=method), light))
+        return timed_frame_ms(benches[method], for_s)
+
+    cost = measured_cost(frame_ms, light.tabulated_cost(bench.psf), IN_TIME_SHARE * light.refresh_ms)
+    effort = plan_effort(render, dataclasses.replace(light, measured=cost))
+    bench = benches[effort.quantisation]
+    config = replace(bench.config, render=replace(bench.config.render, codes_ms=(cost.cheap_ms, cost.best_ms)))
+    return dataclasses.replace(bench, effort=effort, config=config)
+
+
+def measured_cost(frame_ms: Callable[[Quantisation, float], float], table: FieldCost, limit_ms: float) -> FieldCost:
+    """The cost of codes by `frame_ms`, which times a frame of a quantisation for so many seconds.
+
+    Where `exact` is clearly in time, `round` is not timed: its share of that is the table's.
+    """
+    best_ms = frame_ms(BEST, TIMED_EXACT_S)
+    if best_ms > limit_ms / HYSTERESIS:
+        cheap_ms = frame_ms(CHEAP, TIMED_ROUND_S)
+    else:
+        cheap_ms = best_ms * (table.cheap_ms / table.best_ms if table.best_ms else 1.0)
+    cheap_ms, best_ms = (max(float(f"{ms:.3g}"), MIN_POSITIVE) for ms in (cheap_ms, best_ms))
+    return FieldCost(cheap_ms, best_ms, f"as measured here ([render] codes_ms = [{cheap_ms:g}, {best_ms:g}] fixes it)")
+
+
+def timed_frame_ms(bench: Bench, for_s: float, now_ns: Callable[[], int] = time.monotonic_ns) -> float:
+    """The time of a frame of an average field that turns at 1 deg/s, ms, by drawing for about `for_s` after a warm-up."""
+    bench.warm_up()
+    took_ms: dict[int, float] = {}
+    end_ns = now_ns() + round(for_s * NS_PER_S)
+    for k, q_icrs_to_cam in [*enumerate(TIMED_FIELDS)] * 2:
+        begin_ns = now_ns()
+        if took_ms and begin_ns > end_ns:
+            break
+        bench.draw(q_icrs_to_cam, 0, TIMED_RATE_RAD_S)
+        bench.renderer.finish()
+        took_ms[k] = min(took_ms.get(k, math.inf), (now_ns() - begin_ns) / NS_PER_MS)
+    bench.renderer.begin_anew()
+    return sum(took_ms.values()) / len(took_ms)
 
 
 def seen_by(file: BenchFile, camera: Camera) -> Seen:
@@ -123,40 +197,6 @@ def seen_by(file: BenchFile, camera: Camera) -> Seen:
     tracker = file.config.tracker
     pixel_px = camera.focal_length_px * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
     return Seen(blur_px=math.sqrt(math.prod(tracker_psf(tracker, file.folder).width_px)) * pixel_px, pixel_px=pixel_px)
-
-
-def _target(config: BenchConfig, panel: Panel, effort: Effort | None, seen: Seen) -> Target:
-    render = config.render
-    if render.quantisation == "auto":
-        raise AssertionError("the effort's plan has chosen")
-    return Target(
-        resolution_px=config.monitor.resolution_px,
-        psf=display_psf(render),
-        response=panel.response,
-        flux_at_white_e_per_s=panel.flux_at_white_e_per_s,
-        quantisation=render.quantisation,
-        uniformity=panel.uniformity,
-        sides=() if effort is None else effort.sides,
-        seen=seen,
-    )
-
-
-def _sky_share(camera: Camera) -> float:
-    """The share of the whole sky that a screen covers, about."""
-    width, height = camera.resolution_px
-    return width * height / math.prod(camera.scales_px_rad()) / (4 * math.pi)
-
-
-def _effort(render: RenderSettings, light: Light) -> Effort | None:
-    """The settings chosen within the bench file's tolerance; None if the file sets them all."""
-    return plan_effort(render, light) if render.effort == "auto" or render.quantisation == "auto" else None
-
-
-def _chosen(config: BenchConfig, effort: Effort | None) -> BenchConfig:
-    if effort is None:
-        return config
-    render = replace(config.render, quantisation=effort.quantisation, motion_above_px=effort.motion_above_px)
-    return replace(config, render=render)
 
 
 def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
@@ -170,25 +210,21 @@ def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
 
 
 def bench_optics(tracker: Tracker, folder: Path) -> Optics:
-    """The same of all channels together."""
+    """The tracker's light-gathering part in all channels together."""
     return all_channels(bench_channels(tracker, folder))
 
 
 def bench_sources(config: BenchConfig, folder: Path) -> Sources:
     """The light of a bench's sky beside its stars. Raises InputError or MachineError."""
-    return Sources(bench_moving(config, folder), bench_diffuse(config, folder))
-
-
-def bench_diffuse(config: BenchConfig, folder: Path) -> tuple[TangentImage, ...]:
-    """The map of diffuse light of a bench, electrons/s/sr; () without one. Raises InputError or MachineError."""
-    diffuse = config.sky.diffuse
+    moving, diffuse = bench_moving(config, folder), config.sky.diffuse
     if diffuse.map is None:
-        return ()
+        return Sources(moving)
     from hilstar.sky.diffuse import read_diffuse_map  # WCS and coordinates take 200 ms, which only a map needs
 
     one = np.ones(1)
     v0_e_per_s = np.float32(star_rates(config, folder)(0 * one, diffuse.bv_mag * one, np.nan * one)[0])
-    return tuple(dataclasses.replace(face, image=face.image * v0_e_per_s) for face in read_diffuse_map(folder / diffuse.map))
+    faces = read_diffuse_map(folder / diffuse.map)
+    return Sources(moving, tuple(dataclasses.replace(face, image=face.image * v0_e_per_s) for face in faces))
 
 
 def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
@@ -286,11 +322,6 @@ def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:
     name = config.monitor.calibration
     source = name if name in BUILT_IN else folder / name
     return load_calibration(source, config.monitor.bits, bit_stealing=config.render.bit_stealing)
-
-
-def _white_e_per_s(render: RenderSettings, stars: Stars) -> float:
-    given = render.flux_at_white_e_per_s
-    return given or brightest_peak_e_per_s(stars, display_psf(render), render.brightest_v_mag)
 
 
 def brightest_peak_e_per_s(stars: Stars, psf: Psf, brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG) -> float:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -131,15 +131,19 @@ class FieldsOfView:
         return f"screen {' x '.join(screen)} deg, tracker {across} deg, {pixel} tracker px a monitor px"
 
     def keys(self) -> dict[str, Any]:
-        """The same as --json has it."""
+        """The fields of view as --json has them."""
         return asdict(self)
 
 
 def fields_of_view(config: BenchConfig, folder: Path) -> FieldsOfView:
-    """What a bench's screen and tracker see, with a warning where a length cannot be right. Raises InputError."""
+    """The fields of view of a bench's screen and tracker, with a warning where a length cannot be right. Raises InputError."""
     found = _measured(config, folder)
-    odd = list(_oddities(config, found))
-    return found if not odd else dataclasses.replace(found, warning=f"{odd[0]}; {_advice(config, folder)}")
+    odd = next(_oddities(config, found), None)
+    if odd is None:
+        return found
+    mends = list(_mends(config, folder))[:MAX_MENDS]
+    advice = f"is {', or '.join(mends)}?" if mends else "check the units of its lengths (_mm, _um) and its resolutions"
+    return dataclasses.replace(found, warning=f"{odd}; {advice}")
 
 
 def _measured(config: BenchConfig, folder: Path) -> FieldsOfView:
@@ -204,25 +208,8 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[str]:
             yield f"[verify] {key} is {true:.6g}, and elsewhere this file says {said:.6g}"
 
 
-def _advice(config: BenchConfig, folder: Path) -> str:
-    """The question which length, read in another unit, would explain the oddity."""
-    mends = list(_mends(config, folder))[:MAX_MENDS]
-    named = ", or ".join(f"[{one.table}] {one.key} = {one.value:.6g} in {one.unit}, which is {one.mended:.6g}" for one in mends)
-    return f"is {named}?" if mends else "check the units of its lengths (_mm, _um) and its resolutions"
-
-
-class Mend(NamedTuple):
-    """A length in the wrong unit: its table, key and value, the unit that it seems to have, and its value converted."""
-
-    table: str
-    key: str
-    value: float
-    unit: str
-    mended: float
-
-
-def _mends(config: BenchConfig, folder: Path) -> Iterator[Mend]:
-    """Each length that makes the bench plausible if it is converted from another unit."""
+def _mends(config: BenchConfig, folder: Path) -> Iterator[str]:
+    """Each length that makes the bench plausible if it is converted from another unit, with that unit."""
     for table, key in LENGTHS:
         settings = getattr(config, table)
         value = getattr(settings, key)
@@ -235,7 +222,7 @@ def _mends(config: BenchConfig, folder: Path) -> Iterator[Mend]:
             except InputError:  # such a lens leaves the screen
                 mended = False
             if mended:
-                yield Mend(table, key, value, unit, value * factor)
+                yield f"[{table}] {key} = {value:.6g} in {unit}, which is {value * factor:.6g}"
 
 
 def _figure(value: float) -> str:

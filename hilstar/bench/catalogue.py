@@ -258,8 +258,10 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
     elif ending == ".csv":
         formats = dict.fromkeys(("ra_deg", "dec_deg"), f".{DECIMALS}f")
         formats |= {n: ".6g" for n, c in catalogue.columns.items() if c.values.dtype.kind == "f" and n not in formats}
+        texts = [[format(v, formats.get(n, "")) for v in c.values.tolist()] for n, c in catalogue.columns.items()]
+        lines = [",".join(catalogue.columns), *(",".join(row) for row in zip(*texts, strict=True)), ""]
         with whole_file(path) as file:
-            file.write("\n".join(_csv_lines(catalogue, formats)).encode())
+            file.write("\n".join(lines).encode())
     elif ending == ".vot":
         from astropy.io.votable import from_table
 
@@ -268,14 +270,6 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
     else:
         with whole_file(path) as file:
             _fits(table, catalogue).writeto(file)
-
-
-def _csv_lines(catalogue: InstrumentCatalogue, formats: dict[str, str]) -> list[str]:
-    texts = []
-    for name, column in catalogue.columns.items():
-        form = formats.get(name, "")
-        texts.append([format(value, form) for value in column.values.tolist()])
-    return [",".join(catalogue.columns), *(",".join(row) for row in zip(*texts, strict=True)), ""]
 
 
 def _fits(table: Any, catalogue: InstrumentCatalogue) -> Any:

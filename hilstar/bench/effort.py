@@ -35,6 +35,10 @@ MAG_PER_SHARE = 2.5 / math.log(10)
 UNLIT = 0.25
 CUT_PHASES = 51
 IN_TIME_SHARE = 0.5  # share of a refresh period that a frame may take
+CHEAP, BEST = BY_COST[0], BY_COST[-1]
+# A measured time that is within this factor of the limit leaves the choice as the table has it: two starts of a run, of which
+# another program slows one, have the same codes.
+HYSTERESIS = 1.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +70,12 @@ class CodeErrors:
 
 @dataclass(frozen=True, slots=True)
 class ChosenCodes:
-    """A quantisation with its maximum errors."""
+    """A quantisation with its maximum errors, and whether the time of a frame took part in the choice."""
 
     method: Quantisation
     errors: CodeErrors
     choice: Choice
+    by_cost: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +95,28 @@ PROJECTION = Choice("projection", "perspective", "exact", "a weak one would save
 
 
 @dataclass(frozen=True, slots=True)
+class FieldCost:
+    """Milliseconds that a frame of an average field, turning at 1 deg/s, takes by `round` and by `exact`.
+
+    `where` says on which machine, `why` why `exact` takes long ("" where it does not).
+    """
+
+    cheap_ms: float
+    best_ms: float
+    where: str
+    why: str = ""
+
+    def in_time(self, limit_ms: float) -> bool:
+        """Whether `exact` is drawn within a limit, or `round` is not either."""
+        return self.best_ms <= limit_ms or self.cheap_ms > limit_ms
+
+
+@dataclass(frozen=True, slots=True)
 class Effort:
     """The effort for a bench's stars: quantisation, sprite sides by rate (see `Target.sides`), and the smallest motion drawn.
 
-    `error_mag` and `error_px` bound the error of all choices together, at the faintest star and the worst phase.
+    `error_mag` and `error_px` bound the error of all choices together, at the faintest star and the worst phase. `by_cost` says
+    whether the time of a frame took part in the choice of the quantisation.
     """
 
     quantisation: Quantisation
@@ -102,6 +125,7 @@ class Effort:
     error_mag: float
     error_px: float
     choices: tuple[Choice, ...]
+    by_cost: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +135,7 @@ class Light:
     `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
     whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider` what it finds stars by: None
     where the bench does not say, and then all of them judge. Its exposure has `exposure_frames`. `cost` is what a quantiser
-    costs where the bench is drawn.
+    costs by the table, `measured` what it costs where the bench is drawn (None: not measured).
     """
 
     response: Response
@@ -124,10 +148,11 @@ class Light:
     centroider: Centroider | None = None
     exposure_frames: int = EXPOSURE_FRAMES
     cost: Callable[[type[Quantiser], Psf], LevelCost] = level_cost
+    measured: FieldCost | None = None
 
     @property
     def panel(self) -> Panel:
-        """What turns it into levels, where the screen is darkest."""
+        """The monitor, where the screen is darkest."""
         return Panel(self.response, self.white_e_per_s)
 
     @property
@@ -135,10 +160,12 @@ class Light:
         """The centroiders that judge where codes show a star."""
         return FAMILY if self.centroider is None else (self.centroider,)
 
-    def field_ms(self, method: Quantisation, psf: Psf) -> float:
-        """The time that a method takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
+    def tabulated_cost(self, psf: Psf) -> FieldCost:
+        """The cost of codes by the quantisers' own figures: on two cores without a GPU."""
         lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
-        return self.cost(QUANTISERS[method], psf).a_star_ms * self.sky_share * float(np.count_nonzero(lit))
+        stars = self.sky_share * float(np.count_nonzero(lit))
+        cheap, best = (self.cost(QUANTISERS[method], psf) for method in (CHEAP, BEST))
+        return FieldCost(cheap.a_star_ms * stars, best.a_star_ms * stars, "on two cores without a GPU", best.why)
 
     @property
     def refresh_ms(self) -> float:
@@ -152,8 +179,19 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     method, errors = codes.method, codes.errors
     if render.effort == "full":
         motion_px = render.motion_above_px
-        return Effort(method, (), motion_px, errors.flux_mag, errors.place_px + motion_px, (codes.choice,))
-    sprites = choose_sides(render, light, method)
+        return Effort(
+            method, (), motion_px, errors.flux_mag, errors.place_px + motion_px, (codes.choice,), by_cost=codes.by_cost
+        )
+    sprites, rates = choose_sides(render, light, method), light.rates_e_per_s
+    limit = QUANTISERS[method].faintest_e_per_s(light.panel, display_psf(render))
+    dark = rates < limit
+    share = float(rates[dark].sum() / rates.sum()) if dark.any() else 0.0
+    stars = Choice(
+        "stars",
+        f"from {limit:.3g} electrons/s on",
+        f"the others light no pixel ({share:.2%} of all light)",
+        f"{int(dark.sum())} of {len(dark)} stars in the sky are not drawn",
+    )
     motion_px = max(render.motion_above_px, MOTION_SHARE * render.tolerance_px)
     paths = Choice(
         "paths",
@@ -167,7 +205,8 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
         motion_above_px=motion_px,
         error_mag=errors.flux_mag + sprites.cut_mag,
         error_px=errors.place_px + sprites.moved_px + motion_px,
-        choices=(_star_choice(render, light, method), codes.choice, sprites.choice, ENCODING, paths, PROJECTION),
+        choices=(stars, codes.choice, sprites.choice, ENCODING, paths, PROJECTION),
+        by_cost=codes.by_cost,
     )
 
 
@@ -189,9 +228,11 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
 
     `auto` does not take `exact` where that would be late in fields of many stars and `round` would not.
     """
-    cheap, best = BY_COST[0], BY_COST[-1]
-    cheap_ms, best_ms = (light.field_ms(method, display_psf(render)) for method in (cheap, best))
-    in_time = best_ms <= IN_TIME_SHARE * light.refresh_ms or cheap_ms > IN_TIME_SHARE * light.refresh_ms
+    table = light.tabulated_cost(display_psf(render))
+    known = light.measured
+    if known is None and render.codes_ms is not None:
+        known = FieldCost(*render.codes_ms, "by [render] codes_ms")
+    cost, in_time = known or table, exact_in_time(table, known, IN_TIME_SHARE * light.refresh_ms)
     wanted = (BY_COST if in_time else BY_COST[:1]) if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
     stars = _code_stars(render, light)
@@ -200,27 +241,31 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
         within = errors.within(*limits)
         if within:
             break
-    error = f"{errors.flux_mag:.4f} mag and {errors.place_px:.4f} px maximum, {_by_whom(errors, light)}"
-    if not within and render.quantisation == "auto" and not in_time:
-        price = (
-            f"{best_ms:.0f} ms of {light.refresh_ms:.0f} ({cheap} {cheap_ms:.0f}) for an average field at 1 deg/s without a GPU"
-        )
-        why = light.cost(QUANTISERS[best], display_psf(render)).why
-        price += f", {why}" if why else ""
-        error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "{best}" is nearer and takes {price})'
+    whom = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
+    whom = f"as `{errors.centroider}` finds stars{whom}, from white to the faintest star"
+    error = f"{errors.flux_mag:.4f} mag and {errors.place_px:.4f} px maximum, {whom}"
+    auto = render.quantisation == "auto"
+    if not within and auto and not in_time:
+        price = f"{cost.best_ms:.0f} ms of {light.refresh_ms:.0f} ({CHEAP} {cost.cheap_ms:.0f}) for an average field at 1 deg/s"
+        price += f" {cost.where}, {cost.why}" if cost.why else f" {cost.where}"
+        error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "{BEST}" is nearer and takes {price})'
     elif not within:
         ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
         error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"
-    longer = best_ms / cheap_ms if cheap_ms else 1.0
-    saving = f"{best} takes {longer:.2g} times as long" if method == cheap else "nothing saved"
-    if method == best:
-        saving = f"an average field at 1 deg/s takes {best_ms:.2g} ms of {light.refresh_ms:.3g} on two cores without a GPU"
-    return ChosenCodes(method, errors, Choice("codes", method, error, saving))
+    longer = cost.best_ms / cost.cheap_ms if cost.cheap_ms else 1.0
+    saving = f"{BEST} takes {longer:.2g} times as long" if method == CHEAP else "nothing saved"
+    if method == BEST:
+        saving = f"an average field at 1 deg/s takes {cost.best_ms:.2g} ms of {light.refresh_ms:.3g} {cost.where}"
+    return ChosenCodes(method, errors, Choice("codes", method, error, saving), auto and not (method == CHEAP and within))
 
 
-def _by_whom(errors: CodeErrors, light: Light) -> str:
-    worst = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
-    return f"as `{errors.centroider}` finds stars{worst}, from white to the faintest star"
+def exact_in_time(table: FieldCost, measured: FieldCost | None, limit_ms: float) -> bool:
+    """Whether `auto` may take `exact`: by the measured cost where that is clear of the limit, and else by the table's."""
+    if measured is not None:
+        clear = {measured.in_time(limit_ms / HYSTERESIS), measured.in_time(limit_ms * HYSTERESIS)}
+        if len(clear) == 1:
+            return clear.pop()
+    return table.in_time(limit_ms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,11 +358,3 @@ def cut_px(size_px: int, psf: Psf) -> float:
         moments = np.array([(shares @ at).sum(), (at @ shares).sum()])
         worst = np.maximum(worst, np.abs(moments / shares.sum()))
     return math.hypot(*worst)
-
-
-def _star_choice(render: RenderSettings, light: Light, method: Quantisation) -> Choice:
-    limit = QUANTISERS[method].faintest_e_per_s(light.panel, display_psf(render))
-    dark = light.rates_e_per_s < limit
-    share = float(light.rates_e_per_s[dark].sum() / light.rates_e_per_s.sum()) if dark.any() else 0.0
-    saving = f"{int(dark.sum())} of {len(dark)} stars in the sky are not drawn"
-    return Choice("stars", f"from {limit:.3g} electrons/s on", f"the others light no pixel ({share:.2%} of all light)", saving)

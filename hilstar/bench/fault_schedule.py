@@ -45,15 +45,6 @@ class _Planned:
     number: int = 0
 
 
-def nobody_listens(change: FaultChange) -> None:
-    """The listener of a schedule that nobody follows."""
-
-
-def as_it_is(fault: Fault) -> Fault:
-    """For faults that nobody draws."""
-    return fault
-
-
 class FaultSchedule:
     """The faults of a run whose frames last `frame_s` each.
 
@@ -66,8 +57,8 @@ class FaultSchedule:
         self,
         scenario: Scenario = NO_SCENARIO,
         frame_s: float = 1 / 60,
-        prepare: Callable[[Fault], Fault] = as_it_is,
-        listen: Callable[[FaultChange], None] = nobody_listens,
+        prepare: Callable[[Fault], Fault] = lambda fault: fault,
+        listen: Callable[[FaultChange], None] = lambda change: None,
     ) -> None:
         self.scenario = scenario
         self._frame_ns = round(frame_s * NS_PER_S)
@@ -125,11 +116,8 @@ class FaultSchedule:
             if any(planned.fault.name == name for planned in self._on):
                 self._stops[name] = who
             elif not waiting:
-                raise InputError(f"the fault {name!r} is not on; " + self._words_for_on())
-
-    def _words_for_on(self) -> str:
-        names = [planned.fault.name for planned in self._on]
-        return f"on are {', '.join(names)}" if names else "none is"
+                names = ", ".join(planned.fault.name for planned in self._on)
+                raise InputError(f"the fault {name!r} is not on; " + (f"on are {names}" if names else "none is"))
 
     def _ask(self, wanted: _Planned) -> None:
         with self._lock:

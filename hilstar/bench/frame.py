@@ -129,7 +129,7 @@ class Bench:
     output: dict[str, object] = field(default_factory=dict, repr=False)
 
     def with_stars(self, stars: Stars) -> Bench:
-        """The same bench, and renderer, with other stars, all of which are shown."""
+        """The bench with the same renderer and other stars, all of which are shown."""
         shown, none = split_by_rate(stars, 0.0)
         return replace(self, stars=stars, shown_stars=shown, faint_stars=none, sources=NO_SOURCES)
 
@@ -145,7 +145,7 @@ class Bench:
 
     @property
     def quantiser(self) -> type[Quantiser]:
-        """How its light becomes levels."""
+        """The quantisation of its levels."""
         return QUANTISERS[self.renderer.target.quantisation]
 
     @property
@@ -284,12 +284,6 @@ class Bench:
         levels = Levels(self.renderer.levels().copy())
         drawn = len(sprites) == len(shown) and not (len(self.faint_stars) or self.renderer.target.sides)
         light = linear_light(self.renderer, sprites, self.stars, drawn)
-        truth, star = self._truth(view, sprites)
-        order = np.argsort(truth["v_mag"], kind="stable")
-        return Frame(view.q_icrs_to_cam, light, levels, self.code_values(levels), truth[order], star[order], t_ns)
-
-    def _truth(self, view: View, sprites: Sprites) -> tuple[npt.NDArray[np.void], IntArray]:
-        """Rows of TRUTH_DTYPE for what sprites and discs are of, and its indices (n,)."""
         truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites))
         if sprites.discs:
             discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
@@ -299,7 +293,8 @@ class Bench:
             rows["clipped"] = np.isin(rows["name"], sprites.over_white)
             truth, star = np.append(truth, rows), np.append(star, found)
         truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
-        return truth, star
+        order = np.argsort(truth["v_mag"], kind="stable")
+        return Frame(view.q_icrs_to_cam, light, levels, self.code_values(levels), truth[order], star[order], t_ns)
 
     def losses_mag(self, frame: Frame, faults: FaultLayer | None = None) -> dict[int | str, float]:
         """For each clipped star of a frame (by HIP number, or a body's name), how many magnitudes too faint it is.
@@ -314,23 +309,17 @@ class Bench:
         footprints = FootprintMap(self.camera.resolution_px, self.psf)
         loss_mag = star_losses_mag(sprites, self.panel, footprints, frame.levels)
         names = sprite_names(self.shown_stars, sprites)
-        losses = dict(zip(names, loss_mag.tolist(), strict=True)) | self._disc_losses_mag(frame, view, sprites)
-        return {name: losses[name] for name in clipped if name in losses}
-
-    def _disc_losses_mag(self, frame: Frame, view: View, sprites: Sprites) -> dict[int | str, float]:
-        """The same for each disc brighter than white, in the pixels of which it has most of the light."""
-        if not sprites.over_white or self._bodies is None:
-            return {}
+        losses = dict(zip(names, loss_mag.tolist(), strict=True))
         wanted, shown = frame.linear, shown_light(frame.levels, self.panel)
-        losses: dict[int | str, float] = {}
-        for disc in self.discs(view):
-            if disc.name in sprites.over_white:
+        for disc in self.discs(view) if sprites.over_white else ():
+            # Of a disc brighter than white, in the pixels of which it has most of the light
+            if disc.name in sprites.over_white and self._bodies is not None:
                 alone = self._bodies.alone(disc, view)
                 self.renderer.draw_linear(replace(sprites, data=sprites.data[:0], extended=alone))
                 own = self.renderer.linear() > MOST * wanted
                 if own.any():
                     losses[disc.name] = float(magnitude(shown[own].sum() / wanted[own].sum(dtype=np.float64)))
-        return losses
+        return {name: losses[name] for name in clipped if name in losses}
 
     def code_values(self, levels: Levels) -> Codes:
         """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""

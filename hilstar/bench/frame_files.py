@@ -64,7 +64,9 @@ def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> Keywords:
     sip = fit_sip(camera)
     if sip is None:
         tan = _tangent_plane(camera, q_icrs_to_cam, camera.principal_point_px, np.eye(2))
-        return tan | {"LENS": True, "LENSERR": round(_tan_error_px(camera), 4)}
+        x_px, y_px = camera.grid_px(HELD_OUT)
+        tan_x, tan_y = replace(camera, lens=None).places_px(*camera.tangents(x_px, y_px))
+        return tan | {"LENS": True, "LENSERR": round(float(np.nanmax(np.hypot(tan_x - x_px, tan_y - y_px))), 4)}
     keywords = _tangent_plane(camera, q_icrs_to_cam, sip.origin_px, sip.linear)
     keywords |= {"CTYPE1": "RA---TAN-SIP", "CTYPE2": "DEC--TAN-SIP", "LENS": True, "LENSERR": round(sip.error_px, 6)}
     for names, terms, first in ((("A", "B"), sip.forward, 2), (("AP", "BP"), sip.back, 1)):
@@ -106,9 +108,10 @@ def fit_sip(camera: Camera) -> Sip | None:
     origin_px = float(x_px[0]), float(y_px[0])
     fitted, held_out = (_pairs(camera, origin_px, count) for count in (FITTED, HELD_OUT))
     degree, whole = _whole(fitted, held_out)
-    linear = whole[[_place(degree, 1, 0), _place(degree, 0, 1)]].T
+    p, q = _powers(degree, 1)
+    linear = np.concatenate([whole[(p == 1) & (q == 0)], whole[(p == 0) & (q == 1)]]).T
     of_pixels = np.linalg.inv(linear).T  # rows of ideal places to pixels
-    forward = whole[np.add(*_powers(degree, 1)) >= 2] @ of_pixels
+    forward = whole[p + q >= 2] @ of_pixels
     pixel, flat = fitted[0], fitted[1] @ of_pixels
     back = _solved(flat, pixel - flat, degree)
     pixel, flat = held_out[0], held_out[1] @ of_pixels
@@ -153,22 +156,10 @@ def _powers(degree: int, first: int) -> tuple[IntArray, IntArray]:
     return p[kept], q[kept]
 
 
-def _place(degree: int, p: int, q: int) -> int:
-    powers = _powers(degree, 1)
-    return int(np.flatnonzero((powers[0] == p) & (powers[1] == q))[0])
-
-
 def _terms(at: FloatArray, degree: int, first: int) -> FloatArray:
     """The powers X^p Y^q at places (n, 2): (n, terms)."""
     p, q = _powers(degree, first)
     return np.asarray(at[:, :1] ** p * at[:, 1:] ** q)
-
-
-def _tan_error_px(camera: Camera) -> float:
-    """The largest distance on the image between where a camera and TAN without SIP have a star, px."""
-    x_px, y_px = camera.grid_px(HELD_OUT)
-    tan_x, tan_y = replace(camera, lens=None).places_px(*camera.tangents(x_px, y_px))
-    return float(np.nanmax(np.hypot(tan_x - x_px, tan_y - y_px)))
 
 
 def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:

@@ -49,8 +49,9 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
         start_ns = round(start_ns / DAY_NS) * DAY_NS  # a Julian year is right to a millisecond
     orbit = config.spacecraft.orbit or GEOCENTRE
     observer = Geocentre() if orbit in {GEOCENTRE, SOURCE} else orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
-    names = body_names(config)
-    sky = config.sky
+    sky, shown = config.sky, config.sky.bodies
+    asked = (("Sun", shown.sun), (EARTH, shown.earth), ("Moon", shown.moon), *((planet, shown.planets) for planet in PLANETS))
+    names = tuple(name for name, wanted in asked if wanted)
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     lit = (*names, "Sun")  # and whatever sunlight falls on
     rates, colours = total_and_colours(
@@ -115,17 +116,6 @@ def bench_satellites(
     return satellites
 
 
-def body_names(config: BenchConfig) -> tuple[str, ...]:
-    """The bodies that a bench file asks for."""
-    bodies = config.sky.bodies
-    return (
-        *(("Sun",) if bodies.sun else ()),
-        *((EARTH,) if bodies.earth else ()),
-        *(("Moon",) if bodies.moon else ()),
-        *(PLANETS if bodies.planets else ()),
-    )
-
-
 def observer_lines(config: BenchConfig) -> list[str]:
     """A line where it is the source of the attitudes that says from where the sky is seen."""
     if not from_source(config):
@@ -139,19 +129,13 @@ def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = Non
     found = {} if moving is None else moving.diameters_arcsec(t_ns)
     px_per_arcsec = camera.scales_px_rad()[1] / ARCSEC_PER_RAD
     widths = sorted(((d * px_per_arcsec, name, d) for name, d in found.items()), reverse=True)
-    return [
-        f"{name}: {_angle(arcsec)} wide, {_pixels(px)} of the screen; drawn as a disc"
-        for px, name, arcsec in widths
-        if px > POINT_PX
-    ]
-
-
-def _angle(arcsec: float) -> str:
-    return f"{arcsec:.1f} arcsec" if arcsec < MAX_ARCSEC else f"{arcsec / 3600:.1f} deg"
-
-
-def _pixels(px: float) -> str:
-    return f"{px:.2f} px" if px < MANY_PX else f"more than {MANY_PX:.0f} px"
+    lines = []
+    for px, name, arcsec in widths:
+        if px > POINT_PX:
+            angle = f"{arcsec:.1f} arcsec" if arcsec < MAX_ARCSEC else f"{arcsec / 3600:.1f} deg"
+            pixels = f"{px:.2f} px" if px < MANY_PX else f"more than {MANY_PX:.0f} px"
+            lines.append(f"{name}: {angle} wide, {pixels} of the screen; drawn as a disc")
+    return lines
 
 
 def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:

@@ -57,7 +57,7 @@ class Scenario:
         return max((f.at_s + f.for_s for f in self.faults if f.at_s is not None and f.for_s is not None), default=0.0)
 
     def prepared(self, prepare: Callable[[Fault], Fault]) -> list[Fault]:
-        """Its faults as `prepare` returns them. Raises InputError with the file and the fault where `prepare` does."""
+        """The faults as `prepare` returns them. Raises InputError with the file and the fault where `prepare` does."""
         found = []
         for fault in self.faults:
             try:
@@ -164,11 +164,11 @@ class Timetable:
         since_ns = None
         while True:
             at_ns = t_ns if since_ns is None else since_ns - 1
-            stuck = [one for one in self.on(at_ns) if isinstance(one.fault, Freeze) or _loses_all(one.fault)]
+            stuck = [
+                one
+                for one in self.on(at_ns)
+                if isinstance(one.fault, Freeze) or (isinstance(one.fault, Drop) and one.fault.share == 1)
+            ]
             if not stuck:
                 return since_ns
             since_ns = min(at_ns - one.since_ns for one in stuck)
-
-
-def _loses_all(fault: Fault) -> bool:
-    return isinstance(fault, Drop) and fault.share == 1

@@ -48,7 +48,7 @@ def replay(
     """Show an attitude log on the monitor."""
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.bench.bench_file import dated, read_bench_file
+    from hilstar.bench.bench_file import dated, read_bench_file, with_codes_ms
     from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.record.ledger import Ledger
     from hilstar.run.replay import FrameImages, Wanted, plan_play
@@ -66,11 +66,12 @@ def replay(
     mounting = Mounting(file.config.tracker.q_body_to_cam)
     stated = Stated(mounting, tuple(kernel or ()), topic, body, reference, epoch_utc, options.parse_place(place))
     play = plan_play(log, Wanted(options.parse_speed(speed), start, stop, step), file.config, stated)
-    file = dated(file, play.conventions.scale, play.first_ns)
+    file = with_codes_ms(dated(file, play.conventions.scale, play.first_ns), play.codes_ms)
     with (
         running.page_listener(console, control, token, console_name) as listener,
         running.optional_pulse(file, notices) as pulse,
-        running.shown_bench(file, headless, windowed, force) as (bench, screen),
+        # The frames of an earlier run have the codes that it had.
+        running.shown_bench(file, headless, windowed, force, timed=play.paced and not play.past) as (bench, screen),
         FrameImages(output, bench) as record,
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept, play.recording) as wrong,

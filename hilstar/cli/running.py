@@ -96,18 +96,18 @@ def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] 
 
 
 @contextmanager
-def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) -> Iterator[tuple[Any, Any]]:
-    """The bench and its screen; None when headless."""
+def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool, *, timed: bool) -> Iterator[tuple[Any, Any]]:
+    """The bench and its screen; None when headless. `timed` as in `open_bench`."""
     if headless:
         from hilstar.bench.build import open_bench
         from hilstar.render.context import create_context
 
-        with open_bench(file, create_context(file.config.render.gpu)) as bench:  # NumPy is too slow for a stream
+        with open_bench(file, create_context(file.config.render.gpu), timed=timed) as bench:  # NumPy is too slow for a stream
             yield bench, None
         return
     from hilstar.run.screen.gate import open_screen
 
-    with open_screen(file, windowed=windowed, force=force) as screen:
+    with open_screen(file, windowed=windowed, force=force, timed=timed) as screen:
         yield screen.bench, screen
 
 

@@ -156,7 +156,8 @@ def serve(
         running.page_listener(console, control, token, console_name) as listener,
         _source(file, fed_by, notices) as link,
         running.optional_pulse(file, notices) as pulse,
-        running.shown_bench(file, headless, windowed, force) as (bench, screen),
+        # In lockstep the simulation waits for each frame: no frame is late, and a run's codes are those of any other machine.
+        running.shown_bench(file, headless, windowed, force, timed=not file.config.attitude.lockstep) as (bench, screen),
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept) as wrong,
     ):

@@ -16,7 +16,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.mcap_log import NO_END, unfinished_part
-from hilstar.bench.bench_file import BenchFile, bench_file_of
+from hilstar.bench.bench_file import BenchFile, bench_file_of, with_codes_ms
 from hilstar.bench.build import open_bench
 from hilstar.bench.frame import Bench
 from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
@@ -26,7 +26,7 @@ from hilstar.frame.fault_kinds import Freeze
 from hilstar.notices import Notices
 from hilstar.run.faults import read_recording
 from hilstar.run.pacer import Shown
-from hilstar.run.record.ledger_records import EventRecord, config_of, wrong_in_frame
+from hilstar.run.record.ledger_records import EventRecord, codes_ms_of, config_of, wrong_in_frame
 from hilstar.run.record.report import COUNTS, METRICS, RunFigures, RunReport, figures_of, summarise, table_rows
 from hilstar.run.replay import played_again, replay
 from hilstar.run.serve import Outlet
@@ -111,7 +111,7 @@ def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
     `sky` is the map of the whole sky.
     """
     try:
-        file = _bench_file(run.head, ledger)
+        file = with_codes_ms(_bench_file(run.head, ledger), codes_ms_of(run.head))
         with open_bench(file) as bench:
             overlay = overlay_of(bench)
             return {

@@ -48,7 +48,14 @@ class BodyLayer:
         discs = self._near(view)
         if not discs:
             return light
-        lights = self._lights(discs, self._poses(view, discs))
+        if view.exposed:
+            posed = self._exposed(view)
+        elif view.turns:
+            large = any(disc.radius_rad * self._px_per_rad > MAX_POSED_PX for disc in discs)
+            posed = self._turning(view, 1 if large else MAX_POSES)
+        else:
+            posed = self._still(view.icrs_to_image(self.canvas.camera))
+        lights = self._lights(discs, posed)
         names = [disc.name for disc in reversed(discs)]
         white_e_per_s = self.canvas.white_in(view)
         return replace(
@@ -94,14 +101,6 @@ class BodyLayer:
         axis = view.icrs_to_image(self.canvas.camera)[2]
         found = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
         return [disc for k, disc in enumerate(found) if not k or not _hidden(disc, found[:k])]
-
-    def _poses(self, view: View, discs: list[Disc]) -> DiscView:
-        if view.exposed:
-            return self._exposed(view)
-        if not view.turns:
-            return self._still(view.icrs_to_image(self.canvas.camera))
-        large = any(disc.radius_rad * self._px_per_rad > MAX_POSED_PX for disc in discs)
-        return self._turning(view, 1 if large else MAX_POSES)
 
     def _still(self, icrs_to_image: FloatArray) -> DiscView:
         return DiscView(self.canvas.camera, self.canvas.psf, (Pose(icrs_to_image),))
@@ -180,13 +179,11 @@ class BodyLayer:
         x, y = np.meshgrid(np.linspace(left, left + width - 1, LATTICE), np.linspace(top, top + height - 1, LATTICE))
         u, v = camera.tangents(x.ravel(), y.ravel())
         seen = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
-        return max(float(light.disc.radiance(seen @ light.icrs_to_image).max()), self._brightest_place(light))
-
-    def _brightest_place(self, light: DiscLight) -> float:
-        """The same at some places of its lit face: a crescent may lie between those of the lattice."""
+        # And of its lit face: a crescent may lie between those of the lattice
         places, _ = light.disc.points(LATTICE)
-        x_px, y_px = self.canvas.camera.project(places @ light.icrs_to_image.T)
-        return float(light.disc.radiance(places[self.canvas.camera.contains_px(x_px, y_px)]).max(initial=0.0))
+        on_image = camera.contains_px(*camera.project(places @ light.icrs_to_image.T))
+        of_face = float(light.disc.radiance(places[on_image]).max(initial=0.0))
+        return max(float(light.disc.radiance(seen @ light.icrs_to_image).max()), of_face)
 
 
 def _hidden(disc: Disc, nearer: list[Disc]) -> bool:

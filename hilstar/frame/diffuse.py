@@ -134,7 +134,7 @@ class _Part:
     own: BoolArray
 
     def spread(self, at_corners: FloatArray) -> Float32Array:
-        """What all cells' corners have, in this part's pixels."""
+        """Values at all cells' corners, interpolated to this part's pixels."""
         return np.asarray(self.down @ np.nan_to_num(at_corners[self.nodes]).astype(np.float32) @ self.across.T)
 
     def keep(self, held: BoolArray, taken: BoolArray) -> None:

@@ -83,7 +83,7 @@ class FaultView:
         self.by, self._seed, self._folder, self._lasting = by, seed, folder, lasting
         self._glow_kept: tuple[Fault, float, extended.GlowLight] | None = None
         self._lock = threading.Lock()
-        self._targets = Targets()
+        self._found: dict[tuple[int, int | str], tuple[object, IntArray]] = {}
         self._maps: dict[Fault, extended.LightMap] = {}
         self._tracks: dict[tuple[str, int], PointChain] = {}
 
@@ -91,20 +91,23 @@ class FaultView:
         """The fault with everything prepared that a frame has no time for. Raises InputError (see `FaultSchedule`)."""
         if isinstance(fault, CosmicRays) and fault.for_s is None:
             fault = msgspec.structs.replace(fault, for_s=self.by.exposure_s)
-        self._targets.check(self.by.stars, fault)
+        by_star = isinstance(fault, Flash | StarGone) and (fault.hip or fault.star)
+        if by_star and not len(self._places(self.by.stars, fault)):
+            said = f'star = "{by_star}"' if isinstance(by_star, str) else f"hip = {by_star}"
+            raise InputError(
+                f"{said}: not among the {len(self.by.stars)} stars and bodies of this bench; write one that is, or look at"
+                " [sky] faintest_v_mag"
+            )
         if isinstance(fault, PointLight | CosmicRays):
             self.by.v0_e_per_s(getattr(fault, "bv_mag", TRACK_BV_MAG))
         if isinstance(fault, Gradient | MeasuredMap):
             self._map(fault)
         if isinstance(fault, PlacedFault) and (fault.tracker_px is not None or fault.screen_px is not None):
-            self._check_place(fault)
+            camera, place = self._source(fault)
+            if not np.isfinite(camera.rays(np.array([place[0]]), np.array([place[1]]))).all():
+                key = "tracker_px" if fault.tracker_px is not None else "screen_px"
+                raise InputError(f"{key} = {list(place)}: the lens has no direction there; write a place nearer to the image")
         return fault
-
-    def _check_place(self, fault: PlacedFault) -> None:
-        camera, place = self._source(fault)
-        if not np.isfinite(camera.rays(np.array([place[0]]), np.array([place[1]]))).all():
-            key = "tracker_px" if fault.tracker_px is not None else "screen_px"
-            raise InputError(f"{key} = {list(place)}: the lens has no direction there; write a place nearer to the image")
 
     def light_e_per_s(self, fault: Fault) -> float:
         """A fault's electrons per second: of a point, or in the tracker's brightest pixel; 1 where a map says it."""
@@ -172,7 +175,7 @@ class FaultView:
     def _direction(self, fault: FalseStar | Flash, stars: Stars) -> FloatArray | None:
         if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
             for known in (stars, self.by.stars):  # a star too faint to show is among all of the bench's stars
-                found = self._targets.find(known, fault)
+                found = self._places(known, fault)
                 if len(found):
                     return np.asarray(known.vectors[found[0]])
             return None
@@ -180,7 +183,7 @@ class FaultView:
 
     def star_direction(self, fault: Fault) -> FloatArray | None:
         """The direction (3,), ICRS, of the star that a fault is about; None if it is about none."""
-        found = self._targets.find(self.by.stars, fault)
+        found = self._places(self.by.stars, fault)
         return np.asarray(self.by.stars.vectors[found[0]]) if len(found) else None
 
     def _added(self, fault: PointLight, share: float = 1.0) -> AddedLight:
@@ -231,11 +234,25 @@ class FaultView:
     def gone(self, now: Sequence[Now], stars: Stars) -> list[tuple[int, float]]:
         """Stars that a fault removes, and the share of their light that is left in this frame."""
         taken = [one for one in now if isinstance(one.fault, StarGone)]
-        return [(int(star), 1 - one.share) for one in taken for star in self._targets.find(stars, one.fault)]
+        return [(int(star), 1 - one.share) for one in taken for star in self._places(stars, one.fault)]
 
-    def gone_bodies(self, now: Sequence[Now]) -> dict[str, float]:
-        """Bodies and stars that a fault removes by name, and the share of their light that is left."""
-        return {one.fault.star: 1 - one.share for one in now if isinstance(one.fault, StarGone) and one.fault.star is not None}
+    def _places(self, stars: Stars, fault: Fault) -> IntArray:
+        """The places of a fault's star in `stars`; empty if it is not among them, or the fault is about none.
+
+        A bench's arrays keep their order for a whole run: each star is searched for once.
+        """
+        wanted = None
+        if isinstance(fault, Flash | StarGone):
+            wanted = fault.hip if fault.hip is not None else fault.star
+        if wanted is None:
+            return np.empty(0, dtype=np.intp)
+        key = (id(stars.hip), wanted)
+        known = self._found.get(key)
+        if known is None or known[0] is not stars.hip:  # the array is kept, so that no other one has its id
+            if len(self._found) >= KEPT_STARS:
+                self._found.clear()
+            known = self._found[key] = (stars.hip, _places(stars, wanted))
+        return known[1]
 
     def surfaces(self, now: Sequence[Now], q_icrs_to_cam: FloatArray) -> list[extended.ExtendedLight]:
         """The stray light of the faults that are on."""
@@ -254,14 +271,8 @@ class FaultView:
         known = self._glow_kept
         if fixed and known is not None and known[:2] == (fault, share):
             return known[2]  # the same object, by which the renderer recognises the same light
-        made = self._new_glow(fault, share, q_icrs_to_cam)
-        if fixed:
-            self._glow_kept = fault, share, made
-        return made
-
-    def _new_glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.GlowLight:
         by = self.by
-        if fault.tracker_px is not None or fault.screen_px is not None:
+        if fixed:
             source, (x_px, y_px) = self._source(fault)
             cam = source.rays(np.array([x_px]), np.array([y_px]))[0]
         else:
@@ -271,7 +282,10 @@ class FaultView:
         covered = (by.tracker.focal_length_px / by.canvas.camera.focal_length_px) ** 2
         peak = self.light_e_per_s(fault) * share * covered
         unit = direction / np.linalg.norm(direction)
-        return extended.GlowLight(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera)
+        made = extended.GlowLight(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera)
+        if fixed:
+            self._glow_kept = fault, share, made
+        return made
 
     def footprints(self, chains: list[PointChain]) -> list[Sprites]:
         """The sprites of chains. Their lines are numbered from one chain to the next, as stars -1, -2 and on."""
@@ -290,39 +304,6 @@ def icrs_direction(fault: PlacedFault) -> FloatArray:
         vector = np.array(fault.icrs)
         return np.asarray(vector / np.linalg.norm(vector))
     return direction_of(*(fault.radec_deg or (0.0, 0.0)))
-
-
-class Targets:
-    """Places of stars in a bench's arrays, which keep their order for a whole run: each is searched for once."""
-
-    def __init__(self) -> None:
-        self._found: dict[tuple[int, int | str], tuple[object, IntArray]] = {}
-
-    def find(self, stars: Stars, fault: Fault) -> IntArray:
-        """The places of a fault's star in `stars`; empty if it is not among them."""
-        if not isinstance(fault, Flash | StarGone):
-            return np.empty(0, dtype=np.intp)
-        wanted = fault.hip if fault.hip is not None else fault.star
-        if wanted is None:
-            return np.empty(0, dtype=np.intp)
-        key = (id(stars.hip), wanted)
-        known = self._found.get(key)
-        if known is None or known[0] is not stars.hip:  # the array is kept, so that no other one has its id
-            if len(self._found) >= KEPT_STARS:
-                self._found.clear()
-            known = self._found[key] = (stars.hip, _places(stars, wanted))
-        return known[1]
-
-    def check(self, stars: Stars, fault: Fault) -> None:
-        """Refuse (InputError) a star that the bench does not have."""
-        if not isinstance(fault, Flash | StarGone) or (fault.hip is None and fault.star is None):
-            return
-        if not len(self.find(stars, fault)):
-            said = f"hip = {fault.hip}" if fault.hip is not None else f'star = "{fault.star}"'
-            raise InputError(
-                f"{said}: not among the {len(stars)} stars and bodies of this bench; write one that is, or look at"
-                " [sky] faintest_v_mag"
-            )
 
 
 def _places(stars: Stars, wanted: int | str) -> IntArray:

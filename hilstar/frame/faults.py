@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.frame.fault_kinds import AttitudeStep, Blank, Drop, Fault, Freeze, Now
+from hilstar.frame.fault_kinds import AttitudeStep, Blank, Drop, Fault, Freeze, Now, StarGone
 from hilstar.frame.fault_light import FaultView
 from hilstar.frame.layers import no_light
 from hilstar.frame.view import View
@@ -68,7 +68,8 @@ class FaultLayer:
             return replace(no_light(light.footprint_px), rate_cam_rad_s=light.rate_cam_rad_s)
         gone = by.gone(now, stars)
         if gone:
-            light = _without_discs(_dimmed(light, gone), by.gone_bodies(now))
+            removed = {one.fault.star: 1 - one.share for one in now if isinstance(one.fault, StarGone) and one.fault.star}
+            light = _without_discs(_dimmed(light, gone), removed)
         directions, named = by.sky_points(now, stars)
         chains, lines = by.camera_points(now, None if view.rate_cam_rad_s is None else view.scan)
         surfaces = by.surfaces(now, view.q_icrs_to_cam)
@@ -77,13 +78,10 @@ class FaultLayer:
             drawn = by.by.points.add(no_light(light.footprint_px), few_stars(directions, named, stars), view)
             parts = [replace(drawn, star=-1 - len(lines) - drawn.star), *parts]
         if parts:
-            per_star = max(light.per_star, *(_most_per_star(part) for part in parts))
+            longest = (int(np.unique(part.star, return_counts=True)[1].max(initial=1)) for part in parts)
+            per_star = max(light.per_star, *(part.per_star for part in parts), *longest)
             light = replace(with_sprites(light, parts), per_star=per_star, added=(*lines, *named))
         return replace(light, extended=(*light.extended, *surfaces)) if surfaces else light
-
-
-def _most_per_star(part: Sprites) -> int:
-    return max(part.per_star, int(np.unique(part.star, return_counts=True)[1].max(initial=1)))
 
 
 def _dimmed(sprites: Sprites, gone: list[tuple[int, float]]) -> Sprites:

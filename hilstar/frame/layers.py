@@ -92,21 +92,14 @@ class StarLayer:
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
         """The light before, with a sprite or a chain of sprites for each star on the image."""
-        made = self._still(stars, view) if view.rate_cam_rad_s is None or not self.paths else self._along_paths(stars, view)
+        canvas, camera = self.canvas, self.canvas.camera
+        if self.paths and view.exposed and view.rate_cam_rad_s is not None:
+            made = smeared_sprites(stars, view.motion, camera, canvas.psf)
+        elif self.paths and view.turns and not view.exposed:
+            made = swept_sprites(stars, view.turn, view.scan, camera, canvas.psf)
+            made = replace(made, rate_cam_rad_s=view.rate_cam_rad_s)
+        else:
+            icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, camera)[0] if view.exposed else view.icrs_to_image(camera)
+            candidates = self.candidates if stars is self.frequent else None
+            made = make_sprites(stars, icrs_to_image, camera, canvas.psf.footprint_px, candidates)
         return with_sprites(light, [made]) if light.extended or len(light.data) else made
-
-    def _still(self, stars: Stars, view: View) -> Sprites:
-        canvas = self.canvas
-        camera = canvas.camera
-        icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, camera)[0] if view.exposed else view.icrs_to_image(camera)
-        candidates = self.candidates if stars is self.frequent else None
-        return make_sprites(stars, icrs_to_image, camera, canvas.psf.footprint_px, candidates)
-
-    def _along_paths(self, stars: Stars, view: View) -> Sprites:
-        canvas = self.canvas
-        if view.exposed:
-            return smeared_sprites(stars, view.motion, canvas.camera, canvas.psf)
-        if not view.turns:
-            return self._still(stars, view)
-        made = swept_sprites(stars, view.turn, view.scan, canvas.camera, canvas.psf)
-        return replace(made, rate_cam_rad_s=view.rate_cam_rad_s)

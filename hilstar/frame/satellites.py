@@ -11,7 +11,7 @@ from hilstar.frame.bodies import POINT_PX
 from hilstar.frame.view import Canvas, View
 from hilstar.scene.frame_motion import slowed
 from hilstar.scene.sprites import Sprites
-from hilstar.scene.trails import EVERY, Brush, Lit, TrailView, disc_of, disc_trail, hidden, places_of, trails, wide, with_trails
+from hilstar.scene.trails import EVERY, Brush, Lit, TrailView, disc_of, disc_trail, hidden, trails, wide, with_trails
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -109,7 +109,8 @@ class SatelliteLayer:
             if found is not None:
                 drawn.append(found)
                 light = hidden(light, stars.directions(light.star), found)
-        satellites.write(stars, *places_of(drawn))
+        index, rates = np.array([one.index for one in drawn], dtype=np.intp), np.array([one.electrons_per_s for one in drawn])
+        satellites.write(stars, index, np.array([one.middle for one in drawn]).reshape(-1, 3), rates)
         white_e_per_s = self.canvas.white_in(view)
         names = tuple(one.along[0].name for one in drawn)
         return replace(

@@ -69,28 +69,22 @@ def pixels_in(camera: Camera, other: Camera) -> PixelsIn:
     if camera is other:
         y, x = np.mgrid[0:height, 0:width].astype(np.float64)
         return PixelsIn(x, y, np.ones((height, width)))
-    coarse = _grid_in(camera, other)
-    if coarse is None:
-        y, x = np.mgrid[0:height, 0:width].astype(np.float64)
-        seen_x, seen_y = (part.reshape(height, width) for part in other.pixels_from(camera, x.ravel(), y.ravel()))
-        (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
-        return PixelsIn(seen_x, seen_y, np.abs(x_right * y_down - x_down * y_right))
-    return PixelsIn(*(spline(np.arange(height), np.arange(width)) for spline in coarse))
-
-
-def _grid_in(camera: Camera, other: Camera) -> list[Any] | None:
-    """Splines for the places in another camera's pixels, x and y, and for the pixels covered; None if a place has none."""
     from scipy.interpolate import RectBivariateSpline
 
     across, down = (np.linspace(0, size - 1, max(5, size // GRID_PX)) for size in camera.resolution_px)
     x, y = np.meshgrid(across, down)
     places = [part.reshape(x.shape) for part in other.pixels_from(camera, x.ravel(), y.ravel())]
     if not all(np.isfinite(place).all() for place in places):
-        return None
+        rows, columns = np.mgrid[0:height, 0:width].astype(np.float64)
+        seen = other.pixels_from(camera, columns.ravel(), rows.ravel())
+        seen_x, seen_y = (part.reshape(height, width) for part in seen)
+        (a, b), (c, d) = np.gradient(seen_x), np.gradient(seen_y)
+        return PixelsIn(seen_x, seen_y, np.abs(b * c - a * d))
     along_x, along_y = (RectBivariateSpline(down, across, place) for place in places)
     x_right, y_right = along_x(down, across, dy=1), along_y(down, across, dy=1)
     x_down, y_down = along_x(down, across, dx=1), along_y(down, across, dx=1)
-    return [along_x, along_y, RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))]
+    covered = RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))
+    return PixelsIn(*(spline(np.arange(height), np.arange(width)) for spline in (along_x, along_y, covered)))
 
 
 def map_sha256(path: Path) -> str:

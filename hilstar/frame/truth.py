@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.frame.bodies import disc_stars
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
@@ -105,33 +104,19 @@ def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt
     over = np.zeros(len(sprites), dtype=bool)
     over[clipped] = True
     own = sprites.star >= 0
-    star, x_px, y_px = _one_a_star(sprites, own)
+    star, x_px, y_px = sprites.star[own], sprites.x_px[own], sprites.y_px[own]
+    once, which = np.unique(star, return_inverse=True)
+    if len(once) < len(star):  # each star once, a satellite in the middle of its streak's light
+        light = sprites.data["electrons_per_s"][own].astype(np.float64)
+        total = np.bincount(which, light)
+        x_px, y_px = (np.bincount(which, light * places) / total for places in (x_px, y_px))
+        star = once
     truth = truth_table(stars, star, x_px, y_px)
     truth["clipped"] = over[own] if len(star) == own.sum() else np.isin(star, sprites.star[over])
     if not sprites.added:
         return truth, star
     added = added_truth(sprites, over)
     return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~own])])
-
-
-class StarPlaces(NamedTuple):
-    """Stars, each once, and their places on the image, (n,) each."""
-
-    star: IntArray
-    x_px: FloatArray
-    y_px: FloatArray
-
-
-def _one_a_star(sprites: Sprites, own: BoolArray) -> StarPlaces:
-    """Each star of these sprites once, a satellite in the middle of its streak's light."""
-    star, x_px, y_px = sprites.star[own], sprites.x_px[own], sprites.y_px[own]
-    once, which = np.unique(star, return_inverse=True)
-    if len(once) == len(star):
-        return StarPlaces(star, x_px, y_px)
-    light = sprites.data["electrons_per_s"][own].astype(np.float64)
-    total = np.bincount(which, light)
-    x_px, y_px = (np.asarray(np.bincount(which, light * places) / total, dtype=np.float64) for places in (x_px, y_px))
-    return StarPlaces(once, x_px, y_px)
 
 
 def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
@@ -186,24 +171,21 @@ def brightest_in_view(light: Sprites, stars: Stars, camera: Camera, q_icrs_to_ca
     off_rad = np.arctan2(np.hypot(cam[:, 0], cam[:, 1]), cam[:, 2])
     x, y, z = vectors.T
     ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+    constellations: list[str] = []
+    if len(found):
+        from astropy.coordinates import SkyCoord, get_constellation  # takes half a second, which only this needs
+
+        # IAU boundaries of 1930
+        constellations = [str(name) for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))]
     columns = (
         stars.hip[found].tolist(),
         stars.v_mag[found].tolist(),
         ra_deg.tolist(),
         dec_deg.tolist(),
-        _constellations(ra_deg, dec_deg),
+        constellations,
         x_px.tolist(),
         y_px.tolist(),
         np.degrees(off_rad).tolist(),
         stars.names(found),
     )
     return [StarInView(*row) for row in zip(*columns, strict=True)]
-
-
-def _constellations(ra_deg: FloatArray, dec_deg: FloatArray) -> list[str]:
-    """The constellations of places in the sky (IAU boundaries of 1930, through Astropy)."""
-    from astropy.coordinates import SkyCoord, get_constellation  # takes half a second, which only this needs
-
-    if not len(ra_deg):
-        return []
-    return [str(name) for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))]

@@ -1,4 +1,4 @@
-"""What `exact` balances of a star: ten sums over its pixels, so that any centroider finds its light and place.
+"""The ten sums over a star's pixels that `exact` balances, so that any centroider finds its light and its place.
 
 A centroider's error is a weighted sum of the errors of the pixels, and centroiders differ by their weights. Those of all are
 near the span of ten: light and first moments of all pixels, the same under a Gaussian (a fitted PSF and a Gaussian window,
@@ -21,12 +21,11 @@ BOX_REACH = 15  # px from a star's nearest pixel; the boxes' weights are tabulat
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Of the sums in a squared error, in light or light times 1 px.
+    """Weights of the sums in a squared error, in light or light times 1 px.
 
-    `few_steps`: a star of so many steps weighs its light twice; its flux is then as near as the panel's step allows.
-    `last_light` is that of the light in the choice among what is left at the end: till then light can be made up for.
-    `window_blurs` is the Gaussian's variance beyond the sprite's, in variances of the blur: a fit has 0 before the blur and 2
-    after it.
+    A star of `few_steps` steps weighs its light twice; its flux is then as near as the panel's step allows. `last_light` weighs
+    the light in the last choice, after which no pixel can make up for it. `window_blurs` is the Gaussian's variance beyond the
+    sprite's, in variances of the blur: a fit has 0 before the blur and 2 after it.
     """
 
     light: float
@@ -74,27 +73,27 @@ class Balance:
 
     def in_box(self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array) -> FloatArray:
         """The part that is in a box of `side` tracker pixels of a pixel so many pixels from a star's nearest."""
-        x, y = (np.minimum(np.abs(away), BOX_REACH).astype(np.intp) for away in (away_x, away_y))
-        table = self._box(side)
-        return np.asarray(table[x] * table[y])
-
-    def _box(self, side: int) -> FloatArray:
-        """The part of pixels 0 to BOX_REACH from a star's nearest, along one axis."""
         from scipy.special import ndtr
 
         half, away = side * self.seen.pixel_px / 2, np.arange(BOX_REACH + 1)
         # A box without blur keeps an edge of half a pixel: where the tracker's pixels lie on the monitor's is not known.
         blur = max(self.seen.blur_px, 0.25)
-        return np.asarray(ndtr((away + half) / blur) - ndtr((away - half) / blur))
+        along_axis = np.asarray(ndtr((away + half) / blur) - ndtr((away - half) / blur))
+        x, y = (np.minimum(np.abs(away), BOX_REACH).astype(np.intp) for away in (away_x, away_y))
+        return np.asarray(along_axis[x] * along_axis[y])
 
     def follows(self, side: int) -> tuple[float, float]:
         """How far a star's centre of mass in a box follows the box: 0 where it holds all light, 1 in an even field."""
-        half = side * self.seen.pixel_px / 2
-        x, y = (_follows(half / math.sqrt(v + self.seen.blur_px**2)) for v in self.psf.variance_px2)
-        return x, y
+        slopes = []
+        for variance in self.psf.variance_px2:
+            # The slope of the mean of a unit Gaussian between -h and h, as both edges move
+            h = side * self.seen.pixel_px / 2 / math.sqrt(variance + self.seen.blur_px**2)
+            density = math.exp(-(h**2) / 2) / math.sqrt(2 * math.pi)
+            slopes.append(2 * h * density / math.erf(h / math.sqrt(2)))
+        return slopes[0], slopes[1]
 
     def arms(self, offset_px: Float32Array, fraction_px: Float32Array, steps: Float32Array) -> Float32Array:
-        """What each pixel's error is multiplied by in each sum, (SUMS, pixels, n).
+        """The factor of each pixel's error in each sum, (SUMS, pixels, n).
 
         `offset_px` (2, pixels, n) are whole pixels from the stars' own, `fraction_px` (2, n) the stars' places from there,
         `steps` (n,) their light in steps from black.
@@ -109,21 +108,10 @@ class Balance:
         window = (1 + u / 8) ** -8
         arms = np.empty((SUMS, *window.shape), dtype=np.float32)
         weights = self.weights
-        arms[0], arms[1:3] = _light_weight(steps, weights), weights.moments * d
+        arms[0], arms[1:3] = weights.light * (1 + weights.few_steps / np.maximum(steps, 1e-3)), weights.moments * d
         arms[3], arms[4:6] = weights.window_light * window, weights.window_moments * window * d
         for first, side, weight in ((6, 3, weights.box_3), (8, 5, weights.box_5)):
             follows = np.array(self.follows(side), dtype=np.float32)[:, None, None]
             box = np.float32(weight) * self.in_box(side, *away).astype(np.float32)
             arms[first : first + 2] = box * (d + follows * off)
         return arms
-
-
-def _light_weight(steps: Float32Array, weights: Weights) -> Float32Array:
-    """The weight of all light of stars of so many steps of light, (n,)."""
-    return np.asarray(weights.light * (1 + weights.few_steps / np.maximum(steps, 1e-3)), dtype=np.float32)
-
-
-def _follows(half_sigmas: float) -> float:
-    """The slope of the mean of a unit Gaussian between -h and h, as both edges move."""
-    density = math.exp(-(half_sigmas**2) / 2) / math.sqrt(2 * math.pi)
-    return 2 * half_sigmas * density / math.erf(half_sigmas / math.sqrt(2))

@@ -11,7 +11,7 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -115,18 +115,49 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     """
     name = str(source)
     if name in FORMULAS:
-        grey = srgb_response(bits) if name == "srgb" else gamma_response(bits)
+        grey = _formula(name, bits)
         response = bit_stealing_response((grey, grey, grey), REC709_WEIGHTS) if bit_stealing else grey
         digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()
         return Calibration(name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula")
-    path = EXAMPLE if name == "lcd-example" else Path(source)
+    path = _path_of(source)
     meant = did_you_mean(name, BUILT_IN)
     if not exists(path) and (meant or not path.suffix):
         raise InputError(
             f"calibration = {shortened(json.dumps(name))}: no such built-in or file; {meant}write "
             f"{', '.join(BUILT_IN)} or FILE.toml"
         )
-    return _load_file(path, name if name == "lcd-example" else path.name, bits, bit_stealing)
+    read: list[bytes] = []
+    file = read_toml(path, read)
+    head = file.calibration
+    if head.bits != bits:
+        raise InputError(f"{path}: [calibration] bits = {head.bits}, but the monitor has {bits}; calibrate at {bits} bits")
+    columns = read_response(beside(path, head.response, "[calibration] response"), bits, read)
+    uniformity = None
+    if file.uniformity is not None:
+        uniformity = read_grid(beside(path, file.uniformity.file, "[uniformity] file"), read)
+    weights = (file.weights.r, file.weights.g, file.weights.b) if file.weights else None
+    response, shares = _response(path, bits, columns, weights, bit_stealing)
+    return Calibration(
+        name=name if name == "lcd-example" else path.name,
+        response=response,
+        sha256=hashlib.sha256(b"".join(read)).hexdigest(),
+        uniformity=uniformity,
+        noise=file.noise.relative if file.noise else 0.0,
+        weights=shares,
+        who=head.who,
+        when=head.when,
+        instrument=head.instrument,
+        unit=head.unit,
+        notes={key: text for key, text in msgspec.structs.asdict(file.notes).items() if text},
+    )
+
+
+def _formula(name: str, bits: int) -> Response:
+    return srgb_response(bits) if name == "srgb" else gamma_response(bits)
+
+
+def _path_of(source: str | Path) -> Path:
+    return EXAMPLE if str(source) == "lcd-example" else Path(source)
 
 
 def primary_lights(source: str | Path, bits: int) -> FloatArray:
@@ -135,11 +166,10 @@ def primary_lights(source: str | Path, bits: int) -> FloatArray:
     Raises InputError as `load_calibration` does with bit stealing.
     """
     if str(source) in FORMULAS:
-        grey = srgb_response(bits) if str(source) == "srgb" else gamma_response(bits)
-        return np.outer(REC709_WEIGHTS, grey.light)
-    path, digest = EXAMPLE if str(source) == "lcd-example" else Path(source), hashlib.sha256()
-    file = read_toml(path, digest)
-    columns = read_response(beside(path, file.calibration.response, "[calibration] response"), bits, digest)
+        return np.outer(REC709_WEIGHTS, _formula(str(source), bits).light)
+    path = _path_of(source)
+    file = read_toml(path)
+    columns = read_response(beside(path, file.calibration.response, "[calibration] response"), bits)
     above = {name: light - light[0] for name, light in columns.items()}
     if "r" in above and file.weights is None:
         light = np.stack([above[name] for name in ("r", "g", "b")])
@@ -159,44 +189,16 @@ def with_uniformity(source: str | Path, bits: int, path: Path, grid: FloatArray 
     """
     response, weights, noise, notes = f"{path.stem}.csv", None, 0.0, NotesTable()
     if str(source) in FORMULAS:
-        light = srgb_response(bits) if str(source) == "srgb" else gamma_response(bits)
         head = CalibrationHead("photometric", "", "", f"none: the formula {source}", "relative", bits, response)
-        columns, weights = {"w": light.light}, WeightsTable(*REC709_WEIGHTS)
+        columns, weights = {"w": _formula(str(source), bits).light}, WeightsTable(*REC709_WEIGHTS)
     else:
-        origin, digest = EXAMPLE if str(source) == "lcd-example" else Path(source), hashlib.sha256()
-        file = read_toml(origin, digest)
-        columns = read_response(beside(origin, file.calibration.response, "[calibration] response"), bits, digest)
+        origin = _path_of(source)
+        file = read_toml(origin)
+        columns = read_response(beside(origin, file.calibration.response, "[calibration] response"), bits)
         head = msgspec.structs.replace(file.calibration, response=response)
         weights, noise, notes = file.weights, file.noise.relative if file.noise else 0.0, file.notes
     table = write_calibration(path, head, columns, noise, notes, weights)
     return (path, table) if grid is None else (path, table, add_uniformity(path, grid))
-
-
-def _load_file(path: Path, name: str, bits: int, bit_stealing: bool) -> Calibration:
-    digest = hashlib.sha256()
-    file = read_toml(path, digest)
-    head = file.calibration
-    if head.bits != bits:
-        raise InputError(f"{path}: [calibration] bits = {head.bits}, but the monitor has {bits}; calibrate at {bits} bits")
-    columns = read_response(beside(path, head.response, "[calibration] response"), bits, digest)
-    uniformity = None
-    if file.uniformity is not None:
-        uniformity = read_grid(beside(path, file.uniformity.file, "[uniformity] file"), digest)
-    weights = (file.weights.r, file.weights.g, file.weights.b) if file.weights else None
-    response, shares = _response(path, bits, columns, weights, bit_stealing)
-    return Calibration(
-        name=name,
-        response=response,
-        sha256=digest.hexdigest(),
-        uniformity=uniformity,
-        noise=file.noise.relative if file.noise else 0.0,
-        weights=shares,
-        who=head.who,
-        when=head.when,
-        instrument=head.instrument,
-        unit=head.unit,
-        notes={key: text for key, text in msgspec.structs.asdict(file.notes).items() if text},
-    )
 
 
 def _response(
@@ -210,26 +212,14 @@ def _response(
         if not sum(weights) > 0:
             raise InputError(f"{path}: [weights] r, g and b are all 0; write the primaries' shares of white")
         weights = weights[0] / sum(weights), weights[1] / sum(weights), weights[2] / sum(weights)
+    elif bit_stealing:
+        raise InputError(f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r, g, b")
     black = float(np.mean([light[0] for light in columns.values()])) / sum(whites.values())
     tables = {name: table_response(bits, (light - light[0]) / whites[name]) for name, light in columns.items()}
-    channels = (tables["w"],) * 3 if "w" in tables else (tables["r"], tables["g"], tables["b"])
-    if bit_stealing and weights is None:
-        raise InputError(f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r, g, b")
-    if bit_stealing and weights is not None:
-        return bit_stealing_response((channels[0], channels[1], channels[2]), weights, black), weights
-    if "w" in tables or weights is None:
+    if weights is None or ("w" in tables and not bit_stealing):
         return table_response(bits, tables["w"].light, black), weights
-    return mixed_response((channels[0], channels[1], channels[2]), weights, black), weights
-
-
-class Digest(Protocol):
-    """What hashlib gives."""
-
-    def update(self, data: bytes, /) -> None:
-        """Take more bytes."""
-
-    def hexdigest(self) -> str:
-        """The hash so far."""
+    r, g, b = (tables["w"],) * 3 if "w" in tables else (tables["r"], tables["g"], tables["b"])
+    return (bit_stealing_response if bit_stealing else mixed_response)((r, g, b), weights, black), weights
 
 
 class CalibrationHead(Table, frozen=True):
@@ -285,9 +275,11 @@ class CalibrationFile(Table, frozen=True):
 KIND = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
 
 
-def _read(path: Path, digest: Digest, limit_bytes: int = MAX_TABLE_BYTES) -> str:
+def _read(path: Path, read: list[bytes] | None, limit_bytes: int = MAX_TABLE_BYTES) -> str:
+    """The text of a file, whose bytes are added to those that were `read`."""
     raw = read_bytes(path, ADVICE, limit_bytes)
-    digest.update(raw)
+    if read is not None:
+        read.append(raw)
     return as_text(path, raw, ADVICE)
 
 
@@ -299,9 +291,9 @@ def beside(path: Path, name: str, key: str) -> Path:
     return other
 
 
-def read_toml(path: Path, digest: Digest) -> CalibrationFile:
+def read_toml(path: Path, read: list[bytes] | None = None) -> CalibrationFile:
     """Read and check a calibration file. Raises InputError: file, key, what is wrong and what to write."""
-    tables = parse_toml(path, _read(path, digest, MAX_TOML_BYTES))
+    tables = parse_toml(path, _read(path, read, MAX_TOML_BYTES))
     head = tables.get("calibration")
     if isinstance(head, dict) and isinstance(head.get("when"), datetime.date):  # TOML has dates of its own
         head["when"] = str(head["when"])
@@ -334,12 +326,12 @@ def _lines(text: str) -> list[tuple[int, str]]:
     return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
 
 
-def read_response(path: Path, bits: int, digest: Digest) -> dict[str, FloatArray]:
+def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dict[str, FloatArray]:
     """Light (2^bits,) of each channel, black level included: every code, or some of them and the curve between.
 
     Raises InputError for a table without code 0 or white, with equal or falling neighbours, or with blacks that disagree.
     """
-    lines = _lines(_read(path, digest))
+    lines = _lines(_read(path, read))
     header = tuple(cell.strip() for cell in lines[0][1].split(",")) if lines else ()
     if header not in (("code", *GREY), ("code", *PRIMARIES)):
         raise InputError(f"{path}: its header is {','.join(header)[:60]!r}; write code,w or code,r,g,b")
@@ -382,9 +374,9 @@ def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, whit
     return np.append(light[0], light[0] + np.exp(np.where(wanted < log_code[0], below, curve(np.maximum(wanted, log_code[0])))))
 
 
-def read_grid(path: Path, digest: Digest) -> FloatArray:
+def read_grid(path: Path, read: list[bytes]) -> FloatArray:
     """A grid of relative light (rows, columns), rows from top to bottom, all positive. Raises InputError."""
-    lines = _lines(_read(path, digest))
+    lines = _lines(_read(path, read))
     grid = _numbers(path, lines, lines[0][1].count(",") + 1 if lines else 1)
     if not grid.min() > 0:
         raise InputError(f"{path}: a field of the screen has no light; every value must be more than 0")

@@ -11,7 +11,6 @@ This is the oracle of shaders/exact.comp, and what draws where that cannot run.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
@@ -52,24 +51,8 @@ EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
 
 
 @dataclass(frozen=True, slots=True)
-class _Pixels:
-    """The near pixels of n stars, (near, n), light in steps from black: what the choice between two levels is about.
-
-    `short` is what the lower level is off the wanted light (0 or less), `step` how much the next one adds (0 where there
-    is none to take). `arm` (SUMS, near, n) weighs a pixel's error into the sums of `error` (SUMS, n), of which that of light
-    counts `last_light` times at the end.
-    """
-
-    short: Float32Array
-    step: Float32Array
-    arm: Float32Array
-    error: Float32Array
-    last_light: float
-
-
-@dataclass(frozen=True, slots=True)
 class Carried:
-    """What n sprites begin with: errors of the sums that they have to make up for (SUMS, n), in steps from black.
+    """The errors of the sums (SUMS, n) that n sprites have to make up for, in steps from black.
 
     Those of light and moments are plain, the others weighed. Where all steps of a star are equal, `phase` (n,) is the part of
     one that its light has in hand.
@@ -79,42 +62,59 @@ class Carried:
     phase: Float32Array
 
     def of(self, some: IntArray) -> Carried:
-        """That of some of the sprites."""
+        """The same of some of the sprites."""
         return Carried(self.error[:, some], self.phase[some])
 
 
 def nothing_carried(count: int) -> Carried:
-    """That of `count` sprites whose frame stands by itself."""
+    """No errors, for `count` sprites of a frame that stands by itself."""
     return Carried(np.zeros((SUMS, count), dtype=np.float32), np.zeros(count, dtype=np.float32))
 
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """What the stars of a frame left to the next one: their numbers (n,) as in `Sprites.star`, and the errors (SUMS, n)."""
+    """The errors (SUMS, n) that the stars of a frame leave to the next one, and their numbers (n,) as in `Sprites.star`."""
 
     star: IntArray
     error: Float32Array
 
 
-class StarQuantiser(Quantiser):
+def _fits(psf: Psf) -> bool:
+    """Whether exact.comp has bits enough for the pixels of such sprites, and their shares are products, as it takes them."""
+    order = PixelOrder(psf)
+    return psf.separable and order.near <= MAX_NEAR and order.size <= MAX_SIZE
+
+
+class ExactQuantiser(Quantiser):
     """Looks at stars: `shader`, a compute shader, chooses the levels of each one together, over the nearest ones.
 
-    `weights` are those of its sums. One that `remembers` begins each star with what the last frame left, in `left`: always
-    None where each frame stands by itself, and at the beginning of a sequence.
+    An instance chooses those of sprites of `psf` on a panel, image after image, for a tracker that sees it as `seen`. `weights`
+    are those of its sums. One that `remembers` begins each star with what the last frame left, in `left`: None where each frame
+    stands by itself, and at the beginning of a sequence.
     """
 
+    words = "all codes of a star are chosen together, so that its flux and centroid are right in a single frame."
     shader = "exact.comp"
     other_codes = 5e-3
     weights: ClassVar[Weights] = IN_A_FRAME
     remembers: ClassVar[bool] = False
     left: Left | None = None
 
-    @abstractmethod
-    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
-        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array.
-
-        Their light is added to that of the levels `floor` (height, width), None for black.
-        """
+    def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
+        super().__init__(panel, resolution_px, psf, seen)
+        self._map = FootprintMap(resolution_px, psf)
+        self._balance = Balance(psf, seen, self.weights)
+        response = panel.response
+        self._light = np.append(response.light, response.light[-1])  # there is no step above white
+        self._step_e_per_s = float(response.light[1]) * panel.flux_at_white_e_per_s
+        self._lower = ThresholdCounter(response.light[1:].astype(np.float32))
+        self._nearest = ThresholdCounter(response.threshold.astype(np.float32))
+        self._first_threshold = np.float32(response.threshold[0])
+        self._flat = np.zeros(self._map.pixels + 1, dtype=level_dtype(response))  # one more, for pixels off the image
+        self._lit: PlaceArray = np.empty(0, dtype=np.int32)
+        self._on_floor = False
+        uniformity = panel.uniformity
+        self._output = None if uniformity is None else np.append(uniformity.ravel(), np.float32(1))
 
     def draw(self, light: FrameLight) -> Levels:
         """The levels of the next frame: its stars are added to its dithered extended light."""
@@ -138,7 +138,7 @@ class StarQuantiser(Quantiser):
 
     @classmethod
     def cost(cls, psf: Psf, gl_version: int) -> LevelCost:
-        """That of the shader, or of NumPy."""
+        """The cost of the shader, or of NumPy where the shader cannot draw."""
         has_compute = gl_version >= COMPUTE_VERSION
         by_numpy_ms = NUMPY_EXACT_MS_A_STAR if _fits(psf) else WIDE_EXACT_MS_A_STAR
         why = "" if has_compute else "in NumPy: its compute shaders need OpenGL 4.3"
@@ -154,41 +154,16 @@ class StarQuantiser(Quantiser):
         """How far the mask that dithers extended light is turned in frame `number`, 0 to 1."""
         return 0.0
 
-
-def _fits(psf: Psf) -> bool:
-    """Whether exact.comp has bits enough for the pixels of such sprites, and their shares are products, as it takes them."""
-    order = PixelOrder(psf)
-    return psf.separable and order.near <= MAX_NEAR and order.size <= MAX_SIZE
-
-
-class ExactQuantiser(StarQuantiser):
-    """Levels of sprites on a panel, one image after another; `psf` is that of the sprites, `seen` the tracker's."""
-
-    words = "all codes of a star are chosen together, so that its flux and centroid are right in a single frame."
-
-    def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
-        super().__init__(panel, resolution_px, psf, seen)
-        self._map = FootprintMap(resolution_px, psf)
-        self._balance = Balance(psf, seen, self.weights)
-        response = panel.response
-        self._light = np.append(response.light, response.light[-1])  # there is no step above white
-        self._step_e_per_s = float(response.light[1]) * panel.flux_at_white_e_per_s
-        self._lower = ThresholdCounter(response.light[1:].astype(np.float32))
-        self._nearest = ThresholdCounter(response.threshold.astype(np.float32))
-        self._first_threshold = np.float32(response.threshold[0])
-        self._flat = np.zeros(self._map.pixels + 1, dtype=level_dtype(response))  # one more, for pixels off the image
-        self._lit: PlaceArray = np.empty(0, dtype=np.int32)
-        self._on_floor = False
-        uniformity = panel.uniformity
-        self._output = None if uniformity is None else np.append(uniformity.ravel(), np.float32(1))
-
     @classmethod
     def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
-        """That of half a step, whichever pixel would show it."""
+        """The rate of half a step: any pixel of the star may show it."""
         return panel.response.half_step * panel.flux_at_white_e_per_s
 
     def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
-        """See `StarQuantiser.levels`."""
+        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array.
+
+        Their light is added to that of the levels `floor` (height, width), None for black.
+        """
         width, height = self._map.resolution_px
         if floor is None:
             self._flat[slice(None) if self._on_floor else self._lit] = 0
@@ -201,7 +176,7 @@ class ExactQuantiser(StarQuantiser):
             levels = np.empty(found.place.shape, dtype=self._flat.dtype)
             carried = self._carried(sprites)
             left = np.empty_like(carried.error)
-            reach = self._reach(found.rate_e_per_s * _in_path(sprites).astype(np.float32))
+            reach = self._reach(found.rate_e_per_s * _sprites_in_path(sprites).astype(np.float32))
             for some in _turns(sprites):
                 levels[:, some], left[:, some] = self._choose(_part(found, some), carried.of(some), reach[some])
                 _hand_on(carried.error, left, some, sprites)
@@ -217,7 +192,7 @@ class ExactQuantiser(StarQuantiser):
         return np.maximum(order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order))
 
     def _carried(self, sprites: Sprites) -> Carried:
-        """What each sprite begins with: nothing, in a frame that is right by itself."""
+        """The errors that each sprite begins with: none, in a frame that is right by itself."""
         return nothing_carried(len(sprites))
 
     def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
@@ -238,18 +213,23 @@ class ExactQuantiser(StarQuantiser):
         far, short, step = short.copy(), np.where(chosen, short[:near], np.float32(0)), np.where(chosen, step, np.float32(0))
         far[:near][chosen] = 0.0
         d = found.offset_px - found.fraction_px[:, None]
+        weights = self._balance.weights
         arm = self._balance.arms(
             found.offset_px[:, :near], found.fraction_px, found.rate_e_per_s / np.float32(self._step_e_per_s)
         )
         error = self._bounded(carried.error, step).copy()
-        error[:3] += _plain_sums(far, d)
-        grid = _equal_step(step)
+        error[:3] += np.stack([far.sum(axis=0), *np.einsum("kpn,pn->kn", d, far)])
+        # Where all steps of a star are equal: the step; 0 elsewhere. What lies between two of them no choice can show.
+        largest, smallest = step.max(axis=0), np.min(step, axis=0, initial=np.inf, where=step > 0)
+        grid = np.where(largest <= smallest * (1 + SAME_STEP), largest, np.float32(0))
         error[0] += carried.phase * grid
-        hidden = _between_steps(short.sum(axis=0) + error[0], grid)
+        lowest, unit = short.sum(axis=0) + error[0], np.where(grid > 0, grid, np.float32(1))
+        hidden = np.where(grid > 0, lowest - np.rint(lowest / unit) * unit, np.float32(0))
         error[0] -= hidden
-        weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(self._balance.weights.moments))])
+        weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(weights.moments))])
         error[:3] *= weight
-        up, left = _decide(_Pixels(short, step, arm, error, self._balance.weights.last_light), grid)
+        up, left = _decide(short, step, arm, error, weights.last_light)
+        _turn_one_more(step, arm, up, left, grid)
         left[:3] /= weight
         left[0] += hidden
         return np.concatenate([lower + up, upper]), left
@@ -266,7 +246,10 @@ class ExactQuantiser(StarQuantiser):
         if self._on_floor:
             asked += self._light[self._flat[found.place]].astype(np.float32)
         np.minimum(asked, np.float32(1), out=asked)  # light over white is lost; neighbours do not make up for it
-        lower, upper = self._lower.count(asked[:near]), self._round(asked[near:])
+        # The nearest level this far out is 0 for all but the brightest stars.
+        lower, upper = self._lower.count(asked[:near]), np.zeros(asked[near:].shape, dtype=np.intp)
+        bright = asked[near:] >= self._first_threshold
+        upper[bright] = self._nearest.count(asked[near:][bright])
         shown = self._light[np.concatenate([lower, upper])]
         step = self._light[lower + 1] - shown[:near]
         short = shown - asked
@@ -277,13 +260,6 @@ class ExactQuantiser(StarQuantiser):
         short /= self._light[1]
         step /= self._light[1]
         return lower, upper, short.astype(np.float32), step.astype(np.float32)
-
-    def _round(self, asked: Float32Array) -> IntArray:
-        """The nearest levels; this far out they are 0 for all but the brightest stars."""
-        levels = np.zeros(asked.shape, dtype=np.intp)
-        bright = asked >= self._first_threshold
-        levels[bright] = self._nearest.count(asked[bright])
-        return levels
 
 
 def _part(found: Footprints, some: IntArray) -> Footprints:
@@ -310,8 +286,7 @@ def _turns(sprites: Sprites) -> Iterator[IntArray]:
             yield turn[start : start + CHUNK]
 
 
-def _in_path(sprites: Sprites) -> IntArray:
-    """How many sprites the path of each has, (n,)."""
+def _sprites_in_path(sprites: Sprites) -> IntArray:
     if sprites.per_star == 1:
         return np.ones(len(sprites), dtype=np.intp)
     begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
@@ -331,90 +306,58 @@ def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites:
         carried[row, there] -= left[0, here] * (place_px[there] - place_px[here])
 
 
-def _plain_sums(error: Float32Array, d: Float32Array) -> Float32Array:
-    """Light and first moments (3, n) of errors (pixels, n) at distances (2, pixels, n)."""
-    return np.stack([error.sum(axis=0), *np.einsum("kpn,pn->kn", d, error)])
+def _decide(
+    short: Float32Array, step: Float32Array, arm: Float32Array, error: Float32Array, last_light: float
+) -> tuple[npt.NDArray[np.bool_], Float32Array]:
+    """Which near pixels of n stars take the upper level, (near, n), and the sums that leaves, (SUMS, n).
 
-
-def _equal_step(step: Float32Array) -> Float32Array:
-    """The step of stars whose steps (near, n) are all equal, 0 of others, (n,)."""
-    largest = step.max(axis=0)
-    smallest = np.min(step, axis=0, initial=np.inf, where=step > 0)
-    return np.where(largest <= smallest * (1 + SAME_STEP), largest, np.float32(0))
-
-
-def _between_steps(lowest: Float32Array, grid: Float32Array) -> Float32Array:
-    """What no choice can show of the light: `lowest` (n,) has all pixels down, `grid` as by `_equal_step`."""
-    step = np.where(grid > 0, grid, np.float32(1))
-    return np.where(grid > 0, lowest - np.rint(lowest / step) * step, np.float32(0))
-
-
-@dataclass(frozen=True, slots=True)
-class _KeptStars:
-    """The choices kept side by side: their sums (SUMS, KEPT, n), the pixels that are up (near, KEPT, n), and who is missing."""
-
-    error: Float32Array
-    up: npt.NDArray[np.bool_]
-    missing: Float32Array
-
-    def compare(self, pixel: int, down: Float32Array, rise: Float32Array) -> npt.NDArray[np.bool_]:
-        """Of the four choices that two of those kept lead to keep two, in their places; who takes the upper level, (KEPT, n).
-
-        `down` is what the lower level leads to, `rise` what the step to the upper one adds.
-        """
+    `short` (near, n) is what the lower level is off the wanted light (0 or less), `step` (near, n) how much the next one adds
+    (0 where there is none to take), both in steps from black. `arm` (SUMS, near, n) weighs a pixel's error into the sums of
+    `error` (SUMS, n), of which that of light counts `last_light` times at the end.
+    """
+    near, count = step.shape
+    kept = np.repeat(error[:, None], KEPT, axis=1)
+    up = np.zeros((near, KEPT, count), dtype=np.bool_)
+    missing = np.zeros((KEPT, count), dtype=np.float32)
+    missing[1:] = NONE
+    for pixel in range(near):
+        weight, by = arm[:, pixel, None], step[pixel]
+        kept += weight * short[pixel]
+        down = np.square(kept).sum(axis=0) + missing
+        rise = by * (2 * (weight * kept).sum(axis=0) + by * np.square(weight).sum(axis=0))
+        rise[:, by == 0] = NONE
+        # Of the four choices that two of those kept lead to keep two, in their places. Where both of one lead to less than
+        # either of the other, the other's place takes the second.
         other = np.arange(KEPT) ^ (1 << (pixel % (KEPT.bit_length() - 1)))
-        rises = rise < 0
         better, worse = down + np.minimum(rise, 0), down + np.maximum(rise, 0)
-        # Where both of one lead to less than either of the other, the other's place takes the second.
         taken = worse[other] < better
         place, star = np.nonzero(taken)
-        self.error[:, place, star] = self.error[:, other[place], star]
-        self.up[:pixel, place, star] = self.up[:pixel, other[place], star]
-        self.missing[place, star] = self.missing[other[place], star]
-        self.up[pixel] = np.where(taken, ~rises[other], rises)
-        return np.asarray(self.up[pixel])
-
-    def best(self, last_light: float) -> tuple[npt.NDArray[np.bool_], Float32Array]:
-        """The pixels that are up in the best choice, (near, n), and its sums (SUMS, n); light counts `last_light` times."""
-        heavier = (last_light**2 - 1) * np.square(self.error[0])
-        best = (np.square(self.error).sum(axis=0) + heavier + self.missing).argmin(axis=0)[None, None]
-        up, error = (np.take_along_axis(part, best, axis=1)[:, 0] for part in (self.up, self.error))
-        return np.asarray(up), np.asarray(error)
+        kept[:, place, star] = kept[:, other[place], star]
+        up[:pixel, place, star] = up[:pixel, other[place], star]
+        missing[place, star] = missing[other[place], star]
+        up[pixel] = np.where(taken, rise[other] >= 0, rise < 0)
+        kept += weight * by * up[pixel]
+    heavier = (last_light**2 - 1) * np.square(kept[0])
+    best = (np.square(kept).sum(axis=0) + heavier + missing).argmin(axis=0)[None, None]
+    return np.take_along_axis(up, best, axis=1)[:, 0], np.take_along_axis(kept, best, axis=1)[:, 0]
 
 
-def _turn_one_more(pixels: _Pixels, up: npt.NDArray[np.bool_], error: Float32Array, grid: Float32Array) -> None:
-    """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other sums the least harm."""
-    stars = np.flatnonzero(np.abs(error[0]) > OFF * pixels.arm[0, 0] * np.where(grid > 0, grid, np.inf))
+def _turn_one_more(
+    step: Float32Array, arm: Float32Array, up: npt.NDArray[np.bool_], error: Float32Array, grid: Float32Array
+) -> None:
+    """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other sums the least harm.
+
+    `step` and `arm` as in `_decide`, whose results are changed.
+    """
+    stars = np.flatnonzero(np.abs(error[0]) > OFF * arm[0, 0] * np.where(grid > 0, grid, np.inf))
     if not len(stars):
         return
     rise = error[0, stars] < 0
-    by = np.where(rise, pixels.step[:, stars], -pixels.step[:, stars])
-    arm = pixels.arm[:, :, stars]
+    by = np.where(rise, step[:, stars], -step[:, stars])
+    arm = arm[:, :, stars]
     more = by * (2 * (arm * error[:, None, stars]).sum(axis=0) + by * np.square(arm).sum(axis=0))
     more[(by == 0) | (up[:, stars] == rise)] = np.inf
     pixel = more.argmin(axis=0)
     can = np.flatnonzero(np.isfinite(more.min(axis=0)))
     up[pixel[can], stars[can]] ^= True
     error[:, stars[can]] += arm[:, pixel[can], can] * by[pixel[can], can]
-
-
-def _decide(pixels: _Pixels, grid: Float32Array) -> tuple[npt.NDArray[np.bool_], Float32Array]:
-    """Which pixels take the upper level, (near, n), and the sums that leaves, (SUMS, n).
-
-    `grid` (n,) is the step of stars whose steps are all equal, else 0.
-    """
-    near, count = pixels.step.shape
-    missing = np.zeros((KEPT, count), dtype=np.float32)
-    missing[1:] = NONE
-    kept = _KeptStars(np.repeat(pixels.error[:, None], KEPT, axis=1), np.zeros((near, KEPT, count), dtype=np.bool_), missing)
-    error = kept.error
-    for pixel in range(near):
-        arm, step = pixels.arm[:, pixel, None], pixels.step[pixel]
-        error += arm * pixels.short[pixel]
-        down = np.square(error).sum(axis=0) + missing
-        rise = step * (2 * (arm * error).sum(axis=0) + step * np.square(arm).sum(axis=0))
-        rise[:, step == 0] = NONE
-        error += arm * step * kept.compare(pixel, down, rise)
-    up, left = kept.best(pixels.last_light)
-    _turn_one_more(pixels, up, left, grid)
-    return up, left

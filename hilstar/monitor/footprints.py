@@ -41,7 +41,10 @@ class PixelOrder:
         self.first = -((self.size - 1) // 2)
         self.bias = 0.5 if self.size % 2 else 0.0
         spread_px = np.sqrt(psf.variance_px2)
-        distance = self._distances(spread_px)
+        phase, steps = self._middles, np.arange(self.size) + self.first
+        x, y = (((steps[:, None] - phase) / s) ** 2 for s in spread_px)
+        # The footprint's pixels from a star of each phase, in sigmas
+        distance = np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(self.size**2, PHASES**2)
         self._least_spread_px = float(spread_px.min())
         reach_sigmas = max(REACH_SIGMA, MIN_REACH_PX / self._least_spread_px)
         self.near = int((distance <= reach_sigmas).sum(axis=0).max())
@@ -50,12 +53,9 @@ class PixelOrder:
         self.area_px2 = 2 * np.pi * float(spread_px.prod())
         self.row, self.column = (part.astype(np.int32) for part in np.divmod(order, self.size))
 
-    def _distances(self, spread_px: FloatArray) -> FloatArray:
-        """The footprint's pixels from a star of each phase, in sigmas, (size^2, PHASES^2)."""
-        phase = (np.arange(PHASES) + 0.5) / PHASES - self.bias
-        steps = np.arange(self.size) + self.first
-        x, y = (((steps[:, None] - phase) / s) ** 2 for s in spread_px)
-        return np.asarray(np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(self.size**2, PHASES**2))
+    @property
+    def _middles(self) -> FloatArray:
+        return (np.arange(PHASES) + 0.5) / PHASES - self.bias
 
     def near_sigmas(self, more_px: float = 0.0) -> float:
         """Distance of the farthest near pixel of any phase in sigmas (a pixel's width included), plus `more_px`.
@@ -78,8 +78,7 @@ class PixelOrder:
     @property
     def phases(self) -> FloatArray:
         """The middle of each phase, px from the star's own pixel: x and y (2, PHASES^2)."""
-        middle = (np.arange(PHASES) + 0.5) / PHASES - self.bias
-        return np.stack([np.tile(middle, PHASES), np.repeat(middle, PHASES)])
+        return np.stack([np.tile(self._middles, PHASES), np.repeat(self._middles, PHASES)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,7 +80,7 @@ class MadeTable(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """What a geometry file says of itself: one sigma of each parameter, how well it is known, and how it was made."""
+    """Notes of a geometry file: one sigma of each parameter, how well it is known, and how it was made."""
 
     sigma: dict[str, float]
     error: ErrorTable
@@ -111,7 +111,7 @@ KIND = "hilstar geometry 1"
 
 def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
     """The camera of a geometry file for a monitor of `resolution_px`. Raises InputError."""
-    found = _read(path)
+    found: GeometryFile = _read(path, GeometryFile, ADVICE)
     if found.kind != KIND:
         raise InputError(f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}")
     if found.resolution_px != resolution_px:
@@ -120,12 +120,18 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
     q = np.array(found.q_cam_to_mon)
     if not abs(float(np.linalg.norm(q)) - 1.0) <= NORM_TOLERANCE:
         raise InputError(f"{path}: q_cam_to_mon: its norm is {np.linalg.norm(q):.6g}; {ADVICE}")
+    field, residual = found.field, None
+    if field is not None:
+        sides = {len(field.x_px), len(field.y_px), *map(len, field.x_px), *map(len, field.y_px)}
+        if len(sides) != 1 or not 0 < len(field.x_px) <= MAX_TERMS:
+            raise InputError(f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}")
+        residual = ResidualField(np.array(field.x_px), np.array(field.y_px), resolution_px)
     a, b = found.tilt_deg
     lens = Lens(
         (found.k1, found.k2, found.k3),
         (found.p1, found.p2),
         (float(np.radians(a)), float(np.radians(b))),
-        None if found.field is None else _field(path, found.field, resolution_px),
+        residual,
         math.inf if found.max_field_deg is None else math.tan(math.radians(found.max_field_deg)),
     )
     return Camera(resolution_px, found.focal_length_px, found.principal_point_px, to_matrix(normalise(q)), lens)
@@ -133,23 +139,16 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
 
 def load_notes(path: Path) -> Notes:
     """The notes of a geometry file. Raises InputError."""
-    found = _read(path)
+    found: GeometryFile = _read(path, GeometryFile, ADVICE)
     return Notes(found.sigma, found.error or ErrorTable(), found.made or MadeTable())
 
 
-def _read(path: Path) -> GeometryFile:
-    table = parse_toml(path, read_text(path, ADVICE, MAX_FILE_BYTES))
+def _read(path: Path, form: type[LensTable], advice: str) -> Any:
+    table = parse_toml(path, read_text(path, advice, MAX_FILE_BYTES))
     try:
-        return msgspec.convert(table, GeometryFile)
+        return msgspec.convert(table, form)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
-
-
-def _field(path: Path, field: FieldTable, resolution_px: tuple[int, int]) -> ResidualField:
-    sizes = {len(field.x_px), len(field.y_px), *map(len, field.x_px), *map(len, field.y_px)}
-    if len(sizes) != 1 or not 0 < len(field.x_px) <= MAX_TERMS:
-        raise InputError(f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}")
-    return ResidualField(np.array(field.x_px), np.array(field.y_px), resolution_px)
+        raise InputError(f"{path}: {shortened(str(error))}; {advice}") from error
 
 
 class DistortionFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -161,11 +160,7 @@ class DistortionFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only
 def load_distortion(path: Path, camera: Camera) -> Camera:
     """The camera of a tracker with the lens of its flight model. Raises InputError."""
     advice = "write k1, k2, k3, p1 and p2, numbers, as far as they are not 0"
-    table = parse_toml(path, read_text(path, advice, MAX_FILE_BYTES))
-    try:
-        found = msgspec.convert(table, DistortionFile)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {shortened(str(error))}; {advice}") from error
+    found: DistortionFile = _read(path, DistortionFile, advice)
     return replace(camera, lens=Lens((found.k1, found.k2, found.k3), (found.p1, found.p2)))
 
 

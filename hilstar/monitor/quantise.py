@@ -37,7 +37,7 @@ MS_A_STAR = 0.002  # a whole frame of 2500 to 5000 stars, for each: 1080p over 3
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """What turns light into levels: a response, the light of white, and the relative light of each pixel.
+    """A monitor as light becomes levels on it: its response, the light of white, and the relative light of each pixel.
 
     `uniformity` float32 (height, width) is each pixel's light relative to what the response says (None: 1 everywhere).
     Raises InputError where it is not positive and finite.
@@ -54,7 +54,7 @@ class Panel:
             )
 
     def gain(self) -> Float32Array | None:
-        """What the wanted light is multiplied by before it is quantised, float32 (height, width), or None for 1.
+        """The factor of the wanted light before it is quantised, float32 (height, width), or None for 1.
 
         A product and not a quotient: of the two only the product is rounded the same by every GL.
         """
@@ -115,11 +115,11 @@ class Quantiser(ABC):
     @classmethod
     @abstractmethod
     def by_pixel(cls) -> type[PixelQuantiser]:
-        """What the GL draws before it looks at stars: a PixelQuantiser draws itself, the others `round`."""
+        """The quantiser that the GL draws before it looks at stars: a PixelQuantiser itself, `round` for the others."""
 
     @classmethod
     def cost(cls, psf: Psf, gl_version: int) -> LevelCost:
-        """What it costs on two cores without a GPU, by OpenGL `gl_version` (as 430)."""
+        """Its cost on two cores without a GPU, by OpenGL `gl_version` (such as 430)."""
         return LevelCost(MS_A_STAR)
 
     @classmethod
@@ -192,7 +192,7 @@ class RoundQuantiser(PixelQuantiser):
 
     @classmethod
     def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
-        """That whose middle pixel reaches the first threshold at the best phase."""
+        """The rate whose middle pixel reaches the first threshold at the best phase."""
         return cls.lit_from_e_per_s(panel) / psf.peak_share
 
 
@@ -208,7 +208,7 @@ class DitherQuantiser(PixelQuantiser):
 
     @classmethod
     def lit_from_e_per_s(cls, panel: Panel) -> float:
-        """Any light may."""
+        """0: any light may."""
         return 0.0
 
     @classmethod
@@ -283,7 +283,7 @@ def mask_turn(frame: int) -> float:
 
 
 def shown_light(levels: Levels, panel: Panel) -> FloatArray:
-    """What the monitor makes of levels (height, width): electrons per second above the black level, float64."""
+    """The light of levels (height, width) on a monitor: electrons per second above the black level, float64."""
     light = panel.response.light[levels] * panel.flux_at_white_e_per_s
     return light if panel.uniformity is None else light * panel.uniformity
 
@@ -337,7 +337,7 @@ def _table(thresholds: Float32Array, shift: int) -> CodeTable:
 
 
 class ThresholdCounter:
-    """What encode.frag does with a CodeTable, in NumPy: ten times as fast as a binary search of unsorted light."""
+    """Counts thresholds by a CodeTable, as encode.frag does: ten times as fast as a binary search of unsorted light."""
 
     def __init__(self, thresholds: Float32Array) -> None:
         table = code_table(thresholds)

@@ -104,20 +104,14 @@ def bit_stealing_response(channels: tuple[Response, Response, Response], weights
     light = np.stack([channel.light[codes] for channel, codes in zip(channels, rgb.T, strict=True)], axis=1) @ share
     order = np.argsort(light, kind="stable")
     rgb, light = rgb[order], light[order]
-    kept = _distinct(light, grey=(rgb == rgb[:, :1]).all(axis=1))
+    grey, kept = (rgb == rgb[:, :1]).all(axis=1), [0]
+    for place in range(1, len(light)):
+        if light[place] > light[kept[-1]] * (1 + SAME_LIGHT):
+            kept.append(place)
+        elif grey[place]:  # of equal lights the grey one is kept
+            kept[-1] = place
     light = light[kept] / light[kept][-1]
     return Response(bits, light, _midway(light), black, rgb[kept].astype(np.uint16))
-
-
-def _distinct(light: FloatArray, grey: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-    """The places of lights that rise by more than SAME_LIGHT; of equal lights the grey one is kept."""
-    kept: list[int] = []
-    for place, value in enumerate(light):
-        if not kept or value > light[kept[-1]] * (1 + SAME_LIGHT):
-            kept.append(place)
-        elif grey[place]:
-            kept[-1] = place
-    return np.array(kept)
 
 
 def _midway(light: FloatArray) -> FloatArray:

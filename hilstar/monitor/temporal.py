@@ -40,17 +40,17 @@ class TemporalQuantiser(ExactQuantiser):
 
     @classmethod
     def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
-        """Every star lights a pixel in some frame."""
+        """0: every star lights a pixel in some frame."""
         return 0.0
 
     @classmethod
     def exposure(cls, before: int, count: int) -> range:
-        """Each frame is unlike the one before."""
+        """All frames of the exposure: each is unlike the one before."""
         return range(before, before + count)
 
     @classmethod
     def fewest(cls, order: PixelOrder) -> int:
-        """All: pixels that stay dark are off the same way in each frame, and the others cannot make up for it."""
+        """All pixels: those that stay dark are off the same way in each frame, and the others cannot make up for it."""
         return order.near
 
     @classmethod

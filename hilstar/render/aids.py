@@ -1,4 +1,4 @@
-"""What can lie over the sky on a monitor, and what it makes of levels: `present.frag` in NumPy."""
+"""Crosshair, grid, blank and patch over the levels of a frame: `present.frag` in NumPy."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _on_line(offset_px: int, overlay: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class AidLevels:
-    """What aids are in the levels of a monitor with codes of `bits` bits; the crosshair goes through pixel `cross_px`."""
+    """The levels of aids on a monitor with codes of `bits` bits; the crosshair goes through pixel `cross_px`."""
 
     response: Response
     bits: int

@@ -1,4 +1,4 @@
-"""What draws frames, and for what: the `Backend` protocol, which OpenGL (`renderer`) and NumPy (`numpy_backend`) keep.
+"""`Backend`, which draws frames of a `Target`: by OpenGL (`renderer`) or by NumPy (`numpy_backend`).
 
 Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on a machine without OpenGL.
 """
@@ -46,7 +46,7 @@ SpriteSides = tuple[SpriteSide, ...]
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What a backend draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted.
+    """The image that a backend draws: its pixels, its sprites, and a monitor's response where codes are wanted.
 
     `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere). `sides` are those
     of fainter stars' sprites, by falling rates, of the same parity as the footprint. `seen` is how the tracker sees the
@@ -63,7 +63,7 @@ class Target:
     seen: Seen = AS_USUAL
 
     def panel(self) -> Panel | None:
-        """What turns light into levels, None without a response. Raises InputError for a map that does not fit."""
+        """The monitor, None without a response. Raises InputError for a map that does not fit."""
         if self.response is None:
             return None
         width, height = self.resolution_px
@@ -75,7 +75,7 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class ScreenView:
-    """What a screen shows: an image of `resolution_px`, on a screen of `screen_px`, codes of `bits` bits.
+    """The picture on a screen: an image of `resolution_px`, on a screen of `screen_px`, codes of `bits` bits.
 
     `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each level, None where level k
     is code k in all channels.
@@ -148,7 +148,7 @@ class Backend(ABC):
         return ""
 
     def fault(self) -> str:
-        """What has become of the GPU since the last call: a reset or an error; "" where all is well. Some microseconds."""
+        """A reset or an error of the GPU since the last call; "" where all is well. It takes some microseconds."""
         return ""
 
     @abstractmethod
@@ -192,7 +192,7 @@ def linear_light(backend: Backend, sprites: Sprites, stars: Stars, drawn: bool =
 
 
 def level_cost(quantiser: type[Quantiser], psf: Psf, context: Context | None = None) -> LevelCost:
-    """What a quantiser costs by the OpenGL of a context.
+    """The tabulated cost of a quantiser by the OpenGL of a context.
 
     Where NumPy draws everything (None) no frame waits for a screen, so the bench is planned as for a usual GL.
     """

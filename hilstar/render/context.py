@@ -38,7 +38,15 @@ class Gpu:
 
 def gpus() -> list[Gpu]:
     """EGL's devices in its order, a context made on each; none where EGL has no list of them."""
-    return [Gpu(index, _renderer_of(index)) for index in range(_device_count())]
+    found = []
+    for index in range(_device_count()):
+        renderer = ""
+        with contextlib.suppress(MachineError):
+            ctx = _context_on(index)
+            renderer = str(ctx.info["GL_RENDERER"])
+            ctx.release()
+        found.append(Gpu(index, renderer))
+    return found
 
 
 def _device_count() -> int:
@@ -54,37 +62,21 @@ def _device_count() -> int:
     return found.value
 
 
-def _renderer_of(index: int) -> str:
-    try:
-        ctx = _context_on(index)
-    except MachineError:
-        return ""
-    try:
-        return str(ctx.info["GL_RENDERER"])
-    finally:
-        ctx.release()
-
-
-def _index_of(wanted: int | str) -> int:
-    """The index of the GPU with an index or a part of a name. Raises InputError."""
-    if isinstance(wanted, int) and wanted < _device_count():
-        return wanted
-    found = gpus()
-    for gpu in found:
-        if isinstance(wanted, str) and wanted.lower() in gpu.renderer.lower():
-            return gpu.index
-    known = "; ".join(gpu.line() for gpu in found) or "none: EGL lists no devices"
-    meant = did_you_mean(wanted, (gpu.renderer for gpu in found))
-    raise InputError(f"[render] gpu = {wanted!r}: no such GPU; {meant}write the index or name of one of {known}")
-
-
 def create_context(gpu: int | str | None = None) -> moderngl.Context:
     """A headless core context of the newest OpenGL, 3.3 at least. Raises MachineError with what to install.
 
     `gpu` is an index of EGL's list or a part of a GL_RENDERER (InputError where there is no such one), by default EGL's
     first. Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
     """
-    return _context_on(None if gpu is None else _index_of(gpu))
+    if gpu is None or (isinstance(gpu, int) and gpu < _device_count()):
+        return _context_on(gpu)
+    found = gpus()
+    for one in found:
+        if isinstance(gpu, str) and gpu.lower() in one.renderer.lower():
+            return _context_on(one.index)
+    known = "; ".join(one.line() for one in found) or "none: EGL lists no devices"
+    meant = did_you_mean(gpu, (one.renderer for one in found))
+    raise InputError(f"[render] gpu = {gpu!r}: no such GPU; {meant}write the index or name of one of {known}")
 
 
 def _context_on(index: int | None) -> moderngl.Context:

@@ -101,7 +101,7 @@ class Driver:
         self._disable(GL_SCISSOR_TEST)
 
     def fault(self) -> str:
-        """What has become of the GPU since the last call: a reset or a GL error; "" where all is well."""
+        """A reset of the GPU or GL errors since the last call; "" where all is well."""
         status = 0 if self._reset is None else self._reset()
         if status:
             return f"the GPU is lost: {RESETS.get(status, f'reset status {status:#x}')}"

@@ -1,4 +1,4 @@
-"""The second pass of the renderer: a linear image to levels, by counting thresholds."""
+"""Programs of shaders/, a PSF for them, and the pass that makes levels of a linear image by counting thresholds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.errors import InputError
-from hilstar.monitor.quantise import CodeTable, Panel, PixelQuantiser, code_table, level_dtype
+from hilstar.monitor.quantise import Panel, PixelQuantiser, code_table, level_dtype
 from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides
@@ -20,6 +20,7 @@ from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 TABLE_WIDTH = 1024  # that of encode.frag
+TABLE_UNIT = 15  # the last texture unit that every OpenGL has: nothing else takes it
 
 
 def build_program(
@@ -45,6 +46,42 @@ def build_compute(
     before = [resource_path("shaders", f"{part}.glsl").read_text() for part in parts]
     with held():  # as for any program
         return ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), *before, body]))
+
+
+class Shares:
+    """The defines, uniforms and table of a PSF for programs with shares.glsl. It lives in its renderer's context."""
+
+    def __init__(self, ctx: moderngl.Context, psf: Psf, footprint_px: int | None = None) -> None:
+        self.footprint_px = footprint_px or psf.footprint_px
+        self.defines, self._uniforms, table = psf.shader(self.footprint_px)
+        self._table: moderngl.Texture | None = None
+        if table is not None:
+            self._table = ctx.texture(table.shape[1::-1], table.shape[2], table, dtype="f4")
+            self._table.filter = (moderngl.NEAREST, moderngl.NEAREST)
+
+    def set(self, program: moderngl.Program | moderngl.ComputeShader) -> None:
+        """Set the uniforms of a program; compilers drop what a program does not need."""
+        for name, value in self._uniforms.items():
+            if name in program:
+                program[name] = value
+        if "share_table" in program:
+            program["share_table"] = TABLE_UNIT
+
+    def bind(self) -> None:
+        """Bind the table, if there is one, for the next passes: another renderer of the context may have bound its own."""
+        if self._table is not None:
+            self._table.use(TABLE_UNIT)
+
+
+def splat_program(
+    ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares, in_units: bool = False
+) -> moderngl.Program:
+    """The program of star.vert and splat.frag; `in_units` draws light in the whole units of a LightUnits."""
+    program = build_program(ctx, "star.vert", "splat.frag", (*shares.defines, *["UNITS"] * in_units), "shares.glsl")
+    shares.set(program)
+    program["resolution_px"] = resolution_px
+    program["footprint_px"] = shares.footprint_px
+    return program
 
 
 MAX_RATE = 3e38  # in float32
@@ -225,16 +262,11 @@ class Encoder:
         self._sprites["resolution_px"] = linear.size
         self._whole_vao = ctx.vertex_array(self._whole, [])
         self._sprite_vao: moderngl.VertexArray | None = None
-        self._textures = {"linear_e_per_s": linear, **self._load_table(table, steps)}
-        if gain is not None:
-            self._textures["gain"] = self._texture(gain)
-        self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}
-        for program in (self._sprites, self._whole):
-            for unit, name in enumerate(self._textures):
-                program[name] = unit
-
-    def _load_table(self, table: CodeTable, steps: npt.NDArray[np.uint32] | None) -> dict[str, moderngl.Texture]:
-        self._steps = None if steps is None else self._ctx.buffer(steps.tobytes())
+        self._textures = {"linear_e_per_s": linear}
+        self._steps = None if steps is None else ctx.buffer(steps.tobytes())
+        if steps is None:
+            self._textures |= {"threshold_e_per_s": self._texture(_rows(table.threshold))}
+            self._textures |= {"first_code": self._texture(_rows(table.first_code))}
         for program in (self._sprites, self._whole):
             if steps is None:
                 program["first_bin"] = table.first_bin
@@ -243,12 +275,12 @@ class Encoder:
             else:
                 program["lowest"] = (table.first_bin - 1) << table.bin_shift
                 program["highest"] = ((table.first_bin + len(table.first_code)) << table.bin_shift) - 1
-        if steps is not None:
-            return {}
-        return {
-            "threshold_e_per_s": self._texture(_rows(table.threshold)),
-            "first_code": self._texture(_rows(table.first_code)),
-        }
+        if gain is not None:
+            self._textures["gain"] = self._texture(gain)
+        self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}
+        for program in (self._sprites, self._whole):
+            for unit, name in enumerate(self._textures):
+                program[name] = unit
 
     def _texture(self, values: npt.NDArray[Any]) -> moderngl.Texture:
         """A texture of float32 or uint32 `values` (height, width), read texel by texel."""
@@ -259,7 +291,7 @@ class Encoder:
 
     @property
     def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
-        """What turns light into levels here."""
+        """The tables by which light becomes levels."""
         textures = [texture for name, texture in self._textures.items() if name != "linear_e_per_s"]
         return [*textures, *([] if self._steps is None else [self._steps])]
 

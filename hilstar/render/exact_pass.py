@@ -1,4 +1,4 @@
-"""A StarQuantiser on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together.
+"""An ExactQuantiser on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together.
 
 With `temporal` what each star leaves is kept on the GPU from frame to frame.
 """
@@ -13,13 +13,12 @@ import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, IntArray
 from hilstar.monitor.balance import SUMS, Balance
-from hilstar.monitor.exact import CARRIED, Left, StarQuantiser
+from hilstar.monitor.exact import CARRIED, ExactQuantiser, Left
 from hilstar.monitor.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.render.backend import Target
-from hilstar.render.encoder import LevelTexture, LookupTable, build_compute
-from hilstar.render.splat import Shares
+from hilstar.render.encoder import LevelTexture, LookupTable, Shares, build_compute
 from hilstar.render.star_passes import StarPasses
 from hilstar.scene.psf import PIXEL_VARIANCE
 from hilstar.scene.sprites import Sprites
@@ -48,7 +47,7 @@ class ExactPass:
 
     def __init__(
         self,
-        quantiser: type[StarQuantiser],
+        quantiser: type[ExactQuantiser],
         target: Target,
         panel: Panel,
         linear: moderngl.Texture,
@@ -73,13 +72,10 @@ class ExactPass:
 
     def _program(self, paths: bool, summed: bool) -> moderngl.ComputeShader:
         """The program for stars or paths, whose light is summed or in the linear image; made when it is first asked for."""
-        if (paths, summed) not in self._programs:
-            self._programs[paths, summed] = self._build(paths, summed)
-        return self._programs[paths, summed]
-
-    def _build(self, paths: bool, summed: bool) -> moderngl.ComputeShader:
+        if (paths, summed) in self._programs:
+            return self._programs[paths, summed]
         order, panel, balance = self._pixels, self._panel, self._balance
-        defines = [f"NEAR {order.near}", f"LEVELS r{8 * self._levels_bytes()}ui"]
+        defines = [f"NEAR {order.near}", f"LEVELS r{8 if self._levels.dtype == 'u1' else 16}ui"]
         defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.psf.width_px) < NARROW_PX)
         defines += self._shares.defines
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
@@ -108,11 +104,12 @@ class ExactPass:
         for name, value in values.items():
             if name in program:  # compilers drop what they do not need
                 program[name] = value
+        self._programs[paths, summed] = program
         return program
 
     @property
     def left(self) -> Left | None:
-        """What the last frame of `temporal` left; None at the beginning of a sequence. It may come from NumPy's quantiser."""
+        """The errors of the last frame of `temporal`; None at the beginning of a sequence. NumPy's quantiser may give them."""
         return None if self._memory is None else self._memory.left
 
     @left.setter
@@ -122,11 +119,8 @@ class ExactPass:
 
     @property
     def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
-        """What levels are chosen by."""
+        """The tables by which levels are chosen."""
         return [self._order.buffer, self._light.buffer, *([] if self._gain is None else [self._gain])]
-
-    def _levels_bytes(self) -> int:
-        return 1 if self._levels.dtype == "u1" else 2
 
     def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
@@ -165,7 +159,7 @@ class ExactPass:
 
 
 class Memory:
-    """What the stars of one frame leave to the next, on the GPU; it lives in its renderer's context."""
+    """The errors that the stars of one frame leave to the next, on the GPU; it lives in its renderer's context."""
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
@@ -200,7 +194,7 @@ class Memory:
 
     @property
     def left(self) -> Left | None:
-        """What the last frame left, read back; None at the beginning of a sequence."""
+        """The errors of the last frame, read back; None at the beginning of a sequence."""
         if self._star is None:
             return None
         sums = np.frombuffer(self._left.read(len(self._star) * SUMS_BYTES), dtype="<f4").reshape(-1, SUMS)
@@ -218,7 +212,7 @@ class Memory:
 
 
 def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
-    """The shader's places: a footprint's pixels by distance for each phase; in a word x, y and their parts in the boxes."""
+    """A footprint's pixels by distance for each phase; in a word x, y and their parts in the boxes."""
     x, y = order.places()
     away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
     box_3, box_5 = (np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5))

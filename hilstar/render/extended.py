@@ -20,7 +20,7 @@ from hilstar.arrays import Float32Array, FloatArray
 from hilstar.render.encoder import build_program
 from hilstar.scene.camera import Camera, ray_shifts
 from hilstar.scene.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
-from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, Disc, gauss_legendre
+from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, gauss_legendre
 
 TILE_PX = 24
 MIN_TILED_PX = 40_000  # a rectangle of fewer pixels is drawn whole
@@ -198,10 +198,17 @@ class ExtendedLayer:
     def _draw_one(self, light: ExtendedLight) -> None:
         if isinstance(light, LightMap):
             self._draw_map(light)
-        elif isinstance(light, GlowLight):
-            self._draw_glow(light)
+            return
+        if isinstance(light, GlowLight):
+            program, triangle = self._with_rays("glow.frag", light.camera)
+            program["direction"] = tuple(light.direction_image.tolist())
+            program["peak_e_per_s"] = light.peak_e_per_s
+            program["scale_rad"] = light.scale_rad
+            program["exponent"] = light.exponent
         else:
-            self._draw_disc(light)
+            program, triangle = self._with_rays("disc.frag", light.camera)
+            _set_disc(program, light)
+        triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def _draw_map(self, light: LightMap) -> None:
         program, triangle = self._program("light_map.frag", "", *(() if light.cover is None else ("COVER",)))
@@ -219,20 +226,12 @@ class ExtendedLayer:
         for texture in own:
             texture.release()
 
-    def _draw_glow(self, light: GlowLight) -> None:
-        program, triangle = self._with_rays("glow.frag", light.camera)
-        program["direction"] = tuple(light.direction_image.tolist())
-        program["peak_e_per_s"] = light.peak_e_per_s
-        program["scale_rad"] = light.scale_rad
-        program["exponent"] = light.exponent
-        triangle.render(moderngl.TRIANGLES, vertices=3)
-
     def _draw_tiles(self, light: DiscLight, tiles: Tiles) -> None:
         program, _ = self._program("tile.frag", "", vertex="tile.vert")
         program["covers"] = float(light.covers)
         self._draw_corners(program, tiles.linear)
         program, _ = self._with_rays("disc.frag", light.camera, "tile.vert")
-        self._set_disc(program, light)
+        _set_disc(program, light)
         self._draw_corners(program, tiles.edges)
 
     def _draw_corners(self, program: moderngl.Program, corners: Float32Array) -> None:
@@ -246,26 +245,6 @@ class ExtendedLayer:
         triangles.render(moderngl.TRIANGLES)
         triangles.release()
         buffer.release()
-
-    def _draw_disc(self, light: DiscLight) -> None:
-        program, triangle = self._with_rays("disc.frag", light.camera)
-        self._set_disc(program, light)
-        triangle.render(moderngl.TRIANGLES, vertices=3)
-
-    @staticmethod
-    def _set_disc(program: moderngl.Program, light: DiscLight) -> None:
-        """The body, the turn and the Gaussian, in a program of disc.frag."""
-        disc = light.disc
-        from_image = disc.to_sphere @ light.icrs_to_image.T
-        program["to_sphere"] = tuple(from_image.T.ravel().tolist())  # column by column
-        program["variance_px"] = light.psf.variance_px2
-        program["times"] = light.times
-        program["covers"] = float(light.covers)
-        shear = light.shear
-        program["turn_rad_s"] = (0.0, 0.0, 0.0) if shear is None else tuple(shear.rate_image_rad_s.tolist())
-        program["late_s_per_px"] = (0.0, 0.0) if shear is None else shear.s_per_px
-        program["middle_px"] = (0.0, 0.0) if shear is None else shear.middle_px
-        _set_face(program, disc)
 
     def _with_rays(
         self, fragment: str, camera: Camera, vertex: str = "full.vert"
@@ -314,8 +293,17 @@ class ExtendedLayer:
         return texture
 
 
-def _set_face(program: moderngl.Program, disc: Disc) -> None:
-    """What a body's face is like, in a program of disc.frag."""
+def _set_disc(program: moderngl.Program, light: DiscLight) -> None:
+    """The body, its face, the turn and the Gaussian, in a program of disc.frag."""
+    disc, shear = light.disc, light.shear
+    from_image = disc.to_sphere @ light.icrs_to_image.T
+    program["to_sphere"] = tuple(from_image.T.ravel().tolist())  # column by column
+    program["variance_px"] = light.psf.variance_px2
+    program["times"] = light.times
+    program["covers"] = float(light.covers)
+    program["turn_rad_s"] = (0.0, 0.0, 0.0) if shear is None else tuple(shear.rate_image_rad_s.tolist())
+    program["late_s_per_px"] = (0.0, 0.0) if shear is None else shear.s_per_px
+    program["middle_px"] = (0.0, 0.0) if shear is None else shear.middle_px
     place, weight = gauss_legendre(NODES)
     program["node"] = ((place + 1) / 2).tolist()
     program["weight"] = (weight / 2).tolist()

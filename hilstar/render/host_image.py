@@ -16,8 +16,7 @@ import numpy.typing as npt
 from hilstar.arrays import IntArray
 from hilstar.render.backend import EGL_LIBRARY
 from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
-from hilstar.render.encoder import build_compute
-from hilstar.render.splat import Shares
+from hilstar.render.encoder import Shares, build_compute
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 PINNED_MEMORY = "GL_AMD_pinned_memory"
@@ -56,7 +55,10 @@ class HostImage:
         edges_px = np.arange(BANDS + 1) * resolution_px[1] // BANDS
         # A sprite's row here is that of its last pixels; its first are footprint - 1 rows before.
         self._first_row, self._end_row = edges_px[:-1], edges_px[1:] + footprint_px - 1
-        self._program = self._build()
+        named = [*shares.defines, f"FOOTPRINT {footprint_px}", f"BANDS {BANDS}"]
+        self._program = build_compute(ctx, "linear.comp", named, ["shares"])
+        shares.set(self._program)
+        self._program["resolution_px"] = resolution_px
 
     @staticmethod
     def runs_on(ctx: moderngl.Context, resolution_px: tuple[int, int]) -> bool:
@@ -64,13 +66,6 @@ class HostImage:
         width, height = resolution_px
         has = computes_in_software(ctx) and PINNED_MEMORY in ctx.extensions
         return has and 4 * width * height <= MAX_WRITTEN_BYTES
-
-    def _build(self) -> moderngl.ComputeShader:
-        named = [*self._shares.defines, f"FOOTPRINT {self._footprint_px}", f"BANDS {BANDS}"]
-        program = build_compute(self._ctx, "linear.comp", named, ["shares"])
-        self._shares.set(program)
-        program["resolution_px"] = self._size_px
-        return program
 
     def _reserved(self) -> moderngl.Buffer:
         return self._ctx.buffer(reserve=2 * self._capacity * SPRITE_DTYPE.itemsize, dynamic=True)

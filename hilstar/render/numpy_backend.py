@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 def open_backend(target: Target, context: Context | None) -> Backend:
-    """What draws for a target: OpenGL in a context, NumPy without one (see `headless_context`)."""
+    """The backend of a target: OpenGL in a context, NumPy without one (see `headless_context`)."""
     if context is None:
         return NumpyBackend(target)
     from hilstar.render.renderer import Renderer  # moderngl, which nothing needs where NumPy draws
@@ -45,9 +45,12 @@ def headless_context(gpu: int | str | None = None) -> Context | None:
 
     Raises InputError where the machine has no such GPU.
     """
-    if gpu is None and not _has_egl():
-        _say_once(f"{EGL_LIBRARY} is missing")
-        return None
+    if gpu is None:
+        try:
+            ctypes.CDLL(EGL_LIBRARY)
+        except OSError:
+            _say_once(f"{EGL_LIBRARY} is missing")
+            return None
     from hilstar.render.context import create_context  # moderngl
 
     try:
@@ -55,14 +58,6 @@ def headless_context(gpu: int | str | None = None) -> Context | None:
     except MachineError as error:
         _say_once(str(error))
         return None
-
-
-def _has_egl() -> bool:
-    try:
-        ctypes.CDLL(EGL_LIBRARY)
-    except OSError:
-        return False
-    return True
 
 
 @lru_cache(maxsize=1)
@@ -137,7 +132,7 @@ class NumpyBackend(Backend):
         self.back_buffer = codes
 
     def take_back_buffer(self) -> None:
-        """Nothing swaps it."""
+        """Return at once: nothing swaps it."""
 
     def remember_tables(self) -> None:
         """The host's memory keeps them."""
@@ -149,10 +144,10 @@ class NumpyBackend(Backend):
             self._quantiser.begin_anew()
 
     def finish(self) -> None:
-        """Nothing is ever under way."""
+        """Return at once: `draw` has drawn."""
 
     def close(self) -> None:
-        """Nothing to free."""
+        """Do nothing."""
 
     def _image(self, sprites: Sprites | None, shrunk: bool) -> Float32Array:
         """The linear image; `shrunk` draws fainter stars within the target's `sides`, as their levels are."""

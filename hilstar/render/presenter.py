@@ -62,7 +62,7 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
 
 
 class Presenter:
-    """Draws a texture of levels on the screen of its context."""
+    """Draws a texture of levels on the screen of its context; `table` has the codes of each level."""
 
     def __init__(self, levels: moderngl.Texture, view: ScreenView) -> None:
         self._texture = levels
@@ -97,22 +97,13 @@ class Presenter:
 
     def set_triples(self, triples: npt.NDArray[np.uint16] | None) -> None:
         """Use other codes for the same levels."""
-        with self._ctx:
-            nothing = np.zeros((1, 3), dtype=np.uint16)
-            self._triples = self._triples_texture(nothing if triples is None else triples)
-
-    def _triples_texture(self, triples: npt.NDArray[np.uint16]) -> moderngl.Texture:
-        rows = -(-len(triples) // TABLE_WIDTH)
+        used = np.zeros((1, 3), dtype=np.uint16) if triples is None else triples
+        rows = -(-len(used) // TABLE_WIDTH)
         padded = np.zeros((rows, TABLE_WIDTH, 3), dtype=np.uint16)
-        padded.reshape(-1, 3)[: len(triples)] = triples
-        texture = self._ctx.texture((TABLE_WIDTH, rows), 3, padded.tobytes(), dtype="u2", alignment=2)
-        texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        return texture
-
-    @property
-    def table(self) -> moderngl.Texture:
-        """The codes of each level."""
-        return self._triples
+        padded.reshape(-1, 3)[: len(used)] = used
+        with self._ctx:
+            self.table = self._ctx.texture((TABLE_WIDTH, rows), 3, padded.tobytes(), dtype="u2", alignment=2)
+            self.table.filter = (moderngl.NEAREST, moderngl.NEAREST)
 
     def wait(self) -> None:
         """Wait until the last swap is done: a driver that queues swaps has to give the next back buffer for this pixel.
@@ -135,7 +126,7 @@ class Presenter:
                 self._driver.take_back_buffer()
             self._ctx.viewport = (0, 0, *self._view.screen_px)
             self._texture.use(0)
-            self._triples.use(1)
+            self.table.use(1)
             program, vao = self._aided if overlay else self._plain
             if overlay:
                 program["overlay"], program["patch_code"] = overlay, patch_code

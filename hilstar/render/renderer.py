@@ -14,12 +14,12 @@ import moderngl
 import numpy as np
 
 from hilstar.arrays import Float32Array
-from hilstar.monitor.exact import StarQuantiser
+from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import DitherQuantiser, Panel
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import NO_FRAME, Backend, ScreenView, Target
-from hilstar.render.context import Context, check_limits, create_context
+from hilstar.render.context import Context, check_limits, computes_in_software, create_context
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
     CUT_WINGS,
@@ -27,15 +27,16 @@ from hilstar.render.encoder import (
     Encoder,
     Eraser,
     LevelTexture,
+    Shares,
     lit_sides,
     most_covered_px,
     set_sides,
+    splat_program,
 )
 from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
 from hilstar.render.host_image import HostImage
 from hilstar.render.presenter import Presenter, changed_codes
-from hilstar.render.splat import Shares, splat_program
 from hilstar.render.star_passes import LightUnits, StarPasses
 from hilstar.scene.extended import ExtendedLight, Rectangle
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
@@ -57,7 +58,7 @@ class Renderer(Backend):
         self._by_numpy = False
         quantiser = QUANTISERS[target.quantisation]
         self._by_pixel = quantiser.by_pixel()
-        self._by_star = quantiser if target.response is not None and issubclass(quantiser, StarQuantiser) else None
+        self._by_star = quantiser if target.response is not None and issubclass(quantiser, ExactQuantiser) else None
         self._last_frame = NO_FRAME
         self.context = self._ctx = context or create_context()
         self.gl_renderer, self.gl_version = (str(self._ctx.info[f"GL_{what}"]) for what in ("RENDERER", "VERSION"))
@@ -108,7 +109,7 @@ class Renderer(Backend):
         self._passes: StarPasses | None = None
         self._unit_splat: moderngl.Program | None = None  # where points are in units
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
-        self._exact: StarQuantiser | None = None
+        self._exact: ExactQuantiser | None = None
         self._floor_encoder: Encoder | None = None
         self._floor_key: tuple[tuple[ExtendedLight, ...], float] = ((), 0.0)
         self._floor_levels: Levels | None = None
@@ -137,10 +138,10 @@ class Renderer(Backend):
             self.path = "points, then compute shaders"
 
     def _build_units(self, levels: LevelTexture, panel: Panel, encoder: Encoder) -> None:
-        """What draws light in whole units: the passes of a software OpenGL, else sprites."""
+        """Build what draws light in whole units: the passes of a software OpenGL, else sprites."""
         target = self.target
         units = self._units = LightUnits(panel, target.resolution_px, target.psf, target.sides)
-        if StarPasses.runs_on(self._ctx):
+        if computes_in_software(self._ctx):  # a graphics card is left idle by a star a lane
             self._passes = StarPasses(levels, panel, target.psf, self._shares, self._by_star is not None, units)
             return
         self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, in_units=True)
@@ -205,7 +206,10 @@ class Renderer(Backend):
         self._draw_linear(sprites, whole=not (self.target.sides or cut), in_units=in_units)
         if self._encoder is not None:
             with self._stage("encode"):
-                self._encode(self._encoder, sprites, covered_px)
+                count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
+                uniforms = self._by_pixel.uniforms(self._last_frame)
+                self._encoder.draw(count, per_star, covered_px, uniforms, self._regions, self._levels_black)
+                self._levels_black = True  # but for what this frame has
         if in_units or (cut and not self.target.sides):
             self._undrawn = (sprites, True)  # without what is left out, when somebody asks
         self._choose(sprites, None)
@@ -237,7 +241,7 @@ class Renderer(Backend):
         self._choose(sprites, passes)
 
     def _stage(self, name: str) -> AbstractContextManager[object]:
-        """What a stage of a frame runs in; see StagedRenderer."""
+        """The context in which a stage of a frame runs; see StagedRenderer."""
         return UNTIMED
 
     def _choose(self, sprites: Sprites | None, passes: StarPasses | None) -> None:
@@ -266,12 +270,6 @@ class Renderer(Backend):
         self._exact_levels = self._exact.levels(sprites, floor)
         levels.write(self._exact_levels)
 
-    def _encode(self, encoder: Encoder, sprites: Sprites | None, covered_px: int) -> None:
-        count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
-        uniforms = self._by_pixel.uniforms(self._last_frame)
-        encoder.draw(count, per_star, covered_px, uniforms, self._regions, self._levels_black)
-        self._levels_black = True  # but for what this frame has
-
     def _floor(self, lights: tuple[ExtendedLight, ...], turn: float, panel: Panel, levels: LevelTexture) -> Levels:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
 
@@ -282,7 +280,7 @@ class Renderer(Backend):
         if self._floor_encoder is None:
             self._floor_encoder = Encoder(self._ctx, self._linear, levels, panel, DitherQuantiser)
         self._erase()
-        self._shine(lights)
+        self._regions = self._extended.draw(self._linear_fbo, lights)
         levels.fbo.clear()
         self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions)
         self._floor_key, self._floor_levels = (lights, turn), levels.read().copy()
@@ -308,13 +306,24 @@ class Renderer(Backend):
         with self._stage("erase"):
             self._erase(levels)
         if sprites is not None and sprites.extended:
-            self._shine(sprites.extended)
+            self._regions = self._extended.draw(self._linear_fbo, sprites.extended)
         if sprites is not None and len(sprites):
             with self._stage("upload"):
                 self._upload(sprites)
             self._last_count = len(sprites)
+            width, height = self.target.resolution_px
+            margin = self.footprint_px
             with self._stage("splat"):
-                self._splat_stars(sprites, whole, in_units)
+                if not in_units:
+                    self._splat["sides"] = 0 if whole else len(self._cut_sides)
+                    self._splat["sprites_per_star"] = float(sprites.per_star)
+                self._linear_fbo.use()
+                self._shares.bind()
+                self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+                self._ctx.enable(moderngl.BLEND)
+                vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao
+                vao.render(moderngl.POINTS, vertices=len(sprites))
+                self._ctx.disable(moderngl.BLEND)
 
     def _erase(self, levels: bool = True) -> None:
         """Make black what the last frame drew."""
@@ -328,25 +337,6 @@ class Renderer(Backend):
         self._eraser.erase_regions(self._linear_fbo, self._regions)
         self._regions = ()
         self._last_count = 0
-
-    def _shine(self, lights: tuple[ExtendedLight, ...]) -> None:
-        """Add extended light to the linear image."""
-        self._regions = self._extended.draw(self._linear_fbo, lights)
-
-    def _splat_stars(self, sprites: Sprites, whole: bool, in_units: bool) -> None:
-        """Add the light of the sprites that are in the buffer to the linear image."""
-        if not in_units:
-            self._splat["sides"] = 0 if whole else len(self._cut_sides)
-            self._splat["sprites_per_star"] = float(sprites.per_star)
-        width, height = self.target.resolution_px
-        margin = self.footprint_px
-        self._linear_fbo.use()
-        self._shares.bind()
-        self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
-        self._ctx.enable(moderngl.BLEND)
-        vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao
-        vao.render(moderngl.POINTS, vertices=len(sprites))
-        self._ctx.disable(moderngl.BLEND)
 
     def levels(self) -> Levels:
         """See `Backend.levels`."""

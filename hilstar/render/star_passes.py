@@ -12,11 +12,10 @@ import moderngl
 import numpy as np
 
 from hilstar.monitor.footprints import PixelOrder
-from hilstar.monitor.quantise import CodeTable, Panel, code_table
+from hilstar.monitor.quantise import Panel, code_table
 from hilstar.render.backend import SpriteSides
-from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
-from hilstar.render.encoder import LevelTexture, LookupTable, build_compute
-from hilstar.render.splat import Shares
+from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES
+from hilstar.render.encoder import LevelTexture, LookupTable, Shares, build_compute
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
@@ -54,7 +53,11 @@ class LightUnits:
         self._lit_e_per_s, self.white_e_per_s = float(thresholds[0]) / high, panel.flux_at_white_e_per_s / low
         self._peak_share = psf.peak_share
         self.axes_px2, self._share_bound = psf.reach
-        self.wings = WINGS if not sides else _wings_of(sides, self._lit_e_per_s, psf)
+        self.wings = float(WINGS)
+        if sides:  # what part of the light that lights a pixel the squares leave out beside them at most: one in so many
+            outside = [self._lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px)) for side in sides]
+            fewest = min([wings for wings in outside if wings > ANY_RATE], default=WINGS / SQUARE_WINGS)
+            self.wings = SQUARE_WINGS * max(1.0, fewest)
         self.side_px = max((side.side_px for side in sides), default=self._footprint_px)
 
     @staticmethod
@@ -104,39 +107,31 @@ class StarPasses:
         self._unit_e_per_s = 0.0  # unit of the sums
         self.sprites = ctx.buffer(reserve=SPRITE_DTYPE.itemsize, dynamic=True)
         self._drawn: int | None = None  # sprites that are in the buffer and on the images; None: it is not known
-        self._build(code_table(thresholds), psf)
-
-    @staticmethod
-    def runs_on(ctx: moderngl.Context) -> bool:
-        """Whether this GL is a processor's, with compute shaders; a graphics card is left idle by a star a lane."""
-        return computes_in_software(ctx)
-
-    def _build(self, table: CodeTable, psf: Psf) -> None:
+        table = code_table(thresholds)
         steps = table.steps()
         if steps is None:
-            raise ValueError("several thresholds in a bin; ask `runs_on` first")
-        self._steps = LookupTable(self._ctx, "STEPS", STEPS_BINDING, steps)
-        texel = {"u1": "r8ui", "u2": "r16ui"}[self._levels.texture.dtype]
-        defines = [f"LEVELS_FORMAT {texel}", f"BIN_SHIFT {table.bin_shift}"]
-        defines += [*self._shares.defines, *["KEEP"] * self._keep]
-        defines += ["UNIFORMITY"] * (self._gain is not None) + self._steps.define
-        side, all_px = f"FOOTPRINT {self._units.side_px}", f"FOOTPRINT {self._footprint_px}"
+            raise ValueError("several thresholds in a bin; ask `LightUnits.takes` first")
+        self._steps = LookupTable(ctx, "STEPS", STEPS_BINDING, steps)
+        texel = {"u1": "r8ui", "u2": "r16ui"}[levels.texture.dtype]
+        defines = [f"LEVELS_FORMAT {texel}", f"BIN_SHIFT {table.bin_shift}", *shares.defines, *["KEEP"] * keep]
+        defines += ["UNIFORMITY"] * (gain is not None) + self._steps.define
+        side, all_px = f"FOOTPRINT {units.side_px}", f"FOOTPRINT {self._footprint_px}"
         self._light, self._encode, self._black = (
-            build_compute(self._ctx, "light.comp", [*part, *defines], ("shares", "sums"))
+            build_compute(ctx, "light.comp", [*part, *defines], ("shares", "sums"))
             for part in (["LIGHT", side], ["LEVELS", side], [all_px])
         )
         for program in (self._light, self._encode, self._black):
-            program["resolution_px"], program["reach_px2"] = self._size_px, self._units.axes_px2
-        if self._keep:
+            program["resolution_px"], program["reach_px2"] = self._size_px, units.axes_px2
+        if keep:
             self._black["least_reach"] = 0.5 * PixelOrder(psf).near_sigmas(PHASE_PX) ** 2
-        self._shares.set(self._light)
-        self._light["most_e_per_s"] = self._units.white_e_per_s
+        shares.set(self._light)
+        self._light["most_e_per_s"] = units.white_e_per_s
         self._encode["lowest"] = (table.first_bin - 1) << table.bin_shift
         self._encode["highest"] = ((table.first_bin + len(table.first_code)) << table.bin_shift) - 1
 
     @property
     def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
-        """What turns light into levels here."""
+        """The tables by which light becomes levels."""
         return [self._steps.buffer, *([] if self._gain is None else [self._gain])]
 
     def forget(self, sums: bool) -> None:
@@ -197,9 +192,3 @@ class StarPasses:
         self._levels.texture.bind_to_image(0, read=False, write=True)
         program.run(-(-self._drawn // LOCAL_SIZE))
         self._ctx.memory_barrier()
-
-
-def _wings_of(sides: SpriteSides, lit_e_per_s: float, psf: Psf) -> float:
-    """What part of the light that lights a pixel the squares of `sides` leave out beside them at most: one in so many."""
-    found = [lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px)) for side in sides]
-    return SQUARE_WINGS * max(1.0, min([wings for wings in found if wings > ANY_RATE], default=WINGS / SQUARE_WINGS))

@@ -13,9 +13,8 @@ import numpy as np
 
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import Target
-from hilstar.render.encoder import build_program
+from hilstar.render.encoder import Shares, build_program, splat_program
 from hilstar.render.renderer import FIRST_CAPACITY, Renderer
-from hilstar.render.splat import Shares, splat_program
 from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
 from hilstar.units import NS_PER_MS
@@ -25,7 +24,7 @@ Profile = Literal["renderer", "erf", "exp erf", "table", "centre"]
 
 @dataclass(frozen=True, slots=True)
 class SplatVariant:
-    """What differs from the renderer: the profile, the linear image's texel, the footprint's side; by default nothing.
+    """A variant of the splat: the profile, the linear image's texel, the footprint's side; by default the renderer's.
 
     `table_size` is the number of samples that the profile `table` interpolates between.
     """
@@ -103,7 +102,7 @@ class StagedRenderer(Renderer):
             self._queries = {stage: self._ctx.query(time=True) for stage in ("splat", "encode")}
 
     def levels(self) -> Levels:
-        """As Renderer.levels."""
+        """See `Backend.levels`; its time is that of `read_back`."""
         begin = time.perf_counter()
         levels = super().levels()
         self.stage_ms["read_back"] = (time.perf_counter() - begin) * 1e3

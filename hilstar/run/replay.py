@@ -32,7 +32,7 @@ from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import NO_RECORDING, Recording, ReplayedFaults, read_recording
 from hilstar.run.loop import Limit, policy_of
 from hilstar.run.pacer import FrameSink, Moment, Shown, ignore
-from hilstar.run.record.ledger_records import FrameRecord, drawable_frames, read_head
+from hilstar.run.record.ledger_records import FrameRecord, codes_ms_of, drawable_frames, read_head
 from hilstar.run.serve import Outlet, Running
 from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
@@ -91,8 +91,8 @@ class Play:
     `first_ns` is the time of the first frame, and `zero_ns` that from which a scenario counts its seconds: the log's first
     sample, or the run's first frame. `moving` says whether stars are drawn along their paths; None: as the bench file says.
     `told` are events to report before it begins. Only an earlier run has `past` frames, faults in its `recording`, and a
-    renderer (`drawn_by`) that its ledger may name. The same renderer draws the same codes from them bit for bit; another draws
-    them within `DrawnBy.other_codes`.
+    renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same renderer draws the same codes from
+    them bit for bit; another draws them within `DrawnBy.other_codes`.
     """
 
     frame: Callable[[int], PlayedFrame]
@@ -107,6 +107,7 @@ class Play:
     past: Sequence[FrameRecord] = ()
     recording: Recording = NO_RECORDING
     drawn_by: DrawnBy | None = None
+    codes_ms: tuple[float, float] | None = None
 
 
 def played_again(frames: Sequence[FrameRecord], packet_count: int, paced: bool, recording: Recording) -> Play:
@@ -173,7 +174,7 @@ def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord
     play = played_again(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor), read_recording(log))
     head, names = read_head(log), ("gl_renderer", "gl_version", "render_path")
     drawn_by = DrawnBy(*(printable(head[name]) for name in names)) if set(names) <= head.keys() else None
-    return replace(play, zero_ns=frames[0].t_ns, drawn_by=drawn_by)
+    return replace(play, zero_ns=frames[0].t_ns, drawn_by=drawn_by, codes_ms=codes_ms_of(head))
 
 
 def _tell_other_renderer(before: DrawnBy | None, bench: Bench, notices: Notices) -> None:

@@ -81,21 +81,17 @@ def _polynomials(
     for row, at, size in zip(place, (x_px, y_px), resolution_px, strict=True):
         np.multiply(at, 2 / size, out=row)
         row -= (size - 1) / size
-    terms = _chebyshev(np.clip(place, -FIELD_EDGE, FIELD_EDGE, out=place), degree + 1)
-    return terms[:, 0], terms[:, 1]
-
-
-def _chebyshev(t: FloatArray, count: int) -> FloatArray:
-    """T_0 to T_(count - 1) at places of any shape: (count, ...). Few and large operations: a frame has 0.3 ms for its lens."""
-    terms = np.empty((count, *t.shape))
+    np.clip(place, -FIELD_EDGE, FIELD_EDGE, out=place)
+    # Chebyshev's T_0 to T_degree in few and large operations: a frame has 0.3 ms for its lens
+    terms = np.empty((degree + 1, *place.shape))
     terms[0] = 1.0
-    if count > 1:
-        terms[1] = t
-    twice = 2 * t
-    for k in range(2, count):
+    if degree:
+        terms[1] = place
+    twice = 2 * place
+    for k in range(2, degree + 1):
         np.multiply(twice, terms[k - 1], out=terms[k])
         terms[k] -= terms[k - 2]
-    return terms
+    return terms[:, 0], terms[:, 1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,33 +124,23 @@ class Lens:
         if p1 or p2:
             rays[0] += p2 * r2
             rays[1] += p1 * r2
-        return _on_plane(rays, self.tilt_rad)
-
-
-def _on_plane(rays: FloatArray, tilt_rad: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """Where rays (3, n) of z 1 meet a plane through (0, 0, 1) that is turned about x, then about y, in its own axes."""
-    if tilt_rad == (0.0, 0.0):
-        return rays[0], rays[1]
-    right, down, normal = _onto_plane(tilt_rad) @ rays
-    normal[~(normal > 0)] = np.nan
-    return right / normal, down / normal
+        if self.tilt_rad == (0.0, 0.0):
+            return rays[0], rays[1]
+        right, down, normal = _onto_plane(self.tilt_rad) @ rays
+        normal[~(normal > 0)] = np.nan
+        return right / normal, down / normal
 
 
 @lru_cache(maxsize=16)
 def _onto_plane(tilt_rad: tuple[float, float]) -> FloatArray:
-    """The map of rays to the plane as a matrix of homogeneous places."""
-    axes = plane_axes(tilt_rad)
-    right, down, normal = axes.T
-    foot = axes[2]
-    return np.array([foot[2] * right - foot[0] * normal, foot[2] * down - foot[1] * normal, normal])
-
-
-def plane_axes(tilt_rad: tuple[float, float]) -> FloatArray:
-    """Right, down and normal of the tilted plane as columns (3, 3), in the axes of the plane before its tilt."""
+    """The matrix (3, 3) that maps rays to homogeneous places on a plane through (0, 0, 1), turned about x and then about y."""
     a, b = tilt_rad
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(a), -np.sin(a)], [0.0, np.sin(a), np.cos(a)]])
     about_y = np.array([[np.cos(b), 0.0, np.sin(b)], [0.0, 1.0, 0.0], [-np.sin(b), 0.0, np.cos(b)]])
-    return np.asarray(about_y @ about_x)
+    axes = about_y @ about_x
+    right, down, normal = axes.T
+    foot = axes[2]
+    return np.array([foot[2] * right - foot[0] * normal, foot[2] * down - foot[1] * normal, normal])
 
 
 def ray_shifts(camera: Camera) -> Float32Array:
@@ -178,14 +164,6 @@ class Slopes(NamedTuple):
     x_by_v: FloatArray
     y_by_u: FloatArray
     y_by_v: FloatArray
-
-
-class Approach(NamedTuple):
-    """Directions (u, v, 1) after some steps of Newton's method, and the size of the last step, (n,) each."""
-
-    u: FloatArray
-    v: FloatArray
-    size: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,29 +241,24 @@ class Camera:
         if self.lens is None:
             return u, v
         free = replace(self, lens=replace(self.lens, max_tangent=np.inf))  # a step may go beyond the bound
+        size = np.full_like(u, np.inf)
         for _ in range(NEWTON_ROUNDS):
-            u, v, size = free._approach(u, v, x_px, y_px)
             if not (size > NEWTON_DONE).any():
                 break
+            a, b, c, d = free.slopes(u, v)
+            area = a * d - b * c
+            for _ in range(STEPS_A_ROUND):
+                x, y = free.places_px(u, v)
+                off_x, off_y = x - x_px, y - y_px
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    step_u, step_v = (d * off_x - b * off_y) / area, (a * off_y - c * off_x) / area
+                size = np.hypot(step_u, step_v)
+                wild = ~(size < MAX_TANGENT)
+                u, v = np.where(wild, np.nan, u - step_u), np.where(wild, np.nan, v - step_v)
+                if not (size > NEWTON_DONE).any():
+                    break
         found = (size < SLOPE_STEP) & (np.hypot(u, v) <= self.lens.max_tangent)
         return np.where(found, u, np.nan), np.where(found, v, np.nan)
-
-    def _approach(self, u: FloatArray, v: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Approach:
-        """A few steps towards pixels with the slopes at (u, v)."""
-        a, b, c, d = self.slopes(u, v)
-        area = a * d - b * c
-        size = np.full_like(u, np.inf)
-        for _ in range(STEPS_A_ROUND):
-            x, y = self.places_px(u, v)
-            off_x, off_y = x - x_px, y - y_px
-            with np.errstate(divide="ignore", invalid="ignore"):
-                step_u, step_v = (d * off_x - b * off_y) / area, (a * off_y - c * off_x) / area
-            size = np.hypot(step_u, step_v)
-            wild = ~(size < MAX_TANGENT)
-            u, v = np.where(wild, np.nan, u - step_u), np.where(wild, np.nan, v - step_v)
-            if not (size > NEWTON_DONE).any():
-                break
-        return Approach(u, v, size)
 
     def slopes(self, u: FloatArray, v: FloatArray) -> Slopes:
         """How fast pixels change with the direction (u, v, 1), (n,) each."""
@@ -426,10 +399,20 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
     if lens is None:
         return camera
     free = replace(camera, lens=replace(lens, max_tangent=np.inf))
-    u, v = free.tangents(*_border_px(camera.resolution_px, margin_px))
+    (left, right), (top, bottom) = ((-0.5 - margin_px, size - 0.5 + margin_px) for size in camera.resolution_px)
+    across, down = np.linspace(left, right, BORDER_PLACES), np.linspace(top, bottom, BORDER_PLACES)
+    border_x = np.concatenate([across, across, np.full(BORDER_PLACES, left), np.full(BORDER_PLACES, right)])
+    border_y = np.concatenate([np.full(BORDER_PLACES, top), np.full(BORDER_PLACES, bottom), down, down])
+    u, v = free.tangents(border_x, border_y)
     reach = min(float(np.nan_to_num(np.hypot(u, v), nan=np.inf).max()), lens.max_tangent)
     box = (_wide(u), _wide(v))
-    if not np.isfinite(reach) or _folds(free, reach):
+    folds = True
+    if np.isfinite(reach):
+        side_u, side_v = (part.ravel() for part in np.meshgrid(*[np.linspace(-reach, reach, FOLD_PLACES)] * 2))
+        inside = np.hypot(side_u, side_v) <= reach
+        a, b, c, d = free.slopes(side_u[inside], side_v[inside])
+        folds = not (a * d - b * c > 0).all()
+    if folds:
         raise InputError("its distortion folds within the screen: two directions share a pixel; fit it again, with fewer terms")
     return replace(camera, lens=replace(lens, max_tangent=reach * BEYOND_BORDER, box=box))
 
@@ -438,21 +421,3 @@ def _wide(tangents: FloatArray) -> tuple[float, float]:
     """The smallest and the largest, and a little more: a side may bow between two of its places; all, where one is unknown."""
     low, high = float(tangents.min()), float(tangents.max())
     return (low - BOW * (high - low), high + BOW * (high - low)) if np.isfinite(low) else ANY_TANGENT
-
-
-def _border_px(resolution_px: tuple[int, int], margin_px: float) -> tuple[FloatArray, FloatArray]:
-    """Places all around the image, `margin_px` outside it."""
-    (left, right), (top, bottom) = ((-0.5 - margin_px, size - 0.5 + margin_px) for size in resolution_px)
-    across, down = np.linspace(left, right, BORDER_PLACES), np.linspace(top, bottom, BORDER_PLACES)
-    x = np.concatenate([across, across, np.full(BORDER_PLACES, left), np.full(BORDER_PLACES, right)])
-    y = np.concatenate([np.full(BORDER_PLACES, top), np.full(BORDER_PLACES, bottom), down, down])
-    return x, y
-
-
-def _folds(camera: Camera, reach: float) -> bool:
-    """Whether the map turns over anywhere within a radius of (u, v)."""
-    side = np.linspace(-reach, reach, FOLD_PLACES)
-    u, v = (part.ravel() for part in np.meshgrid(side, side))
-    inside = np.hypot(u, v) <= reach
-    a, b, c, d = camera.slopes(u[inside], v[inside])
-    return bool(not (a * d - b * c > 0).all())

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
@@ -71,7 +70,18 @@ def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf) -> S
     """
     if not motion.rate_cam_rad_s.any() or not motion.exposure_s:
         return make_sprites(stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, psf.footprint_px)
-    pieces = _piece_count(motion, camera, psf)
+    degrees = np.degrees(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+    turn = f"an exposure in which the camera turns by {degrees:.4g} deg"
+    # Each piece of the turn is short compared with the field and, anywhere on the image, with its nodes.
+    angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+    path_sigma = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s) * motion.exposure_s / min(psf.width_px)
+    needed = max(angle_rad / MAX_PIECE_RAD, path_sigma / MAX_PIECE_SIGMA)
+    if needed > MAX_PIECES:
+        max_deg = np.degrees(angle_rad / needed * MAX_PIECES)
+        raise InputError(
+            f"{turn} is too long; at most {max_deg:.4g} deg can be drawn here: write a shorter exposure_s or a slower rate"
+        )
+    pieces = int(np.ceil(needed))
     fineness = 1.0
     while fineness >= MIN_COARSENESS:
         smear = _Smear(stars, camera, psf, NODES_PER_SIGMA * fineness)
@@ -79,28 +89,7 @@ def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf) -> S
         if sprites is not None:
             return sprites if fineness == 1.0 else replace(sprites, capped=len(np.unique(sprites.star)))
         fineness *= COARSER
-    raise InputError(
-        f"{_turn_words(motion)} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars"
-    )
-
-
-def _piece_count(motion: Motion, camera: Camera, psf: Psf) -> int:
-    """The number of pieces of a turn, each short compared with the field and, anywhere on the image, with its nodes."""
-    angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
-    path_sigma = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s) * motion.exposure_s / min(psf.width_px)
-    pieces = max(angle_rad / MAX_PIECE_RAD, path_sigma / MAX_PIECE_SIGMA)
-    if pieces > MAX_PIECES:
-        max_deg = np.degrees(angle_rad / pieces * MAX_PIECES)
-        raise InputError(
-            f"{_turn_words(motion)} is too long; at most {max_deg:.4g} deg can be drawn here:"
-            " write a shorter exposure_s or a slower rate"
-        )
-    return int(np.ceil(pieces))
-
-
-def _turn_words(motion: Motion) -> str:
-    degrees = np.degrees(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
-    return f"an exposure in which the camera turns by {degrees:.4g} deg"
+    raise InputError(f"{turn} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars")
 
 
 def _joined(smear: _Smear, motion: Motion, pieces: int) -> Sprites | None:
@@ -112,14 +101,6 @@ def _joined(smear: _Smear, motion: Motion, pieces: int) -> Sprites | None:
         if total > MAX_SPRITES:
             return None
     return join_sprites(chain, smear.psf.footprint_px)
-
-
-class PathNodes(NamedTuple):
-    """How many nodes each star's path needs (0: it misses the image), and the part of it, 0 to 1, that is on the image."""
-
-    counts: IntArray
-    begin: FloatArray
-    end: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,23 +121,17 @@ class _Smear:
         near = stars.near(middle[2], radius_rad, edges @ middle, angle_rad)
         paths = Paths(stars.directions(near) @ middle.T, camera.cam_to_image @ motion.rate_cam_rad_s, camera)
         half_s = (end_s - begin_s) / 2
-        counts, begin, end = self._nodes(paths, half_s)
-        nodes = nodes_of(counts)
+        x_px, y_px = paths.all_places_px(np.array([[-half_s], [0.0], [half_s]]))
+        # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
+        length = sum(Chords(x_px[k : k + 2], y_px[k : k + 2]).length_sigma(self.psf.width_px) for k in (0, 1))
+        whole = Chords(x_px[::2], y_px[::2])
+        bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
+        begin, end = whole.on_image(camera.resolution_px, self.psf.footprint_px / 2 + 1 + bulge_px)
+        counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA)
+        counts[end <= begin] = 0  # the path misses the image
+        nodes = nodes_of(np.minimum(counts, MAX_NODES))
         share = begin[nodes.path] + (end - begin)[nodes.path] * (nodes.place + 1) / 2
         x_px, y_px = paths.places_px(nodes.path, (2 * share - 1) * half_s)
         star = near[nodes.path]
         light = nodes.share * (end - begin)[nodes.path] * part * stars.electrons_per_s[star]
         return pack_sprites(x_px, y_px, light, star, camera.resolution_px, self.psf.footprint_px)
-
-    def _nodes(self, paths: Paths, half_s: float) -> PathNodes:
-        """The nodes of paths in a piece of the exposure from -half_s to half_s of the paths' seconds."""
-        x_px, y_px = paths.all_places_px(np.array([[-half_s], [0.0], [half_s]]))
-        halves = [Chords(x_px[k : k + 2], y_px[k : k + 2]) for k in (0, 1)]
-        # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
-        length = sum(half.length_sigma(self.psf.width_px) for half in halves)
-        whole = Chords(x_px[::2], y_px[::2])
-        bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
-        begin, end = whole.on_image(self.camera.resolution_px, self.psf.footprint_px / 2 + 1 + bulge_px)
-        counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA)
-        counts[end <= begin] = 0
-        return PathNodes(np.minimum(counts, MAX_NODES), begin, end)

@@ -94,7 +94,7 @@ class Shear:
 class DiscLight:
     """A body's disc through a camera, spread by a PSF; `icrs_to_image` (3, 3) as for sprites.
 
-    Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it. `scene.discs.disc_lights`
+    Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it. `disc_lights`
     chooses between it and, for a small disc, a map.
     """
 
@@ -120,21 +120,17 @@ class DiscLight:
         x_px, y_px = self.camera.project_outward(seen)
         if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
             return (0, 0, *resolution_px)
+        sheared_px = 0.0  # how far the first and the last pixels' light is moved at most, about
+        if self.shear is not None:
+            late_s = sum(abs(s) * size for s, size in zip(self.shear.s_per_px, self.camera.resolution_px, strict=True)) / 2
+            turn = float(np.linalg.norm(self.shear.rate_image_rad_s)) * late_s
+            sheared_px = 2 * turn * float(np.hypot(self.camera.focal_length_px, max(self.camera.resolution_px)))
         edges = []
         for k, place in enumerate((x_px, y_px)):
             low, high = float(place.min()), float(place.max())
-            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.psf.variance_px2[k])) + 1 + self._sheared_px
+            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.psf.variance_px2[k])) + 1 + sheared_px
             edges.append(((low + high) / 2 - half, (low + high) / 2 + half))
         return clipped((edges[0][0], edges[1][0], edges[0][1], edges[1][1]), resolution_px)
-
-    @property
-    def _sheared_px(self) -> float:
-        """How far the first and the last pixels' light is moved at most, about."""
-        if self.shear is None:
-            return 0.0
-        late_s = sum(abs(s) * size for s, size in zip(self.shear.s_per_px, self.camera.resolution_px, strict=True)) / 2
-        turn = float(np.linalg.norm(self.shear.rate_image_rad_s)) * late_s
-        return 2 * turn * float(np.hypot(self.camera.focal_length_px, max(self.camera.resolution_px)))
 
 
 ExtendedLight = LightMap | GlowLight | DiscLight
@@ -222,7 +218,11 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
         return None
     cover = None
     if light.covers:
-        share = light.psf.spread(whole.x_px, whole.y_px, whole.law_sr * _px_per_sr(light), region)
+        # Pixels to a steradian at the disc's middle: nearly the same over a small disc
+        u, v, w = light.icrs_to_image @ disc.direction
+        a, b, c, d = camera.slopes(np.array([u / w]), np.array([v / w]))
+        px_per_sr = float(np.nan_to_num(a * d - b * c)[0] / abs(w) ** 3)
+        share = light.psf.spread(whole.x_px, whole.y_px, whole.law_sr * px_per_sr, region)
         cover = np.where(share > WHOLE, np.float32(1), share)
     image = light.psf.spread(lit.x_px, lit.y_px, light.times * disc.normal_e_per_s_sr * lit.law_sr, region)
     return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name, lasting=False)
@@ -242,10 +242,3 @@ def _places(light: DiscLight, disc: Disc, nodes: int) -> FacePlaces:
     x_px, y_px = light.camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
     return FacePlaces(x_px, y_px, law_sr) if known.all() else FacePlaces(x_px[known], y_px[known], law_sr[known])
-
-
-def _px_per_sr(light: DiscLight) -> float:
-    """Pixels to a steradian at the disc's middle: nearly the same over a small disc."""
-    u, v, w = light.icrs_to_image @ light.disc.direction
-    a, b, c, d = light.camera.slopes(np.array([u / w]), np.array([v / w]))
-    return float(np.nan_to_num(a * d - b * c)[0] / abs(w) ** 3)

@@ -114,9 +114,19 @@ def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, ps
     close = camera.in_view(seen, margin_px, turn.speed_rad_s * scan.longest_s)
     near = near[close]
     paths = _paths(seen[close], turn, scan, camera)
-    late_s = _row_delays_s(paths, scan, camera)
+    late_s = np.zeros(len(paths))  # how long after the middle row each star's own row lights up
+    for _ in range(2 if scan.scanout_s else 0):
+        # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5 of it for 5 px in 1080 rows.
+        x_px, y_px = paths.places_px(EVERY, late_s)
+        late_s = scan.late_s(x_px, y_px, camera.resolution_px)
+    late_s = np.where(np.isfinite(late_s), late_s, 0.0)
     wanted, first, last, span_s = _wanted_nodes(paths, late_s, scan, psf)
-    counts = within_budget(_of_the_brightest(wanted, stars.electrons_per_s[near], footprint_px), _extra(footprint_px))
+    chosen, wanting = wanted, np.flatnonzero(wanted)
+    kept = brightest(stars.electrons_per_s[near][wanting], max_stars(footprint_px))
+    if kept is not None:  # a frame has no room for the faintest
+        chosen = np.zeros_like(wanted)
+        chosen[wanting[kept]] = wanted[wanting[kept]]
+    counts = within_budget(chosen, min(EXTRA_SPRITES, EXTRA_PX // footprint_px**2))
     nodes = nodes_of(counts)
     begin, length = first[nodes.path], (last - first)[nodes.path]
     seconds = late_s[nodes.path] + (begin + length * (nodes.place + 1) / 2) * span_s[nodes.path]
@@ -143,38 +153,12 @@ def _paths(seen: FloatArray, turn: CameraTurn, scan: Scan, camera: Camera) -> Pa
     return ShortPaths(exact, scan.late_s(x_px[0], y_px[0], camera.resolution_px) + scan.hold_s / 2, half_s, points)
 
 
-def _extra(footprint_px: int) -> int:
-    """How many sprites all paths together may have beyond one per star; fewer where sprites are large."""
-    return min(EXTRA_SPRITES, EXTRA_PX // footprint_px**2)
-
-
-def _of_the_brightest(wanted: IntArray, electrons_per_s: FloatArray, footprint_px: int) -> IntArray:
-    """`wanted` (n,), set to 0 for the faintest stars where a frame has no room for all."""
-    wanting = np.flatnonzero(wanted)
-    kept = brightest(electrons_per_s[wanting], max_stars(footprint_px))
-    if kept is None:
-        return wanted
-    chosen = np.zeros_like(wanted)
-    chosen[wanting[kept]] = wanted[wanting[kept]]
-    return chosen
-
-
 def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bool]:
     """The turn itself, or one about the same axis that takes no star farther than MAX_TURN_FIELD; and whether it is slower."""
     angle_rad, most_rad = turn.speed_rad_s * scan.whole_s, MAX_TURN_FIELD * camera.field_radius_rad(0.0)
     if angle_rad <= most_rad:
         return turn, False
     return CameraTurn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True
-
-
-def _row_delays_s(paths: Paths | ShortPaths, scan: Scan, camera: Camera) -> FloatArray:
-    """How long after the middle row each star's own row lights up."""
-    late_s = np.zeros(len(paths))
-    for _ in range(2 if scan.scanout_s else 0):
-        # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5 of it for 5 px in 1080 rows.
-        x_px, y_px = paths.places_px(EVERY, late_s)
-        late_s = scan.late_s(x_px, y_px, camera.resolution_px)
-    return np.where(np.isfinite(late_s), late_s, 0.0)
 
 
 class FramePaths(NamedTuple):
@@ -189,7 +173,12 @@ class FramePaths(NamedTuple):
 def _wanted_nodes(paths: Paths | ShortPaths, late_s: FloatArray, scan: Scan, psf: Psf) -> FramePaths:
     """The nodes that each star's path needs."""
     ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
-    span_s = _spans_s(ends[1], late_s, scan, paths.camera)
+    # From the first light of the row where a path begins until the row where it ends is written again: a star that falls by a
+    # share s of the rows that the panel lights meanwhile is overtaken by the panel hold / (1 - s) after the first.
+    span_s = np.zeros(len(late_s))
+    if scan.hold_s:
+        share = (scan.late_s(*ends[1], paths.camera.resolution_px) - late_s) / scan.hold_s
+        span_s = scan.hold_s / (1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD))
     chords = Chords(*(np.stack(places) for places in zip(*ends, strict=True)))
     angle_rad = paths.speed_rad_s * scan.hold_s
     # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
@@ -199,15 +188,3 @@ def _wanted_nodes(paths: Paths | ShortPaths, late_s: FloatArray, scan: Scan, psf
     counts = node_counts(chords.length_sigma(psf.width_px) * (end - begin), NODES_PER_SIGMA, 1, POINT_SIGMA)
     counts[end <= begin] = 0
     return FramePaths(counts, begin, end, span_s)
-
-
-def _spans_s(end_px: tuple[FloatArray, FloatArray], late_s: FloatArray, scan: Scan, camera: Camera) -> FloatArray:
-    """From the first light of the row where each path begins until the row where it ends is written again.
-
-    `end_px` (n,) is where the stars are `hold_s` after the first. A star that falls by a share s of the rows that the panel
-    lights meanwhile is overtaken by the panel hold / (1 - s) after the first.
-    """
-    if not scan.hold_s:
-        return np.zeros(len(late_s))
-    share = (scan.late_s(*end_px, camera.resolution_px) - late_s) / scan.hold_s
-    return np.asarray(scan.hold_s / (1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD)))

@@ -161,16 +161,12 @@ class Chords:
             begin = np.maximum(begin, np.where(still, np.where(outside, 1.0, 0.0), np.minimum(a, b)))
             end = np.minimum(end, np.where(still, np.where(outside, 0.0, 1.0), np.maximum(a, b)))
         seen = end > begin
-        half_seen = self._half_seen(resolution_px)
+        finite, (width, height) = np.isfinite(self.x_px), resolution_px
+        there = (np.abs(self.x_px - width / 2) <= width) & (np.abs(self.y_px - height / 2) <= height)
+        half_seen = (finite.sum(axis=0) == 1) & there.any(axis=0)
         begin, end = np.where(seen, begin, 1.0), np.where(seen, end, 0.0)
         begin[half_seen], end[half_seen] = 0.0, 1.0
         return begin, end
-
-    def _half_seen(self, resolution_px: tuple[int, int]) -> npt.NDArray[np.bool_]:
-        finite = np.isfinite(self.x_px)
-        width, height = resolution_px
-        there = (np.abs(self.x_px - width / 2) <= width) & (np.abs(self.y_px - height / 2) <= height)
-        return np.asarray((finite.sum(axis=0) == 1) & there.any(axis=0))
 
 
 def node_counts(length_sigma: FloatArray, per_sigma: float, at_rest: int, shortest_sigma: float) -> IntArray:

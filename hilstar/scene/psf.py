@@ -49,7 +49,7 @@ MIN_WIDTH_PX, WIDTH_ROUNDS = 0.05, 60  # of the Gaussian nearest to a sampled PS
 
 
 class ShareShader(NamedTuple):
-    """What shares.glsl needs of a PSF: lines to define before it, its uniforms by name, any table (h, w, channels)."""
+    """A PSF for shares.glsl: lines to define before it, its uniforms by name, any table (h, w, channels)."""
 
     defines: tuple[str, ...]
     uniforms: dict[str, tuple[float, float]]
@@ -146,7 +146,7 @@ class GaussianPsf(Psf):
 
     @property
     def width_px(self) -> tuple[float, float]:
-        """Its sigmas."""
+        """The sigmas."""
         return self.sigma_px
 
     @cached_property
@@ -210,7 +210,7 @@ class GaussianPsf(Psf):
         return 1.0 - inside
 
     def outside_share(self, size_px: int) -> float:
-        """That of a pixel beside the middle of an edge."""
+        """The share of a pixel beside the middle of an edge."""
         (x, y), beyond = self.sigma_px, size_px / 2
         return max(pixel_share(beyond, x) * pixel_share(0.0, y), pixel_share(beyond, y) * pixel_share(0.0, x))
 
@@ -255,7 +255,9 @@ class SampledPsf(Psf):
             raise InputError(f"a PSF of {self.per_px} samples a pixel; write 1 or more")
         if not np.isfinite(samples).all() or samples.sum() <= 0:
             raise InputError("a PSF has samples that are not finite, or no light; write finite ones with a positive sum")
-        least, negative = self._extremes
+        # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the largest of those below zero
+        phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
+        least, negative = min(float(part.sum()) for part in phases), max(float(-part.clip(max=0).sum()) for part in phases)
         if negative > MAX_NEGATIVE:
             raise InputError(
                 f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample it more finely than "
@@ -293,12 +295,6 @@ class SampledPsf(Psf):
         last = 2 * math.ceil((max(self.samples.shape) // 2 + BLACK_SAMPLES) / self.per_px + 1)
         at_px = np.arange(-last, last + 1) / 2
         return self._before_cut(at_px, at_px)
-
-    @cached_property
-    def _extremes(self) -> tuple[float, float]:
-        """Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the largest of those below zero."""
-        phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
-        return min(float(part.sum()) for part in phases), max(float(-part.clip(max=0).sum()) for part in phases)
 
     @cached_property
     def width_px(self) -> tuple[float, float]:
@@ -347,7 +343,7 @@ class SampledPsf(Psf):
 
     @cached_property
     def reach(self) -> Reach:
-        """Of ellipses of the PSF's axes that hold all shares over a ten-thousandth of the largest, the smallest."""
+        """The smallest ellipse with the PSF's axes that holds all shares over a ten-thousandth of the largest."""
         squares = ((np.arange(len(self._table)) - len(self._table) // 2) / self._steps) ** 2
         logs = np.log(np.maximum(self._table, 1e-30))
 
@@ -370,7 +366,7 @@ class SampledPsf(Psf):
         return np.asarray((1 - y) * above + y * below)
 
     def stamps(self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int) -> Float32Array:
-        """All offsets at once."""
+        """See `Psf.stamps`: all offsets at once."""
         pixel = np.arange(side_px) - (side_px - 1) // 2
         x, y = (pixel[:, None] - at for at in fraction_px)
         return np.asarray(self.shares(x[None], y[:, None]) * electrons_per_s, dtype=np.float32)

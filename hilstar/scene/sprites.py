@@ -273,7 +273,11 @@ def clipped_sprites(
     bright_e_per_s = 0.5 * flux_at_white_e_per_s * darkest / psf.peak_share
     if sprites.per_star * sprites.data["electrons_per_s"].max(initial=0.0) <= bright_e_per_s:
         return np.empty(0, dtype=np.intp)  # most frames: no star is that bright, however its light is divided
-    bright = (_star_rates(sprites) > bright_e_per_s).nonzero()[0]
+    rates: Float32Array | FloatArray = sprites.data["electrons_per_s"]
+    if sprites.per_star > 1:  # of each sprite's whole star
+        _, star = np.unique(sprites.star, return_inverse=True)
+        rates = np.asarray(np.bincount(star, rates)[star], dtype=np.float64)
+    bright = (rates > bright_e_per_s).nonzero()[0]
     x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
     inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
     bright, x, y = bright[inside], x[inside], y[inside]
@@ -290,19 +294,11 @@ def clipped_sprites(
     return np.asarray(bright[over], dtype=np.intp)
 
 
-def _star_rates(sprites: Sprites) -> Float32Array | FloatArray:
-    """The rate of each sprite's whole star, electrons per second (n,)."""
-    rates: Float32Array = sprites.data["electrons_per_s"]
-    if sprites.per_star == 1:
-        return rates
-    _, star = np.unique(sprites.star, return_inverse=True)
-    return np.asarray(np.bincount(star, rates)[star], dtype=np.float64)
-
-
 def _light_at(sprites: Sprites, x: IntArray, y: IntArray, psf: Psf) -> FloatArray:
     """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
-    close = _close_to(sprites, x, y)
-    reach = sprites.footprint_px / 2
+    pixel, reach = sprites.data["pixel"], sprites.footprint_px / 2
+    # Sprites whose footprints can reach one of the columns and rows, and some more
+    close = np.flatnonzero(_reach(pixel[:, 0], x, sprites.footprint_px) & _reach(pixel[:, 1], y, sprites.footprint_px))
     if len(x) * len(close) <= FEW_PAIRS:
         offset_x, offset_y = (wanted[:, None] - places[close] for places, wanted in ((sprites.x_px, x), (sprites.y_px, y)))
         share = psf.shares(offset_x, offset_y)
@@ -319,12 +315,6 @@ def _light_at(sprites: Sprites, x: IntArray, y: IntArray, psf: Psf) -> FloatArra
     pixel, other, offset_y = pixel[near], other[near], offset_y[near]
     share = psf.shares(x[pixel] - sprites.x_px[other], offset_y)
     return np.asarray(np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)), dtype=np.float64)
-
-
-def _close_to(sprites: Sprites, x: IntArray, y: IntArray) -> IntArray:
-    """Positions of the sprites whose footprints can reach one of the columns `x` and rows `y` (k,), and some more."""
-    pixel = sprites.data["pixel"]
-    return np.flatnonzero(_reach(pixel[:, 0], x, sprites.footprint_px) & _reach(pixel[:, 1], y, sprites.footprint_px))
 
 
 def _reach(pixel: IntArray, wanted: IntArray, size_px: int) -> BoolArray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -218,7 +218,9 @@ def disc_trail(seen: Pass, name: str, view: TrailView, lit: Lit, brush: Brush) -
     if not lights:
         return None
     middle = seen.directions(slice(None), lit.middle_s)[0]
-    brightest = _brightest_e_per_s(lights, view)
+    maps = sum(float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap))
+    radiance = sum(light.times * light.disc.normal_e_per_s_sr for light in lights if isinstance(light, DiscLight))
+    brightest = maps + radiance / view.camera.scales_px_rad()[0] ** 2
     return DiscTrail(
         int(seen.index[0]), float(rates.sum()) * share, middle, along, np.full(count, share), tuple(lights), brightest
     )
@@ -227,12 +229,6 @@ def disc_trail(seen: Pass, name: str, view: TrailView, lit: Lit, brush: Brush) -
 def _lights(disc: Disc, view: TrailView, second: float, brush: Brush, share: float, covers: bool) -> list[ExtendedLight]:
     turned = to_matrix(propagate(AT_REST, view.rate_image_rad_s, second)) @ view.icrs_to_image
     return disc_lights(disc, DiscView(view.camera, brush.psf, (Pose(turned, share),)), covers)
-
-
-def _brightest_e_per_s(lights: list[ExtendedLight], view: TrailView) -> float:
-    maps = sum(float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap))
-    radiance = sum(light.times * light.disc.normal_e_per_s_sr for light in lights if isinstance(light, DiscLight))
-    return maps + radiance / view.camera.scales_px_rad()[0] ** 2
 
 
 def hidden(sprites: Sprites, directions: FloatArray, found: DiscTrail) -> Sprites:
@@ -245,18 +241,3 @@ def hidden(sprites: Sprites, directions: FloatArray, found: DiscTrail) -> Sprite
     data["electrons_per_s"] *= left[kept].astype(np.float32)
     star, x_px, y_px = sprites.star[kept], sprites.x_px[kept], sprites.y_px[kept]
     return replace(sprites, data=data, star=star, x_px=x_px, y_px=y_px)
-
-
-class TrailPlaces(NamedTuple):
-    """Satellites' places in the list, directions (k, 3), ICRS, and electrons per second (k,)."""
-
-    listed: IntArray
-    directions: FloatArray
-    electrons_per_s: FloatArray
-
-
-def places_of(found: list[DiscTrail]) -> TrailPlaces:
-    """Where several satellites are in the middle of their light."""
-    index = np.array([one.index for one in found], dtype=np.intp)
-    middle = np.array([one.middle for one in found]).reshape(-1, 3)
-    return TrailPlaces(index, middle, np.array([one.electrons_per_s for one in found]))

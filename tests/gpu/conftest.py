@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.render.star_passes import LightUnits, StarPasses
+from hilstar.render.star_passes import LightUnits
 
 
 @pytest.fixture
 def by_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sprites are rasterised and blended."""
-    monkeypatch.setattr(StarPasses, "runs_on", staticmethod(lambda context: False))
+    monkeypatch.setattr("hilstar.render.renderer.computes_in_software", lambda context: False)
 
 
 @pytest.fixture

@@ -18,7 +18,6 @@ from hilstar.notices import Notices
 from hilstar.render.backend import SpriteSide, Target
 from hilstar.render.context import computes_in_software
 from hilstar.render.renderer import Renderer
-from hilstar.render.star_passes import StarPasses
 from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.replay import DrawnBy, Wanted, plan_play, replay
 from hilstar.run.serve import Outlet
@@ -65,7 +64,7 @@ def both_ways(target: Target, frames: list[Sprites], monkeypatch) -> tuple[list[
         assert gl.path == "compute shaders"
     star_by_star = drawn(target, frames)
     with monkeypatch.context() as patched:
-        patched.setattr(StarPasses, "runs_on", staticmethod(lambda context: False))
+        patched.setattr("hilstar.render.renderer.computes_in_software", lambda context: False)
         with Renderer(target) as gl:
             assert gl.path.startswith("points")
         return star_by_star, drawn(target, frames)
@@ -173,7 +172,7 @@ def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_i
     assert all(np.array_equal(first[number], again[number]) for number in first)
     if before.path != "compute shaders":
         pytest.skip(f"{before} draws one way only")
-    monkeypatch.setattr(StarPasses, "runs_on", staticmethod(lambda context: False))
+    monkeypatch.setattr("hilstar.render.renderer.computes_in_software", lambda context: False)
     by_points, told, now = replayed(path, ledger)
     assert len(told) == 1 and str(before) in told[0] and str(now) in told[0]
     assert before.other_codes(now, quantisation) == QUANTISERS[quantisation].other_codes

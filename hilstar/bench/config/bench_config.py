@@ -91,70 +91,8 @@ def from_source(config: BenchConfig) -> bool:
     return config.spacecraft.orbit == SOURCE
 
 
-def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> BenchConfig:
-    """The same with the Julian year of `epoch_utc`, which a bench's hash covers. Raises InputError for keys that disagree."""
-    if config.sky.epoch_utc is not None and "epoch_jyear" in tables.get("sky", {}):
-        raise InputError(f"{path}: [sky] has epoch_utc and epoch_jyear; write one of them")
-    if config.sky.bodies.satellite_magnitudes is not None and config.sky.bodies.satellites is None:
-        raise InputError(f'{path}: [sky.bodies] satellite_magnitudes is of no satellites; write satellites = "tles.txt" too')
-    if has_observer(config):
-        if config.sky.epoch_utc is None:
-            raise InputError(
-                f'{path}: [sky.bodies] and [spacecraft] need a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"'
-            )
-        if any(config.sky.observer_velocity_km_s):
-            raise InputError(
-                f"{path}: [sky] observer_velocity_km_s: with [sky.bodies] or [spacecraft] the velocity follows from the"
-                " ephemeris; leave it out"
-            )
-    _check_variables(config, path)
-    _check_orbit(config, path)
-    attitude, orbit = config.attitude, config.spacecraft.orbit
-    if orbit not in {None, GEOCENTRE, SOURCE} and attitude.source == "vizard" and attitude.use_velocity:
-        raise InputError(
-            f"{path}: [attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft] orbit; write"
-            ' use_velocity = false, or orbit = "geocentre"'
-        )
-    if config.sky.epoch_utc in {FROM_SOURCE, UNIX}:
-        return config
-    try:
-        utc_ns = epoch_utc_ns(config)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    if utc_ns is None:
-        return config
-    return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_jyear=jyear(utc_ns)))
-
-
-def _check_variables(config: BenchConfig, path: Path) -> None:
-    if config.sky.variables == "phase" and config.sky.epoch_utc is None:
-        raise InputError(f'{path}: [sky] variables = "phase" needs a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"')
-
-
-def _check_orbit(config: BenchConfig, path: Path) -> None:
-    """Refuse (InputError) a place that nobody gives, and the Earth from its own centre."""
-    attitude, orbit = config.attitude, config.spacecraft.orbit
-    if config.sky.bodies.earth and orbit in {None, GEOCENTRE}:
-        raise InputError(
-            f"{path}: [sky.bodies] earth = true: from its centre no Earth is seen; write [spacecraft] orbit = the path of a TLE"
-            f' or an OEM, or "{SOURCE}"'
-        )
-    if not from_source(config):
-        return
-    if attitude.source != "vizard":
-        raise InputError(
-            f'{path}: [spacecraft] orbit = "{SOURCE}": of the sources of attitudes only "vizard" (Basilisk) sends the'
-            f' spacecraft\'s place, and [attitude] source = "{attitude.source}"; write the path of a TLE or an OEM'
-        )
-    if not attitude.use_velocity:
-        raise InputError(
-            f'{path}: [attitude] use_velocity = false, and [spacecraft] orbit = "{SOURCE}" takes the source\'s place and'
-            " velocity; leave use_velocity out"
-        )
-
-
 def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchConfig:
-    """The same for a source that gives the dates: its first time, ns since 1970 on a time scale (see `Conventions`).
+    """The configuration for a source that gives the dates: its first time, ns since 1970 on a time scale (see `Conventions`).
 
     `epoch_utc` is then the UTC of its t_ns = 0 by the leap seconds of that day, and `epoch_jyear` the beginning of the day: for
     it stars are placed. Unchanged where the file has a date of its own. Raises InputError for a source without dates, and for
@@ -178,12 +116,12 @@ def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchCo
 
 
 def today(config: BenchConfig) -> BenchConfig:
-    """The same with stars of the present day, by this machine's clock, where t_ns counts from 1970."""
+    """The configuration with stars of the present day, by this machine's clock, where t_ns counts from 1970."""
     return _on_day(config, UNIX, time.time_ns()) if config.sky.epoch_utc == UNIX else config
 
 
 def _on_day(config: BenchConfig, epoch_utc: str, utc_ns: int) -> BenchConfig:
-    """The same with this `epoch_utc`, and stars placed for the beginning of a UTC's day."""
+    """The configuration with this `epoch_utc`, and stars placed for the beginning of a UTC's day."""
     day = jyear(utc_ns // DAY_NS * DAY_NS)
     return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_utc=epoch_utc, epoch_jyear=day))
 
@@ -225,88 +163,125 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
     """Check the tables of the bench file `path`, as TOML gives them. Raises InputError as `parse_config` does."""
     if HEADS in tables:
         raise InputError(f"{path}: names several heads, and one bench file is wanted here; give one of its heads' files")
-    _check_finite(tables, path)
     try:
-        config = msgspec.convert(tables, BenchConfig)
+        _check_finite(tables)
+        config = _converted(tables)
+        _check_meaning(config)
+        _check_sky(config, tables)
+        render, sky = config.render, config.sky
+        # A bench's hash covers the default white, and the Julian year of `epoch_utc`.
+        if render.flux_at_white_e_per_s is None and render.brightest_v_mag is None:
+            render = msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG)
+        if sky.epoch_utc not in {FROM_SOURCE, UNIX} and (utc_ns := epoch_utc_ns(config)) is not None:
+            sky = msgspec.structs.replace(sky, epoch_jyear=jyear(utc_ns))
+        return msgspec.structs.replace(config, render=render, sky=sky)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _converted(tables: dict[str, Any]) -> BenchConfig:
+    try:
+        return msgspec.convert(tables, BenchConfig)
     except InputError as error:  # what the detector's keys mean together
-        raise InputError(f"{path}: [tracker.detector] {error}") from error
+        raise InputError(f"[tracker.detector] {error}") from error
     except RecursionError as error:
-        raise InputError(f"{path}: its tables are nested too deep; see {KIND.reference}") from error
+        raise InputError(f"its tables are nested too deep; see {KIND.reference}") from error
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
-    _check_meaning(config, path)
-    return with_epoch(_with_white(config), path, tables)
+        raise InputError(explained(str(error), tables, KIND)) from error
 
 
-def _with_white(config: BenchConfig) -> BenchConfig:
-    """The same with the default white where the file gives none: a bench's hash covers it."""
-    render = config.render
-    if render.flux_at_white_e_per_s is not None or render.brightest_v_mag is not None:
-        return config
-    return msgspec.structs.replace(config, render=msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG))
-
-
-def _check_finite(value: Any, path: Path, where: str = "") -> None:
+def _check_finite(value: Any, where: str = "") -> None:
     """Refuse (InputError) nan and inf, which TOML allows and no key here does."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            _check_finite(inner, path, f"{where}.{key}" if where else key)
+            _check_finite(inner, f"{where}.{key}" if where else key)
     elif isinstance(value, list):
         for inner in value:
-            _check_finite(inner, path, where)
+            _check_finite(inner, where)
     elif isinstance(value, float) and not math.isfinite(value):
-        raise InputError(f"{path}: {shortened(where)} = {value}; a finite number is wanted")
+        raise InputError(f"{shortened(where)} = {value}; a finite number is wanted")
 
 
-def _check_meaning(config: BenchConfig, path: Path) -> None:
+def _check_meaning(config: BenchConfig) -> None:
     """Refuse (InputError) values that contradict each other."""
-    _check_unit(path, "[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon)
-    if config.tracker.q_body_to_cam is not None:
-        _check_unit(path, "[tracker] q_body_to_cam", config.tracker.q_body_to_cam)
-    _check_areas(path, config)
-    room_km_s = MAX_SPEED_KM_S if config.attitude.source == "vizard" else 0.0
-    if math.hypot(*config.sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
-        raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
-    levels = ("electrons_per_px", "zodiacal_v_mag_arcsec2", "zodiacal")
-    given = [name for name in levels if getattr(config.background, name) is not None]
-    if len(given) > 1:
-        raise InputError(f"{path}: [background] has {given[0]} and {given[1]}; write one of them")
-    if config.background.zodiacal is not None and config.sky.epoch_utc is None:
-        raise InputError(f'{path}: [background] zodiacal needs a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"')
-    if config.render.flux_at_white_e_per_s is not None and config.render.brightest_v_mag is not None:
-        raise InputError(f"{path}: [render] has flux_at_white_e_per_s and brightest_v_mag; write one of them")
-    ideal = [
-        name
-        for name in ("true_focal_length_mm", "true_pixel_pitch_um", "true_q_cam_to_mon")
-        if getattr(config.verify, name) is not None
-    ]
-    if config.verify.true_geometry is not None and ideal:
-        raise InputError(f"{path}: [verify] true_geometry takes the place of {ideal[0]}; leave one of them out")
-    if config.faults.endpoint is not None and config.faults.endpoint == config.attitude.address:
-        raise InputError(
-            f"{path}: [faults] endpoint = {config.faults.endpoint}: the attitude comes from there; write another port"
-        )
-    try:
-        check_channels(config.tracker)
-        check_sync(config.sync, config.tracker, config.monitor, config.attitude)
-    except InputError as error:  # it names the tables itself
-        raise InputError(f"{path}: {error}") from error
-    try:
-        check_road(config.attitude)
-    except InputError as error:
-        raise InputError(f"{path}: [attitude] {error}") from error
-
-
-def _check_areas(path: Path, config: BenchConfig) -> None:
+    for where, q in (
+        ("[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon),
+        ("[tracker] q_body_to_cam", config.tracker.q_body_to_cam),
+    ):
+        if q is not None and abs(math.hypot(*q) - 1) > NORM_TOLERANCE:
+            raise InputError(f"{where}: its norm is {math.hypot(*q):.6g}; write a unit quaternion w, x, y, z")
     for table, (width, height) in (("tracker", config.tracker.resolution_px), ("monitor", config.monitor.resolution_px)):
         if width * height > MAX_AREA_PX:
             raise InputError(
-                f"{path}: [{table}] resolution_px = [{width}, {height}]: {width * height / 1e6:.0f} million pixels; write"
+                f"[{table}] resolution_px = [{width}, {height}]: {width * height / 1e6:.0f} million pixels; write"
                 f" {MAX_AREA_PX / 1e6:.0f} million at most, such as [8192, 8192]"
             )
+    render, faults = config.render, config.faults
+    if render.flux_at_white_e_per_s is not None and render.brightest_v_mag is not None:
+        raise InputError("[render] has flux_at_white_e_per_s and brightest_v_mag; write one of them")
+    ideal = ("true_focal_length_mm", "true_pixel_pitch_um", "true_q_cam_to_mon")
+    beside = next((name for name in ideal if getattr(config.verify, name) is not None), None)
+    if config.verify.true_geometry is not None and beside is not None:
+        raise InputError(f"[verify] true_geometry takes the place of {beside}; leave one of them out")
+    if faults.endpoint is not None and faults.endpoint == config.attitude.address:
+        raise InputError(f"[faults] endpoint = {faults.endpoint}: the attitude comes from there; write another port")
+    check_channels(config.tracker)
+    check_sync(config.sync, config.tracker, config.monitor, config.attitude)
+    try:
+        check_road(config.attitude)
+    except InputError as error:
+        raise InputError(f"[attitude] {error}") from error
 
 
-def _check_unit(path: Path, where: str, q: tuple[float, ...]) -> None:
-    norm = math.hypot(*q)
-    if abs(norm - 1) > NORM_TOLERANCE:
-        raise InputError(f"{path}: {where}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
+def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
+    """Refuse (InputError) a sky that lacks a date, a place or a velocity, or has two of them."""
+    sky, background, attitude = config.sky, config.background, config.attitude
+    room_km_s = MAX_SPEED_KM_S if attitude.source == "vizard" else 0.0
+    if math.hypot(*sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
+        raise InputError("[sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
+    levels = ("electrons_per_px", "zodiacal_v_mag_arcsec2", "zodiacal")
+    given = [name for name in levels if getattr(background, name) is not None]
+    if len(given) > 1:
+        raise InputError(f"[background] has {given[0]} and {given[1]}; write one of them")
+    if sky.epoch_utc is not None and "epoch_jyear" in tables.get("sky", {}):
+        raise InputError("[sky] has epoch_utc and epoch_jyear; write one of them")
+    if sky.bodies.satellite_magnitudes is not None and sky.bodies.satellites is None:
+        raise InputError('[sky.bodies] satellite_magnitudes is of no satellites; write satellites = "tles.txt" too')
+    for needs, what in (
+        (background.zodiacal is not None, "[background] zodiacal needs"),
+        (has_observer(config), "[sky.bodies] and [spacecraft] need"),
+        (sky.variables == "phase", '[sky] variables = "phase" needs'),
+    ):
+        if needs and sky.epoch_utc is None:
+            raise InputError(f'{what} a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"')
+    if has_observer(config) and any(sky.observer_velocity_km_s):
+        raise InputError(
+            "[sky] observer_velocity_km_s: with [sky.bodies] or [spacecraft] the velocity follows from the ephemeris; leave it"
+            " out"
+        )
+    _check_orbit(config)
+
+
+def _check_orbit(config: BenchConfig) -> None:
+    """Refuse (InputError) a place that nobody gives, two velocities, and the Earth from its own centre."""
+    attitude, orbit = config.attitude, config.spacecraft.orbit
+    if config.sky.bodies.earth and orbit in {None, GEOCENTRE}:
+        raise InputError(
+            "[sky.bodies] earth = true: from its centre no Earth is seen; write [spacecraft] orbit = the path of a TLE or an"
+            f' OEM, or "{SOURCE}"'
+        )
+    if orbit == SOURCE and attitude.source != "vizard":
+        raise InputError(
+            f'[spacecraft] orbit = "{SOURCE}": of the sources of attitudes only "vizard" (Basilisk) sends the spacecraft\'s'
+            f' place, and [attitude] source = "{attitude.source}"; write the path of a TLE or an OEM'
+        )
+    if orbit == SOURCE and not attitude.use_velocity:
+        raise InputError(
+            f'[attitude] use_velocity = false, and [spacecraft] orbit = "{SOURCE}" takes the source\'s place and velocity;'
+            " leave use_velocity out"
+        )
+    if orbit not in {None, GEOCENTRE, SOURCE} and attitude.source == "vizard" and attitude.use_velocity:
+        raise InputError(
+            "[attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft] orbit; write use_velocity = false,"
+            ' or orbit = "geocentre"'
+        )

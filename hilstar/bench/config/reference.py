@@ -111,7 +111,7 @@ def row(field: FieldInfo, hint: Any) -> str:
 
 
 def notes_of(hint: Any) -> list[Meta]:
-    """What the annotations of a type say, inner ones first; those of `X | None` are X's too."""
+    """The notes in the annotations of a type, inner ones first; those of `X | None` are X's too."""
     if get_origin(hint) is not Annotated:
         return []
     inner, *notes = get_args(hint)
@@ -125,7 +125,7 @@ def is_optional(kind: Any) -> bool:
 
 
 def value_text(name: str, hint: Any) -> str:
-    """What a key may hold: its choices, or its form, limits and unit."""
+    """The values of a key: its choices, or its form, limits and unit."""
     kind, notes = plain(hint), notes_of(hint)
     choices = tuple(plain(choice) for choice in get_args(kind) if choice is not type(None)) if is_optional(kind) else ()
     if len(choices) == 1:
@@ -149,7 +149,7 @@ def limits_text(notes: list[Meta]) -> str:
 
 
 def default_text(field: FieldInfo, notes: list[Meta]) -> str:
-    """What holds where the file has no such key."""
+    """The value where the file has no such key."""
     told = next((note.extra["default"] for note in notes if note.extra and "default" in note.extra), None)
     if field.default is NODEFAULT:
         return "**required**"

@@ -41,10 +41,19 @@ class RenderSettings(Table, frozen=True):
             description="How light becomes codes. "
             + "".join(f'`"{name}"`: {quantiser.words} ' for name, quantiser in QUANTISERS.items())
             + '`"auto"`: `round` where that stays within the tolerance, '
-            "else `exact`, unless an average field, turning at 1 deg/s, would take it more than half a refresh on two cores "
-            "without a GPU and would not take `round` as long; `--explain` of `frame`, `serve` and `replay` says which."
+            "else `exact`, unless an average field, turning at 1 deg/s, would take it more than half a refresh and would not "
+            "take `round` as long; `--explain` of `frame`, `serve` and `replay` says which. `serve` and `replay` in real time "
+            "measure that when they start; lockstep and all other commands take the time on two cores without a GPU."
         ),
     ] = "auto"
+    codes_ms: Annotated[
+        tuple[Positive, Positive] | None,
+        Meta(
+            description="What a frame of an average field takes by `round` and by `exact`, for `auto` of every command: "
+            "nothing is measured then. `--explain` of a run that measured prints the line to write.",
+            extra={"default": "measured, or tabulated", "form": "[round, exact]"},
+        ),
+    ] = None
     bit_stealing: Annotated[
         bool,
         Meta(

@@ -79,7 +79,7 @@ class _Server:
         self._has_dpms = bool(query and self._xext.DPMSCapable(self._display))
 
     def blanking(self) -> _Blanking:
-        """As it is set now."""
+        """The present setting."""
         parts = [ctypes.c_int() for _ in range(4)]
         self._x11.XGetScreenSaver(self._display, *(ctypes.byref(part) for part in parts))
         level, on = ctypes.c_ushort(), ctypes.c_ubyte()

@@ -62,7 +62,7 @@ class OutputState:
 
 
 class Finding(NamedTuple):
-    """What is wrong with an output, and what mends it; `refused` where codes or times are known to be wrong by it."""
+    """A fault of an output, and what mends it; `refused` where codes or times are known to be wrong by it."""
 
     text: str
     refused: bool
@@ -80,7 +80,7 @@ def property_value(kind: str, form: int, items: tuple[int, ...], names: Callable
 
 
 def findings(state: OutputState, bits: int, pixel_pitch_um: float | None = None) -> Iterator[Finding]:
-    """What is wrong with an output that shows codes of `bits` bits on pixels of that pitch (None: not known)."""
+    """The faults of an output that shows codes of `bits` bits on pixels of that pitch (None: not known)."""
     for rule in RULES:
         value = (state.properties or {}).get(rule.name)
         verdict = RIGHT if value is None else rule.judge(value, bits)
@@ -88,9 +88,15 @@ def findings(state: OutputState, bits: int, pixel_pitch_um: float | None = None)
             mend = rule.mend.format(output=state.name, name=rule.name, bits=bits)
             yield Finding(f"{rule.name} of {state.name} is {_words(value)}: {rule.why}; {mend}", verdict == WRONG)
     yield from _geometry_findings(state)
-    yield from _path_findings(state)
-    if pixel_pitch_um is not None:
-        yield from _pitch_findings(state, pixel_pitch_um)
+    found = _own_pitch_um(state.edid)
+    if (
+        pixel_pitch_um is not None
+        and found is not None
+        and abs(found[0] - pixel_pitch_um) > PITCH_TOLERANCE * found[0] + found[1]
+    ):
+        told = f"{state.name} says by its EDID that its pixels are {found[0]:.1f} um apart"
+        text = f"{told} and the bench file says {pixel_pitch_um:g}; measure it, and set [monitor] pixel_pitch_um"
+        yield Finding(text, False)
 
 
 def _geometry_findings(state: OutputState) -> Iterator[Finding]:
@@ -108,24 +114,10 @@ def _geometry_findings(state: OutputState) -> Iterator[Finding]:
     if state.rotated:
         mend = f"xrandr --output {state.name} --rotate normal --reflect normal, and [monitor] rotate_deg, flip_x, flip_y"
         yield Finding(f"X rotates or reflects {state.name}, by a copy of each frame; {mend}", False)
-
-
-def _path_findings(state: OutputState) -> Iterator[Finding]:
     if len(state.providers) > 1:
         gpus = f"the X screen has {len(state.providers)} GPUs ({', '.join(state.providers)})"
         mend = "plug the monitor into the GPU that draws, or draw by its own (xrandr --listproviders; DRI_PRIME=0)"
         yield Finding(f"{gpus}: frames may be copied from one to the other, a refresh late; {mend}", False)
-
-
-def _pitch_findings(state: OutputState, pixel_pitch_um: float) -> Iterator[Finding]:
-    found = _own_pitch_um(state.edid)
-    if found is None:
-        return
-    pitch_um, uncertain_um = found
-    if abs(pitch_um - pixel_pitch_um) > PITCH_TOLERANCE * pitch_um + uncertain_um:
-        told = f"{state.name} says by its EDID that its pixels are {pitch_um:.1f} um apart"
-        text = f"{told} and the bench file says {pixel_pitch_um:g}; measure it, and set [monitor] pixel_pitch_um"
-        yield Finding(text, False)
 
 
 def size_mm_of(edid: bytes) -> Pair | None:
@@ -184,10 +176,6 @@ def _doubtful_unless(right: str) -> Judge:
     return lambda value, bits: RIGHT if str(value).lower() in good else DOUBTFUL
 
 
-def _deep_enough(value: Value, bits: int) -> str:
-    return RIGHT if not isinstance(value, int) or value >= bits else WRONG
-
-
 def _identity_matrix(value: Value, bits: int) -> str:
     """A matrix of drm_color_ctm: nine numbers of sign, 31 and 32 bits, the low half first; all 0 where none is set."""
     halves = np.array([value] if isinstance(value, int) else value).astype(np.int64) & 0xFFFFFFFF if value else np.zeros(1)
@@ -208,7 +196,12 @@ DITHERS = "the driver adds a pattern to every code"
 RULES = (
     _Rule("Broadcast RGB", _one_of("full", "automatic"), "codes go to 16 to 235, always or at television modes", _set("Full")),
     _Rule("output_csc", _one_of("bypass"), "codes are converted on their way", _set("bypass")),
-    _Rule("max bpc", _deep_enough, "the cable carries fewer bits than the bench's codes have", _set("{bits}")),
+    _Rule(
+        "max bpc",
+        lambda value, bits: WRONG if isinstance(value, int) and value < bits else RIGHT,
+        "the cable carries fewer bits than the bench's codes have",
+        _set("{bits}"),
+    ),
     _Rule("dithering mode", _one_of("off"), DITHERS, _set("off")),
     _Rule("dither", _one_of("off"), DITHERS, _set("off")),
     _Rule("CTM", _identity_matrix, "a colour matrix mixes the primaries", _set("0,1,0,0,0,0,0,0,0,1,0,0,0,0,0,0,0,1")),

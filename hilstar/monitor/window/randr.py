@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from hilstar.monitor.window.output_settings import IDENTITY, NVIDIA, NVIDIA_ATTRIBUTES, OutputState, Pair, Value, property_value
-from hilstar.monitor.window.x11 import X11_LIBRARY, Survival, has_extension
+from hilstar.monitor.window.x11 import INT, TEXT, X11_LIBRARY, Survival, has_extension, load_library
 
 XRANDR_LIBRARY = "libXrandr.so.2"
 ROTATE_0 = 1  # randr.h
@@ -26,9 +26,7 @@ BYTE_BITS = 8
 _Pointer, _Id, _Ids = ctypes.c_void_p, ctypes.c_ulong, ctypes.POINTER(ctypes.c_ulong)
 
 
-class _Mode(ctypes.Structure):
-    """XRRModeInfo."""
-
+class _Mode(ctypes.Structure):  # XRRModeInfo
     _fields_ = (
         ("id", _Id),
         ("width", ctypes.c_uint),
@@ -41,9 +39,7 @@ class _Mode(ctypes.Structure):
     )
 
 
-class _Resources(ctypes.Structure):
-    """XRRScreenResources."""
-
+class _Resources(ctypes.Structure):  # XRRScreenResources
     _fields_ = (
         ("times", ctypes.c_ulong * 2),
         ("ncrtc", ctypes.c_int),
@@ -55,9 +51,7 @@ class _Resources(ctypes.Structure):
     )
 
 
-class _Output(ctypes.Structure):
-    """XRROutputInfo."""
-
+class _Output(ctypes.Structure):  # XRROutputInfo
     _fields_ = (
         ("time", ctypes.c_ulong),
         ("crtc", _Id),
@@ -76,9 +70,7 @@ class _Output(ctypes.Structure):
     )
 
 
-class _Crtc(ctypes.Structure):
-    """XRRCrtcInfo, its beginning."""
-
+class _Crtc(ctypes.Structure):  # XRRCrtcInfo, its beginning
     _fields_ = (
         ("time", ctypes.c_ulong),
         ("corner", ctypes.c_int * 2),
@@ -88,9 +80,7 @@ class _Crtc(ctypes.Structure):
     )
 
 
-class _Transform(ctypes.Structure):
-    """XRRCrtcTransformAttributes."""
-
+class _Transform(ctypes.Structure):  # XRRCrtcTransformAttributes
     _fields_ = (
         ("pending", ctypes.c_int * 9),
         ("pending_filter", _Pointer),
@@ -101,21 +91,15 @@ class _Transform(ctypes.Structure):
     )
 
 
-class _Gamma(ctypes.Structure):
-    """XRRCrtcGamma."""
-
+class _Gamma(ctypes.Structure):  # XRRCrtcGamma
     _fields_ = (("size", ctypes.c_int), *((name, _Pointer) for name in ("red", "green", "blue")))
 
 
-class _Providers(ctypes.Structure):
-    """XRRProviderResources."""
-
+class _Providers(ctypes.Structure):  # XRRProviderResources
     _fields_ = (("time", ctypes.c_ulong), ("count", ctypes.c_int), ("ids", _Ids))
 
 
-class _Provider(ctypes.Structure):
-    """XRRProviderInfo, its beginning."""
-
+class _Provider(ctypes.Structure):  # XRRProviderInfo, its beginning
     _fields_ = (
         ("capabilities", ctypes.c_uint),
         ("ncrtcs", ctypes.c_int),
@@ -126,6 +110,29 @@ class _Provider(ctypes.Structure):
     )
 
 
+X11_FUNCTIONS: dict[str, tuple[Any, ...]] = {
+    "XOpenDisplay": (_Pointer, TEXT),
+    "XCloseDisplay": (INT, _Pointer),
+    "XDefaultRootWindow": (_Id, _Pointer),
+    "XGetAtomName": (_Pointer, _Pointer, _Id),
+    "XFree": (INT, _Pointer),
+}
+XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
+    "XRRGetScreenResourcesCurrent": (_Pointer, _Pointer, _Id),
+    "XRRGetOutputInfo": (_Pointer, _Pointer, _Pointer, _Id),
+    "XRRGetCrtcInfo": (_Pointer, _Pointer, _Pointer, _Id),
+    "XRRGetCrtcGamma": (_Pointer, _Pointer, _Id),
+    "XRRGetCrtcTransform": (INT, _Pointer, _Id, _Pointer),
+    "XRRListOutputProperties": (_Ids, _Pointer, _Id, _Pointer),
+    "XRRGetOutputProperty": (INT, _Pointer, _Id, _Id, *[ctypes.c_long] * 2, *[INT] * 2, _Id, *[_Pointer] * 5),
+    "XRRGetProviderResources": (_Pointer, _Pointer, _Id),
+    "XRRGetProviderInfo": (_Pointer, _Pointer, _Pointer, _Id),
+} | {
+    f"XRRFree{what}": (None, _Pointer)
+    for what in ("ScreenResources", "OutputInfo", "CrtcInfo", "Gamma", "ProviderResources", "ProviderInfo")
+}
+
+
 class Randr:
     """A connection to the X server of DISPLAY. Free it with `close`. Raises OSError without a server or libXrandr.
 
@@ -133,7 +140,7 @@ class Randr:
     """
 
     def __init__(self, survival: Survival | None = None) -> None:
-        self._x11, self._xrandr = _libraries()
+        self._x11, self._xrandr = load_library(X11_LIBRARY, **X11_FUNCTIONS), load_library(XRANDR_LIBRARY, **XRANDR_FUNCTIONS)
         self._display: Any = self._x11.XOpenDisplay(None)
         if not self._display:
             raise OSError("no X server")
@@ -180,15 +187,13 @@ class Randr:
             for number in () if resources is None else resources.outputs[: resources.noutput]:
                 with self._output(resources, number) as output:
                     crtc = output.crtc if output is not None and _name(output) == name else 0
-                if crtc:
-                    return self._ramp_of(crtc)
+                if not crtc:
+                    continue
+                found = self._xrandr.XRRGetCrtcGamma(self._display, crtc)
+                with self._got(_Gamma, self._xrandr.XRRFreeGamma, found) as gamma:
+                    parts = () if gamma is None else (gamma.red, gamma.green, gamma.blue)
+                    return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in parts)
         return b""
-
-    def _ramp_of(self, crtc: int) -> bytes:
-        with self._got(_Gamma, self._xrandr.XRRFreeGamma, self._xrandr.XRRGetCrtcGamma(self._display, crtc)) as gamma:
-            if gamma is None:
-                return b""
-            return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in (gamma.red, gamma.green, gamma.blue))
 
     def _state(self, resources: Any, number: int, output: Any, modes: dict[int, Pair]) -> OutputState | None:
         crtc = self._xrandr.XRRGetCrtcInfo(self._display, ctypes.byref(resources), output.crtc)
@@ -256,13 +261,13 @@ class Randr:
         found = self._xrandr.XRRGetProviderResources(self._display, self._root)
         with self._got(_Providers, self._xrandr.XRRFreeProviderResources, found) as providers:
             numbers = [] if providers is None else providers.ids[: providers.count]
+        names = []
         with self._resources() as resources:
-            return () if resources is None else tuple(self._provider_name(resources, number) for number in numbers)
-
-    def _provider_name(self, resources: Any, number: int) -> str:
-        found = self._xrandr.XRRGetProviderInfo(self._display, ctypes.byref(resources), number)
-        with self._got(_Provider, self._xrandr.XRRFreeProviderInfo, found) as provider:
-            return "" if provider is None else _name(provider)
+            for number in () if resources is None else numbers:
+                found = self._xrandr.XRRGetProviderInfo(self._display, ctypes.byref(resources), number)
+                with self._got(_Provider, self._xrandr.XRRFreeProviderInfo, found) as provider:
+                    names.append("" if provider is None else _name(provider))
+        return tuple(names)
 
     def _of_nvidia(self, output: str) -> dict[str, Value]:
         """What nvidia-settings says of an output, where NVIDIA's driver runs: RandR has none of it."""
@@ -324,34 +329,3 @@ def _nvidia_values(tool: str, output: str) -> Iterator[tuple[str, Value]]:
             return
         if said.removeprefix("-").isdecimal():
             yield NVIDIA + attribute, int(said)
-
-
-def _libraries() -> tuple[Any, Any]:
-    x11: Any = ctypes.CDLL(X11_LIBRARY)
-    xrandr: Any = ctypes.CDLL(XRANDR_LIBRARY)
-    for library, name, result, arguments in (
-        (x11, "XOpenDisplay", _Pointer, [ctypes.c_char_p]),
-        (x11, "XCloseDisplay", ctypes.c_int, [_Pointer]),
-        (x11, "XDefaultRootWindow", _Id, [_Pointer]),
-        (x11, "XGetAtomName", _Pointer, [_Pointer, _Id]),
-        (x11, "XFree", ctypes.c_int, [_Pointer]),
-        (xrandr, "XRRGetScreenResourcesCurrent", _Pointer, [_Pointer, _Id]),
-        (xrandr, "XRRGetOutputInfo", _Pointer, [_Pointer, _Pointer, _Id]),
-        (xrandr, "XRRGetCrtcInfo", _Pointer, [_Pointer, _Pointer, _Id]),
-        (xrandr, "XRRGetCrtcGamma", _Pointer, [_Pointer, _Id]),
-        (xrandr, "XRRGetCrtcTransform", ctypes.c_int, [_Pointer, _Id, _Pointer]),
-        (xrandr, "XRRListOutputProperties", _Ids, [_Pointer, _Id, _Pointer]),
-        (
-            xrandr,
-            "XRRGetOutputProperty",
-            ctypes.c_int,
-            [_Pointer, _Id, _Id, *[ctypes.c_long] * 2, *[ctypes.c_int] * 2, _Id, *[_Pointer] * 5],
-        ),
-        (xrandr, "XRRGetProviderResources", _Pointer, [_Pointer, _Id]),
-        (xrandr, "XRRGetProviderInfo", _Pointer, [_Pointer, _Pointer, _Id]),
-        *((xrandr, f"XRRFree{what}", None, [_Pointer]) for what in ("ScreenResources", "OutputInfo", "CrtcInfo", "Gamma")),
-        *((xrandr, f"XRRFree{what}", None, [_Pointer]) for what in ("ProviderResources", "ProviderInfo")),
-    ):
-        function = getattr(library, name)
-        function.restype, function.argtypes = result, arguments
-    return x11, xrandr

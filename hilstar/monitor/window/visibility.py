@@ -9,7 +9,7 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Self
 
-from hilstar.monitor.window.x11 import X11_LIBRARY, Survival
+from hilstar.monitor.window.x11 import INT, NUMBER, POINTER, TEXT, X11_LIBRARY, Survival, load_library
 
 # X.h
 VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
@@ -26,9 +26,7 @@ class ScreenArea:
     size_px: tuple[int, int]
 
 
-class _VisibilityEvent(ctypes.Structure):
-    """XVisibilityEvent of Xlib, and the beginning of every other event."""
-
+class _VisibilityEvent(ctypes.Structure):  # XVisibilityEvent of Xlib, and the beginning of every other event
     _fields_ = (
         ("type", ctypes.c_int),
         ("serial", ctypes.c_ulong),
@@ -39,9 +37,7 @@ class _VisibilityEvent(ctypes.Structure):
     )
 
 
-class _Event(ctypes.Union):
-    """XEvent of Xlib."""
-
+class _Event(ctypes.Union):  # XEvent of Xlib
     _fields_ = (("visibility", _VisibilityEvent), ("pad", ctypes.c_long * 24))
 
 
@@ -143,9 +139,7 @@ def _ended(descriptor: int) -> bool:
 def _sleep_of(connection: int) -> Any:
     """A function that tells whether the display sleeps (DPMS); always false where that is not known."""
     try:
-        library: Any = ctypes.CDLL("libXext.so.6")
-        library.DPMSCapable.argtypes = [ctypes.c_void_p]
-        library.DPMSInfo.argtypes = [ctypes.c_void_p] * 3
+        library = load_library("libXext.so.6", DPMSCapable=(INT, POINTER), DPMSInfo=(INT, POINTER, POINTER, POINTER))
         parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
         # Asked for a missing extension, Xlib prints to stderr.
         if not _library().XQueryExtension(connection, b"DPMS", *parts) or not library.DPMSCapable(connection):
@@ -162,21 +156,17 @@ def _sleep_of(connection: int) -> Any:
 
 
 def _library() -> Any:
-    x11: Any = ctypes.CDLL(X11_LIBRARY)
-    pointer, number = ctypes.c_void_p, ctypes.c_ulong
-    for name, result, arguments in (
-        ("XOpenDisplay", pointer, [ctypes.c_char_p]),
-        ("XCloseDisplay", ctypes.c_int, [pointer]),
-        ("XConnectionNumber", ctypes.c_int, [pointer]),
-        ("XDefaultRootWindow", number, [pointer]),
-        ("XSelectInput", ctypes.c_int, [pointer, number, ctypes.c_long]),
-        ("XQueryExtension", ctypes.c_int, [pointer, ctypes.c_char_p, *[pointer] * 3]),
-        ("XPending", ctypes.c_int, [pointer]),
-        ("XNextEvent", ctypes.c_int, [pointer, pointer]),
-        ("XSync", ctypes.c_int, [pointer, ctypes.c_int]),
-        ("XGetGeometry", ctypes.c_int, [pointer, number, *[pointer] * 7]),
-        ("XTranslateCoordinates", ctypes.c_int, [pointer, number, number, ctypes.c_int, ctypes.c_int, *[pointer] * 3]),
-    ):
-        function = getattr(x11, name)
-        function.restype, function.argtypes = result, arguments
-    return x11
+    return load_library(
+        X11_LIBRARY,
+        XOpenDisplay=(POINTER, TEXT),
+        XCloseDisplay=(INT, POINTER),
+        XConnectionNumber=(INT, POINTER),
+        XDefaultRootWindow=(NUMBER, POINTER),
+        XSelectInput=(INT, POINTER, NUMBER, ctypes.c_long),
+        XQueryExtension=(INT, POINTER, TEXT, *[POINTER] * 3),
+        XPending=(INT, POINTER),
+        XNextEvent=(INT, POINTER, POINTER),
+        XSync=(INT, POINTER, INT),
+        XGetGeometry=(INT, POINTER, NUMBER, *[POINTER] * 7),
+        XTranslateCoordinates=(INT, POINTER, NUMBER, NUMBER, INT, INT, *[POINTER] * 3),
+    )

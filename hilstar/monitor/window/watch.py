@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from hilstar.arrays import FloatArray
 from hilstar.monitor.window.randr import Randr
-from hilstar.monitor.window.x11 import Survival
+from hilstar.monitor.window.x11 import INT, POINTER, TEXT, Survival, load_library
 
 LOOK_S = 1.0
 RAMP_TOLERANCE = 1 / 512  # half a code of 8 bits
@@ -26,9 +27,9 @@ MODES = ("copy", "flip", "skip", "copy")  # the last is a copy that a flip could
 UNKNOWN = "unknown"
 
 
-def is_straight(ramp: bytes) -> bool:
-    """Whether a gamma ramp (16 bits for each step of red, then green, then blue) is the identity, to half a code of 8 bits."""
-    parts = np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP
+def is_straight(ramp: bytes | FloatArray) -> bool:
+    """Whether a gamma ramp is the identity, to half a code of 8 bits: red, green and blue, in 16 bits a step or (3, steps)."""
+    parts = np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP if isinstance(ramp, bytes) else ramp
     return bool(parts.size and np.all(np.abs(parts - np.linspace(0, 1, parts.shape[1])) < RAMP_TOLERANCE))
 
 
@@ -39,7 +40,18 @@ class PresentEvents:
     """
 
     def __init__(self, window: int) -> None:
-        self._xcb, self._present = _present_libraries()
+        number = ctypes.c_uint32
+        self._xcb = load_library(
+            XCB_LIBRARY,
+            xcb_connect=(POINTER, TEXT, POINTER),
+            xcb_connection_has_error=(INT, POINTER),
+            xcb_get_extension_data=(ctypes.POINTER(ctypes.c_ubyte), POINTER, POINTER),
+            xcb_generate_id=(number, POINTER),
+            xcb_flush=(INT, POINTER),
+            xcb_poll_for_event=(POINTER, POINTER),
+            xcb_disconnect=(None, POINTER),
+        )
+        self._present = load_library(PRESENT_LIBRARY, xcb_present_select_input=(ctypes.c_uint, POINTER, number, number, number))
         self._free: Any = ctypes.CDLL(None).free
         self._free.argtypes = [ctypes.c_void_p]
         self._connection: Any = self._xcb.xcb_connect(None, None)
@@ -133,22 +145,3 @@ def presented_as(shown: dict[str, int]) -> str:
     """In a word how frames were shown: "flip", "copy", "flip and copy", or "unknown" where the server did not say."""
     modes = [mode for mode in ("flip", "copy") if shown.get(mode)]
     return " and ".join(modes) or UNKNOWN
-
-
-def _present_libraries() -> tuple[Any, Any]:
-    xcb: Any = ctypes.CDLL(XCB_LIBRARY)
-    present: Any = ctypes.CDLL(PRESENT_LIBRARY)
-    pointer, number = ctypes.c_void_p, ctypes.c_uint32
-    for library, name, result, arguments in (
-        (xcb, "xcb_connect", pointer, [ctypes.c_char_p, pointer]),
-        (xcb, "xcb_connection_has_error", ctypes.c_int, [pointer]),
-        (xcb, "xcb_get_extension_data", ctypes.POINTER(ctypes.c_ubyte), [pointer, pointer]),
-        (xcb, "xcb_generate_id", number, [pointer]),
-        (xcb, "xcb_flush", ctypes.c_int, [pointer]),
-        (xcb, "xcb_poll_for_event", pointer, [pointer]),
-        (xcb, "xcb_disconnect", None, [pointer]),
-        (present, "xcb_present_select_input", ctypes.c_uint, [pointer, number, number, number]),
-    ):
-        function = getattr(library, name)
-        function.restype, function.argtypes = result, arguments
-    return xcb, present

@@ -13,13 +13,15 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
+
 from hilstar.errors import InputError, MachineError, did_you_mean
 from hilstar.monitor.window.awake import Awake
 from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.output_settings import OutputState
 from hilstar.monitor.window.randr import output_named
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
-from hilstar.monitor.window.watch import DisplayWatch
+from hilstar.monitor.window.watch import DisplayWatch, is_straight
 from hilstar.monitor.window.x11 import BackBuffer, Survival, SwapStamps, back_buffer, has_extension, is_composited, sync_control
 from hilstar.process.scheduling import drawing_threads_apart
 from hilstar.units import GL_VERSIONS, NS_PER_S
@@ -27,7 +29,6 @@ from hilstar.units import GL_VERSIONS, NS_PER_S
 TITLE = "hilstar"
 USUAL_REFRESH_HZ = 60
 GL_RENDERER = 0x1F01
-RAMP_TOLERANCE = 1 / 512  # half a code of 8 bits
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
 WAYLAND = (
     "no X11 display: this session is Wayland's, where a program can neither time its frames nor set the gamma ramp; "
@@ -71,7 +72,7 @@ class WindowSettings:
 def displays() -> list[Display]:
     """The monitors of this machine. Raises MachineError without a display."""
     with _glfw():
-        return [_describe(index, monitor) for index, monitor in enumerate(glfw.get_monitors())]
+        return _displays()
 
 
 def window_renderer() -> str:
@@ -117,6 +118,10 @@ def _describe(index: int, monitor: Any) -> Display:
     )
 
 
+def _displays() -> list[Display]:
+    return [_describe(index, monitor) for index, monitor in enumerate(glfw.get_monitors())]
+
+
 def _pair(values: Any) -> tuple[int, int]:
     first, second = values
     return int(first), int(second)
@@ -157,7 +162,9 @@ class Window:
         if settings.display is not None:
             self.display, monitor = _find(settings.display)
             # Left to itself, GLFW switches a display to its highest refresh.
-            glfw.window_hint(glfw.REFRESH_RATE, _refresh_to_ask(self.display, monitor, settings.refresh_hz))
+            wanted_hz = round(settings.refresh_hz or 0)
+            has_it = wanted_hz in _modes_hz(self.display, monitor)
+            glfw.window_hint(glfw.REFRESH_RATE, wanted_hz if has_it else self.display.refresh_hz or glfw.DONT_CARE)
         for hint, value in (
             (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
             (glfw.RESIZABLE, False),
@@ -208,7 +215,7 @@ class Window:
         straight = [value / (size - 1) for value in range(size)]
         identity: Any = (straight, straight, straight)
         glfw.set_gamma_ramp(monitor, identity)
-        self.ramp_refused = not _is_straight(glfw.get_gamma_ramp(monitor))
+        self.ramp_refused = not is_straight(np.array([*glfw.get_gamma_ramp(monitor)]))
 
     def _on_iconify(self, window: Any, minimised: int) -> None:
         self._minimised = bool(minimised)
@@ -272,7 +279,7 @@ class Window:
 
     @property
     def back_buffer(self) -> BackBuffer:
-        """What is drawn on."""
+        """The back buffer's depth and samples."""
         return back_buffer(glfw.get_proc_address)
 
     @property
@@ -305,24 +312,21 @@ class Window:
     @property
     def by_wayland(self) -> bool:
         """True where the X server is XWayland: a Wayland compositor draws the display."""
-        names = (_describe(index, monitor).name for index, monitor in enumerate(glfw.get_monitors()))
-        return has_extension(self._x_display, b"XWAYLAND") or any(name.startswith("XWAYLAND") for name in names)
+        return has_extension(self._x_display, b"XWAYLAND") or any(one.name.startswith("XWAYLAND") for one in _displays())
 
     @property
     def others(self) -> tuple[str, ...]:
         """The names of the other displays of the same X screen, where this window fills one."""
         if self.display is None or self.gone is not None:
             return ()
-        names = (_describe(index, monitor).name for index, monitor in enumerate(glfw.get_monitors()))
-        return tuple(name for name in names if name != self.display.name)
+        return tuple(one.name for one in _displays() if one.name != self.display.name)
 
     @property
     def mirrored(self) -> str | None:
         """The name of another display that shows the same part of the desktop, where there is one."""
         if self.display is None:
             return None
-        others = [_describe(index, monitor) for index, monitor in enumerate(glfw.get_monitors())]
-        same = (d.name for d in others if d.name != self.display.name and d.position_px == self.display.position_px)
+        same = (d.name for d in _displays() if d.name != self.display.name and d.position_px == self.display.position_px)
         return next(same, None)
 
     @property
@@ -401,19 +405,6 @@ def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:
     return tuple(sorted(same - {0}))
 
 
-def _refresh_to_ask(display: Display, monitor: Any, wanted_hz: float | None) -> int:
-    """The refresh that a display is opened with: the one wanted if it has it, else the one at which it runs."""
-    if wanted_hz is not None and round(wanted_hz) in _modes_hz(display, monitor):
-        return round(wanted_hz)
-    return display.refresh_hz or int(glfw.DONT_CARE)
-
-
-def _is_straight(ramp: Any) -> bool:
-    """Whether a gamma ramp as read back is the identity, within the 16 bits of the server and the steps of a small table."""
-    size = len(ramp.red)
-    return all(abs(value - k / (size - 1)) < RAMP_TOLERANCE for part in ramp for k, value in enumerate(part))
-
-
 def _newest_window(width: int, height: int, monitor: Any) -> Any:
     """A window with the newest OpenGL that its driver gives; None where it gives none of 3.3 or newer.
 
@@ -435,9 +426,8 @@ def _area_of(monitor: Any) -> ScreenArea:
 
 
 def _find(wanted: int | str) -> tuple[Display, Any]:
-    monitors = glfw.get_monitors()
-    described = [_describe(index, monitor) for index, monitor in enumerate(monitors)]
-    for display, monitor in zip(described, monitors, strict=True):
+    described = _displays()
+    for display, monitor in zip(described, glfw.get_monitors(), strict=True):
         if wanted == display.index or (isinstance(wanted, str) and wanted.lower() in display.name.lower()):
             return display, monitor
     known = "; ".join(display.line() for display in described)

@@ -1,5 +1,5 @@
-"""What only X11 and GLX know, through ctypes: when a swap reached the screen, whether a compositor runs, and that the
-server or the window is gone.
+"""Calls to X11 and GLX through ctypes: when a swap reached the screen, whether a compositor runs, and whether the server
+or the window is gone.
 
 Each answer is None or False where the system has no such thing: Wayland, or a driver without the extension.
 """
@@ -28,15 +28,29 @@ SERVER_GONE = "the X server is gone, or has closed the window's connection"
 WINDOW_GONE = "the window is gone: another program has closed it"
 
 
+POINTER, NUMBER, INT, TEXT = ctypes.c_void_p, ctypes.c_ulong, ctypes.c_int, ctypes.c_char_p
+
 log = logging.getLogger(__name__)
+
+
+def load_library(name: str, **functions: tuple[Any, ...]) -> Any:
+    """A library whose `functions` have these types: of the result, then of the arguments. Raises OSError or AttributeError."""
+    library: Any = ctypes.CDLL(name)
+    for function, (result, *arguments) in functions.items():
+        found = getattr(library, function)
+        found.restype, found.argtypes = result, arguments
+    return library
 
 
 def server_of() -> str:
     """The X server of `DISPLAY`: its maker and release; "" without one. Raises OSError without libX11."""
-    library: Any = ctypes.CDLL(X11_LIBRARY)
-    library.XOpenDisplay.restype, library.XOpenDisplay.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
-    library.XServerVendor.restype, library.XServerVendor.argtypes = ctypes.c_char_p, [ctypes.c_void_p]
-    library.XVendorRelease.argtypes = library.XCloseDisplay.argtypes = [ctypes.c_void_p]
+    library = load_library(
+        X11_LIBRARY,
+        XOpenDisplay=(POINTER, TEXT),
+        XServerVendor=(TEXT, POINTER),
+        XVendorRelease=(INT, POINTER),
+        XCloseDisplay=(INT, POINTER),
+    )
     display = library.XOpenDisplay(None)
     if not display:
         return ""
@@ -47,9 +61,7 @@ def server_of() -> str:
     return f"{vendor} {major}.{minor}.{patch}"
 
 
-class _ErrorEvent(ctypes.Structure):
-    """XErrorEvent of Xlib."""
-
+class _ErrorEvent(ctypes.Structure):  # XErrorEvent of Xlib
     _fields_ = (
         ("type", ctypes.c_int),
         ("display", ctypes.c_void_p),
@@ -108,9 +120,7 @@ class SyncControl:
     """GLX_OML_sync_control of one window: the time at which its last swap was scanned out."""
 
     def __init__(self, library: Any, x_display: int, drawable: int) -> None:
-        address = library.glXGetProcAddress
-        address.restype, address.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
-        function = address(b"glXWaitForSbcOML")
+        function = library.glXGetProcAddress(b"glXWaitForSbcOML")
         if not function:
             raise OSError("glXWaitForSbcOML is not there")
         counter = ctypes.POINTER(ctypes.c_int64)
@@ -159,9 +169,7 @@ def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | N
     if not x_display or not drawable:
         return None
     try:
-        library: Any = ctypes.CDLL(GL_LIBRARY)
-        library.glXQueryExtensionsString.restype = ctypes.c_char_p
-        library.glXQueryExtensionsString.argtypes = [ctypes.c_void_p, ctypes.c_int]
+        library = load_library(GL_LIBRARY, glXQueryExtensionsString=(TEXT, POINTER, INT), glXGetProcAddress=(POINTER, TEXT))
         extensions = library.glXQueryExtensionsString(x_display, 0) or b""
         return SyncControl(library, x_display, drawable) if SYNC_EXTENSION in extensions.split() else None
     except (OSError, AttributeError):
@@ -170,7 +178,7 @@ def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | N
 
 @dataclass(frozen=True, slots=True)
 class BackBuffer:
-    """What is drawn on: bits of each colour (the fewest of the three), and samples of a pixel (0 or 1: one)."""
+    """A back buffer: bits of each colour (the fewest of the three), and samples of a pixel (0 or 1: one)."""
 
     bits: int
     samples: int
@@ -195,8 +203,7 @@ def has_extension(x_display: int | None, name: bytes) -> bool:
     """Whether an X server has an extension."""
     if not x_display:
         return False
-    library: Any = ctypes.CDLL(X11_LIBRARY)
-    library.XQueryExtension.argtypes = [ctypes.c_void_p, ctypes.c_char_p, *[ctypes.c_void_p] * 3]
+    library = load_library(X11_LIBRARY, XQueryExtension=(INT, POINTER, TEXT, *[POINTER] * 3))
     parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
     return bool(library.XQueryExtension(x_display, name, *parts))
 
@@ -206,11 +213,9 @@ def is_composited(x_display: int | None) -> bool:
     if not x_display:
         return False
     try:
-        library: Any = ctypes.CDLL(X11_LIBRARY)
-        library.XInternAtom.restype = ctypes.c_ulong
-        library.XInternAtom.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int]
-        library.XGetSelectionOwner.restype = ctypes.c_ulong
-        library.XGetSelectionOwner.argtypes = [ctypes.c_void_p, ctypes.c_ulong]
+        library = load_library(
+            X11_LIBRARY, XInternAtom=(NUMBER, POINTER, TEXT, INT), XGetSelectionOwner=(NUMBER, POINTER, NUMBER)
+        )
         atom = library.XInternAtom(x_display, b"_NET_WM_CM_S0", 1)
         return bool(atom and library.XGetSelectionOwner(x_display, atom))
     except (OSError, AttributeError):

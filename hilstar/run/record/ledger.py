@@ -249,6 +249,8 @@ class Ledger(Closing):
             "gl_renderer": bench.renderer.gl_renderer,
             "gl_version": bench.renderer.gl_version,
             "render_path": bench.renderer.path,
+            "quantisation": bench.renderer.target.quantisation,
+            "codes_ms": json.dumps(bench.config.render.codes_ms),
             "output": json.dumps(bench.output),
             "monotonic_ns": str(time.monotonic_ns()),
             "unix_ns": str(time.time_ns()),

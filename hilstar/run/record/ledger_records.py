@@ -296,6 +296,14 @@ def read_head(path: Path) -> dict[str, str]:
         raise cannot_read(path, error, "give the ledger of a run") from error
 
 
+def codes_ms_of(head: dict[str, str]) -> tuple[float, float] | None:
+    """What codes cost in a run (see `[render] codes_ms`), from its ledger's head; None where nothing was measured or fixed."""
+    try:
+        return msgspec.json.decode(head.get("codes_ms", "null"), type=tuple[float, float] | None)
+    except msgspec.MsgspecError:
+        return None
+
+
 def config_of(head: dict[str, str]) -> BenchConfig | None:
     """The configuration of a run, from its ledger's head; None if that holds none that can be read."""
     try:

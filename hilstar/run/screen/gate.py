@@ -61,14 +61,14 @@ class Timing:
 
 
 @contextmanager
-def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Screen]:
-    """The bench of a file on its display, past the gate. Raises InputError or MachineError."""
+def open_screen(file: BenchFile, *, windowed: bool, force: bool, timed: bool) -> Iterator[Screen]:
+    """The bench of a file on its display, past the gate; `timed` as in `open_bench`. Raises InputError or MachineError."""
     monitor = file.config.monitor
     display = None if windowed else monitor.display
     size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
     sleep_in_waits()
     settings = WindowSettings(size_px, monitor.bits, display, monitor.refresh_hz)
-    with Window(settings) as window, open_bench(file, window_context()) as bench:
+    with Window(settings) as window, open_bench(file, window_context(), timed=timed) as bench:
         wanted, draws = file.config.render.gpu, bench.renderer.gl_renderer
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
             log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)

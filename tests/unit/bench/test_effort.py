@@ -10,9 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilstar.bench.build import load
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.bench.build import TIMED_EXACT_S, load, measured_cost, open_bench, timed_frame_ms
 from hilstar.bench.config import RenderSettings
-from hilstar.bench.effort import Light, choose_codes, choose_sides, cut_px, explain, plan_effort
+from hilstar.bench.effort import FieldCost, Light, choose_codes, choose_sides, cut_px, exact_in_time, explain, plan_effort
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import level_cost
@@ -186,3 +187,97 @@ def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_sa
     assert "9 ms of 16.7" in choose_codes(settings(quantisation="exact"), crowded).choice.saving
     few, wide = replace(crowded, rates_e_per_s=np.full(70, 1e3)), {"sprite_sigma_px": (2.5, 2.5)}
     assert (choose_codes(settings(), few).method, choose_codes(settings(**wide), few).method) == ("exact", "round")
+
+
+def cost(cheap_ms: float, best_ms: float) -> FieldCost:
+    """Made up."""
+    return FieldCost(cheap_ms, best_ms, "here")
+
+
+IN_TIME, LATE = cost(1.0, 2.0), cost(1.0, 20.0)  # by the table, of a limit of 8 ms
+
+
+@pytest.mark.parametrize(
+    ("measured", "of_table_in_time", "of_table_late"),
+    [
+        (None, True, False),
+        (cost(1.0, 6.3), True, True),
+        (cost(1.0, 6.5), True, False),  # from here the table's choice stays
+        (cost(1.0, 9.9), True, False),
+        (cost(1.0, 10.1), False, False),
+        (cost(9.9, 40.0), True, False),  # `round` may be late, too
+        (cost(10.1, 40.0), True, True),
+    ],
+)
+def test_a_measured_cost_overrules_the_table_only_where_it_is_clear_of_the_limit(measured, of_table_in_time, of_table_late):
+    assert exact_in_time(IN_TIME, measured, 8.0) is of_table_in_time
+    assert exact_in_time(LATE, measured, 8.0) is of_table_late
+
+
+def test_a_machine_that_holds_exact_takes_it_where_the_table_would_not():
+    """3000 stars in view at 60 Hz: 9 ms on two cores without a GPU; and as a slow machine has 70."""
+    crowded = replace(light(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(3000, 1e4))
+    by_gpu = choose_codes(settings(), replace(crowded, measured=cost(0.2, 0.4)))
+    assert (by_gpu.method, by_gpu.by_cost) == ("exact", True) and "takes 0.4 ms of 16.7 here" in by_gpu.choice.saving
+    few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
+    slow = choose_codes(settings(), replace(few, measured=cost(2.0, 15.0)))
+    assert slow.method == "round" and "takes 15 ms of 17 (round 2) for an average field at 1 deg/s here" in slow.choice.error
+    assert choose_codes(settings(codes_ms=(2.0, 15.0)), few).method == "round"
+    assert "by [render] codes_ms" in choose_codes(settings(codes_ms=(0.2, 0.4)), crowded).choice.saving
+    assert not choose_codes(settings(), light(16, 6.0)).by_cost  # `round` is within the tolerance, whatever it costs
+    assert not choose_codes(settings(quantisation="exact"), few).by_cost
+
+
+def test_round_is_timed_only_where_exact_may_be_late():
+    timed = []
+
+    def frame_ms(method: str, for_s: float) -> float:
+        timed.append((method, for_s))
+        return {"round": 4.5678, "exact": 9.12345}[method]
+
+    fast = measured_cost(frame_ms, cost(2.0, 3.0), 16.0)
+    assert (fast.cheap_ms, fast.best_ms) == (6.08, 9.12) and timed == [("exact", TIMED_EXACT_S)]
+    slow = measured_cost(frame_ms, cost(2.0, 3.0), 8.0)
+    assert (slow.cheap_ms, slow.best_ms) == (4.57, 9.12) and [method for method, _ in timed[1:]] == ["exact", "round"]
+    assert "[render] codes_ms = [4.57, 9.12]" in slow.where
+
+
+def test_frames_are_timed_for_no_longer_than_asked(small_bench_file):
+    """By a clock of which each look takes 30 ms: a frame is 30 ms, and there is time for two of them."""
+    looks = []
+
+    def now_ns() -> int:
+        looks.append(1)
+        return len(looks) * 30_000_000
+
+    with load(small_bench_file) as bench:
+        assert timed_frame_ms(bench, 0.1, now_ns) == 30.0
+    assert len(looks) == 6  # the begin, two frames, and the look that ends it
+
+
+def test_a_timed_bench_has_measured_codes_and_any_other_has_not(small_bench_file):
+    file = read_bench_file(small_bench_file)
+    with open_bench(file, timed=True) as timed, open_bench(file) as planned:
+        cheap_ms, best_ms = timed.config.render.codes_ms
+        assert min(cheap_ms, best_ms) > 0
+        assert (
+            f"measured here ([render] codes_ms = [{cheap_ms:g}, {best_ms:g}] fixes it)"
+            in explain(timed.effort, timed.config.render)[0]
+        )
+        assert planned.config.render.codes_ms is None and "without a GPU" in explain(planned.effort, planned.config.render)[0]
+        assert timed.file.sha256 == planned.file.sha256
+    small_bench_file.write_text(small_bench_file.read_text() + "[render]\ncodes_ms = [2, 500]\n")
+    with open_bench(read_bench_file(small_bench_file), timed=True) as fixed:
+        assert fixed.config.render.codes_ms == (2, 500) and fixed.renderer.target.quantisation == "round"
+
+
+def test_a_timed_bench_takes_the_codes_that_its_machine_holds(small_bench_file, monkeypatch):
+    """Whatever the table says: the bench is drawn anew with the others."""
+    small_bench_file.write_text(small_bench_file.read_text() + '[render]\neffort = "auto"\n')
+    monkeypatch.setattr(
+        "hilstar.bench.build.timed_frame_ms", lambda bench, for_s: 500.0 if "exact" in bench.quantiser.shader else 1.0
+    )
+    with open_bench(read_bench_file(small_bench_file), timed=True) as bench:
+        assert bench.config.render.quantisation == bench.renderer.target.quantisation == bench.effort.quantisation == "round"
+        assert bench.config.render.codes_ms == (1.0, 500.0)
+        assert bench.draw(ORION).levels.any()

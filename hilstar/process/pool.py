@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from hilstar.process.closing import Closing
 from hilstar.process.interrupts import end_with_parent
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class News(NamedTuple):
     said: Any
 
 
-class ProcessPool:
+class ProcessPool(Closing):
     """Workers that call `start(*arguments)` once for a greeting and their work, and then the work for each task.
 
     A worker's exception of the types `told` comes back as an "error"; any other ends the worker. Use the pool as a context
@@ -105,10 +106,8 @@ class ProcessPool:
             worker.process.kill()
             worker.process.join(END_S)
 
-    def __enter__(self) -> ProcessPool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Kill the workers."""
         for worker in self.workers:
             worker.process.terminate()
         for worker in list(self.workers):

@@ -16,8 +16,9 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Self
+
+from hilstar.process.closing import Closing
 
 MAX_OUTPUT_BYTES = 4_000_000  # each of stdout and stderr: a chatty solver prints some 100 kB
 CHUNK_BYTES = 65_536
@@ -27,7 +28,7 @@ READY_POLL_S = 0.05
 US_PER_S = 1_000_000
 
 
-class Child:
+class Child(Closing):
     """A running command without a shell; one that prints more than MAX_OUTPUT_BYTES is killed, and its children with it.
 
     Use it as a context manager: what is left of its group ends with it. Raises OSError where it cannot be started.
@@ -89,10 +90,8 @@ class Child:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def close(self) -> None:
+        """End what is left of its group."""
         self.kill()
         self._process.wait()
         for reader in self._readers:
@@ -102,7 +101,7 @@ class Child:
                 stream.close()
 
 
-class Service:
+class Service(Closing):
     """This process as a service of systemd's; without one (no NOTIFY_SOCKET) it does nothing.
 
     `ready` tells when it does its work, `alive` whether it still does, and `status` what a person may read of it.
@@ -117,7 +116,10 @@ class Service:
     ) -> None:
         self._ready, self._alive, self._status = ready, alive, status
         self._address = environment.get("NOTIFY_SOCKET", "")
-        self._each_s = min(_watchdog_s(environment) / 2, EACH_S)
+        self._each_s = EACH_S
+        with contextlib.suppress(ValueError, KeyError):  # where systemd watches it, half of what it waits
+            if int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid():
+                self._each_s = min(int(environment["WATCHDOG_USEC"]) / US_PER_S / 2, EACH_S)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.setblocking(False)
         self._stop = threading.Event()
@@ -132,30 +134,20 @@ class Service:
         while not self._ready():
             if self._stop.wait(READY_POLL_S):
                 return
-        self._send(f"READY=1\nSTATUS={self._line()}")
+        self._send(f"READY=1\nSTATUS={' '.join(self._status().split())}")
         while not self._stop.wait(self._each_s):
             if self._alive():
-                self._send(f"WATCHDOG=1\nSTATUS={self._line()}")
-
-    def _line(self) -> str:
-        return " ".join(self._status().split())
+                self._send(f"WATCHDOG=1\nSTATUS={' '.join(self._status().split())}")
 
     def __enter__(self) -> Self:
         if self._address:
             self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def close(self) -> None:
+        """Tell that the service ends."""
         self._stop.set()
         if self._address:
             self._thread.join()
             self._send("STOPPING=1")
         self._socket.close()
-
-
-def _watchdog_s(environment: Mapping[str, str]) -> float:
-    """The time after which systemd takes this process for dead; infinite where it does not watch it."""
-    with contextlib.suppress(ValueError):
-        if int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid():
-            return int(environment["WATCHDOG_USEC"]) / US_PER_S if "WATCHDOG_USEC" in environment else float("inf")
-    return float("inf")

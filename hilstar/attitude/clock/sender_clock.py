@@ -59,7 +59,6 @@ class _OffsetLine:
 class _Slot(NamedTuple):
     """The message with the smallest offset within SLOT_NS."""
 
-    number: int
     host_ns: int
     offset_ns: int
 
@@ -69,16 +68,15 @@ class Slots(deque[_Slot]):
 
     def lower(self, host_ns: int, offset_ns: int) -> bool:
         """Take a message into the newest slot; False, and nothing taken, where it begins a new one."""
-        number = host_ns // SLOT_NS
-        if not self or self[-1].number != number:
+        if not self or self[-1].host_ns // SLOT_NS != host_ns // SLOT_NS:
             return False
         if offset_ns < self[-1].offset_ns:
-            self[-1] = _Slot(number, host_ns, offset_ns)
+            self[-1] = _Slot(host_ns, offset_ns)
         return True
 
     def begin(self, host_ns: int, offset_ns: int) -> None:
         """Begin a new slot with this message."""
-        self.append(_Slot(host_ns // SLOT_NS, host_ns, offset_ns))
+        self.append(_Slot(host_ns, offset_ns))
 
     def relative_to(self, origin: _Slot) -> tuple[FloatArray, FloatArray]:
         """Host times and offsets (n,), ns, from those of `origin`."""

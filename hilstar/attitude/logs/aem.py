@@ -174,30 +174,24 @@ class _DatedBlock:
         return min(max(start, first), last), max(min(stop, last), first)
 
 
-def _resolved(segments: list[_DatedBlock]) -> tuple[list[list[LogEntry]], str | None]:
-    """The entries of segments, which come in the order of their first epochs, with those that overlap made one run of pieces.
-
-    And what was done, in words; None where no segments overlap. Raises AemFaultError.
-    """
+def _resolved(segments: list[_DatedBlock], told: dict[str, str]) -> list[list[LogEntry]]:
+    """The entries of segments, which come in the order of their first epochs; those that overlap are made one run of pieces."""
     groups: list[list[_DatedBlock]] = []
     end_ns = 0
     for segment in segments:
-        overlaps = bool(groups) and segment.times[0] < end_ns and segment.is_whole and all(each.is_whole for each in groups[-1])
-        if overlaps:
+        if groups and segment.times[0] < end_ns and all(each.is_whole for each in (segment, *groups[-1])):
             groups[-1].append(segment)
+            end_ns = max(end_ns, segment.times[-1])
         else:
             groups.append([segment])
-        end_ns = max(end_ns, segment.times[-1]) if overlaps else segment.times[-1]
-    runs = [group[0].entries if len(group) == 1 else _one_run(group) for group in groups]
+            end_ns = segment.times[-1]
     several = [group for group in groups if len(group) > 1]
-    if not several:
-        return runs, None
-    many = sum(map(len, several))
-    first_ns = several[0][1].times[0]
-    return runs, (
-        f"{many} segments overlap, first at {epoch_text(first_ns)}: where they do, the one that its USEABLE times give is"
-        " taken, and of several the one that begins later"
-    )
+    if several:
+        told["aem-overlap"] = (
+            f"{sum(map(len, several))} segments overlap, first at {epoch_text(several[0][1].times[0])}: where they do, the one"
+            " that its USEABLE times give is taken, and of several the one that begins later"
+        )
+    return [group[0].entries if len(group) == 1 else _one_run(group) for group in groups]
 
 
 def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
@@ -216,9 +210,8 @@ def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
         else:
             pieces.append((taken, start, stop))
     run: list[LogEntry] = []
-    for number, (k, start, stop) in enumerate(pieces):
-        last = number == len(pieces) - 1
-        piece = _piece(group[k], start, stop if last else stop - 1)
+    for k, start, stop in pieces:
+        piece = _piece(group[k], start, stop if stop == edges[-1] else stop - 1)
         if run and isinstance(piece[0].event, AttitudeSample):
             piece[0] = LogEntry(piece[0].where, replace(piece[0].event, discontinuity=True))
         run += piece
@@ -239,8 +232,8 @@ def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
 def read_aem(text: str, of_date: OfDate) -> LogReading:
     """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs.
 
-    `of_date` has the frames that move: from a frame's name, a time system and times (n,), ns, the rotations (n, 4) from ICRS
-    the frame's own rate (3,) in its components, and a notice or None.
+    `of_date` has the frames that move: of a frame's name, a time system and times (n,), ns, it gives the rotations (n, 4) from
+    ICRS, the frame's own rate (3,) in its components, and a notice or None.
 
     Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame and one of those above.
     """
@@ -254,19 +247,18 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[LogEntry] = []
     told: dict[str, str] = {}
-    runs, overlap = _resolved(
-        [_DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed]
-    )
-    if overlap is not None:
-        told["aem-overlap"] = overlap
-    for following in runs:
-        if entries:
-            _part(entries, following)
+    segments = [_DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed]
+    for following in _resolved(segments, told):
+        first, end = following[0], entries[-1] if entries else None
+        if end is not None and isinstance(end.event, AttitudeSample) and isinstance(first.event, AttitudeSample):
+            if end.event.t_ns == first.event.t_ns:  # 504.0-B-1 allows it: the earlier block then ends 1 ns before
+                entries[-1] = LogEntry(end.where, replace(end.event, t_ns=end.event.t_ns - 1))
+            following[0] = LogEntry(first.where, replace(first.event, discontinuity=True))
         entries += following
     if any(block.meta["ATTITUDE_TYPE"] == EULER_RATE for block in blocks):
         told["aem-rates"] = AMBIGUOUS
-    (first_ns, *_), first = timed[0]
-    return LogReading(entries, _conventions(first, first_ns, of_date), ADVICE, list(told.items()))
+    (first_ns, *_), block = timed[0]
+    return LogReading(entries, _conventions(block, first_ns, of_date), ADVICE, list(told.items()))
 
 
 def _conventions(block: Block, first_ns: int, of_date: OfDate) -> Conventions:
@@ -297,15 +289,6 @@ def _conventions(block: Block, first_ns: int, of_date: OfDate) -> Conventions:
         written=written,
         scale=scale,
     )
-
-
-def _part(entries: list[LogEntry], following: list[LogEntry]) -> None:
-    """Mark the break between two blocks. 504.0-B-1 allows them a common epoch: the earlier then ends 1 ns before it."""
-    (end_where, end), (where, first) = entries[-1], following[0]
-    if isinstance(end, AttitudeSample) and isinstance(first, AttitudeSample):
-        if end.t_ns == first.t_ns:
-            entries[-1] = LogEntry(end_where, replace(end, t_ns=end.t_ns - 1))
-        following[0] = LogEntry(where, replace(first, discontinuity=True))
 
 
 def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[LogEntry]:

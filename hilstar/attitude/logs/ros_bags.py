@@ -78,15 +78,6 @@ def type_name(text: str) -> str:
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else "/".join(parts)
 
 
-def _chunk_bytes(data: bytes, compression: str, size: int) -> bytes:
-    """A chunk, unpacked to the `size` that the bag states. Raises ValueError, and what the unpackers raise."""
-    if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
-    if compression not in {"none", "bz2", "lz4", "zstd"}:
-        raise ValueError(f"compression {compression[:20]!r} is not one of bz2, lz4 and zstd")
-    return unpacked(data, compression, size)
-
-
 def _message_bytes(data: bytes) -> bytes:
     """A message's bytes, unpacked where the recorder packed each by itself (no CDR begins as Zstandard does)."""
     return unpacked(data, "zstd", MAX_CHUNK_BYTES, exact=False) if data[:4] == ZSTD_MAGIC else data
@@ -251,8 +242,13 @@ class _BagFile:
                 while (record := _record(file)) is not None:
                     fields, data = record
                     if _operation(fields) == CHUNK:
-                        chunk = _chunk_bytes(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
-                        room -= len(chunk)
+                        size, compression = _u32.unpack(fields[b"size"])[0], fields[b"compression"].decode()
+                        if size > MAX_CHUNK_BYTES:
+                            raise ValueError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
+                        if compression not in {"none", "bz2", "lz4", "zstd"}:
+                            raise ValueError(f"compression {compression[:20]!r} is not one of bz2, lz4 and zstd")
+                        chunk = unpacked(data, compression, size)
+                        room -= size
                         if room < 0:
                             raise ValueError(f"unpacks to more than {MAX_INFLATION} times its size")
                         yield from self._inside(io.BytesIO(chunk))

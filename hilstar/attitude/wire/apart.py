@@ -71,10 +71,10 @@ class ReadOrder(NamedTuple):
 
 
 class Record(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What the other process hands over, of one order: any of these; a record of nothing is a sign of life.
+    """What the other process hands over, of one order. A record without anything is a sign of life.
 
-    A message that came; why the device does not `answer` any more; what the counts have grown by since the last record that
-    had them; a notice of the link, told where it is lasting, else only mentioned; why the process ends.
+    `gone` says why the device no longer answers, `counts` what the counts have grown by since the last record that had them,
+    `end` why the process ends. A `lasting` notice is told, another only mentioned.
     """
 
     order: int = 0
@@ -121,9 +121,9 @@ class RecordStream:
 
 
 class ReaderProcess:
-    """Runs the process that reads a link: starts it, gives it its order, and restarts it where it ended.
+    """Runs the process that reads a link: starts it, gives it its order, and restarts it where it ended or hangs.
 
-    `generation` counts its starts. Its end raises nothing.
+    `generation` counts its starts.
     """
 
     def __init__(self, notices: Notices, module: str = CHILD, clock: HostClock = HOST_CLOCK) -> None:

@@ -22,7 +22,6 @@ import stat
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 from hilstar.errors import InputError, shortened
 
@@ -45,7 +44,6 @@ MAX_KNOWN = 1000
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
-T = TypeVar("T")
 LOOPBACK: tuple[Network, ...] = (ipaddress.IPv4Network("127.0.0.0/8"), ipaddress.IPv6Network("::1/128"))
 
 
@@ -98,17 +96,13 @@ def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
 
 
 def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
-    """Refuse (InputError) an endpoint that cannot be bound or connected, or whose file a bind would delete."""
-    if endpoint.path is not None:
-        _check_socket_file(endpoint.path, text, bind)
-    elif not bind and endpoint.any_host:
-        raise InputError(f"{text}: cannot connect to every interface; write the address of the side that binds")
-    elif not bind and endpoint.any_port:
-        raise InputError(f"{text}: cannot connect to a free port; write the port of the side that binds")
-
-
-def _check_socket_file(path: Path, text: str, bind: bool) -> None:
-    """libzmq deletes any file at the path that it binds."""
+    """Refuse (InputError) an endpoint that cannot be bound or connected, or whose file a bind would delete, as libzmq does."""
+    path = endpoint.path
+    if path is None:
+        if not bind and (endpoint.any_host or endpoint.any_port):
+            where, what = ("every interface", "address") if endpoint.any_host else ("a free port", "port")
+            raise InputError(f"{text}: cannot connect to {where}; write the {what} of the side that binds")
+        return
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
@@ -117,11 +111,9 @@ def _check_socket_file(path: Path, text: str, bind: bool) -> None:
         raise InputError(f"{text}: {error.strerror}; {PATH_FORM}") from error
     if bind and not path.parent.is_dir():
         raise InputError(f"{text}: the directory {path.parent} does not exist; create it, or write another path")
-    if mode is None:
-        return
-    if not stat.S_ISSOCK(mode):
+    if mode is not None and not stat.S_ISSOCK(mode):
         raise InputError(f"{text}: an existing file that is not a socket, and binding would delete it; write another path")
-    if bind and _is_served(path):
+    if mode is not None and bind and _is_served(path):
         raise InputError(f"{text}: in use by a running program; stop that program, or write another path")
 
 
@@ -201,19 +193,14 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
         if not endpoint.startswith("udp://"):
             raise InputError(f"{word}: not a UDP endpoint; write udp://ADDRESS:PORT, or {BIND_FORM.removeprefix('write ')}")
         said[word] = _parts(endpoint.removeprefix("udp://"), word)
-    host = _agreed({word: host for word, (host, _) in said.items() if host is not None}, DEFAULT_HOST)
-    return UdpPlace(
-        ipaddress.ip_address(host), _agreed({word: n for word, (_, n) in said.items() if n is not None}, DEFAULT_PORT)
-    )
-
-
-def _agreed(said: dict[str, T], otherwise: T) -> T:
-    """What they all say. Raises InputError for the first two that differ."""
-    words, values = list(said), list(said.values())
-    for word, value in said.items():
-        if value != values[0]:
-            raise InputError(f"{words[0]} and {word} disagree; leave one of them out")
-    return values[0] if values else otherwise
+    hosts = {word: host for word, (host, _) in said.items() if host is not None} or {"": DEFAULT_HOST}
+    ports = {word: number for word, (_, number) in said.items() if number is not None} or {"": DEFAULT_PORT}
+    for values in (hosts, ports):
+        first, *others = values.items()
+        for word, value in others:
+            if value != first[1]:
+                raise InputError(f"{first[0]} and {word} disagree; leave one of them out")
+    return UdpPlace(ipaddress.ip_address(next(iter(hosts.values()))), next(iter(ports.values())))
 
 
 def _parts(text: str, word: str) -> tuple[str, int | None]:

@@ -172,11 +172,12 @@ class StreamLink(Link):
     """A link whose sender runs freely."""
 
     steps: ClassVar[Literal[False]] = False
+    bound: bool = False  # ZeroMQ's, to which any number of senders connect: none of them comes back
 
     @property
     def reconnects(self) -> int:
         """How often the sender came back."""
-        return max(0, self.link_counts.connections - 1)
+        return 0 if self.bound else max(0, self.link_counts.connections - 1)
 
     @abstractmethod
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:

@@ -157,10 +157,10 @@ class DifferenceRates:
 
 
 class Follower:
-    """The attitudes of one spacecraft from messages: that of the `name`, or the only one there is.
+    """The attitudes of one spacecraft from messages: the one with the `name`, or the only one there is.
 
-    Each has the spacecraft's velocity with respect to the origin of Basilisk's frame, of `taken` "velocity"; or its place and
-    velocity about the Earth, of "state".
+    With `taken` "velocity" each has the spacecraft's velocity against N's origin, with "state" its place and velocity about the
+    Earth.
     """
 
     def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates, taken: StateUse = "attitude") -> None:

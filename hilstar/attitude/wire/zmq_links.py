@@ -14,7 +14,7 @@ import zmq
 
 from hilstar.attitude.wire.apart import OpenStream, ReaderProcess
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
-from hilstar.attitude.wire.links import Arrival, FloodGate, LockstepLink, RawMessage, StreamLink
+from hilstar.attitude.wire.links import Arrival, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import (
     AttitudeSample,
     Event,
@@ -80,13 +80,7 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         if not bind:  # a connecting socket hears nothing until a sender binds there
             self.verb = "waiting for a sender at"
         self._shut()
-        self._gate = FloodGate(self.link_counts, self._notices, clock)
         self._lost_until = clock.within(0.0)
-
-    @property
-    def reconnects(self) -> int:
-        """How often the sender reconnected."""
-        return 0 if self._bind else super().reconnects
 
     def opener(self) -> OpenStream:
         """What another process opens the same socket by."""
@@ -143,15 +137,10 @@ class ZmqApart(StreamLink):
         link.close()
         self.verb, self.endpoint, self.conventions = link.verb, link.endpoint, link.conventions
         self.link_counts = link.link_counts
-        self._decoder, self._bind, self._opener = link.decoder, link.bound, link.opener()
+        self._decoder, self.bound, self._opener = link.decoder, link.bound, link.opener()
         self._waiting: list[RawMessage] = []
         self._ordered = False
         self._reader = ReaderProcess(self._notices, clock=clock)
-
-    @property
-    def reconnects(self) -> int:
-        """How often the sender reconnected."""
-        return 0 if self._bind else super().reconnects
 
     def await_ready(self) -> None:
         """Wait until the socket can be opened at once, or for a moment."""

@@ -23,10 +23,9 @@ import zmq
 
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
 from hilstar.attitude.wire.keys import AllowList, CurveKeys, check_reach, load_public, load_secret
-from hilstar.attitude.wire.links import PAUSE_S, LinkCounts
+from hilstar.attitude.wire.links import PAUSE_S, Link, LinkCounts
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.process.closing import Closing
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
 
 if TYPE_CHECKING:
@@ -153,7 +152,10 @@ class _Doorkeeper:
         if event == zmq.EVENT_ACCEPTED:
             self._counts.connections += 1
             self._open.pop(value, None)
-            self._open[value] = _peer(value)
+            self._open[value] = ""
+            with _connection(value) as connection:
+                name = () if connection is None else connection.getpeername()
+                self._open[value] = f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
         elif event == zmq.EVENT_DISCONNECTED:
             self._leave(value)
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED and not self._bound:
@@ -220,19 +222,12 @@ def _connection(file: int) -> Iterator[socket.socket | None]:
         yield connection
 
 
-def _peer(file: int) -> str:
-    with _connection(file) as connection:
-        name = () if connection is None else connection.getpeername()
-        return f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
-    return ""
-
-
 def zmq_version() -> str:
     """The version of libzmq."""
     return zmq.zmq_version()
 
 
-class ZmqSocket(Closing):
+class ZmqSocket(Link):
     """A socket and its context, bound or connected; reopened after a flood.
 
     A socket that binds is opened at once, to check that it can be. One that receives a stream is then closed until its first
@@ -251,14 +246,13 @@ class ZmqSocket(Closing):
         max_part_bytes: int = MAX_PART_BYTES,
         clock: HostClock = HOST_CLOCK,
     ) -> None:
-        self._max_part_bytes, self._clock = max_part_bytes, clock
+        super().__init__(notices, clock)
+        self._max_part_bytes = max_part_bytes
         self._place = parse_endpoint(endpoint)
         check_reach(self._place, endpoint, bind=bind, keys=keys)
         check_use(self._place, endpoint, bind=bind)
         self.endpoint = endpoint
         self.verb = "bound to" if bind else "connected to"
-        self.link_counts = LinkCounts()
-        self._notices = Notices() if notices is None else notices
         self._kind, self._bind, self._address = kind, bind, self._place.address
         self._keys = keys
         self._pair = None if keys.secret_key is None else load_secret(keys.secret_key)

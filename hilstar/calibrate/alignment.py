@@ -35,7 +35,7 @@ MIN_REPEATS = 3  # degrees of freedom of the repeats' scatter
 FALSE_ALARM = 1e-3
 FLOOR_RAD = 1e-3 / ARCSEC_PER_RAD  # smallest noise: quaternions are rounded
 MIN_EXPLAINED = 0.5  # share of the residual's squares that a named cause explains
-MIN_ATTITUDES = 6  # a cause is sought from so many on
+MIN_ATTITUDES = 6  # minimum from which a cause is sought
 MAX_NAMED = 10  # wild rows
 ONE_ATTITUDE = (
     "one attitude: it determines the rotation, but does not tell what changes with attitude; take several, all over the sky"

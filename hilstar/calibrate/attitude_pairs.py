@@ -41,9 +41,9 @@ CUT_SIGMAS, FEW = 6.0, 10.0
 FLOOR_RAD = 0.01 / ARCSEC_PER_RAD  # smallest scale: the digits of written quaternions
 ROUNDS, DONE_RAD = 50, 1e-13
 MAX_PAIRS = 500  # enough, spread over the table, to recognise a convention
-CLEARLY = 5.0  # another convention must fit so many times better where the pairs agree as they are
+CLEARLY = 5.0  # how many times better another convention must fit where the pairs agree as they are
 CLEARLY_RAD = 30.0 / ARCSEC_PER_RAD  # below this scatter no other convention is sought
-SIMPLER = 1.5  # the simpler convention is named if it fits up to so many times worse than the best
+SIMPLER = 1.5  # the simpler convention is named if its fit is at most this many times worse than the best
 
 Change = Callable[[FloatArray], FloatArray]
 

@@ -111,10 +111,7 @@ class Paired:
 
 
 def pair(seen: Edges, shown: Edges, period_ns: float) -> Paired:
-    """Match each edge to the frame that caused it: by the most frequent latency, within half a refresh period.
-
-    Raises InputError where too few agree.
-    """
+    """Match each edge to its frame by the most frequent latency, within half a period. Raises InputError if too few agree."""
     inside = (seen.host_ns >= shown.host_ns[0] - MAX_EARLY_NS) & (seen.host_ns <= shown.host_ns[-1] + MAX_LATENCY_NS)
     host_ns, level = seen.host_ns[inside], seen.level[inside]
     guess_ns, ambiguous = _likely_latency_ns(Edges(host_ns, level), shown)

@@ -41,10 +41,7 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """The plan's size: bits of a code, levels from black to white, repeats of each, and channels.
-
-    Raises InputError for a plan that cannot be measured.
-    """
+    """The plan's size: bits of a code, levels from black to white, repeats of each, channels. Raises InputError."""
 
     bits: int
     levels: int = 32

@@ -50,22 +50,18 @@ def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: floa
         raise InputError(f"an exposure of {exposure_s:g} s; write --exposure S, as the tracker exposed")
     ratios = []
     for reading in readings:
-        rate = _rate_of(bench, reading.hip)
+        place = np.flatnonzero(bench.stars.hip == reading.hip)
+        named = f"--reading {reading.hip}"
+        if not len(place):
+            raise InputError(f"{named}: the bench has no such star; take one of [sky] catalogue within faintest_v_mag")
+        rate = float(bench.stars.electrons_per_s[place[0]])
+        if rate * bench.psf.peak_share > bench.flux_at_white_e_per_s:
+            raise InputError(f"{named}: the star clips on the monitor; take a fainter one")
+        if rate < bench.faintest_shown_e_per_s:
+            raise InputError(f"{named}: the star is too faint for the monitor to show; take a brighter one")
         ratios.append(reading.dn * detector.gain_e_per_dn / (rate * exposure_s))
     median = float(np.median(ratios))
     return MeasuredScale(bench.flux_at_white_e_per_s * median, bench.flux_at_white_e_per_s, np.array(ratios))
-
-
-def _rate_of(bench: Bench, hip: int) -> float:
-    place = np.flatnonzero(bench.stars.hip == hip)
-    if not len(place):
-        raise InputError(f"--reading {hip}: the bench has no such star; take one of [sky] catalogue within faintest_v_mag")
-    rate = float(bench.stars.electrons_per_s[place[0]])
-    if rate * bench.psf.peak_share > bench.flux_at_white_e_per_s:
-        raise InputError(f"--reading {hip}: the star clips on the monitor; take a fainter one")
-    if rate < bench.faintest_shown_e_per_s:
-        raise InputError(f"--reading {hip}: the star is too faint for the monitor to show; take a brighter one")
-    return rate
 
 
 def with_flux_at_white(file: BenchFile, flux_at_white_e_per_s: float, output: Path) -> None:

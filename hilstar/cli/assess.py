@@ -10,6 +10,7 @@ import typer
 from hilstar.cli.options import Json, RunFile, check_files
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
+from hilstar.files import check_directory, make_directory
 
 MAX_LATENCY_MS = 1e7
 
@@ -38,7 +39,6 @@ def assess(
     """Find a tracker's error budget: bias, field-of-view error, pixel error, noise, clock, availability, wrong answers."""
     from hilstar.assess.assessment import AssessSettings, assess_files
     from hilstar.assess.report import budget_of, lines_of, write_page, write_tables
-    from hilstar.files import check_directory, make_directory
 
     check_directory("-o", output)
     if not abs(latency_ms) < MAX_LATENCY_MS:

@@ -9,6 +9,8 @@ import typer
 
 from hilstar.cli import options
 from hilstar.console.terminal import print_json, say
+from hilstar.errors import InputError
+from hilstar.resources import resource_path
 
 if TYPE_CHECKING:
     from hilstar.attitude.logs.entries import Stated
@@ -52,8 +54,6 @@ def attitude(
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
-    from hilstar.errors import InputError
-    from hilstar.resources import resource_path
 
     live = source.suffix.lower() == ".toml"
     first = read_bench_file(source if live else bench or resource_path("configs", "demo.toml"))
@@ -88,7 +88,6 @@ class _Found(NamedTuple):
 
 def _live(file: BenchFile, at: str | None, patience_s: float) -> _Found:
     """The first attitude of the stream that a bench file names."""
-    from hilstar.errors import InputError
     from hilstar.run.open_link import first_attitude, open_link
 
     if at is not None:

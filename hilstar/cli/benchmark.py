@@ -11,7 +11,7 @@ import typer
 from hilstar.cli.options import MAX_SEED, Json, parse_counts, parse_sizes
 from hilstar.console.terminal import print_json, progress
 from hilstar.errors import InputError
-from hilstar.files import check_directory
+from hilstar.files import check_directory, make_directory
 
 OwnBench = Annotated[Path | None, typer.Argument(metavar="[BENCH.toml]", help="Your bench file, at its own image size.")]
 
@@ -32,7 +32,6 @@ def benchmark(
     import numpy as np
 
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.files import make_directory
     from hilstar.study.speed import benchmark as speed
     from hilstar.study.speed import report as speed_report
 

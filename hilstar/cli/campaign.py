@@ -15,6 +15,7 @@ import typer
 from hilstar.cli.options import Json, parse_memory
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
+from hilstar.files import check_directory
 
 if TYPE_CHECKING:
     from hilstar.campaign.cluster import Scheduler
@@ -63,7 +64,6 @@ def campaign(
     from hilstar.campaign.cluster import Scheduler
     from hilstar.campaign.run import Asked, Campaign
     from hilstar.campaign.store import Directory
-    from hilstar.files import check_directory
 
     check_directory("-o", output)
     if scheduler is not None and (workers is not None or memory is not None):

@@ -9,6 +9,8 @@ import typer
 
 from hilstar.cli.options import BenchFile, Json
 from hilstar.console.terminal import print_json
+from hilstar.errors import InputError, shortened
+from hilstar.files import check_outputs
 
 
 def catalogue(
@@ -31,8 +33,6 @@ def catalogue(
     """Write the stars as the tracker sees them: places with errors, types, electrons per second, instrument magnitudes."""
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.bench.catalogue import ENDINGS, bench_catalogue, write_catalogue
-    from hilstar.errors import InputError, shortened
-    from hilstar.files import check_outputs
 
     if output.suffix.lower() not in ENDINGS:
         raise InputError(f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}")

@@ -9,7 +9,7 @@ import typer
 
 from hilstar.cli.options import Json
 from hilstar.console.terminal import print_json
-from hilstar.files import check_directory
+from hilstar.files import check_directory, make_directory
 
 MAX_LINES = 10  # stars listed: if the whole sky differs, more of them say nothing
 
@@ -26,7 +26,6 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare two frames star by star; exit code 0 if they show the same sky, 1 if not."""
-    from hilstar.files import make_directory
     from hilstar.testing import compare as compare_files
     from hilstar.testing.report import write_report
     from hilstar.testing.sky_comparison import CENTROID_PX, FLUX_MAG, star_lines

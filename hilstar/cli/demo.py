@@ -15,6 +15,7 @@ from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.terminal import progress, report, say
 from hilstar.files import check_directory
 from hilstar.notices import Notices
+from hilstar.process.interrupts import caught
 
 if TYPE_CHECKING:
     from hilstar.bench.frame import Bench
@@ -41,7 +42,6 @@ def demo(
     """
     import numpy as np
 
-    from hilstar.process.interrupts import caught
     from hilstar.run.demo import run_demo, write_pictures
 
     check_directory("-o", output)

@@ -14,7 +14,7 @@ from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files, parse_di
 from hilstar.cli.running import Console, ConsoleName, Control, Token, page_listener
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError, did_you_mean
-from hilstar.files import check_directory
+from hilstar.files import check_directory, make_directory
 from hilstar.reading import exists
 from hilstar.resources import resource_path
 
@@ -77,7 +77,6 @@ def first_light(
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.records import write_page
     from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
-    from hilstar.files import make_directory
     from hilstar.run.sync import beat_line
 
     wrong = [name for name in again or [] if name not in NAMES]
@@ -136,8 +135,7 @@ def _image_source(
 ) -> ImageSource:
     """The source of images. Raises InputError for options that exclude each other."""
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode
-    from hilstar.calibrate.first_light.virtual import VirtualBench
+    from hilstar.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode, VirtualBench
     from hilstar.calibrate.geometric.observed import read_image
 
     if virtual is not None:

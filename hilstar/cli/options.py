@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hilstar.errors import InputError, did_you_mean
+from hilstar.files import check_outputs, files_named_in, refuse_existing, refuse_writer
 from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -107,8 +108,6 @@ def check_files(
 
     The bench file and all files that it names count as inputs; `kept` is an output that cannot be made again.
     """
-    from hilstar.files import check_outputs, files_named_in, refuse_existing, refuse_writer
-
     named = [] if file is None else files_named_in(file.path, file.text)
     check_outputs([*inputs, *named], [*outputs, kept])
     if kept is not None:
@@ -146,10 +145,7 @@ def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> A
 
 
 def parse_at(command: str, at_s: float | None, config: BenchConfig, timed: bool = False) -> int | None:
-    """The moment of one frame, ns after `epoch_utc`; None for that one.
-
-    Raises InputError where nothing moves and no scenario is `timed`.
-    """
+    """The moment of a frame, ns after `epoch_utc`, None for that one. Raises InputError where nothing changes with time."""
     from hilstar.bench.config.bench_config import has_observer
 
     if at_s is None:

@@ -20,6 +20,7 @@ from hilstar.console.terminal import say, without_attitude
 from hilstar.errors import InputError
 from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
+from hilstar.process.interrupts import end_with_parent
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.links import Pictures
@@ -93,7 +94,6 @@ def fed_link(file: ReadFile, fed_by: str, notices: Notices) -> ZmqReceiver:
     """A head's link to the process that has the source, with which it ends; `fed_by` is that one's endpoint and process id."""
     from hilstar.attitude.wire.source import PACKETS, Mounting
     from hilstar.attitude.wire.zmq_links import FedDecoder, ZmqReceiver
-    from hilstar.process.interrupts import end_with_parent
 
     endpoint, _, parent = fed_by.rpartition(",")
     end_with_parent(int(parent))

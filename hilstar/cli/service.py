@@ -16,8 +16,10 @@ import typer
 
 from hilstar.cli.options import BenchFile, Overwrite, with_values
 from hilstar.cli.running import UTC_MARK
+from hilstar.cli.serve import serve
 from hilstar.console.terminal import say
 from hilstar.errors import InputError, cannot_write, shortened
+from hilstar.files import refuse_existing, write_whole
 
 if TYPE_CHECKING:
     from hilstar.console.listener import ListenAddress
@@ -87,7 +89,6 @@ def install(
 ) -> None:
     """Write a systemd unit of this user that serves a bench: watched, and back within seconds whenever it ends."""
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.files import refuse_existing, write_whole
 
     read_bench_file(bench_file)
     words, console = _checked(bench_file, options or [])
@@ -154,7 +155,6 @@ def _systemctl(*words: str) -> bool:
 
 def _checked(bench_file: Path, options: list[str]) -> tuple[list[str], ListenAddress | None]:
     """The options, checked by `hilstar serve`, and the address of its page. Raises InputError."""
-    from hilstar.cli.serve import serve
     from hilstar.console.listener import parse_address
 
     words = with_values(options)
@@ -206,7 +206,8 @@ def unit_text(
 
     A `confined` one drops its capabilities, if `can_confine`.
     """
-    command = [*_hilstar(), "serve", str(bench), *options]
+    script = shutil.which("hilstar", path=str(Path(sys.executable).parent))
+    command = [*([script] if script else [sys.executable, "-m", "hilstar"]), "serve", str(bench), *options]
     folder = Path.cwd()
     found = {name: environment[name] for name in DISPLAY_VARIABLES if environment.get(name)}
     return UNIT.format(
@@ -219,11 +220,6 @@ def unit_text(
         confined=CONFINED if confined else "",
         calls=DENIED_CALLS,
     )
-
-
-def _hilstar() -> list[str]:
-    script = shutil.which("hilstar", path=str(Path(sys.executable).parent))
-    return [script] if script else [sys.executable, "-m", "hilstar"]
 
 
 def _literal(text: str) -> str:

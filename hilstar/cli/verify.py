@@ -12,7 +12,7 @@ from hilstar.cli.options import MAX_SEED, BenchFile, Json, ScenarioFile
 from hilstar.cli.running import optional_scenario
 from hilstar.console.terminal import print_json, progress
 from hilstar.errors import InputError
-from hilstar.files import check_directory
+from hilstar.files import check_directory, make_directory
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile as Bench
@@ -39,7 +39,6 @@ def verify(
     import numpy as np
 
     from hilstar.bench.bench_file import HeadsFile, read_bench_or_heads
-    from hilstar.files import make_directory
     from hilstar.twin.verify.proposals import check_writable
     from hilstar.twin.verify.summary import summarise, summary_lines, write_report
     from hilstar.twin.verify.summary import verify as run_twin

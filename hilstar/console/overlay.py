@@ -193,7 +193,7 @@ def _digits(step_deg: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class OverlayScene:
-    """Plain arrays and small objects, which can be pickled.
+    """What the page's process draws over a bench's pictures, in a form that can be pickled.
 
     `hip` and `v_mag` (n,) are those of the bench's shown stars, `names` what those without a HIP number are called, by place,
     and `sky` is the map of the whole sky. `aids_in_levels` says that levels have the operator's aids in them already.

@@ -22,8 +22,7 @@ from typing import Protocol, Self
 
 import msgspec
 
-from hilstar.console.messages import Order, OrderAnswer, RunEvent, RunState, Setup
-from hilstar.console.shared_memory import SharedMemory
+from hilstar.console.messages import Order, OrderAnswer, RunEvent, RunState, Setup, SharedMemory
 from hilstar.errors import one_line
 from hilstar.notices import Listener, Notice
 
@@ -125,8 +124,12 @@ class PageProcess:
         if page is None:
             if now_s >= self._start_s:
                 self._start_page(now_s)
-        elif page.process.poll() is not None:
-            self._lost(page, now_s)
+        elif (code := page.process.poll()) is not None:
+            page.channel.close()
+            self._page = None
+            if now_s - page.begun_s > STEADY_S:
+                self._wait_s = FIRST_WAIT_S
+            self._put_off(now_s, f"the operator's page ended ({f'signal {-code}' if code < 0 else f'exit code {code}'})")
 
     def _start_page(self, now_s: float) -> None:
         channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -148,14 +151,6 @@ class PageProcess:
             its_end.close()
         channel.setblocking(False)
         self._page = _Page(process, channel, now_s)
-
-    def _lost(self, page: _Page, now_s: float) -> None:
-        page.channel.close()
-        self._page = None
-        if now_s - page.begun_s > STEADY_S:
-            self._wait_s = FIRST_WAIT_S
-        code = page.process.returncode
-        self._put_off(now_s, f"the operator's page ended ({f'signal {-code}' if code < 0 else f'exit code {code}'})")
 
     def _put_off(self, now_s: float, what: str) -> None:
         self._watched.tell("console-lost", f"{what}; it is started again")

@@ -12,7 +12,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 SUBPROTOCOL, TOKEN_PROTOCOL = "hilstar", "hilstar.token."  # the WebSocket's subprotocols; the token follows the second
-GIVES_WAY = 4013  # close code: the page comes back after a while, or it would take the place of the next one
+GIVES_WAY = 4013  # close code: the page waits before it comes back, so as not to displace the next one
 HISTORY_S = 60  # length of the charts
 KEPT_EVENTS = 200
 MIN_HZ, MAX_HZ = 0.1, 10.0  # bounds on a page's rate of pictures

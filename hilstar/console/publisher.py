@@ -22,8 +22,11 @@ from hilstar.console.messages import (
     BLANK,
     FRAME,
     HAS_AGE,
+    MAX_SPRITES,
     MISSING,
     PICTURE,
+    PICTURE_HEAD_BYTES,
+    SPRITE,
     STALE,
     Order,
     OrderAnswer,
@@ -31,6 +34,7 @@ from hilstar.console.messages import (
     PictureHead,
     RunState,
     Setup,
+    SharedMemory,
 )
 from hilstar.console.overlay import OverlayScene, overlay_of
 from hilstar.console.page_process import PageProcess
@@ -44,7 +48,6 @@ from hilstar.console.protocol import (
     ShownAttitude,
     ShownClock,
 )
-from hilstar.console.shared_memory import MAX_SPRITES, PICTURE_HEAD_BYTES, SPRITE, SharedMemory
 from hilstar.errors import HilstarError, did_you_mean, one_line, printable
 from hilstar.notices import Listener, Notice
 from hilstar.rotation import to_radec_roll_deg

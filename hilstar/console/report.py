@@ -106,10 +106,7 @@ class _Unreported(Notices):
 
 
 def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
-    """The run's `pictures` in order, with a `caution` where the bench has changed, or `no_pictures`, the reason for none.
-
-    `sky` is the map of the whole sky.
-    """
+    """The run's `pictures` and a `caution` where the bench has changed, or why `no_pictures`; `sky` is the map of the sky."""
     try:
         file = with_codes_ms(_bench_file(run.head, ledger), codes_ms_of(run.head))
         with open_bench(file) as bench:
@@ -244,15 +241,10 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
         reasons.append(f"{found.missed_frames} refresh periods without a frame of their own")
     headline = "Sky was right throughout" if not reasons else "Sky was not right throughout"
     due = found.frames + found.missed_frames  # refresh periods in which a frame was due
-    share = _share(found.right_frames, due)
-    return {"ok": not reasons, "headline": headline, "share": share, "reasons": reasons}
-
-
-def _share(part: int, whole: int) -> str:
-    """A share of a run in %, rounded down: only all of it is 100 %."""
-    percent = 100 * part / max(whole, 1)
+    percent = 100 * found.right_frames / max(due, 1)
     digits = 3 if percent > 99.9 else 2 if percent > 99 else 1
-    return f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"
+    share = f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"  # rounded down: only all of them are 100 %
+    return {"ok": not reasons, "headline": headline, "share": share, "reasons": reasons}
 
 
 def _utc(run: RunFigures, host_ns: int) -> str | None:

@@ -84,8 +84,8 @@ Watching = Callable[[Bench, str], AbstractContextManager[tuple[FrameSink, Outlet
 def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watching: Watching) -> Demo:
     """Stream a slew from a process of its own through a loopback socket, and serve it.
 
-    The sender begins once the loop has drawn its first frame, and the run once an attitude has come. `watching` opens, for a
-    bench and its endpoint, what sees every frame and who follows the run. Raises InputError or MachineError.
+    The sender begins once the loop has drawn its first frame, and the run once an attitude has come. `watching` opens the sink
+    of all frames and the run's outlet, for a bench and its endpoint. Raises InputError or MachineError.
     """
     make_directory(directory)
     log_path = directory / SLEW_LOG

@@ -167,10 +167,7 @@ MAX_NAMES = 100  # in the summary: a stream may make up names
 
 
 class RunFaults:
-    """The faults of one run: `schedule` for who wants to start one, `frames` for the loop.
-
-    Raises InputError for a fault that this bench cannot draw.
-    """
+    """The faults of a run: `schedule` starts them, `frames` is the loop's. Raises InputError for one that cannot be drawn."""
 
     def __init__(self, bench: Bench, scenario: Scenario, notices: Notices, ledger: LedgerSwitch | None = None) -> None:
         self._scenario, self._notices, self._ledger = scenario, notices, ledger
@@ -216,11 +213,11 @@ class RunFaults:
         )
 
     def begin(self, zero_ns: int) -> None:
-        """Say from which time of the timeline a scenario's seconds count; by default from the first frame with an attitude."""
+        """Set the time of the timeline from which a scenario counts; by default that of the first frame with an attitude."""
         self.schedule.begin(zero_ns)
 
     def recall(self, record: FrameRecord | None) -> None:
-        """These faults come from the schedule, whatever an earlier run had."""
+        """Do nothing: these faults come from the schedule."""
 
     @contextmanager
     def listening(self, settings: FaultSettings, folder: Path) -> Iterator[str]:
@@ -252,10 +249,7 @@ class RunFaults:
 
 
 class ReplayedFaults:
-    """The faults of an earlier run for the loop that draws it again, and for the ledger of that.
-
-    Raises InputError for a fault that this bench cannot draw.
-    """
+    """The faults of an earlier run that is drawn and recorded again. Raises InputError for one that cannot be drawn."""
 
     def __init__(self, bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None) -> None:
         view = display_view(bench, recording.scenario)
@@ -271,7 +265,7 @@ class ReplayedFaults:
                 ledger.fault(record)
 
     def begin(self, zero_ns: int) -> None:
-        """The recording says what is on in each frame."""
+        """Do nothing: the recording says which faults each frame had."""
 
     def recall(self, record: FrameRecord | None) -> None:
         """Take the faults of the frame that is drawn next: those of light, and what freezes it.

@@ -91,7 +91,13 @@ class FramePulse(Closing):
             time.sleep(max(set_ns + self._pulse_ns - time.monotonic_ns(), 0) / NS_PER_S)
             self._line.set(False)
         except LOST as error:
-            self._lose(error)
+            self._count("lost")
+            self._count("skipped")
+            why = one_line(str(error))
+            self._notices.tell("sync-lost", f"[sync] port {self._line.port} is gone ({why}): frames go on without their pulse")
+            self._line.close()
+            self._back_off_s = MIN_BACK_OFF_S
+            self._retry_s = time.monotonic() + self._back_off_s
             return
         self._count("sent")
         self._delay_ms.add((begin_ns - self._frame_ns) / NS_PER_MS)
@@ -100,15 +106,6 @@ class FramePulse(Closing):
     def _count(self, what: str) -> None:
         self._counts[what] += 1
         self.counted(what)
-
-    def _lose(self, error: BaseException) -> None:
-        self._count("lost")
-        self._count("skipped")
-        why = one_line(str(error))
-        self._notices.tell("sync-lost", f"[sync] port {self._line.port} is gone ({why}): frames go on without their pulse")
-        self._line.close()
-        self._back_off_s = MIN_BACK_OFF_S
-        self._retry_s = time.monotonic() + self._back_off_s
 
     def _reopen(self) -> None:
         if time.monotonic() < self._retry_s:

@@ -1,6 +1,6 @@
 """Several heads beside one source: what arrives goes to a process for each head, which is restarted where it ends early.
 
-A head tells its life as a service does (sd_notify): ready once it draws, and a sign each second while frames go on.
+A head reports as a systemd service does (sd_notify): ready once it draws, then a sign of life each second while frames go on.
 """
 
 from __future__ import annotations
@@ -52,10 +52,8 @@ BODY = (1.0, 0.0, 0.0, 0.0)
 class HeadProcess:
     """A head's process, restarted whenever it ends early or gives no sign of life.
 
-    `command(number, drawn_s)` is that of its begin `number`, `drawn_s` after it drew first, 0 where it never did.
-
-    It tells its life as a service does (sd_notify), to the socket `life`: ready once it draws, and a sign each second while
-    frames go on.
+    `command(number, drawn_s)` is the command of its start `number`, `drawn_s` after it first drew (0 where it never did). It
+    sends its signs of life to the socket `life`.
     """
 
     def __init__(self, name: str, command: Command, say: Say, life: Path, secrets: Mapping[str, str] = NOTHING) -> None:

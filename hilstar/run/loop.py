@@ -65,14 +65,14 @@ class FaultyFrames:
         self._held: Held | None = None
 
     def at(self, t_ns: int, attitude: Attitude | None) -> FaultLayer | None:
-        """What is wrong in a frame; None where nothing is, and before the run's first attitude, from which time counts."""
+        """The faults of a frame as a layer; None without any, and before the run's first attitude."""
         if attitude is None and self._held is None:
             return None
         now = self.now = self._source(t_ns)
         return FaultLayer(self._view, now) if now else None
 
     def drops(self, effects: FaultLayer | None, number: int) -> bool:
-        """Whether a frame is never shown; it is counted."""
+        """Whether a fault drops the frame; it is counted."""
         if effects is None or self._held is None or not effects.drops(number):
             return False
         self.dropped += 1
@@ -100,7 +100,7 @@ class FaultyFrames:
     def shown(
         self, effects: FaultLayer | None, drawn: Drawn, attitude: Attitude | None, t_ns: int, stays: bool
     ) -> tuple[Now, ...]:
-        """Take note of a frame; its faults, which of one that `stays` are those of its light and what freezes it."""
+        """Remember a shown frame, and return its faults: of one that `stays` its first ones, and what freezes it now."""
         now = () if effects is None else effects.now
         if stays and self._held is not None:
             return (*self._held.now, *(one for one in now if isinstance(one.fault, Freeze)))
@@ -112,8 +112,8 @@ class FrameLoop:
     """Draws frames; a slow frame is missed, and never delays those after it.
 
     `moving` says whether stars are drawn along their paths; by default as the bench file has it, which is on a screen only.
-    `on_frame` is called with each frame's number and time stamp, host ns: once a screen has swapped it; without one when it is
-    due, or where nothing paces it, when it is out.
+    `on_frame` is called with each frame's number and time stamp, host ns: on a screen after its swap, else when it is due, and
+    in an unpaced run once it is drawn.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Pacing: when each frame of a run is to be begun, when its light leaves, and how it was shown.
 
 A pacer hands the frame loop one moment after another. `Pacer` keeps a grid of this host's clock, for a run without a screen;
-`screen.display_pacer` follows a display's refresh.
+`DisplayPacer` (`screen/screen.py`) follows a display's refresh.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Pacer:
             slot = max(slot, passed) + 1
 
     def steady(self) -> AbstractContextManager[object]:
-        """While this is open, the process does not interrupt its frames; without a screen nothing is done for that."""
+        """A context in which frames have priority over other work; without a screen it does nothing."""
         return nullcontext()
 
     def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:

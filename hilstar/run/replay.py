@@ -196,10 +196,7 @@ def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
 
 
 def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
-    """Replay recorded frames; returns the summary.
-
-    Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
-    """
+    """Replay recorded frames: paced, where late ones are missed as on a monitor, or all of them as fast as possible."""
     outlet = outlet or Outlet()
     if outlet.faults is None and play.recording.faults:
         outlet = replace(outlet, faults=ReplayedFaults(bench, play.recording, outlet.ledger))

@@ -41,10 +41,7 @@ Numbers = Sequence[float] | FloatArray
 
 
 def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, clock: Clock = time.monotonic_ns) -> SenderEnd:
-    """The end that `to` names: a serial line, UDP, or else a ZeroMQ endpoint; `clock` (ns) stamps its time replies.
-
-    Raises InputError.
-    """
+    """The end that `to` names: serial line, UDP, or else ZeroMQ; `clock` (ns) stamps its time replies. Raises InputError."""
     line = serial_target(to)
     if line is None and not to.startswith("udp:"):
         return ZmqSender(to, bind=not connect, keys=keys)

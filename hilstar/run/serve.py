@@ -28,8 +28,7 @@ from hilstar.run.operator import Aids, Operator, SwitchRequests, aid_levels_of
 from hilstar.run.pacer import FrameSink, Moment, Pacer, Shown, ignore
 from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.record.ledger_records import below_step, frame_record
-from hilstar.run.screen.display_pacer import DisplayPacer
-from hilstar.run.screen.screen import Screen
+from hilstar.run.screen.screen import DisplayPacer, Screen
 from hilstar.run.summary import RunSummary
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -39,10 +38,7 @@ POLL_MS = 50
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """Counters and identity of a run in progress. Readable from any thread.
-
-    `clock` gives the state of the sender's clock; None in a run without a sender.
-    """
+    """Counters of a run in progress, readable from any thread; `clock` tells of the sender's clock, None without a sender."""
 
     loop: FrameLoop
     packets: PacketCounts
@@ -203,8 +199,13 @@ class LockstepRun:
     def _take(self, host_ns: int, event: Event, raw: bytes) -> Refusal | None:
         """Show what a request says, or say why it is refused; the last frame then stays."""
         self.counts.received += 1
-        refusal = self._refusal(event)
         sample = event if isinstance(event, AttitudeSample) else None
+        refusal = event if isinstance(event, Refusal) else None
+        if sample is not None:
+            self._rates.see(sample)
+            refusal = rate_refusal(self._rates.believed(sample), self._max_rate_rad_s)
+        elif refusal is None:
+            refusal = Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
         if refusal is not None:
             self.counts.refused_by[refusal.reason] += 1
             if self.counts.refused_by[refusal.reason] == 1:
@@ -227,14 +228,6 @@ class LockstepRun:
             self._last = shown
             self._outlet.record(self._bench, self._loop, shown, shown.t_ns)
         return refusal
-
-    def _refusal(self, event: Event) -> Refusal | None:
-        if isinstance(event, Refusal):
-            return event
-        if isinstance(event, AttitudeSample):
-            self._rates.see(event)
-            return rate_refusal(self._rates.believed(event), self._max_rate_rad_s)
-        return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
 
 
 class StatusMaker:

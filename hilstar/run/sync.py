@@ -1,7 +1,7 @@
 """How a tracker's exposures beat with a screen's refresh, whether that costs more than the bench tolerates, and what avoids it.
 
 An exposure of n + f refreshes (f under 1) sees about n whole frames and a part of one at each end. Each frame shows a star at
-the middle of its own light. A frame of which only a part is seen still counts at that middle, and not where that part was.
+the middle of its own light. A frame seen only in part still counts at its own middle.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ class Exposures:
     """A tracker before a screen: refresh rate, exposure, how often it exposes, and how long a row stays lit in a refresh.
 
     `frame_hz` None: one exposure follows the other without a gap. `lit_s` None: the whole refresh; no longer than that counts.
-    `triggered` exposures begin with a frame. Raises InputError for a refresh rate or frame rate that is none, and for an
-    exposure or light that is negative or no number.
+    `triggered` exposures begin with a frame. Raises InputError for a rate not above 0, and an exposure or light below 0.
     """
 
     refresh_hz: float
@@ -282,7 +281,7 @@ def beat_line(found: BeatSummary) -> str | None:
 
 
 class SyncSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """The pulses of a run: how many, and how many frames that were due one had none; how often the line was lost.
+    """The pulses of a run: how many were sent, how many due ones were skipped, and how often the line was lost.
 
     `delay_ms` is the mean from a frame's time stamp to its pulse as this machine asks the line for it, `jitter_ms` the standard
     deviation, `max_delay_ms` the largest; `line_ms` is the mean time that the line takes, which comes on top. None without any.

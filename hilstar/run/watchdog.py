@@ -131,7 +131,7 @@ class GpuWatch:
     """Looks once a second, in the loop's thread and between its frames, whether the GPU is lost; then the run is stopped.
 
     After the machine has slept it also compares the tables that turn light into codes, and has the next frame drawn on black:
-    a driver may lose what was in the GPU's memory, and says nothing of it.
+    a driver may lose the GPU's memory without an error.
     """
 
     def __init__(self, backend: Backend, notices: Notices, stop: threading.Event, clock: HostClock = HOST_CLOCK) -> None:

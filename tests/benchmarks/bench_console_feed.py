@@ -10,8 +10,8 @@ import numpy as np
 import hilstar
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
+from hilstar.console.messages import PictureRequest, SharedMemory
 from hilstar.console.publisher import FramePublisher
-from hilstar.console.shared_memory import PictureRequest, SharedMemory
 from hilstar.resources import resource_path
 from hilstar.run.pacer import Shown
 from hilstar.run.summary import RunTally

@@ -12,9 +12,8 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera, tracker_psf
-from hilstar.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, black
+from hilstar.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, VirtualBench, black
 from hilstar.calibrate.first_light.records import Figure, KeyChange
-from hilstar.calibrate.first_light.virtual import VirtualBench
 from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError
 from hilstar.files import make_directory
@@ -22,7 +21,7 @@ from hilstar.scene.psf import Psf
 from hilstar.twin.optics import BenchGeometry
 
 MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
-HOT_FILL = 0.5  # a pixel that is fuller in the dark is hot, and tells nothing
+HOT_FILL = 0.5  # a pixel above this in the dark frame is hot, and is not used
 LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
 
 
@@ -41,7 +40,7 @@ class DarkSubtracted:
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """What a step has to work with.
+    """Everything that a step works with.
 
     Images go to `folder`, results to `session`. `kept` has the images of an interrupted attempt, which are not taken again.
     `known` has the figures of earlier steps; `patches` is the maximum number of readings of the response. `watch` is called

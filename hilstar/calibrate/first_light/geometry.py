@@ -246,7 +246,7 @@ def _sigmas(padded: FloatArray, x_px: FloatArray, y_px: FloatArray) -> FloatArra
 PLAN_SEED = 0
 FRAMES = 20
 MIN_LIT, MAX_LIT = 12, 60  # dots in a frame
-TRACKER_PX_A_DOT = 40.0  # between the dots of a frame: so many fit beside each other
+TRACKER_PX_A_DOT = 40.0  # tracker px between neighbouring dots of a frame
 DOT_PX = 3  # side of a dot, monitor px
 BLURRED = 1.3  # times the bench file's sigma
 BLURRED_BY_PX = 0.1

@@ -260,20 +260,14 @@ class Photometer:
         light = (sums - under) / (np.array(lit) * self.exposure_s)
         # On a black screen every pixel glows alike; the repeats tell how well that is known.
         light[dark] = (sums[dark] - sums[dark].mean()) / (self.field.monitor_px * self.exposure_s)
-        glow = self._glow()
-        if glow is not None:
+        unlit = self.context.unlit()
+        if unlit is not None:  # a black screen minus one that is switched off
+            self.images.append(unlit)
+            more = float((self._part(self._dark_screen) - self._part(unlit)).sum())
+            glow = max(more / (self.field.monitor_px * self.context.exposure_s), 0.0)
             return np.maximum(light + glow, 0.0), True
         whites = [light[[patch == Patch(self.context.white, name) for patch in planned]].mean() for name in self.assumed.light]
         return np.maximum(light + self.assumed.black * float(np.sum(whites)), 0.0), False
-
-    def _glow(self) -> float | None:
-        """The light of a black pixel, DN/s: a black screen minus one that is switched off; None without the latter."""
-        unlit = self.context.unlit()
-        if unlit is None:
-            return None
-        self.images.append(unlit)
-        more = float((self._part(self._dark_screen) - self._part(unlit)).sum())
-        return max(more / (self.field.monitor_px * self.context.exposure_s), 0.0)
 
     def _look(self, name: str, period: int, patch: Patch) -> tuple[float, float]:
         """The sum over a lattice's field, DN, and its brightest pixel relative to full scale."""

@@ -59,10 +59,7 @@ class StepOutcome:
 
 
 class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A step in session.json.
-
-    `state_sha256` covers what the step depends on; `files` has the SHA-256 of each by its path relative to the session.
-    """
+    """A step in session.json: `state_sha256` is of what it depends on, `files` has each file's SHA-256 by its path there."""
 
     name: str
     verdict: Verdict
@@ -80,8 +77,8 @@ class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
 class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     """session.json: the bench, where its patterns are seen, and the steps in their order.
 
-    `unfinished` has, by step, the state in which images were taken that a further attempt need not take again. `beat` is
-    that of the tracker's exposures with the display's refresh, as measured where it was.
+    `unfinished` has the state of each interrupted step: while it is the same, the images taken are used again. `beat` is that
+    of the tracker's exposures with the display's refresh, measured where it could be.
     """
 
     kind: str

@@ -223,10 +223,7 @@ class FirstLightSession:
         self.unfinished = {} if found is None else dict(found.unfinished)
 
     def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
-        """Run the steps that are not done; the exit code is 0, 1 where a step failed, or that of a MachineError.
-
-        Raises Stopped where the display is closed.
-        """
+        """Run what is not done; exit code 0, 1 where a step failed, or a MachineError's. Raises Stopped at a closed display."""
         clear_parts(self.folder)
         before = self.folder / BEFORE_FILE
         if not before.exists():

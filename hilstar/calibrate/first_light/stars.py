@@ -28,7 +28,7 @@ from hilstar.monitor.calibration import BUILT_IN
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import Levels
 from hilstar.rotation import to_matrix
-from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars, noisiest_background
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.twin.verify.summary import summarise
 from hilstar.twin.verify.summary import verify as run_twin
 from hilstar.units import ARCSEC_PER_RAD, ERROR_OF_MEDIAN, MAG_PER_RELATIVE, magnitude
@@ -219,7 +219,11 @@ def _codes_mag(
 
 
 def _compared(context: StepContext, looked: DarkSubtracted, wanted: ExpectedStars) -> StarsSeen:
-    found, noise_dn = _found(context, looked.image)
+    background, spot_px = noisiest_background(looked.image), _spot_sigma_px(context)
+    settings = CentroidSettings(
+        THRESHOLD_SIGMA, 2, window_sigma_px=WINDOW_SIGMA_PX, window_radius_px=RADIUS_PX, psf_sigma_px=spot_px
+    )
+    found, noise_dn = find_stars(looked.image, settings, background), background.noise
     seen = np.stack([found.x_px, found.y_px], axis=1)
     count = len(wanted.e_per_s)
     far, nearest = np.full(count, np.inf), np.zeros(count, dtype=np.intp)
@@ -234,7 +238,7 @@ def _compared(context: StepContext, looked: DarkSubtracted, wanted: ExpectedStar
     dn, gain = found.flux[chosen], context.file.config.tracker.detector.gain_e_per_dn
     noise = np.sqrt(np.maximum(dn, 0.0) / gain + WINDOW_PX * noise_dn**2) / np.maximum(dn, 1e-9)
     # The gain changes from pixel to pixel; a star averages it over its own pixels.
-    prnu = context.file.config.tracker.detector.prnu / math.sqrt(4 * math.pi * math.prod(_spot_sigma_px(context)))
+    prnu = context.file.config.tracker.detector.prnu / math.sqrt(4 * math.pi * math.prod(spot_px))
     noise = np.hypot(noise, prnu)
     saturated = found.peak[chosen] > MAX_FILL * context.full_dn - looked.floor_dn
     return StarsSeen(
@@ -248,15 +252,6 @@ def _compared(context: StepContext, looked: DarkSubtracted, wanted: ExpectedStar
         lost=int((~near & (wanted.e_per_s >= faintest)).sum()),
         images=(looked.path,),
     )
-
-
-def _found(context: StepContext, image: FloatArray) -> tuple[Centroids, float]:
-    """The stars of an image (h, w), and the noise of its pixels, DN."""
-    settings = CentroidSettings(
-        THRESHOLD_SIGMA, 2, window_sigma_px=WINDOW_SIGMA_PX, window_radius_px=RADIUS_PX, psf_sigma_px=_spot_sigma_px(context)
-    )
-    background = noisiest_background(image)
-    return find_stars(image, settings, background), background.noise
 
 
 def _spot_sigma_px(context: StepContext) -> tuple[float, float]:

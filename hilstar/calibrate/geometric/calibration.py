@@ -189,7 +189,7 @@ def matched(
     refuse_motion(data)
     for _ in range(MATCH_ROUNDS):
         problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or DEFAULT_NOISE_PX)
-        # The largest model that so many centroids can determine.
+        # The largest model that these centroids can determine.
         names = next((names for names in (BROWN_CONRADY, RADIAL) if len(data) > 2 * len(names)), PINHOLE)
         model = Model(names, tracker_names if names is BROWN_CONRADY else (), len(look.q_poses))
         rough = fit(problem, model, 0, data)

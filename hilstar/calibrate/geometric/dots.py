@@ -1,7 +1,7 @@
 """Frames of dots, each of which blinks its own code: a dot in the tracker's image identifies itself.
 
-Every dot is lit in the same number of frames, which checks for lost and false centroids. Any two codes differ in as many frames
-as the number of dots allows.
+Every dot is lit in the same number of frames, which shows lost and false centroids. Two codes differ in as many frames as the
+number of dots allows.
 """
 
 from __future__ import annotations
@@ -53,18 +53,15 @@ def plan_dots(resolution_px: tuple[int, int], frames: int, dots_per_frame: int, 
         raise InputError(f"--frames {frames}: the dots' codes need {MIN_FRAMES} frames or more")
     weight = int(np.clip(round(LIT_SHARE * frames), MIN_LIT, MAX_LIT))
     count = round(dots_per_frame * frames / weight)
-    lit = _codes(count, frames, weight, rng)
+    # Codes of one weight, as far apart as random search finds them.
+    tried = (_codes_apart(count, frames, weight, distance, rng) for distance in range(2 * weight, 0, -2))
+    lit = next((codes for codes in tried if codes is not None), None)
+    if lit is None:
+        raise InputError(
+            f"--dots: {count} dots are more than the codes of {frames} frames; write more --frames or fewer --dots"
+        )
     x_px, y_px = _places(resolution_px, count)
     return DotPlan(x_px, y_px, lit)
-
-
-def _codes(count: int, frames: int, weight: int, rng: np.random.Generator) -> BoolArray:
-    """`count` different codes (count, frames) of one weight, as far apart as random search finds them."""
-    for distance in range(2 * weight, 0, -2):
-        codes = _codes_apart(count, frames, weight, distance, rng)
-        if codes is not None:
-            return codes
-    raise InputError(f"--dots: {count} dots are more than the codes of {frames} frames; write more --frames or fewer --dots")
 
 
 def _codes_apart(count: int, frames: int, weight: int, distance: int, rng: np.random.Generator) -> BoolArray | None:

@@ -63,10 +63,7 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """The cameras of one set of parameters.
-
-    `q_poses` (poses, 4) turns components in the tracker's axes of the first pose (cam) into those of each pose.
-    """
+    """The cameras of one set of parameters; `q_poses` (poses, 4) turns cam, the first pose's axes, into each pose's."""
 
     monitor: Camera
     q_cam_to_mon: FloatArray

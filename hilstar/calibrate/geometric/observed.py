@@ -50,25 +50,22 @@ def read_observed(path: Path) -> Observed:
     """Read a table of centroids. Raises InputError with the line that is wrong."""
     rows: list[tuple[float, ...]] = []
     for line, cells in read_rows(path, NEEDED, ADVICE, MAX_OBSERVED_BYTES, ("sigma_px", "pose")):
-        rows.append(_row(path, line, cells))
+        try:
+            frame_number, x, y = int(cells[0]), float(cells[1]), float(cells[2])
+            sigma, pose_number = float(cells[3] or 1.0), int(cells[4] or 0)
+            finite = math.isfinite(x) and math.isfinite(y) and 0 < sigma < math.inf
+            if not (finite and 0 <= frame_number < 10**6 and 0 <= pose_number < 1000):
+                raise ValueError
+        except ValueError as error:
+            wanted = "a frame from 0, finite x_px and y_px, sigma_px above 0 and a pose from 0 are wanted"
+            raise InputError(f"{path}:{line}: {','.join(cells)[:80]!r}; {wanted}") from error
+        rows.append((frame_number, x, y, sigma, pose_number))
         if len(rows) > MAX_ROWS:
             raise InputError(f"{path}: more than {MAX_ROWS} centroids; write fewer frames")
     if not rows:
         raise InputError(f"{path}: has no centroid; {ADVICE}")
     frame, x_px, y_px, sigma_px, pose = np.array(rows).T
     return Observed(frame.astype(np.intp), pose.astype(np.intp), x_px, y_px, sigma_px)
-
-
-def _row(path: Path, line: int, cells: list[str]) -> tuple[float, ...]:
-    try:
-        frame, x_px, y_px = int(cells[0]), float(cells[1]), float(cells[2])
-        sigma_px, pose = float(cells[3] or 1.0), int(cells[4] or 0)
-        if not (all(map(math.isfinite, (x_px, y_px))) and 0 < sigma_px < math.inf and 0 <= frame < 10**6 and 0 <= pose < 1000):
-            raise ValueError
-    except ValueError as error:
-        wanted = "a frame from 0, finite x_px and y_px, sigma_px above 0 and a pose from 0 are wanted"
-        raise InputError(f"{path}:{line}: {','.join(cells)[:80]!r}; {wanted}") from error
-    return frame, x_px, y_px, sigma_px, pose
 
 
 FITS_ENDINGS = (".fits", ".fit", ".fts")

@@ -21,13 +21,12 @@ from collections.abc import Iterator
 import msgspec
 import uvicorn
 
-from hilstar.console.messages import Order, OrderAnswer, Setup
+from hilstar.console.messages import Order, OrderAnswer, PictureRequest, Setup, SharedMemory
 from hilstar.console.overlay import OverlayScene
 from hilstar.console.protocol import PageText
 from hilstar.console.server.app import ORDERED_S, Page
 from hilstar.console.server.connections import PING_S, PONG_S, BoundedHttp, OpenPages, ReadingWebSocket
 from hilstar.console.server.reader import TICK_S, PicturePacker, RunReader
-from hilstar.console.shared_memory import PictureRequest, SharedMemory
 from hilstar.errors import one_line
 from hilstar.units import NS_PER_S
 

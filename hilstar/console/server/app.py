@@ -257,16 +257,13 @@ class Page:
         who = (who or "somebody at the page") + ("" if address in {"127.0.0.1", "::1", ""} else f" ({address})")
         order = Order(id=0, name=name, who=who, on=body.on, level=body.level, text=body.text, fault=body.name)
         answer = await self.give(order)
-        await self._state_after(time.monotonic_ns())
+        done_ns = time.monotonic_ns()
+        with contextlib.suppress(TimeoutError):  # the next request is to see what the order changed
+            async with asyncio.timeout(STATE_S):
+                while self.reader.seen is not None and self.reader.seen.host_ns <= done_ns:
+                    await asyncio.sleep(0.02)
         key = "line" if answer.status < 400 else "error"
         return JSONResponse({key: answer.line}, answer.status)
-
-    async def _state_after(self, host_ns: int) -> None:
-        """Wait until the state is newer than `host_ns`, so that the next request sees what an order changed."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(STATE_S):
-                while self.reader.seen is not None and self.reader.seen.host_ns <= host_ns:
-                    await asyncio.sleep(0.02)
 
     async def _live(self, socket: WebSocket) -> None:
         self.pages.make_room()

@@ -20,9 +20,9 @@ from hilstar.console.server.reader import PackedPicture
 
 HEAD_S = 5.0  # for a request's head to be whole
 WHOLE_S = 20.0  # for its body, and for the answer to be read
-MAX_CONNECTIONS = 100  # that are no WebSocket; first those give way that have had an answer, then the oldest
-PING_S, PONG_S = 2.0, 20.0  # each so often a WebSocket is asked for a sign of life, and so long it may take
-UNREAD_S = 4.0  # without that sign a peer counts as one that does not read
+MAX_CONNECTIONS = 100  # besides WebSockets; those with an answer give way first, then the oldest
+PING_S, PONG_S = 2.0, 20.0  # interval of a WebSocket's pings, and the time limit of a pong
+UNREAD_S = 4.0  # a peer without a pong for this long counts as one that does not read
 MAX_UNSENT_BYTES = 65_536  # in the kernel
 MAX_PONGS_BYTES = 200_000  # that wait for a peer that sends pings and reads nothing
 LINE = "hilstar.line"  # in a WebSocket's scope: its `ReadingWebSocket`
@@ -234,8 +234,8 @@ class OpenPage:
 class OpenPages:
     """All pages that are open. A slow one loses pictures, then its connection.
 
-    A page that comes always has a place. Where all are taken one gives way: one that does not read, before one that has
-    asked for nothing, before one that is no browser's, before the oldest of the address with the most pages.
+    A new page always gets a place. Where all are taken, another gives way: first one that does not read, then one that has
+    asked for nothing, then one that is no browser's, then the oldest of the address with the most pages.
     """
 
     def __init__(self) -> None:

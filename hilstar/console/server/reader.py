@@ -15,7 +15,20 @@ from datetime import UTC, datetime
 import msgspec
 import numpy as np
 
-from hilstar.console.messages import FRAME, HAS_AGE, PICTURE, FrameNumbers, Pace, PictureHead, RunEvent, RunState, Setup
+from hilstar.console.messages import (
+    FRAME,
+    HAS_AGE,
+    PICTURE,
+    PICTURE_HEAD_BYTES,
+    SPRITE,
+    FrameNumbers,
+    Pace,
+    PictureHead,
+    RunEvent,
+    RunState,
+    Setup,
+    SharedMemory,
+)
 from hilstar.console.overlay import MAX_STARS, OverlayScene
 from hilstar.console.protocol import (
     HISTORY_S,
@@ -31,7 +44,6 @@ from hilstar.console.protocol import (
     StarMark,
     Truth,
 )
-from hilstar.console.shared_memory import PICTURE_HEAD_BYTES, SPRITE, SharedMemory
 from hilstar.monitor.response import Levels
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -262,7 +274,9 @@ class PicturePacker:
             return None
         number, data = found
         head = PictureHead._make(PICTURE.unpack_from(data))
-        levels, sprites = _parts(head, data)
+        count, dtype = head.width * head.height, np.dtype(f"<u{head.item_bytes}")
+        levels = Levels(np.frombuffer(data, dtype, count, PICTURE_HEAD_BYTES).reshape(head.height, head.width))
+        sprites = np.frombuffer(data, SPRITE, head.sprites, PICTURE_HEAD_BYTES + count * head.item_bytes)
         if self._scene is not None and seen is not None and seen.overlay and not self._scene.aids_in_levels:
             levels = self._scene.aids.laid_over(levels, seen.overlay, seen.patch_share)
         return PackedPicture(number, _message(head, levels), *self._truths(head, sprites, seen))
@@ -276,14 +290,6 @@ class PicturePacker:
             truth = self._scene.marks.truth(head.frame, stars, q if np.isfinite(q).all() else None, grid=True)
         without_grid = msgspec.structs.replace(truth, grid=msgspec.UNSET)
         return PageText(truth=without_grid).json(), PageText(truth=truth).json()
-
-
-def _parts(head: PictureHead, data: bytes) -> tuple[Levels, np.ndarray]:
-    count = head.width * head.height
-    dtype = np.dtype(f"<u{head.item_bytes}")
-    levels = np.frombuffer(data, dtype=dtype, count=count, offset=PICTURE_HEAD_BYTES).reshape(head.height, head.width)
-    sprites = np.frombuffer(data, dtype=SPRITE, count=head.sprites, offset=PICTURE_HEAD_BYTES + count * head.item_bytes)
-    return Levels(levels), sprites
 
 
 def _message(head: PictureHead, levels: Levels) -> bytes:

@@ -262,7 +262,7 @@ class Ledger(Closing):
         self._part = 0
         self._renewed_s, self._rest_s = -math.inf, EACH_S
         self._moved = False
-        self.standing: Callable[[], list[FaultRecord]] = list  # what a file has to know that begins in the middle of a run
+        self.standing: Callable[[], list[FaultRecord]] = list  # records that a file begun during a run repeats
         self._file, self._writer = self._begin(path, overwrite)
         self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
         self._begun_s = self._alive_s = time.monotonic()
@@ -336,7 +336,11 @@ class Ledger(Closing):
 
     def _turn(self, last: bool) -> None:
         try:
-            self._look_at_file(last)
+            harm = self._file.harm(self._writer.size_bytes, self._writer.crc)
+            if harm is None:
+                self._look_at_place()
+            elif last or time.monotonic() - self._renewed_s > self._rest_s:
+                self._renew(harm, last)
             for entry in self._queue.take():
                 self._take(entry)
             now_s = time.monotonic()
@@ -389,15 +393,8 @@ class Ledger(Closing):
             self._add("process", now_ns, msgspec.json.encode(process))
         self._look_at_disk()
 
-    def _look_at_file(self, last: bool) -> None:
-        """Go on in another file where this one was deleted, truncated or overwritten."""
-        harm = self._file.harm(self._writer.size_bytes, self._writer.crc)
-        if harm is None:
-            self._look_at_place()
-        elif last or time.monotonic() - self._renewed_s > self._rest_s:
-            self._renew(harm, last)
-
     def _renew(self, harm: str, last: bool) -> None:
+        """Go on in another file where this one was deleted, truncated or overwritten."""
         if self._renewed_s > 0:  # repeated damage must not fill the disk with files
             self._rest_s = min(2 * self._rest_s, MAX_REST_S)
         self._renewed_s = time.monotonic()

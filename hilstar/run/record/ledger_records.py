@@ -34,13 +34,11 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 class FrameRecord(msgspec.Struct, kw_only=True):
     """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of this host's.
 
-    `q` is the attitude at `light_ns`, when the middle row lights, and `rate` (rad/s, cam) the turn for which paths were
-    drawn, null where stars are points. `velocity_km_s` (ICRS) is that for which stars are aberrated besides the bench file's,
-    `place_km` where the source has the observer about the Earth, null where the bench file says it.
-    `capped` counts the stars whose paths are coarser than they should be, `missed_before` the refresh periods before it without
-    a frame, `missed` those of the run, and `marker` is the photodiode square. `operator`
-    says how an operator's keys changed the sky ("blank, grid"; under a blank or a patch `q` is null), `hidden` why the window
-    was not seen; "" for neither.
+    `q` is the attitude at `light_ns`, when the middle row lights. `rate` (rad/s, cam) is the turn along which stars are drawn
+    as paths, null for points. `velocity_km_s` (ICRS, for aberration) and `place_km` (about the Earth) are the observer's where
+    the source gives them, else null. `capped` counts stars with coarser paths. `missed_before` counts the refresh periods just
+    before it without a frame, `missed` those of the run. `marker` is the photodiode square. `operator` names the operator's
+    switches ("blank, grid"; under a blank or a patch `q` is null), `hidden` says why the window was not seen; "" for neither.
     """
 
     frame: Count
@@ -105,7 +103,7 @@ class EventRecord(msgspec.Struct, kw_only=True):
 class FaultRecord(msgspec.Struct, kw_only=True):
     """A fault begins or ends ("start", "end"), or fell between two frames ("missed"): at host time, and `t_ns` of the run.
 
-    `number` counts the starts of a run, `who` is "file", "stream" or whoever asked. `table` is the fault as JSON, with the
+    `number` counts the starts of a run, `who` is "file", "stream" or a person. `table` is the fault as JSON, with the
     keys of a scenario; `seed` that of its randomness, `folder` where its files are, and `file_sha256` that of its map.
     """
 

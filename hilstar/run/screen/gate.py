@@ -30,7 +30,7 @@ MAX_DROPPED = 2  # among GATE_FRAMES: a desktop that is still busy with the new 
 BURSTS, BURST = 3, 8  # bursts of swaps, to find how many are queued
 BURST_AT = 0.25  # share of a period after a swap: far from the next one
 OFF_GRID = (0.125, 0.75)  # in periods: where a burst ends on a variable refresh, off the grid of a fixed one
-DRAINED = 6  # periods after which no queue has a frame
+DRAINED = 6  # periods after which a driver's queue is empty
 # The first is today's and serves most drivers; a 4K display or a slow X server needs more.
 GUARDS_MS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 GUARD_TRIALS = 4
@@ -80,10 +80,7 @@ def open_screen(file: BenchFile, *, windowed: bool, force: bool, timed: bool) ->
 
 
 def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Timing:
-    """Time GATE_FRAMES swaps and refuse (MachineError) a display that is not as the bench file has it; its timing.
-
-    With `force` a fault is only logged.
-    """
+    """Time GATE_FRAMES swaps, refuse (MachineError) a display that is not the bench file's unless `force`; its timing."""
     window, monitor = screen.window, screen.bench.config.monitor
     screen.bench.draw(None)
     swaps_ns = []
@@ -132,9 +129,9 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
 def burst_periods(screen: Screen, clock: HostClock) -> float:
     """How long BURST swaps in a row take, in periods, from a quarter of a period after a swap on with no frame queued.
 
-    The last swap returns when the frame before it by as many as are queued is shown: on the grid of a fixed refresh after
-    BURST - 0.25 periods without a queue, and a period earlier for each frame that is. A variable refresh shows the first
-    frame at once, and its last swap returns off that grid.
+    The last swap returns once the frame that precedes it by the queue's length is shown. At a fixed refresh that is after
+    BURST - 0.25 periods, less a period for each queued frame. A variable refresh shows the first frame at once, and its last
+    swap returns off that grid.
     """
     took = []
     for _ in range(BURSTS):

@@ -9,6 +9,7 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light.context import StepContext
+from hilstar.calibrate.first_light.image_sources import VirtualBench
 from hilstar.calibrate.first_light.photometry import (
     Assumed,
     Photometer,
@@ -20,7 +21,6 @@ from hilstar.calibrate.first_light.photometry import (
     response_error_mag,
 )
 from hilstar.calibrate.first_light.stars import scale, trend
-from hilstar.calibrate.first_light.virtual import VirtualBench
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, primary_lights, write_calibration

@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 
-from hilstar.console.shared_memory import EVENTS, FRAMES, PictureRequest, Ring, SharedMemory
+from hilstar.console.messages import EVENTS, FRAMES, PictureRequest, Ring, SharedMemory
 
 SLOTS, SLOT_BYTES = 4, 100
 

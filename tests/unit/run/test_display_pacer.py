@@ -14,8 +14,7 @@ from hilstar.notices import Notices
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.operator import Aids
 from hilstar.run.pacer import Moment, Shown
-from hilstar.run.screen.display_pacer import DisplayPacer
-from hilstar.run.screen.screen import DrawBudget, SwapClock
+from hilstar.run.screen.screen import DisplayPacer, DrawBudget, SwapClock
 from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock, WellGpu
 

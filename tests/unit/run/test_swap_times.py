@@ -12,8 +12,8 @@ from hilstar.errors import MachineError
 from hilstar.notices import Notices
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.pacer import Moment, Shown
-from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.gate import GUARDS_MS, pass_gate
+from hilstar.run.screen.screen import DisplayPacer
 from tests.support.model_display import model_screen
 
 HZ = (60, 144, 240)

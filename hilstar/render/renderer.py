@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import zlib
 from contextlib import AbstractContextManager, nullcontext
-from types import TracebackType
 from typing import Self
 
 import moderngl
@@ -425,7 +424,7 @@ class Renderer(Backend):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

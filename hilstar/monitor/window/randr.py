@@ -11,7 +11,6 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from types import TracebackType
 from typing import Any, Self
 
 from hilstar.monitor.window.output_settings import IDENTITY, NVIDIA, NVIDIA_ATTRIBUTES, OutputState, Pair, Value, property_value
@@ -162,7 +161,7 @@ class Randr:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def outputs(self) -> list[OutputState]:

@@ -92,7 +92,7 @@ def catalogue_errors(directory: Path) -> ChartFinding:
     with chart(directory / "catalogue_errors", text, 2, 3, note=note, share_x=False) as panels:
         for axes, title, (name, (unit, printed)) in zip(panels, NAMES_2_3, TABLE_2_3.items(), strict=True):
             axes.hist(np.clip(facts[name], 0, 5 * printed), bins=60, color=BLUE)
-            axes.axvline(printed, color=ORANGE)
+            axes.axvline(printed, color=INK)
             axes.set(title=title, xlabel=f"error [{unit}]", yscale="log")
     return ChartFinding("catalogue_errors", text)
 
@@ -126,7 +126,7 @@ def passbands(directory: Path) -> ChartFinding:
         for (band, curve), colour in zip(curves.items(), (PURPLE, BLUE, GREEN, ORANGE, INK), strict=True):
             upper.plot(curve.wavelength_nm, curve.value, color=colour, label="_")
             peak = curve.value.argmax()
-            upper.annotate(band.upper(), (curve.wavelength_nm[peak], curve.value[peak]), va="bottom", ha="center")
+            upper.annotate(band.upper(), (curve.wavelength_nm[peak], curve.value[peak]), va="bottom", ha="center", color=colour)
         for (name, values), colour in zip(shown.items(), (INK, ORANGE), strict=True):
             lower.plot(nm, values, color=colour, label=name)
         upper.set(ylabel="response [1]", ylim=(0, 1.15))

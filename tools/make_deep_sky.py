@@ -1,9 +1,10 @@
 """Make a map of bright galaxies, globular clusters and nebulae for `[sky.diffuse] map`, from your copy of OpenNGC.
 
     curl -LO https://github.com/mattiaverga/OpenNGC/raw/master/database_files/NGC.csv      (and addendum.csv)
-    python tools/make_deep_sky.py NGC.csv addendum.csv -o deep_sky.fits [--to 9.0]
+    python tools/make_deep_sky.py NGC.csv addendum.csv -o deep_sky.fits.gz [--to 9.0]
 
-OpenNGC is under CC-BY-SA 4.0, and so is the map: hilstar ships neither. Each object is an image of its own: an ellipse with the
+OpenNGC is under CC-BY-SA 4.0, and so is the map: `examples/deep_sky.fits.gz`, of OpenNGC's commit 17397545, which is no part of
+the package. Each object is an image of its own: an ellipse with the
 catalogue's axes, position angle and total V (B - 0.7 where that is missing). Galaxies are exponential discs, ellipticals
 Sersic profiles of index 4, cut at the catalogue's axes (B = 25 mag/arcsec2). The scale length of a disc is 1 / 3.2 of that
 radius (Freeman 1970), an elliptical's effective radius 1 / 3. Globular clusters are discs as well, nebulae even ellipses.
@@ -24,7 +25,8 @@ from astropy.wcs import WCS
 
 SERSIC_4 = 7.669  # b of index 4: half of the light is within the effective radius
 GALAXIES, DISCS, NEBULAE = ("G", "GPair", "GTrpl"), ("GCl",), ("HII", "Neb", "RfN", "PN", "SNR", "EmN")
-SIDE_PX, FINER = 65, 5  # the middle of a profile is the mean of FINER by FINER places
+MAX_SIDE_PX, MIN_SIDE_PX, FINER = 65, 33, 5  # the middle of a profile is the mean of FINER by FINER places
+PX_DEG = 10 / 3600  # finer than a tracker's
 BLUER_MAG = 0.7
 
 
@@ -43,17 +45,18 @@ def image_of(row: dict[str, str], v_mag: float) -> Any:
     """An object as an image with its WCS, whose light sums to its magnitude."""
     major = float(row["MajAx"]) / 60 / 2
     minor = float(row["MinAx"] or row["MajAx"]) / 60 / 2
-    px_deg = 2 * major / (SIDE_PX - 3)
-    at = (np.arange(SIDE_PX * FINER) - (SIDE_PX * FINER - 1) / 2) / FINER * px_deg
+    side = max(MIN_SIDE_PX, min(MAX_SIDE_PX, 2 * math.ceil(major / PX_DEG) + 3))
+    px_deg = 2 * major / (side - 3)
+    at = (np.arange(side * FINER) - (side * FINER - 1) / 2) / FINER * px_deg
     north, west = np.meshgrid(at, at, indexing="ij")
     angle = math.radians(float(row["PosAng"] or 0.0))  # from north to east
     along, across = north * math.cos(angle) - west * math.sin(angle), north * math.sin(angle) + west * math.cos(angle)
-    light = profile(row, np.hypot(along / major, across / minor)).reshape(SIDE_PX, FINER, SIDE_PX, FINER).mean(axis=(1, 3))
+    light = profile(row, np.hypot(along / major, across / minor)).reshape(side, FINER, side, FINER).mean(axis=(1, 3))
     square_arcsec = (px_deg * 3600) ** 2
     with np.errstate(divide="ignore"):
         mag_arcsec2 = v_mag - 2.5 * np.log10(light / light.sum() / square_arcsec)
     wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crpix = ("RA---TAN", "DEC--TAN"), [-px_deg, px_deg], [(SIDE_PX + 1) / 2] * 2
+    wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crpix = ("RA---TAN", "DEC--TAN"), [-px_deg, px_deg], [(side + 1) / 2] * 2
     (hours, *ra), (degrees, *dec) = row["RA"].split(":"), row["Dec"].split(":")
     sign = -1 if degrees.startswith("-") else 1
     wcs.wcs.crval = [15 * _sexagesimal(hours, *ra), sign * _sexagesimal(degrees.lstrip("+-"), *dec)]

@@ -10,7 +10,15 @@ from typing import Literal
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.assess.bench_effects import DisplayCost, Slice, display_cost, display_errors, field_magnitudes, slices_of
+from hilstar.assess.bench_effects import (
+    DisplayCost,
+    Slice,
+    display_cost,
+    display_errors,
+    field_magnitudes,
+    noise_limit,
+    slices_of,
+)
 from hilstar.assess.budget import Axes, Decomposed, DecomposedRun, assess_run, axes_of_variance
 from hilstar.assess.clock import CoarseClock, coarse_offset, speed_offsets
 from hilstar.assess.components import MIN_ROWS
@@ -100,6 +108,8 @@ class WrongAnswer:
 class Assessment:
     """The whole assessment. `noise_arcsec` excludes the display's own error where the answers show it.
 
+    `limit_arcsec` is the least noise that the tracker's stars allow, None where the bench cannot be read.
+
     `offset_s` is the tracker's clock minus the run's at the run's start.
     """
 
@@ -111,6 +121,7 @@ class Assessment:
     lock: Lock
     wrong: tuple[WrongAnswer, ...]
     display: DisplayCost | None
+    limit_arcsec: Axes | None
     by_rate: tuple[Slice, ...]
     by_magnitude: tuple[Slice, ...]
     t_s: FloatArray
@@ -148,11 +159,12 @@ def assess_files(
     freedom = parts.fov.freedom + parts.pixel.freedom + 1
     by_rate = slices_of(np.degrees(np.linalg.norm(found.rate_rad_s, axis=1)), parts.left, error, freedom)
     by_magnitude: tuple[Slice, ...] = ()
-    display = None
+    display = limit = None
     try:
         file = run.bench_file()
         say("the field's stars")
         by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
+        limit = noise_limit(file, found.commanded_q)
         if settings.display_attitudes:
             say("the display's own error")
             some = np.unique(np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int))
@@ -174,6 +186,7 @@ def assess_files(
             for k, at in zip(found.wrong, valid[found.wrong], strict=True)
         ),
         display=display,
+        limit_arcsec=limit,
         by_rate=by_rate,
         by_magnitude=by_magnitude,
         t_s=t_s,

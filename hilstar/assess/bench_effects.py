@@ -8,22 +8,26 @@ weighted by their light.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.assess.budget import Axes
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_stars
 from hilstar.bench.cameras import tracker_camera
 from hilstar.rotation import to_matrix
+from hilstar.twin.noise import attitude_limits_arcsec
 from hilstar.twin.verify.star_finder import StarFinder, star_finder
 from hilstar.twin.verify.twin import Twin
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 BINS, MIN_IN_BIN = 5, 20
 FIELDS = 400  # attitudes at which the field's light is summed; other answers take the nearest of them
+LIMIT_FIELDS = 12  # attitudes whose stars tell the limit of the noise
 MIN_STARS = 3
 SURE = 3.0
 
@@ -90,6 +94,16 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
     field = np.where(light > 0, magnitude(np.maximum(light, 1e-30)), np.nan)
     nearest = np.abs(np.searchsorted(some, np.arange(len(q_icrs_to_cam))).clip(0, len(some) - 1))
     return np.asarray(field[nearest])
+
+
+def noise_limit(file: BenchFile, q_icrs_to_cam: FloatArray) -> Axes:
+    """The least noise of an answer that the bench's tracker allows, by Cramer and Rao: the median along attitudes (n, 4).
+
+    One exposure at rest, arcsec; None for fields of too few stars. Raises InputError.
+    """
+    some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, LIMIT_FIELDS).astype(int))
+    median = np.median(attitude_limits_arcsec(file, q_icrs_to_cam[some]), axis=0).tolist()
+    return Axes(*(each if math.isfinite(each) else None for each in median))
 
 
 def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:

@@ -44,6 +44,7 @@ def budget_of(found: Assessment) -> dict[str, Any]:
         },
         "availability": found.lock.availability,
         "wrong": found.wrong,
+        "limit_arcsec": found.limit_arcsec,
     }
 
 
@@ -71,6 +72,19 @@ def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRo
             yield FigureRow(name, axis, value, "arcsec", *ends)
 
 
+def limit_rows(limit: Axes | None) -> Iterator[FigureRow]:
+    """The rows of the least noise that the tracker's stars allow."""
+    for axis in ("cross", "roll") if limit is not None else ():
+        yield FigureRow("limit of the tracker's stars", axis, getattr(limit, axis), "arcsec")
+
+
+def limit_text(limit: Axes | None) -> str:
+    """The least noise that a tracker's stars allow, in words."""
+    if limit is None or limit.cross is None or limit.roll is None:
+        return "not known"
+    return f"{limit.cross:.3g} arcsec across, {limit.roll:.3g} about the boresight (Cramer-Rao, one exposure at rest)"
+
+
 def rows_of(found: Assessment) -> Iterator[FigureRow]:
     """The rows of budget.csv."""
     yield from part_rows(found.found, found.noise_arcsec)
@@ -92,6 +106,7 @@ def rows_of(found: Assessment) -> Iterator[FigureRow]:
         yield FigureRow("display's own error", "cross", found.display.cross_arcsec, "arcsec")
         yield FigureRow("display's own error", "roll", found.display.roll_arcsec, "arcsec")
         yield FigureRow("display's own error, share seen", "", found.display.seen)
+    yield from limit_rows(found.limit_arcsec)
 
 
 def write_tables(directory: Path, found: Assessment) -> None:
@@ -142,6 +157,7 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("acquisition", "-" if share is None else f"{100 * share:.0f} %, median {wait} s"),
         ("wrong", f"{len(found.wrong)}, {where} {named}" if found.wrong else "none"),
         ("display's own error", own),
+        ("limit of its stars", limit_text(found.limit_arcsec)),
     ]
 
 

@@ -18,7 +18,7 @@ from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Photometry, star_temperatures_k
 from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag
 from hilstar.sky.spectral_types import luminosity_class
-from hilstar.sky.star_table import TableChoice, choose_catalog
+from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
 from hilstar.sky.stars import unit_vectors_icrs
 from hilstar.sky.synthetic import BANDS, VEGA_V_MAG, ab_electrons_per_s, colours, vega_electrons_per_s
 from hilstar.units import ARCSEC_PER_RAD, magnitude
@@ -59,7 +59,8 @@ def bench_catalogue(file: BenchFile, faintest_v_mag: float | None, epoch_jyear: 
     """
     sky = file.config.sky
     source = sky.catalogue if sky.catalogue == "hipparcos" else file.folder / sky.catalogue
-    every = choose_catalog(TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
+    choice = TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear)
+    every = choose_catalog(choice)
     limit = sky.faintest_v_mag if faintest_v_mag is None else faintest_v_mag
     rows = np.flatnonzero(every.v_mag <= limit)
     if not len(rows):
@@ -68,7 +69,8 @@ def bench_catalogue(file: BenchFile, faintest_v_mag: float | None, epoch_jyear: 
         )
     rows = rows[np.argsort(every.v_mag[rows], kind="stable")]
     epoch = sky.epoch_jyear if epoch_jyear is None else epoch_jyear
-    chosen, facts = every.taken(rows), errors_of(every.taken(rows))
+    chosen = every.taken(rows)
+    facts = table_facts(choice, chosen, errors_of(chosen))
     light, zero_points = _light(file, chosen, facts)
     columns = _places(chosen, facts, epoch) | _photometry(chosen, facts) | light | _distances(chosen, facts, light)
     return InstrumentCatalogue(columns | _company(every, rows, facts, epoch), epoch, zero_points)
@@ -112,7 +114,7 @@ def _photometry(stars: Catalog, facts: dict[str, Any]) -> dict[str, Column]:
     return {
         "v_mag": Column(stars.v_mag, "mag", "phot.mag;em.opt.V", "Johnson V"),
         "sigma_v_mag": Column(sigma_v_mag(facts, stars.bv_mag), "mag", "stat.error;phot.mag;em.opt.V", "its error"),
-        "v_source": origin("v_source", "origin of V: G ground, H Hipparcos, T Tycho"),
+        "v_source": origin("v_source", "origin of V: G ground, H Hipparcos, T Tycho, U the table"),
         "b_v_mag": Column(stars.bv_mag, "mag", "phot.color;em.opt.B;em.opt.V", "Johnson B-V"),
         "sigma_b_v_mag": Column(facts["sigma_bv_mag"], "mag", "stat.error;phot.color", "its error"),
         "b_v_source": origin("bv_source", "origin of B-V: G ground, T Tycho"),
@@ -121,7 +123,7 @@ def _photometry(stars: Catalog, facts: dict[str, Any]) -> dict[str, Column]:
         "v_i_source": origin("vi_source", "origin of V-I: field H42 of CDS I/239"),
         "spectral_type": Column(facts["spectral_type"].astype(np.str_), "", "src.spType", "MK type"),
         "luminosity_class": Column(luminosity_class(facts["spectral_type"]), "", "src.class.luminosity", "class in that type"),
-        "spectral_type_source": origin("spectral_type_source", "origin of the type: field H77 of CDS I/239"),
+        "spectral_type_source": origin("spectral_type_source", "origin of the type: field H77 of CDS I/239, or U: the table"),
         "variable": Column(stars.variable.astype(np.str_), "", "src.var", "P periodic, U unsolved, M within 0.03 mag"),
         "range_mag": Column(_decimals(stars.range_mag), "mag", "src.var.amplitude", "range of its light in Hp"),
         "period_d": Column(_decimals(stars.period_d), "d", "time.period", "period"),

@@ -27,6 +27,7 @@ from hilstar.reading import read_text
 from hilstar.tracker.settings import BOLTZMANN_EV_PER_K, DetectorSettings
 
 MAX_EMVA_BYTES = 1_000_000
+FRAME_ADVICE = "give raw frames as FITS or PNG, 8 to 16 bits of grey"
 EMVA_ADVICE = "write rows quantity,value,unit, such as K,0.25,DN/e- and eta@530nm,62,%"
 ICE_K = 273.15
 MAX_EXPOSURE_S = 1e6
@@ -93,15 +94,15 @@ def import_emva(path: Path) -> SensorFile:
     unused: list[str] = []
     for place, name, value, unit in _emva_rows(path):
         plain, _, wavelength = name.lower().partition("@")
-        found = next((one for one in QUANTITIES if plain.strip() in one.names), None)
-        if found is None:
+        quantity = next((one for one in QUANTITIES if plain.strip() in one.names), None)
+        if quantity is None:
             unused.append(name)
             continue
-        convert = found.units.get(unit.lower().replace(" ", ""))
-        if convert is None or (found.key == "gain_e_per_dn" and not value > 0):
-            raise InputError(f"{place}: {name} = {value:g} {unit}; write it above 0 in {' or '.join(found.units)}")
-        if found.key != "eta":
-            keys[found.key] = convert(value)
+        convert = quantity.units.get(unit.lower().replace(" ", ""))
+        if convert is None or (quantity.key == "gain_e_per_dn" and not value > 0):
+            raise InputError(f"{place}: {name} = {value:g} {unit}; write it above 0 in {' or '.join(quantity.units)}")
+        if quantity.key != "eta":
+            keys[quantity.key] = convert(value)
         elif not re.fullmatch(r"\s*\d+(\.\d+)?\s*nm\s*", wavelength):
             raise InputError(f"{place}: {name}; write its wavelength, such as eta@530nm")
         else:
@@ -114,7 +115,21 @@ def import_emva(path: Path) -> SensorFile:
         kelvin = keys.get("temperature_k", DetectorSettings().temperature_k)
         keys["dark_activation_ev"] = math.log(2) * BOLTZMANN_EV_PER_K * kelvin * (kelvin + doubling_k) / doubling_k
     notes = (f"not used: {', '.join(map(shortened, unused))}",) if unused else ()
-    return SensorFile(keys, {}, tuple(sorted(efficiency)), notes)
+    return _checked(path, SensorFile(keys, {}, tuple(sorted(efficiency)), notes))
+
+
+def _checked(path: Path, sensor: SensorFile) -> SensorFile:
+    """Refuse (InputError) what no sensor has."""
+    if len({nm for nm, _ in sensor.efficiency}) < len(sensor.efficiency):
+        raise InputError(f"{path}: eta has a wavelength twice; write each once")
+    for nm, share in sensor.efficiency:
+        if not 0 <= share <= 1:
+            raise InputError(f"{path}: eta@{nm:g}nm = {100 * share:g} %; write it from 0 to 100 %")
+    try:
+        _ = sensor.settings
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return sensor
 
 
 def _emva_rows(path: Path) -> Iterator[tuple[str, str, float, str]]:
@@ -165,9 +180,9 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
     """Levels of frames that come in pairs: two of one light and exposure after each other. Raises InputError."""
     if not paths or len(paths) % 2:
         raise InputError(f"{what}: {len(paths)} frames; give two of each exposure, one after the other")
-    rows, largest_dn, shape = [], 0.0, read_image(paths[0]).shape
+    rows, largest_dn, shape = [], 0.0, read_image(paths[0], advice=FRAME_ADVICE).shape
     for first, second in zip(paths[::2], paths[1::2], strict=True):
-        a, b = read_image(first), read_image(second)
+        a, b = (read_image(path, advice=FRAME_ADVICE) for path in (first, second))
         seconds, again = _exposure_s(first), _exposure_s(second)
         if not (a.shape == b.shape == shape and (seconds == again or (math.isnan(seconds) and math.isnan(again)))):
             raise InputError(f"{second}: its size or EXPTIME is not that of {first}; give two frames of each exposure")

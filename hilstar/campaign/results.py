@@ -24,10 +24,11 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.assess.bench_effects import noise_limit
 from hilstar.assess.budget import Axes, Decomposed, assess_cases, axes_of_variance
 from hilstar.assess.places import Scale
-from hilstar.assess.report import PARTS, FigureRow, part_rows
-from hilstar.bench.config import BenchConfig
+from hilstar.assess.report import PARTS, FigureRow, limit_rows, limit_text, part_rows
+from hilstar.bench.bench_file import BenchFile
 from hilstar.campaign.store import failures, file_sha256
 from hilstar.charts import INK, MUTED, chart, write_csv
 from hilstar.errors import InputError
@@ -93,13 +94,13 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
         raise InputError(f"{path}: is no table of a campaign ({error}); delete it, and run the same command again") from error
 
 
-def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -> tuple[dict[str, Any], Decomposed | None]:
+def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tuple[dict[str, Any], Decomposed | None]:
     """The budget of a campaign's cases by the keys of --json, and its parts, as `hilstar assess` has them.
 
     A figure that too few answers determine is None, and a note says why.
     """
     asked, solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("frames", "solved", "wrong"))
-    tracker = config.tracker
+    tracker = file.config.tracker
     scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
     # The solver's attitudes, NaN where there is none: a case's mean error applied to its commanded attitude.
     commanded, reported = (cases.vectors(form, "wxyz") for form in ("q{}", "solved_q{}"))
@@ -122,6 +123,7 @@ def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -
         "availability": (solved - wrong) / asked if asked else 0.0,
         "wrong": int(wrong),
         "centroids": _centroids(cases),
+        "limit_arcsec": noise_limit(file, commanded),
         "notes": notes,
     }, parts
 
@@ -133,6 +135,7 @@ def budget_rows(budget: dict[str, Any], parts: Decomposed | None) -> Iterator[Fi
     scatter = budget["scatter_arcsec"] or unknown
     yield FigureRow(SCATTER, "cross", scatter.cross, "arcsec")
     yield FigureRow(SCATTER, "roll", scatter.roll, "arcsec")
+    yield from limit_rows(budget["limit_arcsec"])
     yield FigureRow("availability", "", budget["availability"])
     yield FigureRow("wrong answers", "", budget["wrong"])
     for name, value in (budget["centroids"] or {}).items():
@@ -333,14 +336,14 @@ def draw_costs(path: Path, found: list[Cost]) -> None:
             axis.set_ylabel("share" if cost.unit == "1" else f"{cost.unit}, median")
 
 
-def write_results(table: Path, config: BenchConfig, seed: int) -> dict[str, Any]:
+def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies; the JSON object of `hilstar campaign`.
 
     Raises InputError where the table cannot be read, or a file not be written.
     """
     because = failures(table)
     cases = read_cases(table)
-    budget, parts = case_budget(cases, config, np.random.default_rng(seed))
+    budget, parts = case_budget(cases, file, np.random.default_rng(seed))
     rows = [["" if value is None else value for value in row] for row in budget_rows(budget, parts)]
     write_csv(table.with_name("budget.csv"), FigureRow._fields, rows)
     found = costs(cases)
@@ -380,4 +383,5 @@ def lines_of(summary: dict[str, Any]) -> list[str]:
             f"{'centroids':20}{found['sigma_x_px']:.3g}, {found['sigma_y_px']:.3g} px one sigma,"
             f" {100 * found['found_share']:.3g} % of stars found, {found['false_a_frame']:.3g} false a frame"
         )
+    lines.append(f"{'limit of its stars':20}{limit_text(summary['limit_arcsec'])}")
     return [*lines, *summary["notes"], *summary["findings"]]

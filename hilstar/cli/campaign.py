@@ -82,7 +82,7 @@ def campaign(
             run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
         from hilstar.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
 
-        summary = write_results(directory.table, this.maker.file.config, this.plan.seed)
+        summary = write_results(directory.table, this.maker.file, this.plan.seed)
     finally:
         directory.close()
     if as_json:

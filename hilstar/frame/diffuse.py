@@ -90,7 +90,7 @@ class DiffuseLayer:
 
         near = self._rays @ (icrs_to_cam @ face.middle) >= face.cos_radius
         lit = [np.flatnonzero(near.any(axis=axis)) for axis in (1, 0)]
-        if not len(lit[0]):
+        if min(map(len, lit)) < 2:  # no whole cell: its light is two cells and more beside the image
             return []
         around = tuple(slice(int(one[0]), int(one[-1]) + 1) for one in lit)
         x_px, y_px = face.image.places_px(self._rays[around] @ icrs_to_cam)

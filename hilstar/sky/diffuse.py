@@ -6,6 +6,7 @@ middle, or a HEALPix map, becomes the six faces of a cube. Between pixels all ar
 
 from __future__ import annotations
 
+import gzip
 import io
 import math
 import warnings
@@ -89,6 +90,8 @@ def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
 
     raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
     try:
+        if raw[:2] == b"\x1f\x8b":
+            raw = _unzipped(path, raw)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # astropy's about keywords of older standards; what matters is refused
             units = fits.open(io.BytesIO(raw), memmap=False)
@@ -103,6 +106,14 @@ def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
     except Exception as error:  # each library raises its own for a damaged file
         raise cannot_read(path, f"{type(error).__name__}: {error}", MAP_ADVICE) from error
     raise InputError(f"{path}: has neither an image nor a HEALPix table; {MAP_ADVICE}")
+
+
+def _unzipped(path: Path, raw: bytes) -> bytes:
+    with gzip.open(io.BytesIO(raw)) as file:
+        found = file.read(MAX_FILE_BYTES + 1)
+    if len(found) > MAX_FILE_BYTES:
+        raise InputError(f"{path}: has more than {MAX_FILE_BYTES:g} bytes unpacked; give a smaller map")
+    return found
 
 
 def brightness(path: Path, values: Any, unit_name: str | None) -> FloatArray:

@@ -41,7 +41,8 @@ STEP_FACTS: dict[str, tuple[int, int, str]] = {
 LETTER_FACTS = {"v_source": 7, "bv_source": 39, "vi_source": 42, "spectral_type_source": 77}
 # Scatter of V about Hp by colour, of single constant stars, measured over the catalogue: V from Hp (H), from the ground (G) for
 # B-V under 1 and above; V from Tycho's VT (T) as the ground's.
-V_SCATTER_MAG = {b"H": (0.004, 0.004), b"G": (0.010, 0.025), b"T": (0.010, 0.025)}
+# A user's table (U) gives the error of V itself.
+V_SCATTER_MAG = {b"H": (0.004, 0.004), b"G": (0.010, 0.025), b"T": (0.010, 0.025), b"U": (0.0, 0.0)}
 RED_BV_MAG = 1.0
 STEP = 1e-30  # of the complex-step derivatives: exact to rounding
 

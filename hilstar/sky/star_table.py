@@ -33,7 +33,18 @@ from hilstar.files import make_directory, whole_file
 from hilstar.reading import open_regular
 from hilstar.sky.catalog import PACKAGED_CATALOG, RANGES, TYC_REGION, TYCHO, Catalog, column_names, load_catalog, plain_catalog
 from hilstar.sky.stars import cell_grid, unit_vectors_icrs
-from hilstar.sky.table_reader import COLUMNS_WANTED, FILE_WANTED, MAX_TABLE_BYTES, ROUTES, RawTable, factor_to, read_table
+from hilstar.sky.table_reader import (
+    COLUMNS_WANTED,
+    ERROR_NAMES,
+    FILE_WANTED,
+    MAX_TABLE_BYTES,
+    NAMES,
+    ROUTES,
+    SPECTRAL_TYPE,
+    RawTable,
+    factor_to,
+    read_table,
+)
 
 # Epochs of the places, Julian years, where a table has its catalogue's own names and no epoch.
 EPOCH_OF_PLACES = {"ramdeg": 2000.0, "raicrs": 1991.25, "raj2000": 2000.0, "_raj2000": 2000.0}
@@ -517,6 +528,33 @@ def _made(path: Path, choice: TableChoice) -> Kept:
 def _by_cell(catalog: Catalog, *notes: str) -> Catalog:
     """The same stars, neighbours together: a bench that sorts them by cell then reads each array from its start to its end."""
     return replace(catalog.taken(cell_grid(unit_vectors_icrs(catalog, GAIA_DR3_JYEAR)).order), notes=notes)
+
+
+def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Hipparcos' `facts` (n,) of the `stars` of a choice, and in their place what its table says of its own stars.
+
+    Reads the table once more, for the columns that no bench needs. Raises InputError.
+    """
+    if str(choice.source) == "hipparcos" or _is_hip_main(Path(choice.source)):
+        return facts
+    columns = _Columns(Path(choice.source), read_table(Path(choice.source), NAMES | ERROR_NAMES))
+    if not any(role in columns.layout.role for role in ERROR_NAMES):
+        return facts
+    identifier = columns.identifiers()[1]
+    order = np.argsort(identifier, kind="stable")
+    row = order[np.minimum(np.searchsorted(identifier, stars.identifier, sorter=order), len(order) - 1)]
+    own = (identifier[row] == stars.identifier) & ~(choice.with_hipparcos & (stars.hip == stars.identifier))
+    found = dict(facts)
+    for role in ERROR_NAMES:
+        name = columns.layout.role.get(role)
+        if name is not None and role == SPECTRAL_TYPE:
+            found[role] = np.where(own, columns.table.columns[name][row], facts[role])
+            found["spectral_type_source"] = np.where(own, b"U", facts["spectral_type_source"])
+        elif name is not None:
+            found[role] = np.where(own, columns.role(role, np.nan)[row], facts[role])
+    if "sigma_measured_mag" in columns.layout.role:
+        found["v_source"] = np.where(own, b"U", facts["v_source"])
+    return found
 
 
 def _is_hip_main(path: Path) -> bool:

@@ -78,13 +78,36 @@ NAMES: dict[str, tuple[str, ...]] = {
     "tyc3": ("tyc3",),
     "hip": ("hip",),
 }
+# What `hilstar catalogue` alone asks for: the errors of Gaia, Tycho-2, Hipparcos and this project, and the MK type.
+SPECTRAL_TYPE = "spectral_type"
+ERROR_NAMES: dict[str, tuple[str, ...]] = {
+    "sigma_ra_mas": ("ra_error", "e_ra_icrs", "e_raicrs", "e_radeg", "e_raj2000", "e_ramdeg", "sigma_ra_mas"),
+    "sigma_dec_mas": ("dec_error", "e_de_icrs", "e_deicrs", "e_dedeg", "e_dej2000", "e_demdeg", "sigma_dec_mas"),
+    "sigma_parallax_mas": ("parallax_error", "e_plx", "sigma_parallax_mas"),
+    "sigma_pm_ra_mas_yr": ("pmra_error", "e_pmra", "sigma_pm_ra_mas_yr"),
+    "sigma_pm_dec_mas_yr": ("pmdec_error", "e_pmde", "sigma_pm_dec_mas_yr"),
+    "ra_dec_correlation": ("ra_dec_corr", "ra_dec_correlation"),
+    "ra_pm_ra_correlation": ("ra_pmra_corr", "ra_pm_ra_correlation"),
+    "dec_pm_ra_correlation": ("dec_pmra_corr", "dec_pm_ra_correlation"),
+    "ra_pm_dec_correlation": ("ra_pmdec_corr", "ra_pm_dec_correlation"),
+    "dec_pm_dec_correlation": ("dec_pmdec_corr", "dec_pm_dec_correlation"),
+    "pm_ra_pm_dec_correlation": ("pmra_pmdec_corr", "pm_ra_pm_dec_correlation"),
+    "sigma_measured_mag": ("e_vmag", "sigma_v_mag"),
+    "sigma_bv_mag": ("e_b-v", "e_b_v", "sigma_b_v_mag"),
+    "sigma_vi_mag": ("e_v-i", "e_v_i", "sigma_v_i_mag"),
+    SPECTRAL_TYPE: ("sptype", "sp_type", "spectral_type", "mk"),
+}
 COLUMNS_WANTED = (
     "name V with B-V or V-I (vmag, b-v, v-i), Tycho's vtmag and btmag, or Gaia's phot_g_mean_mag with bp_rp or with "
     "phot_bp_mean_mag and phot_rp_mean_mag"
 )
 MAX_NAMED = 12
 HOURS = ("h", "hr", "hour", "hourangle")
-UNITS = {"deg": ("ra_deg", "dec_deg"), "mas / yr": ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"), "mas": ("parallax_mas",)}
+UNITS = {
+    "deg": ("ra_deg", "dec_deg"),
+    "mas / yr": ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "sigma_pm_ra_mas_yr", "sigma_pm_dec_mas_yr"),
+    "mas": ("parallax_mas", "sigma_ra_mas", "sigma_dec_mas", "sigma_parallax_mas"),
+}
 UNIT_OF = {role: unit for unit, roles in UNITS.items() for role in roles}
 FILE_WANTED = "give a table of stars as FITS, ECSV, CSV or VOTable, or the CDS I/239 hip_main.dat"
 MAX_TABLE_BYTES = 4_000_000_000
@@ -187,11 +210,11 @@ class Layout:
         return sorted({*self.role.values(), *(name for pair in self.places for name in pair)})
 
 
-def layout_of(path: Path, names: Sequence[str]) -> Layout:
-    """Which of a table's columns are used. Raises InputError where there is no place or no magnitude with a colour."""
+def layout_of(path: Path, names: Sequence[str], roles: Mapping[str, tuple[str, ...]] = NAMES) -> Layout:
+    """Which of a table's columns have the `roles`. Raises InputError where there is no place or no magnitude with a colour."""
     known = {name.strip().lower(): name for name in reversed(names)}
     places = tuple((known[ra], known[dec]) for ra, dec in PLACES if ra in known and dec in known)
-    role = {role: known[found] for role, words in NAMES.items() if (found := next((w for w in words if w in known), None))}
+    role = {role: known[found] for role, words in roles.items() if (found := next((w for w in words if w in known), None))}
     magnitudes = tuple(route.roles for route in ROUTES if all(name in role for name in route.roles))
     found = ", ".join(shortened(name, 40) for name in names[:MAX_NAMED]) + (", ..." if len(names) > MAX_NAMED else "")
     if not places:
@@ -230,8 +253,8 @@ class RawTable:
 Whole = ("gaia", "tyc1", "tyc2", "tyc3", "hip")
 
 
-def read_table(path: Path) -> RawTable:
-    """Read a table of stars. Raises InputError for another file, and for one that is too large."""
+def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawTable:
+    """Read the columns of a table of stars that have `roles`. Raises InputError for another file, or one that is too large."""
     with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
         head = file.read(4096)
     kind = kind_of(head[:HEAD_BYTES])
@@ -239,12 +262,12 @@ def read_table(path: Path) -> RawTable:
         raise cannot_read(path, f"it is {kind}", "unpack it first" if kind.endswith("zip file") else FILE_WANTED)
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     if kind == "a FITS file":
-        return _read_fits(path)
+        return _read_fits(path, roles)
     if text[:5] == b"<?xml" or text[:8].upper() == b"<VOTABLE":
-        return _read_votable(path)
+        return _read_votable(path, roles)
     if not text:
         raise InputError(f"{path}: is empty; {FILE_WANTED}")
-    return _read_text(path)
+    return _read_text(path, roles)
 
 
 @contextmanager
@@ -262,14 +285,14 @@ def _quiet(path: Path) -> Iterator[None]:
         raise cannot_read(path, f"{type(error).__name__}: {error}".rstrip(": "), FILE_WANTED) from error
 
 
-def _read_fits(path: Path) -> RawTable:
+def _read_fits(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
     from astropy.io import fits
 
     with _quiet(path), fits.open(path, memmap=True) as hdus:
         table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)), None)
         if table is None:
             raise InputError(f"{path}: holds no table; {FILE_WANTED}")
-        layout = layout_of(path, table.columns.names)
+        layout = layout_of(path, table.columns.names, roles)
         _check_rows(path, int(table.header["NAXIS2"]))
         by_name = {column.name: column for column in table.columns}
         columns, unit = {}, {}
@@ -281,7 +304,7 @@ def _read_fits(path: Path) -> RawTable:
         return RawTable(layout, columns, unit, len(table.data))
 
 
-def _read_votable(path: Path) -> RawTable:
+def _read_votable(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
     from astropy.io import votable
 
     if path.stat().st_size > MAX_XML_BYTES:
@@ -292,7 +315,7 @@ def _read_votable(path: Path) -> RawTable:
     with _quiet(path):
         table = votable.parse_single_table(path, verify="ignore")
         fields = {field.name: field for field in table.fields}
-        layout = layout_of(path, list(fields))
+        layout = layout_of(path, list(fields), roles)
         _check_rows(path, len(table.array))
         columns, unit = {}, {}
         for name in layout.needed():
@@ -302,9 +325,9 @@ def _read_votable(path: Path) -> RawTable:
         return RawTable(layout, columns, unit, len(table.array))
 
 
-def _read_text(path: Path) -> RawTable:
+def _read_text(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
     names, unit, delimiter = _text_head(path)
-    layout = layout_of(path, names)
+    layout = layout_of(path, names, roles)
     needed = layout.needed()
     parts: dict[str, list[Any]] = {name: [] for name in needed}
     count = 0
@@ -363,7 +386,10 @@ def _text_head(path: Path) -> tuple[list[str], dict[str, str | None], str]:
 
 
 def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], mask: Any) -> Any:
-    """A column as float64, or as int64 where it identifies the star. Raises InputError where it is text."""
+    """A column as float64, int64 where it identifies the star, or bytes of the MK type. Raises InputError for other text."""
+    if name == layout.role.get(SPECTRAL_TYPE):
+        texts = np.array([str(text).strip().encode("ascii", "replace") for text in values.tolist()], dtype=np.bytes_)
+        return texts if mask is None else np.where(mask, b"", texts)
     whole = name in {layout.role.get(role) for role in Whole}
     if values.dtype.kind not in "iufb":
         raise InputError(

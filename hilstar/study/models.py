@@ -2,11 +2,11 @@
 
 Charts: figures 5.19 and 5.22 of the thesis (RAPP); temperatures against Torres 2010; the electrons of a star of V = 0 by zero
 point and passband weighting; the cost of each choice over B-V and for Hipparcos; spectra against the library's own.
+The thesis's other figures are in `hilstar/study/thesis.py`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,7 @@ from hilstar.sky.spectrum import (
     torres2010_k,
 )
 from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_by_type, held_out_errors, study_optics
+from hilstar.study.thesis import FIGURES, ChartFinding
 from hilstar.units import LIGHT_M_S, magnitude
 
 SENSORS = {"ccd47-20": "CCD47-20", "kai-4021": "KAI-4021 (approximate QE)"}
@@ -50,20 +51,12 @@ SCALE_BV_MAG = np.arange(-35, 181) / 100  # where Torres 2010 holds; exact at 0,
 QUOTED_K = (3000.0, 5000.0, 9000.0, 50_000.0)
 SAID_OF_THESIS = {  # section 5.4, of figures 5.19 and 5.22
     "ccd47-20": " (thesis: 15 % to 5 %)",
-    "kai-4021": " (thesis: RAPP1 and RAPP2 as the CCD47-20's, which a curve of 300 to 1050 nm has; this has 400 to 1000)",
+    "kai-4021": "; RAPP1 at 50000 K is {:.2f}, and {:.2f} with any curve from 300 to 1050 nm (thesis: the CCD47-20's)",
 }
 
 BV_MAG = np.arange(-30, 201) / 100
 WINDOW_MAG = 0.05  # half the width of the running percentiles in B-V
 MIN_STARS = 20
-
-
-@dataclass(frozen=True, slots=True)
-class ChartFinding:
-    """A chart, by the stem of its files, and its finding."""
-
-    figure: str
-    text: str
 
 
 def spectra(directory: Path) -> ChartFinding:
@@ -202,11 +195,12 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
     kelvin = np.union1d(np.geomspace(3000, 50_000, 400)[1:-1], QUOTED_K)
     optics = study_optics(sensor)
     ratios = {weighting: rapp_ratios(kelvin, optics, weighting) for weighting in WEIGHTINGS}
+    in_full_range = rapp_ratios(kelvin[-1:], study_optics("ccd47-20"), "energy")  # which the range of wavelengths alone makes
     coolest, cool, hot, hottest = ratios["energy"][2][np.searchsorted(kelvin, QUOTED_K)]
     text = (
         f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the average one at 3000 K,"
         f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by {100 * (hottest - 1):+.1f} %"
-        + SAID_OF_THESIS.get(sensor, "")
+        + SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
     )
     title = (
         f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the average model,"
@@ -315,6 +309,6 @@ def running_percentiles(bv_mag: FloatArray, value: FloatArray, at_bv_mag: FloatA
 def run(directory: Path) -> list[ChartFinding]:
     """Write every chart and its table (CSV) into `directory`, and `findings.csv`. Raises InputError."""
     findings = [rapp(directory, sensor) for sensor in SENSORS]
-    findings += [chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra)]
+    findings += [chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES)]
     write_csv(directory / "findings.csv", ("figure", "finding"), [(f.figure, f.text) for f in findings])
     return findings

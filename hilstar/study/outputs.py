@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.charts import INK, MUTED, chart, write_csv
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg
+from hilstar.tracker.settings import DetectorSettings
 from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
@@ -50,6 +52,9 @@ def _draw_scene(directory: Path, scene: OutputScene) -> str:
     with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
         view = simulator.view(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
         clean = simulator.expose(view, None)
+        sky_e, exposure_s = float(np.median(clean.mean_e)), simulator.config.tracker.exposure_s
+        total_e = math.sqrt(simulator.detector.settings.noise(sky_e, exposure_s).total_e2)
+        thesis_e = thesis_total_e(simulator.detector.settings, sky_e, exposure_s)
         noise = FrameNoise(seed=SEED)
         noisy = simulator.expose(view, noise.rng())
         write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, noise)
@@ -60,7 +65,16 @@ def _draw_scene(directory: Path, scene: OutputScene) -> str:
     v_mag, saturated = truth["v_mag"], int(truth["clipped"].sum())
     return (
         f"{scene.name}: {len(truth)} stars, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f};"
-        f" sky {background:.0f} DN, {saturated} stars saturated"
+        f" sky {background:.0f} DN, {saturated} stars saturated; n_TOT of a pixel of sky {total_e:.0f} e-"
+        f" (table 4.1: {thesis_e:.0f})"
+    )
+
+
+def thesis_total_e(detector: DetectorSettings, light_e: float, exposure_s: float) -> float:
+    """The n_TOT of the thesis's table 4.1 and eq. 4.14 as printed, with the roots of PRNU and DSNU that have no dimension."""
+    fixed_e2 = light_e * detector.prnu + detector.dsnu_e_per_s * exposure_s
+    return math.sqrt(
+        light_e + detector.dark_e_per_s * exposure_s + fixed_e2 + detector.adc_noise_e**2 + detector.read_noise_e**2
     )
 
 

@@ -151,9 +151,10 @@ class Detector:
         spilt_e, normal = (np.empty(self.shape if settings.blooming else 0, dtype=np.float32) for _ in range(2))
 
         def draw(part: slice, words: Word64Array) -> None:
-            self._check_light(light_e[part])
-            expected_e: Float32Array = np.multiply(self.dark_map_e_per_s[part], exposure_s, dtype=np.float32)
-            expected_e += light_e[part].astype(np.float32) * self.gain_map[part]
+            expected_e: Float32Array = light_e[part].astype(np.float32)
+            self._check_light(expected_e)
+            expected_e *= self.gain_map[part]
+            expected_e += self.dark_map_e_per_s[part] * np.float32(exposure_s)
             self._check_largest(expected_e)
             shot, read = normal_pairs(words)
             charge_e = poisson(expected_e, shot)
@@ -232,7 +233,8 @@ class Detector:
         codes /= self.settings.gain_e_per_dn
         codes += self.settings.offset_dn
         np.rint(codes, out=codes)
-        np.clip(codes, 0, 2**self.settings.bits - 1, out=codes)
+        np.minimum(codes, 2**self.settings.bits - 1, out=codes)
+        np.maximum(codes, 0, out=codes)
         return codes.astype(np.uint16)
 
 

@@ -25,8 +25,7 @@ from hilstar.arrays import Float32Array
 
 Word64Array = npt.NDArray[np.int64]
 
-PART_PX = 1 << 15  # the arrays of a part stay in a core's cache
-PARTS_IN_BLOCK = 2
+BLOCK_PX = 1 << 16  # the arrays of a block stay in a core's cache
 
 EXACT_BELOW_E = 64.0
 TABLE_BELOW_E = 8.0
@@ -175,22 +174,21 @@ def _count_table() -> CountTable:
 
 
 def draw_blocks(shape: tuple[int, int], rng: np.random.Generator, draw: Callable[[slice, Word64Array], None]) -> None:
-    """Call `draw` for the rows of each part of an image (height, width) with random words, (rows, width), on every core.
+    """Call `draw` for the rows of each block of an image (height, width) with random words, (rows, width), on every core.
 
-    One seed gives each part the same words on any number of threads. `OMP_NUM_THREADS` bounds them.
+    One seed gives each block the same words on any number of threads. `OMP_NUM_THREADS` bounds them.
     """
     height, width = shape
-    rows = max(1, PART_PX // width)
+    rows = 2 * max(1, BLOCK_PX // 2 // width)
     key = int(rng.integers(2**63))
 
     def draw_block(first: int) -> None:
         stream = np.random.Generator(np.random.SFC64(np.random.SeedSequence((key, first))))
-        for top in range(first, min(first + PARTS_IN_BLOCK * rows, height), rows):
-            part = slice(top, min(top + rows, height))
-            words = stream.integers(-(2**63), 2**63, size=(part.stop - top) * width, dtype=np.int64)
-            draw(part, words.reshape(-1, width))
+        block = slice(first, min(first + rows, height))
+        words = stream.integers(-(2**63), 2**63, size=(block.stop - first) * width, dtype=np.int64)
+        draw(block, words.reshape(-1, width))
 
-    blocks = range(0, height, PARTS_IN_BLOCK * rows)
+    blocks = range(0, height, rows)
     asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
     threads = min(len(blocks), int(asked) if asked.isdecimal() and int(asked) else len(os.sched_getaffinity(0)))
     if threads == 1:

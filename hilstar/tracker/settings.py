@@ -101,6 +101,14 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         Literal["normal", "gamma", "log-normal"],
         Meta(description='Law of pixels\' dark currents about their mean: `"normal"`, cut at 0, `"gamma"`, `"log-normal"`.'),
     ] = "normal"
+    dark_quantiles: Annotated[
+        tuple[tuple[Share, Amount], ...],
+        Meta(
+            description="Measured quantiles of the pixels' dark currents, points `[share, e-/s]`. `dark_distribution` is fitted"
+            " to them, and gives `dark_e_per_s` and `dsnu_e_per_s`.",
+            extra={"form": "[[share, e/s], ...]", "default": "none"},
+        ),
+    ] = ()
     prnu: Annotated[Share, Meta(description="Relative sigma of the gain map (PRNU), which is fixed for a device.")] = 0.0
     device_seed: Annotated[
         int,
@@ -171,6 +179,10 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         """Refuse (InputError) a value that no sensor has."""
         for name, kind in _KINDS.items():
             check_value(name, getattr(self, name), kind)
+        if self.dark_quantiles:
+            mean, sigma = fitted_dark(self.dark_distribution, np.array(self.dark_quantiles, dtype=np.float64))
+            msgspec.structs.force_setattr(self, "dark_e_per_s", mean)
+            msgspec.structs.force_setattr(self, "dsnu_e_per_s", sigma)
         low_k, high_k = DATASHEET_RANGE_K
         for name in ("temperature_k", "dark_reference_temperature_k"):
             if self.dark_law in E2V_DARK and not low_k <= getattr(self, name) <= high_k:
@@ -258,6 +270,37 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
 
 _KINDS = get_type_hints(DetectorSettings, include_extras=True)
+
+
+def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
+    """Mean and sigma of the law of `dark_distribution` through quantiles (n, 2): shares and e-/s. Raises InputError.
+
+    Least squares of the quantiles; of their logarithms, except for the normal law.
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.special import gammaincinv, ndtri
+
+    share, rate = points.reshape(-1, 2).T
+    low = 0.0 if law == "normal" else 1e-9
+    if len(share) < 2 or not (share[0] > 0 and share[-1] < 1 and (np.diff(share) > 0).all() and (np.diff(rate) > 0).all()):
+        raise InputError("dark_quantiles: write two points or more, shares between 0 and 1, both columns rising")
+    if rate[0] < low:
+        raise InputError(f'dark_quantiles: dark_distribution = "{law}" has no rate of 0; write rates above 0')
+    if law == "gamma":
+
+        def misfit(log_shape: float) -> float:
+            return float(np.var(np.log(rate / np.maximum(gammaincinv(math.exp(log_shape), share), 1e-300))))
+
+        shape = math.exp(minimize_scalar(misfit, bounds=(math.log(0.02), math.log(1e6)), method="bounded").x)
+        mean = shape * math.exp(float(np.log(rate / gammaincinv(shape, share)).mean()))
+        return mean, mean / math.sqrt(shape)
+    slope, middle = map(float, np.polyfit(ndtri(share), rate if law == "normal" else np.log(rate), 1))
+    if law == "normal":
+        if middle < 0:
+            raise InputError('dark_quantiles: their normal law has a mean below 0; write dark_distribution = "gamma"')
+        return middle, slope
+    mean = math.exp(middle + slope**2 / 2)
+    return mean, mean * math.sqrt(math.expm1(slope**2))
 
 
 def e2v_dark(law: str, temperature_k: float) -> float:

@@ -9,6 +9,7 @@ reaches it. Pixels that clip tell nothing. Fixed patterns count as noise: all th
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -287,6 +288,27 @@ def noise_budget(
         nea=nea,
         nea_arcsec={kind: {way: nea[-1][f"{kind}_{way}_arcsec"] for way in ("across", "about")} for kind in WHO},
     )
+
+
+def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
+    """NEA across and about the boresight (n, 2) that a bench's tracker at rest allows at attitudes (n, 4), by all its stars.
+
+    Infinite with too few stars, and nearer to the Sun than its zodiacal light is known. Raises InputError.
+    """
+    tracker = file.config.tracker
+    camera, stars = tracker_camera(tracker, file.folder), bench_stars(file.config, file.folder)
+    star = NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s)
+    background = TrackerBackground(file.config, file.folder, camera, refuse=True)
+    found = np.full((len(q_icrs_to_cam), 2), np.inf)
+    for k, q in enumerate(q_icrs_to_cam):
+        field = field_stars(stars, camera, q)
+        with contextlib.suppress(InputError):
+            sky_e = float(background.of_view_e(View.exposure(q, STILL, tracker.exposure_s)).mean())
+            own = star.noise(field["electrons_per_s"] * tracker.exposure_s, np.full(len(field), sky_e), CentroidSettings())
+            bounds = np.stack([own["bound_x_px"], own["bound_y_px"]])
+            nea = nea_arcsec(turns_of(camera, field["x_px"], field["y_px"]), bounds, own["detection"])
+            found[k] = nea[:, -1:].ravel() if nea.size else np.inf
+    return found
 
 
 def between(noise: Table, star_e: FloatArray) -> FloatArray:

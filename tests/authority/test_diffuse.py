@@ -186,6 +186,20 @@ def test_the_monitor_draws_what_passes_its_first_step_and_says_where_nothing_doe
         assert not any(isinstance(layer, DiffuseLayer) for layer in bench.layers)
 
 
+def test_a_map_leaves_the_screen_over_any_edge(tmp_path):
+    """Step by step of a third of a cell: also where one row of cells' corners alone is near its light."""
+    write_disc(tmp_path / "map.fits")
+    with open_bench(bench_in(tmp_path)) as bench:
+        cell_deg = np.degrees(16 / min(bench.camera.scales_px_rad()))
+        for roll in (0.0, 90.0, 180.0, 270.0):
+            drawn = [
+                bool(bench.light(bench.view(from_radec_roll_deg(RA_DEG, DEC_DEG + off, roll))).extended)
+                for off in np.arange(4.0, 14.0, cell_deg / 3)
+            ]
+            assert drawn[0] and not drawn[-1]
+            assert drawn == sorted(drawn, reverse=True)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.resources import resource_path
 from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s, v_band_mean_w_m2_m
@@ -76,6 +78,10 @@ def test_the_square_of_4_48_sigma_has_95_percent_and_rosetta_s_pixel_22():
     assert erf(4.48 / 2 / math.sqrt(2)) ** 2 == pytest.approx(0.95, abs=PRINTED)
     shares = [GaussianPsf((sigma, sigma)).peak_share for sigma in (0.80, 0.46)]
     np.testing.assert_allclose(shares, [0.22, 0.52], atol=PRINTED)
+    tracker = read_bench_file(resource_path("configs", "rosetta-navcam.toml")).config.tracker
+    assert 0.50 <= GaussianPsf(tracker.psf_sigma_px).peak_share <= 0.55  # ESA
+    detector = tracker.detector
+    assert min(detector.column_noise_e, detector.hot_pixel_fraction, detector.false_stars) > 0
 
 
 def test_orion_s_circle_of_eq_4_6_reaches_beyond_its_corner():

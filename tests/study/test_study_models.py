@@ -22,6 +22,7 @@ from tests.support.commands import run_hilstar_here
 from tests.support.waiting import PATIENCE_S
 
 STEMS = ("rapp_ccd47-20", "rapp_kai-4021", "temperature_scales", "zero_points", "choices", "spectra")
+STEMS += ("catalogue_errors", "passbands", "curves", "detector_laws", "zodiacal")
 
 # Planck, the zero point and Johnson V written a second time, integrated adaptively by pieces to 1e-8; the study's
 # Gauss-Legendre is good to 1e-13, and the constants below are CODATA's, rounded at 1e-9.
@@ -275,6 +276,24 @@ def test_a_title_follows_its_data(tmp_path, monkeypatch):
     monkeypatch.setattr(electrons, "BOLOMETRIC_0_W_M2", electrons.BOLOMETRIC_0_W_M2 * 10**0.4)
     (old,), (new,) = (re.findall(r"\((-?[\d.]+) mag\)", text) for text in (before, zero_points(tmp_path).text))
     assert float(new) == pytest.approx(float(old) - 1, abs=0.011)  # two figures rounded at 0.01
+
+
+def test_the_thesis_s_tables_stand_beside_what_is_here(study):
+    folder, texts = study
+    rows = columns(folder / "catalogue_errors.csv")
+    here, thesis = (dict(zip(rows["what"], rows[name], strict=True)) for name in ("here", "thesis"))
+    assert thesis["V from T"] == here["V from T"] == 409  # table 2.2
+    for name in ("sigma_bv_mag", "sigma_ra_mas", "sigma_dec_mas", "sigma_parallax_mas", "sigma_pm_ra_mas_yr"):
+        assert here[name] == pytest.approx(thesis[name], abs=0.025)  # table 2.3
+    bands = columns(folder / "passbands.csv")
+    assert list(bands["band"]) == ["U", "B", "V", "R", "I"]
+    assert bands["vega_v0"] == pytest.approx(bands["thesis_bessell"], rel=0.02)  # table 2.5; Vega's own colours are not all 0
+    assert bands["effective_nm"] == pytest.approx(bands["thesis_effective_nm"], rel=0.02)
+    dark = columns(folder / "detector_laws.csv")
+    at = np.flatnonzero(dark["temperature_k"] == 293)[0]
+    assert [dark[law][at] for law in list(dark)[1:]] == pytest.approx([203] * 5)
+    assert "97.2 photons" in texts["zodiacal"] and "96.9 as sunlight" in texts["zodiacal"]
+    assert "RAPP1 at 50000 K is 1.02, and 1.56 with any curve from 300 to 1050 nm" in texts["rapp_kai-4021"]
 
 
 def test_every_figure_is_drawn_and_found(study):

@@ -117,21 +117,21 @@ def _centroids(path: Path, resolution_px: tuple[int, int], under: FloatArray | N
     return found.x_px[kept], found.y_px[kept]
 
 
-def read_image(path: Path, resolution_px: tuple[int, int] | None = None) -> FloatArray:
+def read_image(path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE) -> FloatArray:
     """A grey image (h, w) as float64, first row at the top, of this (width, height) if any. Raises InputError."""
-    data = read_bytes(path, IMAGE_ADVICE, MAX_IMAGE_BYTES)
+    data = read_bytes(path, advice, MAX_IMAGE_BYTES)
     # A grabbing script may write FITS under any name.
     is_fits = path.suffix.lower() in FITS_ENDINGS or data.startswith(FITS_MAGIC)
-    image = _fits(path, data) if is_fits else _picture(path, data)
+    image = _fits(path, data, advice) if is_fits else _picture(path, data, advice)
     if image.ndim != 2:
-        raise InputError(f"{path}: is no grey image of one plane; {IMAGE_ADVICE}")
+        raise InputError(f"{path}: is no grey image of one plane; {advice}")
     if resolution_px is not None and (image.shape[1], image.shape[0]) != resolution_px:
         sizes = "is {1} x {0} px, and [tracker] resolution_px is {2} x {3}".format(*image.shape, *resolution_px)
         raise InputError(f"{path}: {sizes}; give whole images, or set the key")
     return np.asarray(image, dtype=np.float64)
 
 
-def _fits(path: Path, data: bytes) -> npt.NDArray[Any]:
+def _fits(path: Path, data: bytes, advice: str) -> npt.NDArray[Any]:
     from io import BytesIO
 
     from astropy.io import fits
@@ -142,13 +142,13 @@ def _fits(path: Path, data: bytes) -> npt.NDArray[Any]:
             hdus = fits.open(BytesIO(data))
             planes = [hdu.data for hdu in hdus if isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU) and hdu.data is not None]
     except (OSError, ValueError, TypeError, IndexError) as error:
-        raise InputError(f"{path}: cannot be read as FITS ({error}); {IMAGE_ADVICE}") from error
+        raise InputError(f"{path}: cannot be read as FITS ({error}); {advice}") from error
     if not planes:
-        raise InputError(f"{path}: has no image; {IMAGE_ADVICE}")
+        raise InputError(f"{path}: has no image; {advice}")
     return np.asarray(planes[0])
 
 
-def _picture(path: Path, data: bytes) -> npt.NDArray[Any]:
+def _picture(path: Path, data: bytes, advice: str) -> npt.NDArray[Any]:
     from io import BytesIO
 
     from PIL import Image
@@ -157,4 +157,4 @@ def _picture(path: Path, data: bytes) -> npt.NDArray[Any]:
         with Image.open(BytesIO(data)) as picture:
             return np.asarray(picture)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: cannot be read as a picture ({error}); {IMAGE_ADVICE}") from error
+        raise InputError(f"{path}: cannot be read as a picture ({error}); {advice}") from error

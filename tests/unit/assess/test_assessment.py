@@ -39,7 +39,7 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path
     run = run_hilstar_here("assess", ledger, telemetry, "-o", out, "--json", "--display-attitudes", "0")
     assert run.returncode == 0, run.stderr
     found = json.loads(run.stdout)
-    keys = ["bias_arcsec", "fov_arcsec", "pixel_arcsec", "noise_arcsec", "clock", "availability", "wrong"]
+    keys = ["bias_arcsec", "fov_arcsec", "pixel_arcsec", "noise_arcsec", "clock", "availability", "wrong", "limit_arcsec"]
     assert list(found) == keys
     assert list(found["clock"]) == ["offset_ms", "drift_ppm", "sigma_ms"]
     assert found["noise_arcsec"]["cross"] == pytest.approx(1.0, rel=0.1)

@@ -179,3 +179,40 @@ def _data(name):
 def _header(name):
     lines = _data(name).read_text().splitlines()
     return next(k for k, line in enumerate(lines) if line[:1].isdigit())
+
+
+# Hipparcos' facts by the names that Gaia and Tycho-2 give such columns.
+TABLE_NAMES = {
+    "sigma_ra_mas": "ra_error", "sigma_dec_mas": "dec_error", "sigma_parallax_mas": "parallax_error",
+    "sigma_pm_ra_mas_yr": "pmra_error", "sigma_pm_dec_mas_yr": "pmdec_error", "ra_dec_correlation": "ra_dec_corr",
+    "ra_pm_ra_correlation": "ra_pmra_corr", "dec_pm_ra_correlation": "dec_pmra_corr", "ra_pm_dec_correlation": "ra_pmdec_corr",
+    "dec_pm_dec_correlation": "dec_pmdec_corr", "pm_ra_pm_dec_correlation": "pmra_pmdec_corr", "sigma_bv_mag": "e_B-V",
+    "sigma_vi_mag": "e_V-I",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", ["csv", "fits", "vot"])
+def test_a_table_s_own_errors_and_types_are_carried_as_hipparcos_s_are(bench, tmp_path, ending):
+    from astropy.table import Table
+
+    stars = load_catalog().brighter_than(2.5)
+    facts = errors_of(stars)
+    columns = {"ra": stars.ra_deg, "dec": stars.dec_deg, "pmra": stars.pm_ra_cosdec_mas_yr, "pmdec": stars.pm_dec_mas_yr}
+    columns |= {"Vmag": stars.v_mag, "B-V": stars.bv_mag, "V-I": stars.vi_mag, "Plx": stars.parallax_mas}
+    columns |= {name: facts[role] for role, name in TABLE_NAMES.items()} | {"e_Vmag": sigma_v_mag(facts, stars.bv_mag)}
+    table = Table(columns | {"SpType": facts["spectral_type"].astype(str)})
+    table["ra_error"].unit = "mas"
+    forms = {"csv": {"format": "ascii.csv"}, "fits": {"format": "fits"}, "vot": {"format": "votable"}}
+    table.write(tmp_path / f"own.{ending}", overwrite=True, **forms[ending])
+    sky = {"spectrum": "mk", "catalogue": f"own.{ending}", "catalogue_epoch_jyear": 1991.25}
+    (tmp_path / "bench.toml").write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": sky}))
+    own = read_bench_file(tmp_path / "bench.toml")
+    found, wanted = bench_catalogue(own, 2.5, 2030.0).columns, bench_catalogue(bench, 2.5, 2030.0).columns
+    order, theirs = (np.lexsort((one["dec_deg"].values, one["v_mag"].values)) for one in (found, wanted))
+    names = [name for name in wanted if name.startswith("sigma_") or name.endswith("correlation")]
+    assert len(names) == 10
+    for name in names:
+        if name != "sigma_instrument_mag":  # by colour: a table's stars have no type that draws them
+            assert found[name].values[order] == pytest.approx(wanted[name].values[theirs], rel=1e-6, nan_ok=True), name
+    assert found["spectral_type"].values[order].tolist() == wanted["spectral_type"].values[theirs].tolist()
+    assert set(found["v_source"].values.tolist()) == {"U"}

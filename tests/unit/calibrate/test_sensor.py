@@ -146,6 +146,9 @@ def test_a_bench_takes_the_tables_that_are_written(tmp_path):
         ("K,0,DN/e-", "above 0"),
         ("K,much,DN/e-", "is not a finite number"),
         ("K,0.25,DN/e-\neta,60,%", "eta@530nm"),
+        ("K,0.25,DN/e-\neta@530nm,140,%", "emva.csv: eta@530nm = 140 %; write it from 0 to 100 %"),
+        ("K,0.25,DN/e-\neta@530nm,40,%\neta@530nm,44,%", "a wavelength twice"),
+        ("K,0.25,DN/e-\nbits,40,bit", "emva.csv: bits = 40; write a number from 1 to 16"),
     ],
 )
 def test_a_sheet_that_cannot_be_is_refused_in_one_line(tmp_path, monkeypatch, sheet, words):

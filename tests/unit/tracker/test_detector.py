@@ -271,6 +271,38 @@ def test_dark_currents_lie_as_their_law_says_about_one_mean_and_sigma(law, quant
         assert (dark < quantile(share)).mean() == pytest.approx(share, abs=error)
 
 
+QUANTILE_SHARES = (0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
+
+
+@pytest.mark.parametrize(
+    ("law", "of"),
+    [("normal", stats.norm(200, 40)), ("gamma", stats.gamma(4, scale=30)), ("log-normal", stats.lognorm(0.6, scale=100))],
+)
+def test_a_law_is_fitted_to_measured_quantiles(law, of):
+    points = tuple(zip(QUANTILE_SHARES, of.ppf(QUANTILE_SHARES).tolist(), strict=True))
+    settings = DetectorSettings(dark_distribution=law, dark_quantiles=points)
+    assert (settings.dark_e_per_s, settings.dsnu_e_per_s) == pytest.approx((of.mean(), of.std()), rel=1e-5)
+    assert replace(settings, prnu=0.01).dark_e_per_s == settings.dark_e_per_s
+    rates = Detector(settings, (600, 600)).dark_map_e_per_s
+    # A quantile of 360 000 pixels: 1 % of the sigma at 99 %, which is its largest error by five of its own sigmas.
+    assert np.quantile(rates, QUANTILE_SHARES) == pytest.approx(of.ppf(QUANTILE_SHARES), abs=0.05 * of.std())
+
+
+@pytest.mark.parametrize(
+    ("law", "points", "words"),
+    [
+        ("gamma", ((0.5, 3.0),), "two points or more"),
+        ("gamma", ((0.2, 3.0), (0.1, 4.0)), "both columns rising"),
+        ("gamma", ((0.0, 1.0), (0.5, 2.0)), "between 0 and 1"),
+        ("log-normal", ((0.2, 0.0), (0.5, 2.0)), "no rate of 0"),
+        ("normal", ((0.9, 1.0), (0.99, 200.0)), "mean below 0"),
+    ],
+)
+def test_quantiles_that_no_law_has_are_refused(law, points, words):
+    with pytest.raises(InputError, match=words):
+        DetectorSettings(dark_distribution=law, dark_quantiles=points)
+
+
 def test_offsets_of_pixels_stay_whatever_the_exposure_and_the_rows():
     settings = DetectorSettings(gain_e_per_dn=0.1, offset_dn=2000.0, bits=16, dsnu_e=20.0)
     image = Detector(settings, (256, 1024)).expose(np.zeros((1024, 256)), 0.0, generator()) * 0.1 - 200.0

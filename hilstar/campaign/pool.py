@@ -183,11 +183,10 @@ class Pool:
             lost(worker.task, backlog.died(worker.task))
 
     def __enter__(self) -> Pool:
-        self._processes.__enter__()
         return self
 
     def __exit__(self, *raised: object) -> None:
-        self._processes.__exit__(*raised)
+        self._processes.close()
 
 
 def _start_session(job: Job) -> tuple[Identity, Callable[[int, FloatArray], Answered]]:

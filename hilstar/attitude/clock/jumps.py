@@ -241,7 +241,7 @@ class JumpFilter:
             self._agreement_ns = max(AGREEMENT_NS, usual_max_ns)
 
     def _jumped(self, host_ns: int) -> list[SampleArrival]:
-        """The samples in doubt, once they are a jump: the clock is carried across, the earliest as late as ever; else none."""
+        """The samples in doubt where they prove a jump, on a clock that is carried across it; else []."""
         late_ns = [each.late_ns for each in self._doubtful]
         for_ns = host_ns - self._doubtful[0].arrival.host_ns
         if self._shows_none and not self._resumes:
@@ -251,7 +251,7 @@ class JumpFilter:
         if not is_jump or len(late_ns) < MIN_AGREEING:
             return []
         is_new = not self._resumes
-        self.correction_ns += round(min(late_ns))
+        self.correction_ns += round(min(late_ns))  # the earliest of them is then as late as the earliest ever was
         released = self.release()
         if is_new:
             self.jumps += 1

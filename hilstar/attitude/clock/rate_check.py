@@ -124,7 +124,7 @@ CAUSES, PERMUTATIONS = tuple(_causes()), tuple(_permutations())
 
 
 def _stretch_of(samples: Sequence[AttitudeSample]) -> _Stretch | None:
-    """What packets in a row say, in the order of their times; None where most are broken off from those before them."""
+    """Turn and mean rate of packets in the order of their times; None where most of them follow a break."""
     t_s = np.array([sample.t_ns - samples[0].t_ns for sample in samples]) / NS_PER_S
     q = np.array([sample.q_icrs_to_cam for sample in samples])
     rate = np.array([sample.rate_cam_rad_s for sample in samples])

@@ -268,11 +268,11 @@ class Senders:
         return self._give_way(main, self._waiting[-1].sender)
 
     def release(self) -> list[SampleArrival]:
-        """What waits still, as it is."""
+        """The messages that still wait, undecided."""
         return [each.arrival for each in self._emptied()]
 
     def _rival(self, arrival: SampleArrival, agreed: _CourseAgreement) -> _KnownSender | None:
-        """The stranger that a message is rather from, if there is one."""
+        """The stranger that a message fits better than the sender shown, if there is one."""
         best: _KnownSender | None = None
         score, far_rad = agreed.score, agreed.far_rad if agreed.sky else FAR_RATIO * agreed.far_rad
         for each in self._strangers:
@@ -311,7 +311,7 @@ class Senders:
         self._notices.begin(SECOND, "two senders on one link: showing the first, refusing the other (source)")
 
     def _is_too_often(self, main: _KnownSender, sample: AttitudeSample) -> bool:
-        """Whether one sender would not go to and fro like that: it has hardly begun to count, or it never counts."""
+        """True where one sender would hardly go to and fro like that: it has only begun to count, or it never counts."""
         if sample.sequence:
             return main.heard <= 2
         return main.still and self._courses >= MIN_COURSES and self._courses % 2 == 0

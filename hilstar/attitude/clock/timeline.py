@@ -134,8 +134,7 @@ class Attitude:
     """An attitude at one time, with the age, sequence and arrival of the newest sample behind it, and whether it is too old.
 
     `prediction_ns` is how far the attitude was propagated past that sample, and `rate_cam_rad_s` the rate at that time, None
-    where the attitude is held. `velocity_km_s` is that of the sample before it, and `place_km` where it has led from that
-    sample's place.
+    where the attitude is held. `velocity_km_s` is that of the sample before it, and `place_km` is carried on from that sample.
     """
 
     q_icrs_to_cam: FloatArray
@@ -153,9 +152,8 @@ class Attitude:
 class Policy:
     """How far to predict past the newest sample, how long it counts as fresh, and the maximum rate.
 
-    `prediction` "auto" carries a rate's jitter on as far as the samples show that it goes on (`damping`).
-
-    A sample whose rate exceeds `max_rate_rad_s` is refused; two samples farther apart than that are a jump.
+    With `prediction` "auto" a rate's jitter is carried on only as far as the samples show that it goes on. A sample whose rate
+    exceeds `max_rate_rad_s` is refused; two samples farther apart than that are a jump.
     """
 
     max_extrapolation_ns: int

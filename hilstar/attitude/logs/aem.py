@@ -219,7 +219,7 @@ def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
 
 
 def _piece(segment: _DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
-    """The attitudes of a segment from a time to another, both among them, made where it has none just then."""
+    """The attitudes of a segment from `start_ns` to `stop_ns`; an end where it has none is interpolated."""
     piece = segment.entries[bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)]
     own = {entry.event.t_ns for entry in (piece[:1] + piece[-1:]) if isinstance(entry.event, AttitudeSample)}
     if start_ns not in own:

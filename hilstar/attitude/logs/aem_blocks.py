@@ -455,7 +455,7 @@ def _leaves(element: _Element, path: str) -> Iterator[tuple[str, _Element]]:
 
 
 def _key(path: str, leaf: _Element, wanted: list[str], meta: dict[str, str]) -> str:
-    """The path by which a number is known: of a rotation about an axis that its attribute names."""
+    """The path of a number in STATES; the axis of a rotation may stand in an attribute."""
     if leaf.name not in {"rotation1", "rotation2", "rotation3"}:
         return path
     container = path.partition("/")[0]

@@ -247,7 +247,7 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
 
 
 def _zero_utc_ns(path: Path, stated: Stated, first_ns: int) -> int:
-    """What makes UTC (ns since 1970) of the log's times. Raises InputError as `stated_reference`."""
+    """What to add to the log's times to make them UTC, ns since 1970. Raises InputError as `stated_reference`."""
     dated = first_ns >= FIRST_DATE_NS
     if stated.epoch_utc is None:
         if not dated:

@@ -120,8 +120,8 @@ def parts_of(path: Path) -> list[Path]:
 def read_topics(path: Path, *, tell: bool = True) -> Iterator[tuple[str, bytes]]:
     """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
 
-    A file that ends so is said in one line of the log, once it is read, unless not `tell`. Raises InputError for damage, and
-    for anything but a regular file.
+    If `tell`, the log gets a line of the first file that lacks its end, once all are read. Raises InputError for damage, and for
+    anything but a regular file.
     """
     for part in parts_of(path):
         channels: dict[int, str] = {}
@@ -145,7 +145,7 @@ def unfinished_part(path: Path) -> Path | None:
 
 
 def read_messages(path: Path, topic: str, *, tell: bool = True) -> Iterator[bytes]:
-    """What the messages of one topic hold; a file without its end is said unless not `tell`. Raises InputError for damage."""
+    """The contents of the messages of one topic, as `read_topics`. Raises InputError for damage."""
     yield from (data for name, data in read_topics(path, tell=tell) if name == topic)
 
 

@@ -146,7 +146,7 @@ def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], fo
 
 
 def _messages(path: Path, file: IO[bytes], result: _Sieved) -> Iterator[tuple[int, bytes]]:
-    """Kind and content of every message that is whole; `result` gets what is not."""
+    """Kind and content of every whole message; `result` gets what is cut or damaged."""
     ends: list[int] = []
     last = file.tell()
     while True:
@@ -413,7 +413,7 @@ def _chosen(path: Path, topics: set[_ULogTopic], name: str, instance: int | None
 
 
 def _ready(path: Path, series: _Series, q: FloatArray, told: list[tuple[str, str]]) -> tuple[_Series, FloatArray]:
-    """The attitudes from the first that is one."""
+    """The attitudes from the first valid one on."""
     good = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0)
     if not good.any():
         raise InputError(f"{path}: all of its attitudes are zeros or NaN: the estimator never ran; give another log")

@@ -120,8 +120,8 @@ def parts_of(path: Path) -> list[Path]:
 def read_topics(path: Path, *, tell: bool = True) -> Iterator[tuple[str, bytes]]:
     """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
 
-    If `tell`, the log gets a line of the first file that lacks its end, once all are read. Raises InputError for damage, and for
-    anything but a regular file.
+    If `tell`, the log gets a line of the first file that lacks its end, once all are read. Raises InputError for damage, and
+    for anything but a regular file.
     """
     for part in parts_of(path):
         channels: dict[int, str] = {}

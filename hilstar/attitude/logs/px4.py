@@ -351,7 +351,7 @@ def _of(topics: dict[_ULogTopic, _Series], names: tuple[str, ...]) -> list[_Seri
     return [topics[topic] for name in names for topic in sorted(topics) if topic.name == name]
 
 
-class Turning(NamedTuple):
+class _Turning(NamedTuple):
     """What turns north, east, down to the ICRS: UTC at boot (ns since 1970), the place at each attitude, and both in words.
 
     `latitude_deg` and `longitude_deg` (n,) are geodetic.
@@ -389,7 +389,7 @@ def read_ulog(path: Path, stated: Stated) -> LogReading:
     series, q = _ready(path, series, q, told)
     boot_utc_ns, utc_words = _boot_utc(path, stated, topics, told)
     latitude_deg, longitude_deg, place_words = _place_at(path, stated, topics, series.t_us, suffix)
-    turning = Turning(boot_utc_ns, utc_words, latitude_deg, longitude_deg, place_words)
+    turning = _Turning(boot_utc_ns, utc_words, latitude_deg, longitude_deg, place_words)
     rates = _rates(series, topics, suffix)
     first_ns, last_ns = (int(t_us) * 1000 + turning.boot_utc_ns for t_us in (series.t_us.min(), series.t_us.max()))
     beyond = earth.beyond_table(first_ns, last_ns)
@@ -433,7 +433,7 @@ def _rates(series: _Series, topics: dict[_ULogTopic, _Series], suffix: str) -> F
     return None
 
 
-def _entries(series: _Series, q: FloatArray, rates: FloatArray | None, turning: Turning) -> Iterator[LogEntry]:
+def _entries(series: _Series, q: FloatArray, rates: FloatArray | None, turning: _Turning) -> Iterator[LogEntry]:
     counter = series.columns.get("quat_reset_counter", np.zeros(len(q)))
     resets = [False, *np.diff(counter.astype(np.int64)).astype(bool).tolist()]
     with np.errstate(all="ignore"):
@@ -444,7 +444,7 @@ def _entries(series: _Series, q: FloatArray, rates: FloatArray | None, turning: 
         yield LogEntry(f": attitude {number}", checked_sample(t_us * 1000, tuple(own), known, discontinuity=reset))
 
 
-def _conventions(topic: _ULogTopic, series: _Series, turning: Turning, has_rates: bool) -> Conventions:
+def _conventions(topic: _ULogTopic, series: _Series, turning: _Turning, has_rates: bool) -> Conventions:
     q_icrs_to_ned = turning.q_icrs_to_ned(series.t_us[:1], slice(1))[0]
     begin_s = int(series.t_us[0]) / 1e6
     words = "turns components of the body (front, right, down) into north, east, down"

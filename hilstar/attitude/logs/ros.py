@@ -310,22 +310,18 @@ def _listed(names: list[str], count: int, limit: int) -> str:
     return shortened(", ".join([*names[:count], *["..."] * (len(names) > count)]), limit)
 
 
-class _Named(NamedTuple):
-    """What `--reference` says: the frame of the bag, and what its axes are; None for what it does not say."""
+def named(reference: str | None) -> tuple[str | None, Kind | None]:
+    """What `--reference` says: the frame of the bag, and what its axes are; None for what it does not say.
 
-    frame: str | None = None
-    kind: Kind | None = None
-
-
-def named(reference: str | None) -> _Named:
-    """What `--reference` says. Raises InputError for a meaning that is none."""
+    Raises InputError for a meaning that is none.
+    """
     frame, equals, meaning = (reference or "").rpartition("=")
     kind = KINDS.get(meaning.lower())
     if equals and kind is None:
         raise InputError(
             f"--reference {reference}: the axes of {frame} are {FORM}; write --reference {frame}=icrs, for example"
         )
-    return _Named(reference) if kind is None else _Named(frame or None, kind)
+    return (reference, None) if kind is None else (frame or None, kind)
 
 
 def _kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]) -> Kind:
@@ -359,20 +355,9 @@ class _Heard(NamedTuple):
     receive_ns: int
     turn: _RosTurn
 
-
-class _Start(NamedTuple):
-    """The first orientation, and whether the messages have times of their own."""
-
-    turn: _RosTurn
-    receive_ns: int
-    stamped: bool
-
-    def t_ns(self, turn: _RosTurn, receive_ns: int) -> int:
-        return (turn.stamp_ns or 0) if self.stamped else receive_ns
-
-    @property
-    def first_ns(self) -> int:
-        return self.t_ns(self.turn, self.receive_ns)
+    def t_ns(self, stamped: bool) -> int:
+        """Its time, where the messages of its topic have times of their own or not."""
+        return (self.turn.stamp_ns or 0) if stamped else self.receive_ns
 
 
 def read_ros(bag: Bag, stated: Stated) -> LogReading:
@@ -381,26 +366,29 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     _check_definition(f"{bag.path}: {topic.name}", topic)
     told: list[tuple[str, str]] = []
     every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
-    start, heard = _begin(bag, topic, every, stated.body)
-    if not start.stamped:
+    first, stamped, heard = _begin(bag, topic, every, stated.body)
+    if not stamped:
         told.append(("log-stamp", f"the messages of {topic.name} have no time of their own; when they were recorded is taken"))
     why = f"the messages of {topic.name} do not say which frame their orientation refers to"
     if topic.type == IMU:
         why += " (ROS recommends east, north, up: REP 145)"
-    kind = _kind_of_frame(bag.path, start.turn.reference, stated, why, told)
-    reference = stated_reference(bag.path, kind, stated, start.first_ns)
-    entries = to_icrs(_entries(heard, start), reference, start.turn.gyro, told)
-    body = start.turn.body
+    kind = _kind_of_frame(bag.path, first.turn.reference, stated, why, told)
+    reference = stated_reference(bag.path, kind, stated, first.t_ns(stamped))
+    entries = to_icrs(_entries(heard, first.turn, stamped), reference, first.turn.gyro, told)
+    body = first.turn.body
     # An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would turn it twice.
     if body is not None and body.endswith(OPTICAL) and abs(stated.mounting.q_body_to_cam[0]) < 1:
         told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
     return LogReading(
-        _with_notices(in_order(entries, told), bag, told), _conventions(topic, start, reference), ORDER_ADVICE, told
+        _with_notices(in_order(entries, told), bag, told), _conventions(topic, first, stamped, reference), ORDER_ADVICE, told
     )
 
 
-def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None) -> tuple[_Start, Iterator[_Heard]]:
-    """What the first orientations say, and all of those of the stated body. Raises InputError where there are none."""
+def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None) -> tuple[_Heard, bool, Iterator[_Heard]]:
+    """The first orientation of the stated body, whether the messages have times of their own, and all of its orientations.
+
+    Raises InputError where there are none.
+    """
     first = next(heard, None)
     if first is None:
         raise InputError(f"{bag.path}: has no message of {topic.name}; record it, or choose another with --topic")
@@ -415,7 +403,7 @@ def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None)
         raise InputError(f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has")
     # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
     stamped = any(each.turn.stamp_ns for each in begin)
-    return _Start(begin[0].turn, begin[0].receive_ns, stamped), chain(begin, heard)
+    return begin[0], stamped, chain(begin, heard)
 
 
 def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
@@ -459,26 +447,25 @@ def _of_tf(bag: Bag, topic: BagTopic, stated: Stated, told: list[tuple[str, str]
     statics = [other for other in bag.topics() if other.type in TF_TYPES and other.name == beside and other != topic]
     tree = _Tree(bag.path, chain.from_iterable(_of_topic(bag, each) for each in [*statics, topic]))
     body = None if stated.body is None else frame(stated.body)
-    yield from tree.chain(body, named(stated.reference).frame).heard(told)
+    yield from tree.chain(body, named(stated.reference)[0]).heard(told)
 
 
-def _entries(heard: Iterator[_Heard], start: _Start) -> Iterator[LogEntry]:
+def _entries(heard: Iterator[_Heard], first: _RosTurn, stamped: bool) -> Iterator[LogEntry]:
     """Each attitude from the reference to the body, at its time, or why it is none."""
-    for where, receive_ns, turn in heard:
-        w, x, y, z = turn.q
-        fault = _fault(turn, start)
-        yield LogEntry(where, fault or checked_sample(start.t_ns(turn, receive_ns), (w, -x, -y, -z), turn.rate))
+    for each in heard:
+        w, x, y, z = each.turn.q
+        fault = _fault(each.turn, first, stamped)
+        yield LogEntry(each.where, fault or checked_sample(each.t_ns(stamped), (w, -x, -y, -z), each.turn.rate))
 
 
-def _fault(turn: _RosTurn, start: _Start) -> Refusal | None:
-    first = start.turn
+def _fault(turn: _RosTurn, first: _RosTurn, stamped: bool) -> Refusal | None:
     if turn.fault is not None:
         return Refusal("format", turn.fault)
     if turn.reference != first.reference:
         return Refusal("format", f"refers to the frame {turn.reference!r}, the first to {first.reference!r}")
     if turn.body != first.body:
         return Refusal("format", f"is of the frame {turn.body!r}, the first of {first.body!r}; choose one with --body")
-    if turn.stamp_ns and not start.stamped:
+    if turn.stamp_ns and not stamped:
         return Refusal("time", "some messages have a stamp and some have none (0); set it in all of them")
     return None
 
@@ -489,9 +476,9 @@ def _with_notices(entries: Iterator[LogEntry], bag: Bag, told: list[tuple[str, s
     told.extend(bag.told())
 
 
-def _conventions(topic: BagTopic, start: _Start, reference: Reference) -> Conventions:
-    turn, t_ns = start.turn, start.first_ns
-    if not start.stamped:
+def _conventions(topic: BagTopic, first: _Heard, stamped: bool, reference: Reference) -> Conventions:
+    turn, t_ns = first.turn, first.t_ns(stamped)
+    if not stamped:
         time = "when each message was recorded, ns since 1970"
     elif t_ns >= FIRST_DATE_NS:
         time = "header.stamp: UTC, ns since 1970-01-01T00:00:00, leap seconds not counted"

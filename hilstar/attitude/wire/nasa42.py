@@ -120,22 +120,18 @@ class MessageReader:
         t_ns = _time_ns(text)
         if t_ns is None:
             return Refusal("format", f"no TIME YYYY-DDD-hh:mm:ss, but {text[:SHOWN_CHARACTERS]!r}")
-        found = {name: _numbers(values) for name, values in self._line.findall(text)}
+        try:
+            found = {name: tuple(map(float, values.split())) for name, values in self._line.findall(text)}
+        except ValueError:
+            found = {"qn": ()}
         if "qn" not in found:
             return Refusal("format", f'no {self._name}.qn; write the prefix "{self._name}" in Inp_IPC.txt')
         q, rate = found["qn"], found.get("wn", ())
-        if q is None or len(q) != 4 or rate is None or len(rate) not in {0, 3}:
+        if len(q) != 4 or len(rate) not in {0, 3}:
             return Refusal("format", f"{self._name}.qn must have four numbers, and wn three")
         x, y, z, w = q
         body = checked_sample(t_ns, (w, -x, -y, -z), tuple(rate) or None, self._sequence)
         return body if isinstance(body, Refusal) else self._mounting.sample(body)
-
-
-def _numbers(text: str) -> tuple[float, ...] | None:
-    try:
-        return tuple(float(word) for word in text.split())
-    except ValueError:
-        return None
 
 
 def _time_ns(text: str) -> int | None:

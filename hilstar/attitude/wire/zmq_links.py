@@ -211,8 +211,10 @@ class ZmqSender(ZmqSocket):
         with contextlib.suppress(zmq.Again):
             self._ready().send(message, zmq.NOBLOCK)
 
-    def _linger_ms(self) -> int:
-        return self.LINGER_MS if caught() is None else self.STOPPED_LINGER_MS
+    def close(self) -> None:
+        """Close the socket; messages not sent within its linger time are lost."""
+        self._shut(self.LINGER_MS if caught() is None else self.STOPPED_LINGER_MS)
+        super().close()
 
 
 class ZmqLockstep(ZmqSocket, LockstepLink):

@@ -403,15 +403,12 @@ class ZmqSocket(Link):
         self._keeper = self._socket = None
 
     def close(self) -> None:
-        """Close the socket; messages not sent within its linger time are lost."""
-        self._shut(self._linger_ms())
+        """Close the socket."""
+        self._shut()
         if self._authenticator is not None:
             self._authenticator.stop()
         self._context.term()
         self._memory.close()
-
-    def _linger_ms(self) -> int:
-        return 0
 
 
 def _endpoint_trouble(endpoint: str, bind: bool, error: zmq.ZMQError) -> str:

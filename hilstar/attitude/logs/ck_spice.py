@@ -594,30 +594,25 @@ def _coverages(spice: Any, daf: _Daf, segments: list[_CkSegment]) -> list[Covera
 
 
 def _body(spice: Any, path: Path, segments: list[_CkSegment], stated: str | None) -> int:
-    """The id of the structure: the only one, or what the user states."""
+    """The id of the structure: the only one, or what the user states by a number, a frame's name or a body's."""
     bodies = sorted({segment.body for segment in segments})
     named = ", ".join(_name(spice, body) for body in bodies[:MAX_NAMED_BODIES]) + (", ..." * (len(bodies) > MAX_NAMED_BODIES))
     if stated is None:
         if len(bodies) > 1:
             raise InputError(f"{path}: contains several structures, {named}; choose one: --body ID")
         return bodies[0]
-    body = _id_of(spice, stated)
-    if body not in bodies:
-        raise InputError(f"{path}: contains no structure {stated!r}; it has {named}: --body ID, or a name of its frame kernel")
-    return body
-
-
-def _id_of(spice: Any, stated: str) -> int | None:
-    """The id that a user means: a number, a frame's name or a body's."""
+    body: int | None
     try:
-        return int(stated)
+        body = int(stated)
     except ValueError:
         frame = spice.namfrm(stated)
-        _, kind, identity, found = spice.frinfo(frame) if frame else (0, 0, 0, False)
-        if found and kind == CK_CLASS:
-            return int(identity)
-        body, found = spice.bods2c(stated)
-        return int(body) if found else None
+        _, kind, body, found = spice.frinfo(frame) if frame else (0, 0, 0, False)
+        if not found or kind != CK_CLASS:
+            body, found = spice.bods2c(stated)
+            body = body if found else None
+    if body is None or body not in bodies:
+        raise InputError(f"{path}: contains no structure {stated!r}; it has {named}: --body ID, or a name of its frame kernel")
+    return body
 
 
 def _name(spice: Any, body: int) -> str:

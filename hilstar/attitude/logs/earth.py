@@ -243,21 +243,16 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
         return Reference(kind)
     if stated.place is None:
         raise InputError(f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place LAT,LON,HEIGHT")
-    return Reference(kind, stated.place[:2], _zero_utc_ns(path, stated, first_ns))
-
-
-def _zero_utc_ns(path: Path, stated: Stated, first_ns: int) -> int:
-    """What to add to the log's times to make them UTC, ns since 1970. Raises InputError as `stated_reference`."""
-    dated = first_ns >= FIRST_DATE_NS
-    if stated.epoch_utc is None:
-        if not dated:
+    dated, utc_ns = first_ns >= FIRST_DATE_NS, 0
+    if dated and stated.epoch_utc is not None:
+        raise InputError(f"{path}: its times are dates already (ns since 1970); leave out --epoch-utc")
+    if not dated:
+        if stated.epoch_utc is None:
             raise InputError(
                 f"{path}: its times begin at {first_ns / NS_PER_S:.9g} s, no date; give --epoch-utc TIME, UTC at 0 s"
             )
-        return 0
-    if dated:
-        raise InputError(f"{path}: its times are dates already (ns since 1970); leave out --epoch-utc")
-    return utc_ns_of(stated.epoch_utc, "--epoch-utc")
+        utc_ns = utc_ns_of(stated.epoch_utc, "--epoch-utc")
+    return Reference(kind, stated.place[:2], utc_ns)
 
 
 def to_icrs(entries: Iterable[LogEntry], reference: Reference, gyro: bool, told: list[tuple[str, str]]) -> Iterator[LogEntry]:

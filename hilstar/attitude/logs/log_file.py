@@ -74,27 +74,23 @@ def _read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
         yield LogEntry(f":{reader.line_num}", Refusal("format", detail))
         return
     places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
+    wanted = f"write finite numbers for {','.join(CSV_COLUMNS)}"
+    if len(places) > len(CSV_COLUMNS):
+        wanted += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
     for row in rows:
-        yield LogEntry(f":{reader.line_num}", _sample(row, places))
-
-
-def _sample(row: list[str], places: dict[str, int]) -> AttitudeSample | Refusal:
-    try:
-        cells = {name: row[place].strip() for name, place in places.items()}
-        t_ns = ns_of_seconds(cells["t_s"])
-        q = tuple(float(cells[name]) for name in CSV_COLUMNS[1:])
-        turning = [cells.get(name, "") for name in RATE_COLUMNS]
-        rate = tuple(map(float, turning)) if any(turning) else None
-        sequence = int(cells.get("sequence") or 0)
-        discontinuity = {"": False, "0": False, "1": True}[cells.get("discontinuity", "")]
-        if sequence not in WHOLE_NUMBERS:
-            raise ValueError
-    except (ValueError, LookupError, ArithmeticError):
-        wanted = f"write finite numbers for {','.join(CSV_COLUMNS)}"
-        if len(places) > len(CSV_COLUMNS):
-            wanted += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
-        return Refusal("format", f"{','.join(row)[:MAX_QUOTED_CHARACTERS]!r}; {wanted}")
-    return checked_sample(t_ns, q, rate, sequence, discontinuity)
+        try:
+            cells = {name: row[place].strip() for name, place in places.items()}
+            q = tuple(float(cells[name]) for name in CSV_COLUMNS[1:])
+            turning = [cells.get(name, "") for name in RATE_COLUMNS]
+            rate = tuple(map(float, turning)) if any(turning) else None
+            sequence = int(cells.get("sequence") or 0)
+            discontinuity = {"": False, "0": False, "1": True}[cells.get("discontinuity", "")]
+            if sequence not in WHOLE_NUMBERS:
+                raise ValueError
+            event = checked_sample(ns_of_seconds(cells["t_s"]), q, rate, sequence, discontinuity)
+        except (ValueError, LookupError, ArithmeticError):
+            event = Refusal("format", f"{','.join(row)[:MAX_QUOTED_CHARACTERS]!r}; {wanted}")
+        yield LogEntry(f":{reader.line_num}", event)
 
 
 def ns_of_seconds(seconds: str) -> int:

@@ -268,7 +268,13 @@ def _boot_utc(path: Path, stated: Stated, topics: dict[_ULogTopic, _Series], tol
 
     Raises InputError where there is neither.
     """
-    offsets_us = _offsets_us(topics)
+    offsets_us = np.array([], dtype=np.int64)  # UTC less the boot clock (n,), microseconds
+    for series in _of(topics, GPS):  # of the first receiver that has dates
+        utc_us = series.columns.get("time_utc_usec", np.zeros(len(series.t_us)))
+        good = (utc_us >= FIRST_DATE_US) & (utc_us < LAST_DATE_US)
+        if good.any():
+            offsets_us = utc_us[good].astype(np.int64) - _fixed_us(series)[good]
+            break
     gps_ns = round(float(np.median(offsets_us - offsets_us[0]))) * 1000 + int(offsets_us[0]) * 1000 if len(offsets_us) else None
     if stated.epoch_utc is not None:
         boot_ns = earth.utc_ns_of(stated.epoch_utc, "--epoch-utc")
@@ -285,18 +291,6 @@ def _boot_utc(path: Path, stated: Stated, topics: dict[_ULogTopic, _Series], tol
         turned = earth.UT1_ARCSEC_PER_S * spread_s / 2
         told.append(("log-utc", f"GPS times differ by {spread_s:.3g} s; the sky may be turned by {turned:.2g} arcsec"))
     return gps_ns, f"{epoch_text(gps_ns)} by {len(offsets_us)} GPS times, 90 % of them within {spread_s:.3g} s"
-
-
-def _offsets_us(topics: dict[_ULogTopic, _Series]) -> IntArray:
-    """UTC less the boot clock (n,), microseconds, of the first receiver that has dates."""
-    for series in _of(topics, GPS):
-        utc_us = series.columns.get("time_utc_usec")
-        if utc_us is None:
-            continue
-        good = (utc_us >= FIRST_DATE_US) & (utc_us < LAST_DATE_US)
-        if good.any():
-            return np.asarray(utc_us[good].astype(np.int64) - _fixed_us(series)[good])
-    return np.array([], dtype=np.int64)
 
 
 def _fixed_us(series: _Series) -> IntArray:

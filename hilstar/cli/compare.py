@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -35,31 +35,25 @@ def compare(
     comparison = compare_files(frame, golden, flux_mag=limits[0], centroid_px=limits[1], truth=truth)
     if output is not None:
         write_report(make_directory(output), comparison)
+    summary = comparison.summary()
     if as_json:
-        print_json(comparison.summary())
+        print_json(summary)
     else:
-        where = " (-o DIR writes a table of all)" if output is None else f" (in {output / 'compare.csv'})"
         if comparison.common is not None:
             typer.echo(f"{'in common':20}{comparison.common.line()}")
-        tell(comparison.summary(), star_lines(comparison, MAX_LINES, where))
+        rest = f"{summary['blends']} of them blends, {summary['unmeasured']} more with too little light of their own in view"
+        typer.echo(f"{'stars compared':20}{summary['stars']}, {rest}")
+        for name, unit in (("flux", "mag"), ("centroid", "px")):
+            errors, limit = summary[f"{name}_error_{unit}"], summary["limits"][f"{name}_{unit}"]
+            three = " / ".join("-" if value is None else f"{value:.2g}" for value in errors.values())
+            typer.echo(f"{name + ' error':20}{three} {unit} (rms / 95 % / max; limit {limit:g})")
+        if summary["widened"]:
+            why = "for rounding of the light around them or the image's edge"
+            typer.echo(f"{'wider limits':20}{summary['widened']} stars, {why}")
+        typer.echo(f"{'missing, extra':20}{summary['missing']}, {summary['extra']}")
+        where = " (-o DIR writes a table of all)" if output is None else f" (in {output / 'compare.csv'})"
+        for line in star_lines(comparison, MAX_LINES, where):
+            typer.echo(f"{'':20}{line}")
+        typer.echo(f"{'verdict':20}{'the same sky' if comparison.same else 'NOT the same sky'}")
     if not comparison.same:
         raise typer.Exit(1)
-
-
-def tell(summary: dict[str, Any], lines: list[str]) -> None:
-    """Print the comparison as text."""
-
-    def three(errors: dict[str, float | None]) -> str:
-        return " / ".join("-" if value is None else f"{value:.2g}" for value in errors.values())
-
-    rest = f"{summary['blends']} of them blends, {summary['unmeasured']} more with too little light of their own in view"
-    typer.echo(f"{'stars compared':20}{summary['stars']}, {rest}")
-    for name, unit in (("flux", "mag"), ("centroid", "px")):
-        errors, limit = summary[f"{name}_error_{unit}"], summary["limits"][f"{name}_{unit}"]
-        typer.echo(f"{name + ' error':20}{three(errors)} {unit} (rms / 95 % / max; limit {limit:g})")
-    if summary["widened"]:
-        typer.echo(f"{'wider limits':20}{summary['widened']} stars, for rounding of the light around them or the image's edge")
-    typer.echo(f"{'missing, extra':20}{summary['missing']}, {summary['extra']}")
-    for line in lines:
-        typer.echo(f"{'':20}{line}")
-    typer.echo(f"{'verdict':20}{'the same sky' if summary['same'] else 'NOT the same sky'}")

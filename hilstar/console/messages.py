@@ -12,7 +12,7 @@ import mmap
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -262,6 +262,19 @@ class SharedMemory:
     def make(cls, picture_bytes: int) -> SharedMemory:
         """New memory for pictures of at most `picture_bytes`."""
         return cls(os.memfd_create("hilstar-console"), picture_bytes)
+
+    def put_picture(self, head: PictureHead, levels: np.ndarray, sprites: Sequence[np.ndarray] = ()) -> None:
+        """Write a picture: its levels (h, w), and the star, x and y of its sprites, (n,) each. Raises ValueError (size)."""
+        end = PICTURE_HEAD_BYTES + levels.nbytes
+        whole = end + head.sprites * SPRITE.itemsize
+        self.pictures.begin()
+        room = self.pictures.room(whole)
+        room[: PICTURE.size] = PICTURE.pack(*head)
+        np.copyto(np.frombuffer(room[PICTURE_HEAD_BYTES:end], dtype=levels.dtype).reshape(levels.shape), levels)
+        if head.sprites:
+            target = np.frombuffer(room[end:], dtype=SPRITE)
+            target["star"], target["x_px"], target["y_px"] = sprites
+        self.pictures.end(whole, 0)
 
     @property
     def want(self) -> PictureRequest:

@@ -24,9 +24,7 @@ from hilstar.console.messages import (
     HAS_AGE,
     MAX_SPRITES,
     MISSING,
-    PICTURE,
     PICTURE_HEAD_BYTES,
-    SPRITE,
     STALE,
     Order,
     OrderAnswer,
@@ -121,23 +119,16 @@ class FramePublisher:
 
     def _copy(self, shown: Shown) -> None:
         """Copy a picture: levels, attitude, and the places of its stars."""
-        ring, levels, sprites = self._memory.pictures, shown.drawn.levels, shown.drawn.sprites
+        levels, sprites = shown.drawn.levels, shown.drawn.sprites
         height, width = levels.shape
-        count = 0 if sprites is None else min(len(sprites), MAX_SPRITES)
-        start = PICTURE_HEAD_BYTES
-        end = start + levels.nbytes
-        whole = end + count * SPRITE.itemsize
-        ring.begin()
-        room = ring.room(whole)
+        places: list[np.ndarray] = []
+        if sprites is not None:
+            kept = brightest(sprites.data["electrons_per_s"], MAX_SPRITES)
+            places = [part if kept is None else part[kept] for part in (sprites.star, sprites.x_px, sprites.y_px)]
+        count = len(places[0]) if places else 0
         q = () if shown.attitude is None else shown.attitude.q_icrs_to_cam.tolist()
-        head = PICTURE.pack(*PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q))
-        room[: len(head)] = head
-        np.copyto(np.frombuffer(room[start:end], dtype=levels.dtype).reshape(height, width), levels)
-        if sprites is not None and count:
-            target, kept = np.frombuffer(room[end:], dtype=SPRITE), brightest(sprites.data["electrons_per_s"], MAX_SPRITES)
-            which = slice(None) if kept is None else kept
-            target["star"], target["x_px"], target["y_px"] = sprites.star[which], sprites.x_px[which], sprites.y_px[which]
-        ring.end(whole, 0)
+        head = PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q)
+        self._memory.put_picture(head, levels, places)
 
 
 MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
@@ -432,7 +423,7 @@ def opened_page(
         yield feed, requests
 
 
-CODE = np.dtype("<u2")
+CODE_BYTES = 2
 FAILED = "failed:"  # as `first-light` says of a step
 
 
@@ -448,17 +439,13 @@ class SessionPublisher:
     def show(self, pattern: Pattern) -> None:
         """Publish the pattern now shown; of a coloured one the brightest channel."""
         codes = pattern.codes if pattern.codes.ndim == 2 else pattern.codes.max(axis=2)
-        ring, (height, width) = self._memory.pictures, codes.shape
-        whole = PICTURE_HEAD_BYTES + codes.size * CODE.itemsize
-        if whole > ring.slot_bytes:  # a step has found that the monitor is larger than the bench file said
+        height, width = codes.shape
+        # A step may have found that the monitor is larger than the bench file said.
+        if PICTURE_HEAD_BYTES + codes.nbytes > self._memory.pictures.slot_bytes:
             return
         self._patterns += 1
-        ring.begin()
-        room = ring.room(whole)
-        head = PICTURE.pack(*PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, CODE.itemsize, 0))
-        room[: len(head)] = head
-        np.copyto(np.frombuffer(room[PICTURE_HEAD_BYTES:], dtype=CODE).reshape(height, width), codes)
-        ring.end(whole, 0)
+        head = PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, codes.itemsize, 0)
+        self._memory.put_picture(head, codes)
         self.tell("pattern", f"shows {pattern.name}")
 
     def say(self, line: str) -> None:
@@ -499,7 +486,7 @@ def session_page(listener: PageListener, control: bool, file: BenchFile) -> Iter
     """The page of a session while this is open."""
     monitor = file.config.monitor
     width, height = monitor.resolution_px
-    picture_bytes = width * height * CODE.itemsize
+    picture_bytes = width * height * CODE_BYTES
     memory = SharedMemory.make(picture_bytes)
     feed = SessionPublisher(memory)
     setup = setup_for(listener, control, RunDescription("first-light", "session", "", "session"), file, picture_bytes)

@@ -155,7 +155,8 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
         if context.is_too_bright(looked):
             raise InputError(f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step")
         noise_dn = noisiest_background(looked.image).noise
-        parts.append(_sums(_Lattice(firsts, period, reach), context.resolution_px, seen, looked.image, bad))
+        size, first = np.array(context.resolution_px), np.array(firsts)
+        parts.append(_sums(seen, looked.image, bad, firsts=first, period=period, reach=reach, size=size))
     columns, rows, light = (np.concatenate(part) for part in zip(*parts, strict=True))
     lit = light > 0
     if lit.sum() < MIN_DOTS:
@@ -186,26 +187,18 @@ class DotSums(NamedTuple):
     light: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class _Lattice:
-    """The first dot (x, y), the period, and the radius over which a dot's light is summed; monitor px."""
+def _sums(
+    looked_at: FloatArray, image: FloatArray, bad: BoolArray, *, firsts: IntArray, period: int, reach: float, size: IntArray
+) -> DotSums:
+    """The dots without a bad pixel in reach, and the sum of the image (h, w) in reach of each.
 
-    firsts: list[int]
-    period: int
-    reach: float
-
-
-def _sums(lattice: _Lattice, resolution_px: tuple[int, int], seen: FloatArray, image: FloatArray, bad: BoolArray) -> DotSums:
-    """The dots without a bad pixel in reach, and the sum of the image in reach of each.
-
-    `seen` (2, h * w) is where each pixel of the tracker looks, monitor px.
+    `looked_at` (2, h * w) is where each pixel looks on the monitor of `size`, px, whose dots are every `period` from `firsts`.
     """
-    firsts, period = np.array(lattice.firsts), lattice.period
-    counts = [(size - first - DOT_PX // 2 - 1) // period + 1 for size, first in zip(resolution_px, firsts, strict=True)]
-    place = (np.nan_to_num(seen, nan=-1e9) - firsts[:, None]) / period
+    counts = (size - firsts - DOT_PX // 2 - 1) // period + 1
+    place = (np.nan_to_num(looked_at, nan=-1e9) - firsts[:, None]) / period
     nearest = np.rint(place)
     inside = (nearest >= 0).all(axis=0) & (nearest[0] < counts[0]) & (nearest[1] < counts[1])
-    inside &= np.hypot(*(place - nearest)) * period <= lattice.reach
+    inside &= np.hypot(*(place - nearest)) * period <= reach
     index = (nearest[1][inside] * counts[0] + nearest[0][inside]).astype(np.intp)
     total = counts[0] * counts[1]
     light = np.asarray(np.bincount(index, image.ravel()[inside], minlength=total), dtype=np.float64)

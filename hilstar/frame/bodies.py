@@ -113,7 +113,15 @@ class BodyLayer:
             reach_rad += view.turn.speed_rad_s * (view.scan.hold_s / 2 if view.exposed else view.scan.longest_s)
         axis = view.icrs_to_image(self.canvas.camera)[2]
         found = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
-        return [disc for k, disc in enumerate(found) if not k or not _hidden(disc, found[:k])]
+        kept = []
+        for k, disc in enumerate(found):
+            places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)]) if k else disc.direction[None]
+            through = np.ones(len(places))
+            for nearer in found[:k]:
+                through *= nearer.transmission(places)
+            if through.max() >= HIDDEN:
+                kept.append(disc)
+        return kept
 
     def _still(self, icrs_to_image: FloatArray) -> DiscView:
         return DiscView(self.canvas.camera, self.canvas.psf, (Pose(icrs_to_image),))
@@ -175,15 +183,6 @@ class BodyLayer:
         on_image = camera.contains_px(*camera.project(places @ light.icrs_to_image.T))
         of_face = float(light.disc.radiance(places[on_image]).max(initial=0.0))
         return max(float(light.disc.radiance(seen @ light.icrs_to_image).max()), of_face)
-
-
-def _hidden(disc: Disc, nearer: list[Disc]) -> bool:
-    """Whether other discs hide one: its middle and all of its limb."""
-    places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)])
-    through = np.ones(len(places))
-    for one in nearer:
-        through *= one.transmission(places)
-    return bool(through.max() < HIDDEN)
 
 
 def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:

@@ -164,20 +164,15 @@ class FaultView:
             fault = one.fault
             if not isinstance(fault, FalseStar | Flash) or fault.tracker_px is not None or fault.screen_px is not None:
                 continue
-            direction = self._direction(fault, stars)
-            if direction is not None:
-                vectors.append(direction)
+            if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
+                # A star too faint to show is among all of the bench's stars.
+                at = [known.vectors[place] for known in (stars, self.by.stars) for place in self._places(known, fault)[:1]]
+            else:
+                at = [self.by.apparent(icrs_direction(fault)[None])[0]]
+            if at:
+                vectors.append(at[0])
                 lights.append(self._added(fault, one.share))
         return np.reshape(vectors, (-1, 3)), lights
-
-    def _direction(self, fault: FalseStar | Flash, stars: Stars) -> FloatArray | None:
-        if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
-            for known in (stars, self.by.stars):  # a star too faint to show is among all of the bench's stars
-                found = self._places(known, fault)
-                if len(found):
-                    return np.asarray(known.vectors[found[0]])
-            return None
-        return np.asarray(self.by.apparent(icrs_direction(fault)[None])[0])
 
     def star_direction(self, fault: Fault) -> FloatArray | None:
         """The direction (3,), ICRS, of the star that a fault is about; None if it is about none."""

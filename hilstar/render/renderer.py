@@ -121,7 +121,7 @@ class Renderer(Backend):
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, self._by_pixel)
             lit_e_per_s = self._by_pixel.lit_from_e_per_s(panel)
             self._lit_sides = () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
-            self._encoder.shrink(self._lit_sides)
+            set_sides(self._encoder.sprite_program, self._lit_sides)
             if lit_e_per_s and not target.sides:
                 self._cut_sides = lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS)
             # The passes count thresholds alone.
@@ -277,16 +277,6 @@ class Renderer(Backend):
         self._floor_key, self._floor_levels = (lights, turn), levels.read().copy()
         return self._floor_levels
 
-    def _upload(self, sprites: Sprites) -> None:
-        if len(sprites) > self._capacity:
-            self._splat_vao.release()
-            if self._unit_vao is not None:
-                self._unit_vao.release()
-            self._buffer.release()
-            self._reserve(max(2 * self._capacity, len(sprites)))
-        self._buffer.orphan()
-        self._buffer.write(sprites.data)
-
     def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn = None
@@ -300,7 +290,13 @@ class Renderer(Backend):
             self._regions = self._extended.draw(self._linear_fbo, sprites.extended)
         if sprites is not None and len(sprites):
             with self._stage("upload"):
-                self._upload(sprites)
+                if len(sprites) > self._capacity:
+                    for held in (self._splat_vao, self._unit_vao, self._buffer):
+                        if held is not None:
+                            held.release()
+                    self._reserve(max(2 * self._capacity, len(sprites)))
+                self._buffer.orphan()
+                self._buffer.write(sprites.data)
             self._last_count = len(sprites)
             width, height = self.target.resolution_px
             margin = self.footprint_px

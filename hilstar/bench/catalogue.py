@@ -79,6 +79,8 @@ def bench_catalogue(file: BenchFile, faintest_v_mag: float | None, epoch_jyear: 
 def _places(stars: Catalog, facts: dict[str, Any], epoch_jyear: float) -> dict[str, Column]:
     motion = motion_at(stars, facts, epoch_jyear)
     sigma = np.sqrt(np.einsum("nii->in", motion.covariance))
+    product = sigma[0] * sigma[1]
+    correlation = np.divide(motion.covariance[:, 0, 1], product, out=np.full(len(product), np.nan), where=product > 0)
     place, speed = "pos.eq.ra;meta.main", "pos.pm;pos.eq.ra"
     return {
         "hip": Column(stars.hip, "", "meta.id;meta.main", "Hipparcos number, 0 for a star without"),
@@ -90,10 +92,7 @@ def _places(stars: Catalog, facts: dict[str, Any], epoch_jyear: float) -> dict[s
         "dec_deg": Column(np.round(motion.dec_deg, DECIMALS), "deg", place.replace(".ra", ".dec"), "declination, ICRS"),
         "sigma_ra_mas": Column(sigma[0], "mas", "stat.error;pos.eq.ra", "error at the epoch, times cos(dec)"),
         "sigma_dec_mas": Column(sigma[1], "mas", "stat.error;pos.eq.dec", "error of declination at the epoch"),
-        "ra_dec_correlation": Column(
-            _ratio(motion.covariance[:, 0, 1], sigma[0] * sigma[1]),
-            *("", "stat.correlation", "correlation of both errors at the epoch"),
-        ),
+        "ra_dec_correlation": Column(correlation, "", "stat.correlation", "correlation of both errors at the epoch"),
         "pm_ra_mas_yr": Column(motion.pm_ra_mas_yr, "mas/yr", speed, "proper motion in right ascension, times cos(dec)"),
         "pm_dec_mas_yr": Column(motion.pm_dec_mas_yr, "mas/yr", speed.replace(".ra", ".dec"), "proper motion in declination"),
         "sigma_pm_ra_mas_yr": Column(sigma[2], "mas/yr", f"stat.error;{speed}", "its error"),
@@ -101,10 +100,6 @@ def _places(stars: Catalog, facts: dict[str, Any], epoch_jyear: float) -> dict[s
         "parallax_mas": Column(stars.parallax_mas, "mas", "pos.parallax.trig", "parallax"),
         "sigma_parallax_mas": Column(facts["sigma_parallax_mas"], "mas", "stat.error;pos.parallax.trig", "its error"),
     }
-
-
-def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
-    return np.asarray(np.divide(above, below, out=np.full(len(above), np.nan), where=below > 0))
 
 
 def _photometry(stars: Catalog, facts: dict[str, Any]) -> dict[str, Column]:

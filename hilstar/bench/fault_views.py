@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
@@ -29,55 +28,35 @@ if TYPE_CHECKING:
 def display_view(bench: Bench, scenario: Scenario = NO_SCENARIO) -> FaultView:
     """The faults of a scenario as the monitor shows them."""
     tracker = tracker_camera(bench.config.tracker, bench.file.folder)
-    return _view(scenario, _fault_camera(bench.file, bench.canvas, bench.camera, tracker, bench.stars, bench.moving))
+    camera = _fault_camera(bench.file, bench.canvas, bench.camera, tracker, bench.stars, bench.moving)
+    return FaultView(camera, scenario.seed, scenario.folder if scenario.faults else None, frozenset(scenario.faults))
 
 
 def tracker_view(
     file: BenchFile, canvas: Canvas, stars: Stars, moving: MovingSky | None, scenario: Scenario = NO_SCENARIO
 ) -> FaultView:
     """The faults of a scenario as they fall on the virtual tracker's detector, which is `canvas`."""
-    monitor = bench_camera(file.config, file.folder)
-    return _view(scenario, _fault_camera(file, canvas, monitor, canvas.camera, stars, moving))
-
-
-def _view(scenario: Scenario, camera: FaultCamera) -> FaultView:
-    folder = scenario.folder if scenario.faults else None
-    return FaultView(camera, scenario.seed, folder, frozenset(scenario.faults))
+    camera = _fault_camera(file, canvas, bench_camera(file.config, file.folder), canvas.camera, stars, moving)
+    return FaultView(camera, scenario.seed, scenario.folder if scenario.faults else None, frozenset(scenario.faults))
 
 
 def _fault_camera(
     file: BenchFile, canvas: Canvas, monitor: Camera, tracker: Camera, stars: Stars, moving: MovingSky | None
 ) -> FaultCamera:
-    return FaultCamera(
-        canvas=canvas,
-        monitor=monitor,
-        tracker=tracker,
-        exposure_s=file.config.tracker.exposure_s,
-        points=StarLayer(canvas),
-        apparent=_apparent(file, moving),
-        v0_e_per_s=_v0_e_per_s(file),
-        stars=stars,
-    )
-
-
-def _apparent(file: BenchFile, moving: MovingSky | None) -> Callable[[FloatArray], FloatArray]:
-    """Directions as the bench's observer sees them, like its stars' own."""
     velocity_km_s = file.config.sky.observer_velocity_km_s
-    if moving is not None:
-        return lambda vectors: moving.stars_seen(vectors, np.zeros(len(vectors)))
-    if any(velocity_km_s):
-        return lambda vectors: aberrate(vectors, velocity_km_s)
-    return lambda vectors: vectors
-
-
-def _v0_e_per_s(file: BenchFile) -> Callable[[float], float]:
     tables = cache(lambda: star_rates(file.config, file.folder))  # 0.1 s, which only a fault needs
 
+    def apparent(vectors: FloatArray) -> FloatArray:
+        if moving is not None:
+            return moving.stars_seen(vectors, np.zeros(len(vectors)))
+        return aberrate(vectors, velocity_km_s) if any(velocity_km_s) else vectors
+
     @lru_cache(maxsize=256)
-    def rate(bv_mag: float) -> float:
+    def v0_e_per_s(bv_mag: float) -> float:
         return float(tables()(np.zeros(1), np.array([bv_mag]), np.array([np.nan]))[0])
 
-    return rate
+    points, exposure_s = StarLayer(canvas), file.config.tracker.exposure_s
+    return FaultCamera(canvas, monitor, tracker, exposure_s, points, apparent, v0_e_per_s, stars)
 
 
 def faults_at(bench: Bench, scenario: Scenario, t_ns: int) -> FaultLayer:

@@ -107,7 +107,14 @@ def fit_sip(camera: Camera) -> Sip | None:
     x_px, y_px = camera.places_px(np.zeros(1), np.zeros(1))
     origin_px = float(x_px[0]), float(y_px[0])
     fitted, held_out = (_pairs(camera, origin_px, count) for count in (FITTED, HELD_OUT))
-    degree, whole = _whole(fitted, held_out)
+    found = []  # the polynomials from pixels to the ideal image
+    for degree in range(2, MAX_DEGREE + 1):
+        whole = _solved(*fitted, degree)
+        error_px = float(np.hypot(*(_terms(held_out[0], degree, 1) @ whole - held_out[1]).T).max())
+        found.append((error_px, degree, whole))
+        if error_px <= GOOD_PX:
+            break
+    _, degree, whole = found[-1] if error_px <= GOOD_PX else min(found, key=lambda one: one[0])
     p, q = _powers(degree, 1)
     linear = np.concatenate([whole[(p == 1) & (q == 0)], whole[(p == 0) & (q == 1)]]).T
     of_pixels = np.linalg.inv(linear).T  # rows of ideal places to pixels
@@ -119,18 +126,6 @@ def fit_sip(camera: Camera) -> Sip | None:
     again = flat + _terms(flat, degree, 1) @ back - pixel
     error_px = max(float(np.hypot(*off.T).max()) for off in (there, again))
     return Sip(degree, origin_px, linear, forward, back, error_px) if error_px <= MAX_SIP_PX else None
-
-
-def _whole(fitted: tuple[FloatArray, FloatArray], held_out: tuple[FloatArray, FloatArray]) -> tuple[int, FloatArray]:
-    """The degree and the terms (n, 2) of the polynomials from pixels to the ideal image."""
-    found = []
-    for degree in range(2, MAX_DEGREE + 1):
-        whole = _solved(*fitted, degree)
-        error_px = float(np.hypot(*(_terms(held_out[0], degree, 1) @ whole - held_out[1]).T).max())
-        found.append((error_px, degree, whole))
-        if error_px <= GOOD_PX:
-            return degree, whole
-    return min(found, key=lambda one: one[0])[1:]
 
 
 def _pairs(camera: Camera, origin_px: tuple[float, float], count: int) -> tuple[FloatArray, FloatArray]:

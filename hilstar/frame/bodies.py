@@ -84,7 +84,20 @@ class BodyLayer:
 
     def unhidden(self, light: Sprites, stars: Stars, discs: list[Disc], view: View) -> Sprites:
         """Sprites as seen past `discs` and through their air, without those of the discs themselves."""
-        through = self._through(stars, light.star, discs, view)
+        which, first = light.star, len(stars) - len(self._moving.names)
+        through, directions = np.ones(len(which)), stars.directions(which)
+        # Bodies hide only what is farther away. Satellites are left alone: `SatelliteLayer` adds those that nothing hides.
+        satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
+        point = np.flatnonzero(which >= first)
+        far_km = self._moving.distances_km(*view.observer)[which[point] - first] if len(point) else np.empty(0)
+        for disc in discs:
+            reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7  # more than a cosine rounds
+            near = directions @ disc.direction > np.cos(min(reach_rad, np.pi))
+            near[point[far_km <= disc.distance_km]] = False  # itself among them
+            near[satellite] = False
+            behind = np.flatnonzero(near)
+            if len(behind):
+                through[behind] *= disc.transmission(directions[behind])
         through[np.isin(light.star, disc_stars(stars, (disc.name for disc in discs)))] = 0.0
         kept = through >= HIDDEN
         if kept.all() and (through == 1).all():
@@ -100,7 +113,15 @@ class BodyLayer:
             reach_rad += view.turn.speed_rad_s * (view.scan.hold_s / 2 if view.exposed else view.scan.longest_s)
         axis = view.icrs_to_image(self.canvas.camera)[2]
         found = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
-        return [disc for k, disc in enumerate(found) if not k or not _hidden(disc, found[:k])]
+        kept = []
+        for k, disc in enumerate(found):
+            places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)]) if k else disc.direction[None]
+            through = np.ones(len(places))
+            for nearer in found[:k]:
+                through *= nearer.transmission(places)
+            if through.max() >= HIDDEN:
+                kept.append(disc)
+        return kept
 
     def _still(self, icrs_to_image: FloatArray) -> DiscView:
         return DiscView(self.canvas.camera, self.canvas.psf, (Pose(icrs_to_image),))
@@ -137,28 +158,6 @@ class BodyLayer:
         ordered = reversed([*enumerate(discs, 1)])
         return [disc_lights(disc, posed, covers=k < len(discs)) for k, disc in ordered]
 
-    def _through(self, stars: Stars, which: IntArray, discs: list[Disc], view: View) -> FloatArray:
-        """The share of light (n,) of some of `stars` (n,) that comes past discs; bodies hide only what is farther away.
-
-        Satellites are left alone: `SatelliteLayer` adds those that nothing hides.
-        """
-        first = len(stars) - len(self._moving.names)
-        through, directions = np.ones(len(which)), stars.directions(which)
-        satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
-        point = np.flatnonzero(which >= first)
-        far_km = np.empty(0)
-        if len(point):
-            far_km = self._moving.distances_km(*view.observer)[which[point] - first]
-        for disc in discs:
-            reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7  # more than a cosine rounds
-            near = directions @ disc.direction > np.cos(min(reach_rad, np.pi))
-            near[point[far_km <= disc.distance_km]] = False  # itself among them
-            near[satellite] = False
-            behind = np.flatnonzero(near)
-            if len(behind):
-                through[behind] *= disc.transmission(directions[behind])
-        return through
-
     def _clips(self, lights: list[ExtendedLight], white_e_per_s: float) -> bool:
         """Whether a disc's lights have more than white in a pixel; a large disc is tested at a lattice of places."""
         if not math.isfinite(white_e_per_s):
@@ -184,15 +183,6 @@ class BodyLayer:
         on_image = camera.contains_px(*camera.project(places @ light.icrs_to_image.T))
         of_face = float(light.disc.radiance(places[on_image]).max(initial=0.0))
         return max(float(light.disc.radiance(seen @ light.icrs_to_image).max()), of_face)
-
-
-def _hidden(disc: Disc, nearer: list[Disc]) -> bool:
-    """Whether other discs hide one: its middle and all of its limb."""
-    places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)])
-    through = np.ones(len(places))
-    for one in nearer:
-        through *= one.transmission(places)
-    return bool(through.max() < HIDDEN)
 
 
 def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:

@@ -57,19 +57,8 @@ class DiffuseLayer:
         self._kept: tuple[FloatArray, tuple[LightMap, ...]] | None = None
 
     def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
-        """The light before, and the map's."""
-        maps = self._maps(view.q_icrs_to_cam)
-        return replace(light, extended=(*light.extended, *maps)) if maps else light
-
-    def line(self) -> str:
-        """How bright it is on a monitor."""
-        steps = self._brightest / (self._faintest or math.inf)
-        drawn = "is drawn where it passes one" if steps > 1 else "is not drawn; the virtual tracker has it"
-        return f"[sky.diffuse] map: its brightest pixel has {steps:.3g} of the light of the screen's first step; it {drawn}"
-
-    def _maps(self, q_icrs_to_cam: FloatArray) -> tuple[LightMap, ...]:
-        """The light at an attitude; a screen's is that of its cell's middle, and the same objects within a cell."""
-        cell = q_icrs_to_cam
+        """The light before, and the map's; a screen's is that of its attitude's cell, and the same objects within a cell."""
+        cell = view.q_icrs_to_cam
         if self._cell_q:
             cell = np.rint(cell * np.sign(cell[np.argmax(np.abs(cell))]) / self._cell_q) * self._cell_q
         if self._kept is None or not np.array_equal(cell, self._kept[0]):
@@ -79,7 +68,14 @@ class DiffuseLayer:
             taken = np.zeros(self._camera.resolution_px[::-1], dtype=bool) if faces_of_cube > 1 else None
             lit = (self._lit(face, icrs_to_cam, taken if face.is_of_cube else None) for face in near)
             self._kept = cell, tuple(itertools.chain.from_iterable(lit))
-        return self._kept[1]
+        maps = self._kept[1]
+        return replace(light, extended=(*light.extended, *maps)) if maps else light
+
+    def line(self) -> str:
+        """How bright it is on a monitor."""
+        steps = self._brightest / (self._faintest or math.inf)
+        drawn = "is drawn where it passes one" if steps > 1 else "is not drawn; the virtual tracker has it"
+        return f"[sky.diffuse] map: its brightest pixel has {steps:.3g} of the light of the screen's first step; it {drawn}"
 
     def _lit(self, face: _Face, icrs_to_cam: FloatArray, taken: BoolArray | None) -> list[LightMap]:
         """The map of each group of cells that have light at an attitude.

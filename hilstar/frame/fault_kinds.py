@@ -33,6 +33,9 @@ PixelPair = tuple[Pixel, Pixel]
 Hip = Annotated[int, Meta(ge=1, le=2**31 - 1)]
 Name = Annotated[str, Meta(min_length=1, max_length=32)]  # as long as a name in the truth table
 Share = Annotated[float, Meta(gt=0, le=1)]
+PLACES = ("radec_deg", "icrs", "tracker_px", "screen_px")
+LIGHT = ("electrons_per_s", "electrons")
+KeyGroups = tuple[tuple[str, ...], ...]
 
 
 class Fault(Table, frozen=True, kw_only=True):
@@ -43,6 +46,7 @@ class Fault(Table, frozen=True, kw_only=True):
 
     KIND: ClassVar[str] = ""
     OF_LIGHT: ClassVar[bool] = False  # drawn in proportion to the part of a frame that it lasts
+    ONE_OF: ClassVar[KeyGroups] = ()  # groups of keys, of each of which a fault has one
 
     name: Name
     at_s: Seconds | None = None
@@ -50,6 +54,12 @@ class Fault(Table, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Refuse (InputError) keys that contradict each other."""
+        for names in self.ONE_OF:
+            given = [name for name in names if getattr(self, name) is not None]
+            if len(given) > 1:
+                raise InputError(f"has {given[0]} and {given[1]}; write one of them")
+            if not given:
+                raise InputError(f"lacks one of {', '.join(names)}; write one of them (see {REFERENCE})")
 
 
 class PlacedFault(Fault, frozen=True, kw_only=True):
@@ -61,14 +71,15 @@ class PlacedFault(Fault, frozen=True, kw_only=True):
     screen_px: PixelPair | None = None
     rate_px_s: PixelPair = (0.0, 0.0)
 
-    PLACES: ClassVar[tuple[str, ...]] = ("radec_deg", "icrs", "tracker_px", "screen_px")
+    ONE_OF: ClassVar[KeyGroups] = (PLACES,)
 
     def check(self) -> None:
-        """Refuse (InputError) no place, two places, a vector that is no direction, and a rate without a pixel."""
-        given = _only_one(self, self.PLACES)
+        """Refuse (InputError) also a vector that is no direction, and a rate without a pixel."""
+        super().check()
         if self.icrs is not None and abs(math.hypot(*self.icrs) - 1) > UNIT_TOLERANCE:
             raise InputError(f"icrs = {list(self.icrs)}: its norm is {math.hypot(*self.icrs):.6g}; write a unit vector x, y, z")
-        if any(self.rate_px_s) and given not in {"tracker_px", "screen_px"}:
+        if any(self.rate_px_s) and self.tracker_px is None and self.screen_px is None:
+            given = next(name for names in self.ONE_OF for name in names if getattr(self, name) is not None)
             raise InputError(f"rate_px_s moves a tracker_px or a screen_px, not {given}; leave one of them out")
 
 
@@ -76,16 +87,12 @@ class PointLight(PlacedFault, frozen=True, kw_only=True):
     """Light at a point."""
 
     OF_LIGHT: ClassVar[bool] = True
+    ONE_OF: ClassVar[KeyGroups] = (PLACES, (*LIGHT, "v_mag"))
 
     electrons_per_s: Electrons | None = None
     electrons: Electrons | None = None
     v_mag: Annotated[float, Meta(ge=-30, le=30)] | None = None
     bv_mag: Annotated[float, Meta(ge=-1, le=6)] = 0.65  # the Sun's
-
-    def check(self) -> None:
-        """Refuse (InputError) also no light, or light said twice."""
-        super().check()
-        _only_one(self, ("electrons_per_s", "electrons", "v_mag"))
 
 
 class FalseStar(PointLight, frozen=True, kw_only=True):
@@ -98,7 +105,7 @@ class Flash(PointLight, frozen=True, kw_only=True):
     """Light at a star (`hip`, or `star`: a name of the truth table), or at a place, for a time."""
 
     KIND: ClassVar[str] = "flash"
-    PLACES: ClassVar[tuple[str, ...]] = ("hip", "star", *PlacedFault.PLACES)
+    ONE_OF: ClassVar[KeyGroups] = (("hip", "star", *PLACES), (*LIGHT, "v_mag"))
 
     hip: Hip | None = None
     star: Name | None = None
@@ -115,13 +122,10 @@ class StarGone(Fault, frozen=True, kw_only=True):
 
     KIND: ClassVar[str] = "star-gone"
     OF_LIGHT: ClassVar[bool] = True
+    ONE_OF: ClassVar[KeyGroups] = (("hip", "star"),)
 
     hip: Hip | None = None
     star: Name | None = None
-
-    def check(self) -> None:
-        """Refuse (InputError) no star, or two."""
-        _only_one(self, ("hip", "star"))
 
 
 class CosmicRays(Fault, frozen=True, kw_only=True):
@@ -154,14 +158,11 @@ class Gradient(Fault, frozen=True, kw_only=True):
 
     KIND: ClassVar[str] = "gradient"
     OF_LIGHT: ClassVar[bool] = True
+    ONE_OF: ClassVar[KeyGroups] = (LIGHT,)
 
     electrons_per_s: Electrons | None = None
     electrons: Electrons | None = None
     towards_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
-
-    def check(self) -> None:
-        """Refuse (InputError) no light, or light said twice."""
-        _only_one(self, ("electrons_per_s", "electrons"))
 
 
 class Glow(PlacedFault, frozen=True, kw_only=True):
@@ -172,16 +173,12 @@ class Glow(PlacedFault, frozen=True, kw_only=True):
 
     KIND: ClassVar[str] = "glow"
     OF_LIGHT: ClassVar[bool] = True
+    ONE_OF: ClassVar[KeyGroups] = (PLACES, LIGHT)
 
     electrons_per_s: Electrons | None = None
     electrons: Electrons | None = None
     scale_deg: Annotated[float, Meta(ge=1e-3, le=180)] = 1.0
     exponent: Annotated[float, Meta(gt=0, le=20)] = 2.0
-
-    def check(self) -> None:
-        """Refuse (InputError) also no light, or light said twice."""
-        super().check()
-        _only_one(self, ("electrons_per_s", "electrons"))
 
 
 class MeasuredMap(Fault, frozen=True, kw_only=True):
@@ -229,15 +226,17 @@ class AttitudeStep(Fault, frozen=True, kw_only=True):
     """The sky of a wrong attitude: the camera turned by a rotation vector in its own axes, as a rate of that size for 1 s."""
 
     KIND: ClassVar[str] = "attitude-step"
+    ONE_OF: ClassVar[KeyGroups] = (("turn_arcsec", "turn_deg"),)
 
     turn_arcsec: tuple[float, float, float] | None = None
     turn_deg: tuple[float, float, float] | None = None
 
     def check(self) -> None:
-        """Refuse (InputError) no turn, two, or more than half a turn."""
-        _only_one(self, ("turn_arcsec", "turn_deg"))
-        if self.size_rad > math.pi:
-            raise InputError(f"turns by {math.degrees(self.size_rad):.6g} deg; write a turn of 180 deg at most")
+        """Refuse (InputError) also more than half a turn."""
+        super().check()
+        size_rad = math.hypot(*self.turn_rad)
+        if size_rad > math.pi:
+            raise InputError(f"turns by {math.degrees(size_rad):.6g} deg; write a turn of 180 deg at most")
 
     @property
     def turn_rad(self) -> tuple[float, float, float]:
@@ -245,11 +244,6 @@ class AttitudeStep(Fault, frozen=True, kw_only=True):
         unit_rad = math.radians(1 / 3600 if self.turn_deg is None else 1.0)
         x, y, z = self.turn_deg or self.turn_arcsec or (0.0, 0.0, 0.0)
         return x * unit_rad, y * unit_rad, z * unit_rad
-
-    @property
-    def size_rad(self) -> float:
-        """The angle of the turn."""
-        return math.hypot(*self.turn_rad)
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +293,11 @@ def fault_of(table: Any) -> Fault:
     except RecursionError as error:
         raise InputError(f"its values are nested too deep; see {REFERENCE}") from error
     except msgspec.ValidationError as error:
-        raise InputError(_in_words(str(error), keys, made)) from error
+        missing = re.search(r"missing required field `(.*)`", str(error))
+        if missing:
+            raise InputError(f"the key {missing[1]} is missing; add it (see {REFERENCE})") from error
+        message = str(error).replace(" | null", "")
+        raise InputError(explained(message, keys, Kind(made, REFERENCE, TYPE_WORDS))) from error
     if not (fault.name.isprintable() and fault.name.strip() == fault.name):
         raise InputError(
             f"name = {shortened(repr(fault.name))}; write a name of printable letters, without a space at its ends"
@@ -314,13 +312,6 @@ def table_of(fault: Fault) -> dict[str, Any]:
     return {"kind": fault.KIND, **found}
 
 
-def _in_words(message: str, keys: dict[str, Any], made: type[Fault]) -> str:
-    missing = re.search(r"missing required field `(.*)`", message)
-    if missing:
-        return f"the key {missing[1]} is missing; add it (see {REFERENCE})"
-    return explained(message.replace(" | null", ""), keys, Kind(made, REFERENCE, TYPE_WORDS))
-
-
 def _check_finite(value: Any, key: str = "") -> None:
     if isinstance(value, dict):
         for name, inner in value.items():
@@ -330,13 +321,3 @@ def _check_finite(value: Any, key: str = "") -> None:
             _check_finite(inner, key)
     elif isinstance(value, float) and not math.isfinite(value):
         raise InputError(f"{shortened(key)} = {value}; a finite number is wanted")
-
-
-def _only_one(fault: Fault, names: tuple[str, ...]) -> str:
-    """The one key of `names` that a fault has. Raises InputError."""
-    given = [name for name in names if getattr(fault, name) is not None]
-    if len(given) > 1:
-        raise InputError(f"has {given[0]} and {given[1]}; write one of them")
-    if not given:
-        raise InputError(f"lacks one of {', '.join(names)}; write one of them (see {REFERENCE})")
-    return given[0]

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.frame.fault_kinds import (
     CosmicRays,
@@ -129,7 +129,18 @@ class FaultView:
         with self._lock:
             known = self._maps.get(fault)
         if known is None:
-            known = extended.LightMap(self._laid_out(fault), times=self.light_e_per_s(fault))
+            by, camera = self.by, self.by.canvas.camera
+            if isinstance(fault, Gradient):
+                image = gradient_image(fault, camera, by.tracker)
+            elif self._folder is None:
+                advice = "a message names no files; write the fault in the scenario, and start it by name"
+                raise InputError(f"file = {fault.file!r}: {advice}")
+            else:
+                values = read_map(self._folder / fault.file)
+                if fault.electrons_per_s is not None or fault.electrons is not None:
+                    values = values / values.max()
+                image = map_image(values, fault, camera, by.tracker if fault.frame == "tracker" else by.monitor)
+            known = extended.LightMap(image, times=self.light_e_per_s(fault))
         with self._lock:
             self._maps.pop(fault, None)
             self._maps[fault] = known  # the last used is the last to go
@@ -137,19 +148,6 @@ class FaultView:
             if len(others) > KEPT_MAPS:
                 self._maps.pop(others[0])
         return known
-
-    def _laid_out(self, fault: Gradient | MeasuredMap) -> Float32Array:
-        by = self.by
-        if isinstance(fault, Gradient):
-            return gradient_image(fault, by.canvas.camera, by.tracker)
-        if self._folder is None:
-            raise InputError(
-                f"file = {fault.file!r}: a message names no files; write the fault in the scenario, and start it by name"
-            )
-        values = read_map(self._folder / fault.file)
-        if fault.electrons_per_s is not None or fault.electrons is not None:
-            values = values / values.max()
-        return map_image(values, fault, by.canvas.camera, by.tracker if fault.frame == "tracker" else by.monitor)
 
     def _source(self, fault: PlacedFault) -> tuple[Camera, tuple[float, float]]:
         """The camera in whose pixels a place is given, and the place."""
@@ -166,20 +164,15 @@ class FaultView:
             fault = one.fault
             if not isinstance(fault, FalseStar | Flash) or fault.tracker_px is not None or fault.screen_px is not None:
                 continue
-            direction = self._direction(fault, stars)
-            if direction is not None:
-                vectors.append(direction)
+            if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
+                # A star too faint to show is among all of the bench's stars.
+                at = [known.vectors[place] for known in (stars, self.by.stars) for place in self._places(known, fault)[:1]]
+            else:
+                at = [self.by.apparent(icrs_direction(fault)[None])[0]]
+            if at:
+                vectors.append(at[0])
                 lights.append(self._added(fault, one.share))
         return np.reshape(vectors, (-1, 3)), lights
-
-    def _direction(self, fault: FalseStar | Flash, stars: Stars) -> FloatArray | None:
-        if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
-            for known in (stars, self.by.stars):  # a star too faint to show is among all of the bench's stars
-                found = self._places(known, fault)
-                if len(found):
-                    return np.asarray(known.vectors[found[0]])
-            return None
-        return np.asarray(self.by.apparent(icrs_direction(fault)[None])[0])
 
     def star_direction(self, fault: Fault) -> FloatArray | None:
         """The direction (3,), ICRS, of the star that a fault is about; None if it is about none."""

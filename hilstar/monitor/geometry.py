@@ -191,18 +191,15 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         error=notes.error,
         made=notes.made,
     )
-    write_whole(path, toml_text(msgspec.to_builtins(found)))
-
-
-def toml_text(table: dict[str, Any]) -> str:
-    """TOML of plain values and lists, tables after them; what is None or an empty table is left unsaid."""
+    # Plain values and lists, tables after them; what is None or an empty table is left unsaid.
+    table = msgspec.to_builtins(found)
     plain = [f"{key} = {_value(value)}" for key, value in table.items() if not isinstance(value, dict) and value is not None]
     parts = ["\n".join(plain)]
     for key, value in table.items():
         if isinstance(value, dict) and value:
             rows = "\n".join(f"{name} = {_value(inner)}" for name, inner in value.items() if inner is not None)
             parts.append(f"[{key}]\n{rows}")
-    return "\n\n".join(parts) + "\n"
+    write_whole(path, "\n\n".join(parts) + "\n")
 
 
 def _value(value: Any) -> str:

@@ -233,7 +233,7 @@ class LookupTable:
 class Encoder:
     """Draws the levels of a linear image: only the sprites' footprints where that is less work than the whole image.
 
-    It lives in its renderer's context, which is current in every call.
+    `sprite_program`, of star.vert, encodes sprites. It lives in its renderer's context, which is current in every call.
     """
 
     def __init__(
@@ -256,10 +256,10 @@ class Encoder:
         defines += () if steps is None else (f"STEPS {len(steps)}",)
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
         defines += (f"BIN_SHIFT {table.bin_shift}", *(("IMAGES",) if self._linear_image is not None else ()))
-        self._sprites, self._whole = (
+        self.sprite_program, self._whole = (
             build_program(ctx, vertex, "encode.frag", defines, last=rises) for vertex in ("star.vert", "full.vert")
         )
-        self._sprites["resolution_px"] = linear.size
+        self.sprite_program["resolution_px"] = linear.size
         self._whole_vao = ctx.vertex_array(self._whole, [])
         self._sprite_vao: moderngl.VertexArray | None = None
         self._textures = {"linear_e_per_s": linear}
@@ -267,7 +267,7 @@ class Encoder:
         if steps is None:
             self._textures |= {"threshold_e_per_s": self._texture(_rows(table.threshold))}
             self._textures |= {"first_code": self._texture(_rows(table.first_code))}
-        for program in (self._sprites, self._whole):
+        for program in (self.sprite_program, self._whole):
             if steps is None:
                 program["first_bin"] = table.first_bin
                 program["last_bin"] = len(table.first_code) - 1
@@ -278,7 +278,7 @@ class Encoder:
         if gain is not None:
             self._textures["gain"] = self._texture(gain)
         self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}
-        for program in (self._sprites, self._whole):
+        for program in (self.sprite_program, self._whole):
             for unit, name in enumerate(self._textures):
                 program[name] = unit
 
@@ -299,17 +299,8 @@ class Encoder:
         """Read the places and rates of sprites from a buffer of SPRITE_DTYPE."""
         if self._sprite_vao is not None:
             self._sprite_vao.release()
-        self._sprite_vao = self._ctx.vertex_array(self._sprites, [(buffer, PLACES, "pixel", "electrons_per_s")])
-        self._sprites["footprint_px"] = self._footprint_px = footprint_px
-
-    def shrink(self, sides: SpriteSides) -> None:
-        """Encode fainter stars' smaller sprites only."""
-        set_sides(self._sprites, sides)
-
-    @property
-    def sprite_program(self) -> moderngl.Program:
-        """The program of star.vert that encodes sprites."""
-        return self._sprites
+        self._sprite_vao = self._ctx.vertex_array(self.sprite_program, [(buffer, PLACES, "pixel", "electrons_per_s")])
+        self.sprite_program["footprint_px"] = self._footprint_px = footprint_px
 
     def draw(
         self,
@@ -339,12 +330,12 @@ class Encoder:
         if self._steps is not None:
             self._steps.bind_to_uniform_block(0)
         for name, value in uniforms.items():
-            self._sprites[name] = self._whole[name] = value
+            self.sprite_program[name] = self._whole[name] = value
         for region in regions:
             self._fbo.viewport = region
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
         if count and self._sprite_vao is not None:
-            self._sprites["sprites_per_star"] = float(per_star)
+            self.sprite_program["sprites_per_star"] = float(per_star)
             margin = self._footprint_px
             self._fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
             self._sprite_vao.render(moderngl.POINTS, vertices=count)

@@ -128,7 +128,14 @@ class ExactPass:
         program = self._program(paths, passes is not None)
         turns = stretches_of(star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
         count = len(turns)
-        self._upload(turns)
+        data = turns.astype(np.int32).tobytes()
+        if self._turns is None or self._turns.size < len(data):
+            if self._turns is not None:
+                self._turns.release()
+            self._turns = self._ctx.buffer(reserve=2 * len(data), dynamic=True)
+        self._turns.orphan()
+        self._turns.write(data)
+        self._turns.bind_to_storage_buffer(3)
         if self._memory is not None and paths:
             self._memory.bind(star[turns[:, 0]], turns[:, 0] != turns[:, 2])
         elif self._memory is not None:
@@ -146,16 +153,6 @@ class ExactPass:
         program["count"] = count
         program.run(-(-count // LOCAL_SIZE))
         self._ctx.memory_barrier()
-
-    def _upload(self, turns: IntArray) -> None:
-        data = turns.astype(np.int32).tobytes()
-        if self._turns is None or self._turns.size < len(data):
-            if self._turns is not None:
-                self._turns.release()
-            self._turns = self._ctx.buffer(reserve=2 * len(data), dynamic=True)
-        self._turns.orphan()
-        self._turns.write(data)
-        self._turns.bind_to_storage_buffer(3)
 
 
 class Memory:

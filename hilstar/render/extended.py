@@ -64,11 +64,27 @@ def disc_tiles(light: DiscLight, region: Rectangle) -> Tiles | None:
     directions, shape = seen @ light.icrs_to_image, places.shape[:2]
     impact = light.disc.impact(directions).reshape(shape)
     rates = (light.disc.radiance(directions) * sr * light.times).reshape(shape)
-    px_per_rad = light.camera.scales_px_rad()[0]
-    beside = _all(_beside(light, directions, px_per_rad).reshape(shape))
-    face = _face(light, impact, rates > 0, px_per_rad) & ~beside
-    parts = _parts(light, px_per_rad)
-    air = np.zeros_like(face) if parts is None else _all(impact > 1 + _margin(light, px_per_rad)) & ~beside
+    disc, px_per_rad, sigma_px = light.disc, light.camera.scales_px_rad()[0], max(light.psf.variance_px2) ** 0.5
+    # Corners so far away that neither the disc, its air nor the Gaussian reaches their tiles
+    on_sphere = directions @ disc.to_sphere.T
+    angle = np.arctan2(np.hypot(on_sphere[:, 0], on_sphere[:, 1]), on_sphere[:, 2])
+    rim = np.arcsin(min(1.0, (1 + AIR_TOP * disc.air_radii) / disc.distance_radii))
+    far = angle > rim + WIDER * (TILE_PX * np.sqrt(2) + REACH_SIGMAS * sigma_px) / px_per_rad
+    beside = _all(far.reshape(shape))
+    margin = REACH_SIGMAS * sigma_px * disc.distance_radii / px_per_rad  # maximum reach of the Gaussian, in radii
+    # Tiles far enough within the limb, and off the terminator where that would be seen. A face's height over the plane of its
+    # limb goes as the root of 1 - impact^2, whose second derivative is its power -3/2.
+    inside, lit = np.minimum(impact, 1.0), rates > 0  # NaN stays
+    tile_radii = TILE_PX * np.sqrt(np.maximum(disc.distance_radii**2 - inside**2, 0.0)) / px_per_rad
+    flat = ((1 - inside**2) ** 1.5 > tile_radii**2 / (8 * SMOOTH)) & (impact < 1 - margin)
+    face = _all(flat) & (_all(lit) | _all(~lit) | _all(tile_radii < STEEP)) & ~beside
+    # Parts per side of a tile of air: thinner air, and that of a body from within, is drawn ray by ray. A height at the limb,
+    # px: impact grows by the cosine of the angle from the middle there.
+    parts = 0
+    if disc.air is not None and disc.distance_radii > 1:
+        scale_px = disc.air_radii * px_per_rad / np.sqrt(disc.distance_radii**2 - 1)
+        parts = int(np.ceil(TILE_PX / (AIR_STEP * scale_px)))
+    air = _all(impact > 1 + margin) & ~beside if 0 < parts <= MAX_PARTS else np.zeros_like(face)
     drawn = np.argwhere(~beside)
     if not len(drawn):
         return Tiles((left, top, 0, 0), *np.empty((2, 0, 4), dtype=np.float32))
@@ -77,7 +93,7 @@ def disc_tiles(light: DiscLight, region: Rectangle) -> Tiles | None:
     of_face = np.concatenate([places, rates[..., None], np.ones((*shape, 1))], axis=-1)
     return Tiles(
         (int(inner[0]), int(inner[1]), int(inner[2]), int(inner[3])),
-        np.concatenate([_corners(of_face, face), _air(light, places[:-1, :-1][air], parts or 1)]),
+        np.concatenate([_corners(of_face, face), _air(light, places[:-1, :-1][air], parts)]),
         _corners(of_face, ~face & ~air & ~beside),
     )
 
@@ -93,34 +109,6 @@ def _rays(light: DiscLight, places: FloatArray) -> tuple[FloatArray, FloatArray]
     return seen, 1 / ((a * d - b * c) * np.linalg.norm(seen, axis=1) ** 3)
 
 
-def _face(light: DiscLight, impact: FloatArray, lit: Mask, px_per_rad: float) -> Mask:
-    """Which tiles are far enough within the limb, and off the terminator where that would be seen."""
-    disc = light.disc
-    inside = np.minimum(impact, 1.0)  # NaN stays
-    tile_radii = TILE_PX * np.sqrt(np.maximum(disc.distance_radii**2 - inside**2, 0.0)) / px_per_rad
-    # A face's height over the plane of its limb goes as the root of 1 - impact^2, whose second derivative is its power -3/2.
-    flat = (1 - inside**2) ** 1.5 > tile_radii**2 / (8 * SMOOTH)
-    flat &= impact < 1 - _margin(light, px_per_rad)
-    one_sort = _all(lit) | _all(~lit) | _all(tile_radii < STEEP)
-    return np.asarray(_all(flat) & one_sort)
-
-
-def _margin(light: DiscLight, px_per_rad: float) -> float:
-    """Maximum reach of the Gaussian, in radii."""
-    return float(REACH_SIGMAS * max(light.psf.variance_px2) ** 0.5 * light.disc.distance_radii / px_per_rad)
-
-
-def _parts(light: DiscLight, px_per_rad: float) -> int | None:
-    """Number of parts per side of a tile of air; None without air, or where its shell is too thin to be interpolated."""
-    disc = light.disc
-    if disc.air is None or disc.distance_radii <= 1:
-        return None
-    # A height at the limb, px: impact grows by the cosine of the angle from the middle there
-    scale_px = disc.air_radii * px_per_rad / np.sqrt(disc.distance_radii**2 - 1)
-    parts = int(np.ceil(TILE_PX / (AIR_STEP * scale_px)))
-    return parts if parts <= MAX_PARTS else None
-
-
 def _air(light: DiscLight, tiles: FloatArray, parts: int) -> Float32Array:
     """Corners of the parts of tiles of air, whose first corners are (n, 2)."""
     if not len(tiles):
@@ -131,16 +119,6 @@ def _air(light: DiscLight, tiles: FloatArray, parts: int) -> Float32Array:
     radiance, cover = light.disc.air_light(seen @ light.icrs_to_image)
     corners = np.concatenate([places.reshape(-1, 2), (radiance * sr * light.times)[:, None], cover[:, None]], axis=1)
     return _corners(corners.reshape(*places.shape[:3], 4))
-
-
-def _beside(light: DiscLight, directions: FloatArray, px_per_rad: float) -> Mask:
-    """Which corners (n,) are so far away that neither the disc, its air nor the Gaussian reaches their tiles."""
-    disc = light.disc
-    seen = directions @ disc.to_sphere.T
-    angle = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
-    rim = np.arcsin(min(1.0, (1 + AIR_TOP * disc.air_radii) / disc.distance_radii))
-    more_px = TILE_PX * np.sqrt(2) + REACH_SIGMAS * max(light.psf.variance_px2) ** 0.5
-    return np.asarray(angle > rim + WIDER * more_px / px_per_rad)
 
 
 def _all(nodes: Mask) -> Mask:

@@ -26,10 +26,23 @@ def linear_image(sprites: Sprites, resolution_px: tuple[int, int], psf: Psf, foo
 
 def extended_image(lights: tuple[ExtendedLight, ...], resolution_px: tuple[int, int]) -> FloatArray:
     """Electrons per second of each pixel, float64 (height, width), from discs, stray light and maps alone."""
-    width, height = resolution_px
-    image = np.zeros((height, width))
+    image = np.zeros(resolution_px[::-1])
     for light in lights:
-        _lay(light, image)
+        region = light.region(resolution_px)
+        if region is None:
+            continue
+        left, top, width, height = region
+        if isinstance(light, LightMap):
+            x, y = light.corner_px
+            part = slice(top - y, top - y + height), slice(left - x, left - x + width)
+            own = light.times * light.image[part].astype(np.float64)
+            cover = np.zeros(1) if light.cover is None else light.cover[part]
+        elif isinstance(light, GlowLight):
+            own, cover = _glow(light, region), np.zeros(1)
+        else:
+            own, cover = _disc(light, region)
+        where = slice(top, top + height), slice(left, left + width)
+        image[where] = image[where] * (1 - cover) + own  # it hides what was there where it covers that
     return image
 
 
@@ -50,25 +63,6 @@ def add_stars(
         inside = on_y[:, :, None] & on_x[:, None, :]
         places = rows[:, :, None].astype(np.intp) * width + columns[:, None, :]
         np.add.at(image.reshape(-1), places[inside], light[inside])
-
-
-def _lay(light: ExtendedLight, image: FloatArray) -> None:
-    """Add light to an image, and hide what was there where it covers that."""
-    region = light.region((image.shape[1], image.shape[0]))
-    if region is None:
-        return
-    left, top, width, height = region
-    if isinstance(light, LightMap):
-        x, y = light.corner_px
-        part = slice(top - y, top - y + height), slice(left - x, left - x + width)
-        own = light.times * light.image[part].astype(np.float64)
-        cover = np.zeros(1) if light.cover is None else light.cover[part]
-    elif isinstance(light, GlowLight):
-        own, cover = _glow(light, region), np.zeros(1)
-    else:
-        own, cover = _disc(light, region)
-    where = slice(top, top + height), slice(left, left + width)
-    image[where] = image[where] * (1 - cover) + own
 
 
 def _glow(light: GlowLight, region: Rectangle) -> FloatArray:

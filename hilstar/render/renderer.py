@@ -121,7 +121,7 @@ class Renderer(Backend):
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, self._by_pixel)
             lit_e_per_s = self._by_pixel.lit_from_e_per_s(panel)
             self._lit_sides = () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
-            self._encoder.shrink(self._lit_sides)
+            set_sides(self._encoder.sprite_program, self._lit_sides)
             if lit_e_per_s and not target.sides:
                 self._cut_sides = lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS)
             # The passes count thresholds alone.
@@ -171,11 +171,23 @@ class Renderer(Backend):
             self._by_numpy = self._by_star is not None and (self._exact_pass is None or extended)
             units = None if self._by_numpy or extended else self._units
             unit_e_per_s = None if units is None else units.unit_for(sprites)
-            if self._passes is not None and unit_e_per_s is not None:
-                self._draw_by_passes(self._passes, sprites, unit_e_per_s)
+            passes = self._passes
+            if passes is not None and unit_e_per_s is not None:
+                # Levels star by star; the linear image is drawn only when it is read.
+                self._undrawn, self._levels_black = (sprites, True), False
+                with self._stage("erase"):
+                    passes.erase()
+                if sprites is not None and len(sprites):
+                    with self._stage("upload"):
+                        passes.upload(sprites)
+                    with self._stage("splat"):
+                        passes.add_light(unit_e_per_s)
+                    with self._stage("encode"):
+                        passes.encode()
+                self._choose(sprites, passes)
                 return
-            if self._passes is not None:
-                self._passes.forget(sums=False)
+            if passes is not None:
+                passes.forget(sums=False)
             if self._by_numpy:
                 self._draw_by_numpy(sprites, frame)
                 self._undrawn = (sprites, False)
@@ -200,7 +212,13 @@ class Renderer(Backend):
         few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
         sides = self._lit_sides if self._encoder is not None else ()
         covered_px = 0 if sprites is None else most_covered_px(sprites, self.footprint_px, sides, few_px)
-        in_units = self._set_units(sprites, unit_e_per_s)
+        units, encoder, splat = self._units, self._encoder, self._unit_splat
+        in_units = sprites is not None and unit_e_per_s is not None and splat is not None
+        if units is not None and encoder is not None and splat is not None:
+            reach_per_e = 0.0 if sprites is None or unit_e_per_s is None else units.reach_per_e(sprites)
+            encoder.sprite_program["reach_per_e"] = reach_per_e
+            if in_units:
+                splat["reach_per_e"], splat["unit_e_per_s"] = reach_per_e, unit_e_per_s
         cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
         self._draw_linear(sprites, whole=not (self.target.sides or cut), in_units=in_units)
         if self._encoder is not None:
@@ -212,32 +230,6 @@ class Renderer(Backend):
         if in_units or (cut and not self.target.sides):
             self._undrawn = (sprites, True)  # without what is left out, when somebody asks
         self._choose(sprites, None)
-
-    def _set_units(self, sprites: Sprites | None, unit_e_per_s: float | None) -> bool:
-        """Set the frame's unit and ellipses where it is drawn in units; whether it is."""
-        units, encoder, splat = self._units, self._encoder, self._unit_splat
-        if units is None or encoder is None or splat is None:
-            return False
-        if sprites is None or unit_e_per_s is None:
-            encoder.sprite_program["reach_per_e"] = 0.0
-            return False
-        encoder.sprite_program["reach_per_e"] = splat["reach_per_e"] = units.reach_per_e(sprites)
-        splat["unit_e_per_s"] = unit_e_per_s
-        return True
-
-    def _draw_by_passes(self, passes: StarPasses, sprites: Sprites | None, unit_e_per_s: float) -> None:
-        """Levels star by star; the linear image is drawn only when it is read."""
-        self._undrawn, self._levels_black = (sprites, True), False
-        with self._stage("erase"):
-            passes.erase()
-        if sprites is not None and len(sprites):
-            with self._stage("upload"):
-                passes.upload(sprites)
-            with self._stage("splat"):
-                passes.add_light(unit_e_per_s)
-            with self._stage("encode"):
-                passes.encode()
-        self._choose(sprites, passes)
 
     def _stage(self, name: str) -> AbstractContextManager[object]:
         """The context in which a stage of a frame runs; see StagedRenderer."""
@@ -285,16 +277,6 @@ class Renderer(Backend):
         self._floor_key, self._floor_levels = (lights, turn), levels.read().copy()
         return self._floor_levels
 
-    def _upload(self, sprites: Sprites) -> None:
-        if len(sprites) > self._capacity:
-            self._splat_vao.release()
-            if self._unit_vao is not None:
-                self._unit_vao.release()
-            self._buffer.release()
-            self._reserve(max(2 * self._capacity, len(sprites)))
-        self._buffer.orphan()
-        self._buffer.write(sprites.data)
-
     def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn = None
@@ -308,7 +290,13 @@ class Renderer(Backend):
             self._regions = self._extended.draw(self._linear_fbo, sprites.extended)
         if sprites is not None and len(sprites):
             with self._stage("upload"):
-                self._upload(sprites)
+                if len(sprites) > self._capacity:
+                    for held in (self._splat_vao, self._unit_vao, self._buffer):
+                        if held is not None:
+                            held.release()
+                    self._reserve(max(2 * self._capacity, len(sprites)))
+                self._buffer.orphan()
+                self._buffer.write(sprites.data)
             self._last_count = len(sprites)
             width, height = self.target.resolution_px
             margin = self.footprint_px

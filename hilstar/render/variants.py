@@ -65,21 +65,18 @@ class VariantRenderer(Renderer):
             self._splat = build_program(self._ctx, "star.vert", "study/splat.frag", (define,))
             self._splat["resolution_px"] = self.target.resolution_px
             if variant.profile == "table":
-                self._load_table(variant.table_size)
+                # Shares along x and y, the two channels of one row, from a star's centre to past its footprint's edge
+                reach_px, size = self.footprint_px / 2 + 1, variant.table_size
+                offset_px = np.linspace(0, reach_px, size)
+                shares = np.stack([pixel_shares(offset_px, sigma) for sigma in self.target.psf.width_px], axis=-1)
+                self._table = self._ctx.texture((size, 1), 2, shares.astype(np.float32).tobytes(), dtype="f4")
+                self._table.filter = (moderngl.NEAREST, moderngl.NEAREST)
+                self._table.use(0)
+                self._splat["samples_per_px"] = (size - 1) / reach_px
             else:
                 self._splat["sigma_px"] = self.target.psf.width_px
             self._splat["footprint_px"] = self.footprint_px
         self._reserve(FIRST_CAPACITY)
-
-    def _load_table(self, size: int) -> None:
-        """Shares along x and y, the two channels of one row, from a star's centre to past its footprint's edge."""
-        reach_px = self.footprint_px / 2 + 1
-        offset_px = np.linspace(0, reach_px, size)
-        shares = np.stack([pixel_shares(offset_px, sigma) for sigma in self.target.psf.width_px], axis=-1).astype(np.float32)
-        self._table = self._ctx.texture((size, 1), 2, shares.tobytes(), dtype="f4")
-        self._table.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        self._table.use(0)
-        self._splat["samples_per_px"] = (size - 1) / reach_px
 
     def draw_and_wait(self, sprites: Sprites) -> None:
         """Draw the linear image of `sprites`, and return when it is done."""

@@ -85,22 +85,18 @@ def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, psf: Psf) -> S
     fineness = 1.0
     while fineness >= MIN_COARSENESS:
         smear = _Smear(stars, camera, psf, NODES_PER_SIGMA * fineness)
-        sprites = _joined(smear, motion, pieces)
-        if sprites is not None:
+        chain: list[Sprites] = []
+        total = 0
+        for begin, end in itertools.pairwise(np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s):
+            chain.append(smear.piece(motion, float(begin), float(end), 1.0 / pieces))
+            total += len(chain[-1])
+            if total > MAX_SPRITES:
+                break
+        else:
+            sprites = join_sprites(chain, psf.footprint_px)
             return sprites if fineness == 1.0 else replace(sprites, capped=len(np.unique(sprites.star)))
         fineness *= COARSER
     raise InputError(f"{turn} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars")
-
-
-def _joined(smear: _Smear, motion: Motion, pieces: int) -> Sprites | None:
-    """The sprites of all pieces; None once they are too many."""
-    chain, total = [], 0
-    for begin, end in itertools.pairwise(np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s):
-        chain.append(smear.piece(motion, float(begin), float(end), 1.0 / pieces))
-        total += len(chain[-1])
-        if total > MAX_SPRITES:
-            return None
-    return join_sprites(chain, smear.psf.footprint_px)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,10 @@ runs with the scan meets fewer frames in a second, and has more light in each: 1
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import FloatArray
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.paths import Chords, Paths, ShortPaths, bend_px, node_counts, nodes_of, points_within, within_budget
@@ -120,7 +119,20 @@ def swept_sprites(stars: Stars, turn: CameraTurn, scan: Scan, camera: Camera, ps
         x_px, y_px = paths.places_px(EVERY, late_s)
         late_s = scan.late_s(x_px, y_px, camera.resolution_px)
     late_s = np.where(np.isfinite(late_s), late_s, 0.0)
-    wanted, first, last, span_s = _wanted_nodes(paths, late_s, scan, psf)
+    ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
+    chords = Chords(*(np.stack(places) for places in zip(*ends, strict=True)))
+    # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
+    bulge_px = paths.speed_rad_s * scan.hold_s * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
+    # From the first light of the row where a path begins until the row where it ends is written again: a star that falls by a
+    # share s of the rows that the panel lights meanwhile is overtaken by the panel hold / (1 - s) after the first.
+    span_s = np.zeros(len(late_s))
+    if scan.hold_s:
+        share = (scan.late_s(*ends[1], camera.resolution_px) - late_s) / scan.hold_s
+        span_s = scan.hold_s / (1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD))
+        chords = chords.to(span_s / scan.hold_s)
+    first, last = chords.on_image(camera.resolution_px, margin_px + bulge_px)  # the part of each path, 0 to 1
+    wanted = node_counts(chords.length_sigma(psf.width_px) * (last - first), NODES_PER_SIGMA, 1, POINT_SIGMA)
+    wanted[last <= first] = 0  # the path misses the image
     chosen, wanting = wanted, np.flatnonzero(wanted)
     kept = brightest(stars.electrons_per_s[near][wanting], max_stars(footprint_px))
     if kept is not None:  # a frame has no room for the faintest
@@ -159,32 +171,3 @@ def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bo
     if angle_rad <= most_rad:
         return turn, False
     return CameraTurn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True
-
-
-class FramePaths(NamedTuple):
-    """Stars' paths in a frame, (n,) each: nodes (0: the path misses the image), the part on the image, and the path's time."""
-
-    counts: IntArray
-    begin: FloatArray
-    end: FloatArray
-    span_s: FloatArray
-
-
-def _wanted_nodes(paths: Paths | ShortPaths, late_s: FloatArray, scan: Scan, psf: Psf) -> FramePaths:
-    """The nodes that each star's path needs."""
-    ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
-    # From the first light of the row where a path begins until the row where it ends is written again: a star that falls by a
-    # share s of the rows that the panel lights meanwhile is overtaken by the panel hold / (1 - s) after the first.
-    span_s = np.zeros(len(late_s))
-    if scan.hold_s:
-        share = (scan.late_s(*ends[1], paths.camera.resolution_px) - late_s) / scan.hold_s
-        span_s = scan.hold_s / (1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD))
-    chords = Chords(*(np.stack(places) for places in zip(*ends, strict=True)))
-    angle_rad = paths.speed_rad_s * scan.hold_s
-    # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
-    bulge_px = angle_rad * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
-    chords = chords.to(span_s / scan.hold_s) if scan.hold_s else chords
-    begin, end = chords.on_image(paths.camera.resolution_px, psf.footprint_px / 2 + 1 + bulge_px)
-    counts = node_counts(chords.length_sigma(psf.width_px) * (end - begin), NODES_PER_SIGMA, 1, POINT_SIGMA)
-    counts[end <= begin] = 0
-    return FramePaths(counts, begin, end, span_s)

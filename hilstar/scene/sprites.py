@@ -46,28 +46,6 @@ class NearStars(NamedTuple):
     electrons_per_s: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class _Kept:
-    """The stars found about a field at an attitude."""
-
-    stars: Stars
-    camera: Camera
-    margin_px: float
-    icrs_to_image: FloatArray
-    near: NearStars
-
-    def holds(self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float) -> bool:
-        """Whether every star near that field is among these."""
-        kept = self.stars
-        same = stars.vectors is kept.vectors and stars.electrons_per_s is kept.electrons_per_s and stars.grid is kept.grid
-        if not same or camera is not self.camera or margin_px != self.margin_px:
-            return False
-        difference = (icrs_to_image - self.icrs_to_image).ravel()
-        # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from R to S: roll counts as well.
-        chord = math.sqrt(float(difference @ difference) / 8)
-        return 2 * math.asin(min(1.0, chord)) <= KEPT_TURN_RAD - ROUNDING_RAD
-
-
 class Candidates:
     """The stars near a camera's field, looked for again once it has turned by KEPT_TURN_RAD from where they were.
 
@@ -76,17 +54,25 @@ class Candidates:
     """
 
     def __init__(self) -> None:
-        self._kept: _Kept | None = None
+        # The stars, the camera and the margin that were asked about, the attitude then, and what was found
+        self._kept: tuple[Stars, Camera, float, FloatArray, NearStars] | None = None
 
     def near(self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float) -> NearStars:
         """The stars within `margin_px` of the image, and some more. The caller must not change the arrays."""
-        kept, keeps = self._kept, not stars.bodies and stars.velocity_km_s is None
-        if keeps and kept is not None and kept.holds(stars, icrs_to_image, camera, margin_px):
-            return kept.near
+        keeps = not stars.bodies and stars.velocity_km_s is None
+        if keeps and self._kept is not None:
+            last, last_camera, last_margin_px, last_icrs_to_image, near = self._kept
+            same = stars.vectors is last.vectors and stars.electrons_per_s is last.electrons_per_s and stars.grid is last.grid
+            difference = (icrs_to_image - last_icrs_to_image).ravel()
+            # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from R to S: roll counts as well.
+            chord = math.sqrt(float(difference @ difference) / 8)
+            turned_rad = 2 * math.asin(min(1.0, chord))
+            if same and camera is last_camera and margin_px == last_margin_px and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD:
+                return near
         star = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
         near = NearStars(star, stars.directions(star).T, stars.electrons_per_s.take(star))
         if keeps:
-            self._kept = _Kept(stars, camera, margin_px, icrs_to_image.copy(), near)
+            self._kept = stars, camera, margin_px, icrs_to_image.copy(), near
         return near
 
 

@@ -104,7 +104,9 @@ class Trails:
 def trails(seen: Pass, view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
     """The satellites of a pass along their paths; one whose mean rate is fainter than `faintest_e_per_s` is left out."""
     wanted, (begin, end) = sprite_counts(seen, view, lit, brush)
-    counts = _within(wanted, brush.most)
+    counts, total = wanted, int(wanted.sum())
+    if total > brush.most:  # in proportion, one at least
+        counts = np.minimum(wanted, np.maximum(1, (wanted * (brush.most / total)).astype(np.intp)))
     path = np.repeat(np.arange(len(seen)), counts)
     order = np.arange(len(path)) - np.repeat(np.cumsum(counts) - counts, counts)
     part = ((end - begin) / np.maximum(counts, 1))[path]
@@ -112,21 +114,15 @@ def trails(seen: Pass, view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s
     last_s = first_s + part * lit.length_s
     x_px, y_px = view.places_px(seen, path, (first_s + last_s) / 2)
     light = seen.rates_e_per_s(path, first_s, last_s) * part
-    total = np.asarray(np.bincount(path, light, minlength=len(seen)), dtype=np.float64)
-    shown = (total > 0) & (total >= faintest_e_per_s)
+    rates = np.asarray(np.bincount(path, light, minlength=len(seen)), dtype=np.float64)
+    shown = (rates > 0) & (rates >= faintest_e_per_s)
     kept = shown[path] & (light > 0)
     star, size_px = seen.index[path[kept]], view.camera.resolution_px
     sprites = pack_sprites(x_px[kept], y_px[kept], light[kept], star, size_px, brush.psf.footprint_px)
     found = np.flatnonzero(np.isin(seen.index, sprites.star))
     most = int(np.bincount(path[kept], minlength=1).max(initial=1))
     sprites = replace(sprites, per_star=max(1, most), capped=int((counts < wanted)[found].sum()))
-    return Trails(sprites, seen.index[found], total[found], seen.directions(found, lit.middle_s[found]))
-
-
-def _within(wanted: IntArray, most: int) -> IntArray:
-    """The sprites that paths get of those they want: in proportion where that is more than `most`, one at least."""
-    total = int(wanted.sum())
-    return wanted if total <= most else np.minimum(wanted, np.maximum(1, (wanted * (most / total)).astype(np.intp)))
+    return Trails(sprites, seen.index[found], rates[found], seen.directions(found, lit.middle_s[found]))
 
 
 def sprite_counts(seen: Pass, view: TrailView, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:

@@ -271,7 +271,16 @@ class Randr:
     def _of_nvidia(self, output: str) -> dict[str, Value]:
         """What nvidia-settings says of an output, where NVIDIA's driver runs: RandR has none of it."""
         tool = shutil.which("nvidia-settings") if has_extension(self._display, b"NV-CONTROL") else None
-        return {} if tool is None else dict(_nvidia_values(tool, output))
+        values: dict[str, Value] = {}
+        for attribute in () if tool is None else NVIDIA_ATTRIBUTES:
+            command = [str(tool), "-t", "-q", f"[DPY:{output}]/{attribute}"]
+            try:
+                said = subprocess.run(command, capture_output=True, text=True, timeout=NVIDIA_S, check=False).stdout.strip()
+            except (OSError, subprocess.TimeoutExpired):
+                break
+            if said.removeprefix("-").isdecimal():
+                values[NVIDIA + attribute] = int(said)
+        return values
 
     @contextmanager
     def _resources(self) -> Iterator[Any]:
@@ -317,14 +326,3 @@ def lit_outputs() -> list[OutputState]:
 
 def _name(info: Any) -> str:
     return str((info.name or b"").decode(errors="replace"))
-
-
-def _nvidia_values(tool: str, output: str) -> Iterator[tuple[str, Value]]:
-    for attribute in NVIDIA_ATTRIBUTES:
-        command = [tool, "-t", "-q", f"[DPY:{output}]/{attribute}"]
-        try:
-            said = subprocess.run(command, capture_output=True, text=True, timeout=NVIDIA_S, check=False).stdout.strip()
-        except (OSError, subprocess.TimeoutExpired):
-            return
-        if said.removeprefix("-").isdecimal():
-            yield NVIDIA + attribute, int(said)

@@ -76,27 +76,20 @@ class Visibility:
             while self._x11.XPending(self._connection) > 0:
                 event = _Event()
                 self._x11.XNextEvent(self._connection, ctypes.byref(event))
-                self._take(event.visibility)
-            if self._there:
-                self.hidden = self._why(off_place)
+                kind = event.visibility.type
+                if kind == VISIBILITY_NOTIFY:
+                    self._covered = event.visibility.state
+                elif kind in {MAP_NOTIFY, UNMAP_NOTIFY}:
+                    self._mapped = kind == MAP_NOTIFY
+                self._there = self._there and kind != DESTROY_NOTIFY
+            if self._there and not self._mapped:
+                self.hidden = "not on the screen"
+            elif self._there:  # X11 also calls covered what is off the screen
+                self.hidden = off_place or COVERED[self._covered] or ("on a display that sleeps" if self._asleep() else "")
             ready = select.select([descriptor, self._stop], [], [], LOOK_AGAIN_S)[0]
             # A readable connection without an event has ended.
             if self._stop in ready or (ready and self._x11.XPending(self._connection) <= 0 and _ended(descriptor)):
                 return
-
-    def _take(self, event: _VisibilityEvent) -> None:
-        if event.type == VISIBILITY_NOTIFY:
-            self._covered = event.state
-        elif event.type == DESTROY_NOTIFY:
-            self._there = False
-        elif event.type in {MAP_NOTIFY, UNMAP_NOTIFY}:
-            self._mapped = event.type == MAP_NOTIFY
-
-    def _why(self, off_place: str) -> str:
-        if not self._mapped:
-            return "not on the screen"
-        # X11 also calls covered what is off the screen.
-        return off_place or COVERED[self._covered] or ("on a display that sleeps" if self._asleep() else "")
 
     def _off_place(self) -> str:
         """Why the window is not where it should be: on its display, or wholly on the screen; "" where it is."""

@@ -15,7 +15,7 @@ import pytest
 
 from hilstar.monitor.window.awake import _Server
 from tests.support.benches import SCREEN_BENCH, still_log
-from tests.support.commands import HILSTAR
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.screens import xvfb
 from tests.support.x11.xorg import Xorg, xorg
@@ -64,7 +64,7 @@ def shown(server: Xorg, folder: Path, name: str = "bench", *options: str) -> Ite
     command = [*HILSTAR, "replay", str(folder / f"{name}.toml"), str(folder / "still.csv"), "--force", *options]
     with (
         (folder / f"{name}.txt").open("wb") as said,
-        subprocess.Popen(command, env=server.env, stdout=said, stderr=said, start_new_session=True) as process,
+        Started(command, env=server.env, stdout=said, stderr=said, start_new_session=True) as process,
     ):
         try:
             yield process

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.support.benches import SCREEN_BENCH, still_log
-from tests.support.commands import HILSTAR
+from tests.support.forks import HILSTAR, Started
 from tests.support.pages import live, page_of, picture_of
 from tests.support.servers import Served
 from tests.support.waiting import wait_for
@@ -21,7 +21,7 @@ def test_the_page_s_picture_is_what_the_display_shows_under_every_aid(screen, tm
     bench = tmp_path / "bench.toml"
     bench.write_text(SCREEN_BENCH + ROUND)
     command = [*HILSTAR, "replay", str(bench), str(still_log(tmp_path / "still.csv")), "--console", "127.0.0.1:0", "--control"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=screen.env) as process:
+    with Started(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=screen.env) as process:
         served = Served(process, 0)
         try:
             page = page_of(served)

@@ -14,7 +14,8 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light.image_sources import Pattern, PatternDisplay
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import HILSTAR, run_hilstar
+from tests.support.commands import run_hilstar
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
 from tests.support.wire.ptys import Cable
 from tests.support.x11.diode import Diode
@@ -68,7 +69,7 @@ def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_p
     bench.write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
     command = [*HILSTAR, "first-light", str(bench), "-o", str(tmp_path / "s")]
     with (
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env) as process,
+        Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env) as process,
         client(screen.display) as user,
     ):
         try:

@@ -16,7 +16,8 @@ import pytest
 from hilstar.calibrate.latency import Edges, read_edges, save_edges
 from hilstar.run.screen.screen import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.forks import HILSTAR, Started
 from tests.support.ledgers import read_run
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, real_time, wait_for
 from tests.support.wire.ptys import Cable
@@ -51,7 +52,7 @@ def shown(screen: Screen, folder: Path, kind: str):
     still_log(folder / "still.csv")
     command = ["replay", str(bench), str(folder / "still.csv"), "--ledger", str(folder / "run.mcap"), "--json", "--overwrite"]
     (folder / "run.mcap").unlink(missing_ok=True)
-    with subprocess.Popen([*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=screen.env) as process:
+    with Started([*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=screen.env) as process:
         try:
             ledger = folder / "run.mcap"
             wait_for(lambda: process.poll() is not None or (ledger.exists() and ledger.stat().st_size > 20_000))

@@ -14,7 +14,8 @@ import pytest
 
 from hilstar.monitor.window.x11 import sync_control
 from tests.support.benches import SCREEN_BENCH, still_log
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.screens import recorded
 from tests.support.x11.xorg import Xorg, xorg
@@ -40,9 +41,7 @@ def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Pope
     """A run on the screen, its ledger growing."""
     ledger = path.parent / "run.mcap"
     command = ["replay", str(path), str(path.parent / "still.csv"), "--force", "--json", "--ledger", str(ledger), *options]
-    with subprocess.Popen(
-        [*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=server.env
-    ) as process:
+    with Started([*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=server.env) as process:
         try:
             wait_for(lambda: frames(path) > 10 or process.poll() is not None)
             yield process

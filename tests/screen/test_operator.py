@@ -18,7 +18,7 @@ from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.attitude.wire.protocol import HEALTH_BLANK, HEALTH_HIDDEN, HEALTH_NO_ATTITUDE, HEALTH_OPERATOR_OVERRIDE
 from hilstar.run.record.ledger_records import EventRecord, FrameRecord, frame_records
 from tests.support.benches import ORION_Q, SCREEN_BENCH
-from tests.support.commands import HILSTAR
+from tests.support.forks import HILSTAR, Started
 from tests.support.senders import connected, free_port, packet
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.events import Client, client
@@ -119,7 +119,7 @@ def test_the_status_says_what_the_screen_shows(screen, tmp_path):
     command = [*HILSTAR, "serve", str(bench), "--json"]
     with (
         connected(port, zmq.REQ, PATIENCE_S) as asker,
-        subprocess.Popen(command, stdout=subprocess.PIPE, env=screen.env) as process,
+        Started(command, stdout=subprocess.PIPE, env=screen.env) as process,
     ):
         try:
             bits = HEALTH_OPERATOR_OVERRIDE | HEALTH_BLANK | HEALTH_HIDDEN | HEALTH_NO_ATTITUDE

@@ -15,6 +15,7 @@ from hilstar.rotation import propagate
 from hilstar.run.record.ledger_records import frame_records
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import run_hilstar
+from tests.support.forks import Started
 from tests.support.waiting import PATIENCE_S
 from tests.support.x11.events import client
 from tests.support.x11.screens import Screen, Shown, codes_of, lines_over, xvfb
@@ -161,7 +162,7 @@ def test_a_display_that_is_not_there_gets_one_line(screen, bench_file):
 def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
     """Two levels: black and white; the square of the first white one stays 5 s."""
     command = ["calibrate", "plan", "-o", str(tmp_path / "plan.csv"), "--levels", "2", "--repeats", "1", "--show"]
-    with subprocess.Popen(
+    with Started(
         [sys.executable, "-m", "hilstar", *command, "--seconds", "3"], stderr=subprocess.PIPE, text=True, env=screen.env
     ) as process:
         seen = set()
@@ -178,7 +179,7 @@ def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
 def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, tmp_path):
     bench_file.write_text(SCREEN_BENCH.replace("[collimator]", "flip_x = true\n[collimator]"))
     command = ["calibrate", "dots", str(bench_file), "-o", str(tmp_path / "plan"), "--frames", "8", "--dots", "10", "--show"]
-    with subprocess.Popen(
+    with Started(
         [sys.executable, "-m", "hilstar", *command, "--seconds", "0.4"], stderr=subprocess.PIPE, text=True, env=screen.env
     ) as process:
         wanted = None

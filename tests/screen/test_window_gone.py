@@ -11,7 +11,7 @@ import pytest
 
 from hilstar.run.record.ledger_records import frame_records
 from tests.support.benches import SCREEN_BENCH, still_log
-from tests.support.commands import HILSTAR
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.events import client
 from tests.support.x11.screens import Screen, recorded, xvfb
@@ -53,7 +53,7 @@ def ended_by(screen: Screen, folder: Path, end: Callable[[], None]) -> tuple[str
     bench.write_text(SCREEN_BENCH)
     still_log(log)
     command = [*HILSTAR, "replay", str(bench), str(log), "--json", "--ledger", str(ledger)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env) as process:
+    with Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env) as process:
         try:
             wait_for(lambda: process.poll() is not None or len(recorded(ledger)) > 20)
             end()

@@ -8,26 +8,24 @@ import logging
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
 from hilstar.cli import run_command
 from hilstar.cli.entry import LOG_FORMAT
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S
-
-HILSTAR = [sys.executable, "-m", "hilstar"]
 
 
 def run_hilstar(
     *arguments: str | Path, cwd: Path | None = None, timeout: float = PATIENCE_S, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """The command as a user runs it, in a process of its own: half a second of CPU before it begins."""
+    """The command as a user runs it, in a process of its own, without the half second of its imports (see `Started`)."""
     command = [*HILSTAR, *map(str, arguments)]
     env = dict(os.environ) if env is None else env
     # A group of its own: what the command has started (`demo` a sender) ends with it, however it ends.
-    with subprocess.Popen(
+    with Started(
         command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         try:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH, attitude_table
-from tests.support.commands import HILSTAR
+from tests.support.forks import HILSTAR, Started
 from tests.support.senders import await_subscriber_of, free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -25,7 +25,7 @@ STATUS_EACH_S = 0.05
 STATUS = re.compile(r"(\d+) frames, \d+ missed; (\d+) packets, (\d+) refused")
 
 
-class Run(subprocess.Popen[str]):
+class Run(Started):
     """A command that shows frames, and what it says of itself to whoever runs it as a service (sd_notify)."""
 
     def __init__(self, command: list[str]) -> None:

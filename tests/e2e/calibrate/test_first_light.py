@@ -26,7 +26,8 @@ from hilstar.scene.camera import Camera, Lens
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S
 
 GAMMA_22 = {"monitor": {"calibration": "gamma2.2", "photodiode_px": 40}}
@@ -177,7 +178,7 @@ def test_what_is_done_is_not_done_again(whole):
 
 def started(folder, *more):
     words = ["first-light", folder / "bench.toml", "-o", folder / "s", "--virtual", folder / "truth.toml", *more]
-    return subprocess.Popen([*HILSTAR, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return Started([*HILSTAR, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def ended_at(process, folder, image, ending):

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.benches import LIVE_BENCH, attitude_table
-from tests.support.commands import HILSTAR
+from tests.support.forks import HILSTAR, Started
 from tests.support.pages import children, gone
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -42,7 +42,7 @@ class Systemd:
     def started(self) -> Iterator[subprocess.Popen[str]]:
         own = {"NOTIFY_SOCKET": str(self._folder / "notify"), "WATCHDOG_USEC": str(round(WATCHDOG_S * 1e6))}
         command = [*HILSTAR, "serve", str(self._folder / "bench.toml"), "--headless", "--console", "127.0.0.1:0"]
-        with subprocess.Popen(command, env=os.environ | own, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+        with Started(command, env=os.environ | own, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
             try:
                 yield process
             finally:

@@ -9,7 +9,7 @@ import subprocess
 import pytest
 
 from tests.e2e.calibrate.test_first_light import plant
-from tests.support.commands import HILSTAR
+from tests.support.forks import HILSTAR, Started
 from tests.support.pages import children, gone, live, page_of, picture_of
 from tests.support.servers import Served
 from tests.support.waiting import wait_for
@@ -29,7 +29,7 @@ def test_a_session_shows_its_patterns_and_tells_its_steps(tmp_path):
     plant(tmp_path)
     command = [*HILSTAR, "first-light", str(tmp_path / "bench.toml"), "-o", str(tmp_path / "s"), "--console", "127.0.0.1:0"]
     command += ["--virtual", str(tmp_path / "truth.toml"), "--patches", "0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=os.environ) as process:
+    with Started(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=os.environ) as process:
         try:
             page = page_of(Served(process, 0))
             with live(page) as link:

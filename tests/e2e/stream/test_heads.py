@@ -13,7 +13,8 @@ import numpy as np
 
 from hilstar.rotation import angle_between_rad, multiply
 from hilstar.run.record.ledger_records import frame_records
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar
+from tests.support.forks import HILSTAR, Started
 from tests.support.heads import MOUNTINGS, heads_file
 from tests.support.senders import publisher, talking
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -42,7 +43,7 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
     with publisher() as (sender, port), talking(sender, 50.0, tuple(q)), lines.open("w") as said:
         path = heads_file(tmp_path, port)
         command = [*HILSTAR, "serve", str(path), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
+        with Started(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
             try:
                 wait_for(lambda: lines.read_text().count("first attitude") == 3)
                 ledgers = [tmp_path / f"run.{name}.mcap" for name in MOUNTINGS]
@@ -81,7 +82,7 @@ def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):
     environment, lines = {**os.environ, "TMPDIR": str(place)}, tmp_path / "said.txt"
     with publisher() as (sender, port), talking(sender, 50.0, BODY), lines.open("w") as said:
         command = [*HILSTAR, "serve", str(heads_file(tmp_path, port)), "--headless"]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
+        with Started(command, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
             try:
                 wait_for(lambda: lines.read_text().count("first attitude") == 3)
             finally:

@@ -26,7 +26,8 @@ from hilstar.run.send_log import BadCable, Faults, send, spin_samples
 from hilstar.run.sender import UdpSender
 from hilstar.run.serve import Outlet, Running
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.forks import HILSTAR, Started
 from tests.support.live_runs import attitudes, serve_until
 from tests.support.senders import free_port, packet
 from tests.support.servers import Run, Served, interrupted, listening
@@ -55,7 +56,7 @@ def sent(to: str, *options: str) -> dict:
 def test_a_sender_over_ipv6_that_starts_first_waits_none_is_lost_and_both_sides_talk(tmp_path):
     port = free_port()
     options = ["--spin", "z,1", "--rate", "200", "--count", "300", "--to", f"udp://[::1]:{port}", "--json"]
-    with subprocess.Popen([*HILSTAR, "send", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as sender:
+    with Started([*HILSTAR, "send", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as sender:
         assert sender.stderr is not None
         assert "waiting for a listener" in sender.stderr.readline()
         with listening(bench_of(tmp_path, f'bind = "[::1]:{port}"'), f"bound to udp://[::1]:{port}") as process:
@@ -191,7 +192,7 @@ def test_an_address_that_is_not_listed_is_counted_and_never_answered_and_malform
 def test_a_look_at_where_a_live_stream_points_answers_a_sender_that_waits(tmp_path):
     port = free_port()
     command = [*HILSTAR, "send", "--spin", "z,0", "--radec", "30,40,50", "--rate", "50", "--to", f"udp://127.0.0.1:{port}"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as sender:
+    with Started(command, stderr=subprocess.PIPE, text=True) as sender:
         try:
             result = run_hilstar_here("attitude", bench_of(tmp_path, f"port = {port}"), "--json")
         finally:

@@ -17,7 +17,8 @@ from PIL import Image
 
 from hilstar.run.record.ledger_records import FrameRecord, frame_records
 from tests.support.benches import ATTITUDE
-from tests.support.commands import HILSTAR, run_hilstar_here
+from tests.support.commands import run_hilstar_here
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S
 
 SCREEN = "640x480x24"
@@ -74,7 +75,7 @@ class Shown:
 
     def __init__(self, screen: Screen, bench_file: Path, *options: str) -> None:
         command = [*HILSTAR, "replay", str(bench_file), str(bench_file.parent / "still.csv"), "--json", *options]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env)
+        self._process = Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env)
         self._screen = screen
 
     def __enter__(self) -> Shown:

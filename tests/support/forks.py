@@ -1,0 +1,165 @@
+"""hilstar's commands in processes of their own that begin where the imports are over: half of what a start costs.
+
+A process that has imported hilstar, the nursery, makes each as a copy of itself (fork). The copy is the caller's child, with
+its own number, streams, session, folder and environment; it runs `hilstar/__main__.py` and ends as any command does. Imports,
+and what a shell limits, are tested by `subprocess.Popen` of `HILSTAR`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import gc
+import importlib
+import json
+import os
+import resource
+import runpy
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+HILSTAR = [sys.executable, "-m", "hilstar"]
+# What a served, replayed or drawn bench imports before its first frame; no window, no browser, no thread.
+MODULES = ("cli", "bench.build", "run.loop", "run.open_link", "run.record.ledger", "run.serve", "render.numpy_backend")
+LIMITS = (resource.RLIMIT_AS, resource.RLIMIT_CPU, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE)
+MAX_REQUEST_BYTES = 1 << 20
+ROOM = "a" * 2000  # of the nursery's command line, where the names of its copies stand
+
+
+class Started(subprocess.Popen):
+    """A command that starts with `HILSTAR`, forked from the nursery; any other command as `subprocess.Popen` starts it."""
+
+    def _execute_child(self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, pass_fds: Any, cwd: Any, env: Any,
+                       startupinfo: Any, creationflags: Any, shell: Any, *more: Any) -> None:  # fmt: skip
+        (p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite), new_session = more[:6], bool(more[11])
+        environment = dict(os.environ if env is None else env)
+        is_plain = not (preexec_fn or pass_fds or shell) and python_of(environment) == python_of(os.environ)
+        if not is_plain or list(args[: len(HILSTAR)]) != HILSTAR:
+            super()._execute_child(args, executable, preexec_fn, close_fds, pass_fds, cwd, env, startupinfo, creationflags,
+                                   shell, *more)  # fmt: skip
+            return
+        request = {"words": list(map(str, args[len(HILSTAR) :])), "folder": str(cwd or Path.cwd()), "new_session": new_session}
+        request |= {"environment": environment, "heritage": heritage()}
+        streams = [own if own >= 0 else number for number, own in enumerate((p2cread, c2pwrite, errwrite))]
+        self.pid = nursery().fork(request, streams)
+        self._child_created = True
+        self._close_pipe_fds(p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite)
+
+
+def python_of(environment: Mapping[str, str]) -> dict[str, str]:
+    """What an environment says to Python itself and to its loader of libraries, which hear it as they start."""
+    return {name: value for name, value in environment.items() if name.startswith(("PYTHON", "LD_"))}
+
+
+def heritage() -> dict[str, Any]:
+    """What else a child has of its parent: its priority, its cores and its limits."""
+    return {
+        "priority": (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority),
+        "cores": sorted(os.sched_getaffinity(0)),
+        "limits": [(kind, resource.getrlimit(kind)) for kind in LIMITS],
+    }
+
+
+class Nursery:
+    """The process that has imported hilstar; it ends with this one."""
+
+    def __init__(self) -> None:
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        for kind in (socket.SO_SNDBUF, socket.SO_RCVBUF):
+            self._socket.setsockopt(socket.SOL_SOCKET, kind, MAX_REQUEST_BYTES)
+        command = [sys.executable, "-m", "tests.support.forks", str(theirs.fileno()), ROOM]
+        root = Path(__file__).resolve().parents[2]
+        with theirs:
+            self._process = subprocess.Popen(
+                command, cwd=root, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE, start_new_session=True,
+            )  # fmt: skip
+
+    def fork(self, request: dict[str, Any], streams: list[int]) -> int:
+        """Begin a command with these streams; its process' number."""
+        socket.send_fds(self._socket, [json.dumps(request).encode()], streams)
+        answer = self._socket.recv(100)
+        assert answer, "the nursery has ended"
+        return int(answer)
+
+
+@functools.cache
+def nursery() -> Nursery:
+    """This process' own."""
+    return Nursery()
+
+
+def main(made: socket.socket) -> None:
+    """Import, and make copies until nobody asks any more."""
+    for module in MODULES:
+        importlib.import_module(f"hilstar.{module}")
+    from hilstar.sky.catalog import load_catalog
+
+    load_catalog()
+    gc.collect()
+    gc.freeze()
+    while True:
+        data, streams, _, _ = socket.recv_fds(made, MAX_REQUEST_BYTES, 3)
+        if not data:
+            return
+        read, write = os.pipe()
+        between = os.fork()
+        if not between:
+            # Its parent ends at once, so that it becomes the child of the process that asked: that one adopts orphans.
+            if not os.fork():
+                made.close()
+                os.close(read)
+                become(json.loads(data), streams, write)
+            os._exit(0)
+        os.close(write)
+        number = os.read(read, 100)
+        os.waitpid(between, 0)
+        for each in (read, *streams):
+            os.close(each)
+        made.send(number)
+
+
+def become(request: dict[str, Any], streams: list[int], told: int) -> NoReturn:
+    """Be that command, in this copy of the nursery."""
+    if request["new_session"]:
+        os.setsid()
+    for number, stream in enumerate(streams):
+        os.dup2(stream, number)
+        os.close(stream)
+    inherited = request["heritage"]
+    if inherited != json.loads(json.dumps(heritage())):
+        os.sched_setaffinity(0, inherited["cores"])
+        for kind, limits in inherited["limits"]:
+            resource.setrlimit(kind, tuple(limits))
+        policy, priority = inherited["priority"]
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+    os.chdir(request["folder"])
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    tempfile.tempdir = None  # which the environment may say
+    sys.argv = ["hilstar", *request["words"]]
+    be_named([*HILSTAR, *request["words"]])
+    os.write(told, str(os.getpid()).encode())
+    os.close(told)
+    runpy.run_module("hilstar", run_name="__main__", alter_sys=True)
+    sys.exit(0)
+
+
+def be_named(command: list[str]) -> None:
+    """Make this the command line that /proc shows (its fields 48 and 49 are where the kernel reads it)."""
+    begin, end = map(int, Path("/proc/self/stat").read_text().rpartition(")")[2].split()[45:47])
+    text = b"".join(word.encode(errors="surrogateescape") + b"\0" for word in command)[: end - begin - 1]
+    ctypes.memmove(begin, text.ljust(end - begin, b"\0"), end - begin)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with contextlib.suppress(ConnectionError), socket.socket(fileno=int(sys.argv[1])) as asked:
+        main(asked)

@@ -43,25 +43,21 @@ SCENES = (
 
 def run(directory: Path) -> list[str]:
     """Write each scene's figure, noisy image (FITS) and truth (CSV); a line for each."""
-    return [_draw_scene(directory, scene) for scene in SCENES]
-
-
-def _draw_scene(directory: Path, scene: OutputScene) -> str:
-    with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
-        view = simulator.view(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
-        clean = simulator.expose(view, None)
-        noise = FrameNoise(seed=SEED)
-        noisy = simulator.expose(view, noise.rng())
-        write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, noise)
-    truth = noisy.truth
-    write_csv(directory / f"{scene.name}.csv", truth.dtype.names or (), truth.tolist())
-    _figure(directory / scene.name, scene, clean, noisy)
-    background = float(np.median(noisy.dn))
-    v_mag, saturated = truth["v_mag"], int(truth["clipped"].sum())
-    return (
-        f"{scene.name}: {len(truth)} stars, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f};"
-        f" sky {background:.0f} DN, {saturated} stars saturated"
-    )
+    lines, noise = [], FrameNoise(seed=SEED)
+    for scene in SCENES:
+        with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
+            view = simulator.view(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
+            clean, noisy = simulator.expose(view, None), simulator.expose(view, noise.rng())
+            write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, noise)
+        truth = noisy.truth
+        write_csv(directory / f"{scene.name}.csv", truth.dtype.names or (), truth.tolist())
+        _figure(directory / scene.name, scene, clean, noisy)
+        v_mag, saturated = truth["v_mag"], int(truth["clipped"].sum())
+        lines.append(
+            f"{scene.name}: {len(truth)} stars, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f};"
+            f" sky {np.median(noisy.dn):.0f} DN, {saturated} stars saturated"
+        )
+    return lines
 
 
 def _figure(path: Path, scene: OutputScene, clean: Exposure, noisy: Exposure) -> None:

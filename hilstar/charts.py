@@ -164,8 +164,9 @@ def finish(figure: Figure) -> None:
     drafts = [text for axes, named in side_names for text in _name_at_side(axes, named, arrows=False)]
     for axis in log_axes:
         axis.set_ticks([], minor=True)
-    if side_names or log_axes:
-        _lay_out(figure)
+    engine = figure.get_layout_engine()
+    if (side_names or log_axes) and engine is not None:
+        engine.execute(figure)
     for text in drafts:
         text.remove()
     for axes, named in side_names:
@@ -173,15 +174,9 @@ def finish(figure: Figure) -> None:
     for axis in log_axes:
         box = axis.axes.bbox
         log_ticks(axis, box.width / 45 if axis.axis_name == "x" else box.height / 25)
-    _lay_out(figure)
-    figure.set_layout_engine("none")  # each file that is written would repeat it
-
-
-def _lay_out(figure: Figure) -> None:
-    """Give the panels the sizes that their texts leave."""
-    engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
+    figure.set_layout_engine("none")  # each file that is written would repeat it
 
 
 def capital(text: str) -> str:
@@ -227,14 +222,8 @@ def log_ticks(axis: Axis, room: float) -> None:
     """Round ticks of a logarithmic axis within its limits, as many as stand apart where there is room for `room`."""
     low, high = sorted(axis.get_view_interval())
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    choices: list[tuple[tuple[float, ...], int]] = [
-        ((1, 1.5, 2, 3, 4, 5, 7), 1),
-        ((1, 2, 3, 5), 1),
-        ((1, 2, 5), 1),
-        ((1, 3), 1),
-    ]
-    choices += [((1,), every) for every in range(1, 20)]
-    for steps, every in choices:
+    within_decades: tuple[tuple[float, ...], ...] = ((1, 1.5, 2, 3, 4, 5, 7), (1, 2, 3, 5), (1, 2, 5), (1, 3))
+    for steps, every in [*((steps, 1) for steps in within_decades), *(((1.0,), every) for every in range(1, 20))]:
         ticks = [step * 10.0**power for power in range(first, last + 1) if power % every == 0 for step in steps]
         ticks = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
         if min((b / a for a, b in itertools.pairwise(ticks)), default=high) > (high / low) ** (1 / room):

@@ -21,11 +21,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, linalg, optimize
+from scipy import fft, linalg, optimize, sparse
 from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray
-from hilstar.assess.places import Bumps, Scale, bumps_at, centres_of, places_of
+from hilstar.assess.places import Scale, bumps_at, centres_of, places_of
 from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
 from hilstar.run.record.commanded import Commanded, Moments
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
@@ -36,6 +36,7 @@ MAX_BINS, MIN_BINS = 2_000_000, 8
 MIN_OVERLAP = 0.1  # smallest overlap, as a share of the shorter recording
 TRIED = 12  # offsets tried
 COMPARED = 400  # attitudes compared at each
+STARTS = 40  # rotations that are tried as the one with half of all nearest to it
 SCANNED = 3000  # offsets of the scan by attitudes
 AS_GOOD, SMALL_RAD = 1.2, 1e-4  # a spread up to this factor and this angle above the smallest is as good
 MOST = 0.8  # offsets with a smaller share of the largest overlap are dropped
@@ -124,9 +125,9 @@ def _spread_at(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offs
     return CoarseClock(offset_s, spread, rotation, int(moments.known.sum()))
 
 
-def nearest_to_half(rotations: FloatArray, starts: int = 40) -> tuple[FloatArray, float]:
+def nearest_to_half(rotations: FloatArray) -> tuple[FloatArray, float]:
     """The rotation among (n, 4) with half of all nearest to it, and the angle within which they lie, rad."""
-    chosen = np.unique(np.linspace(0, len(rotations) - 1, starts).astype(int))
+    chosen = np.unique(np.linspace(0, len(rotations) - 1, STARTS).astype(int))
     cosine = np.abs(rotations @ rotations[chosen].T)
     # The chord is exact for tiny angles, where the cosine is not.
     chord = np.sqrt(np.maximum(2 - 2 * cosine, 0))
@@ -388,7 +389,7 @@ class Smooth:
     `turn` (p, p) and `square` (p,) are the eigenvectors and eigenvalues of the bumps' normal matrix.
     """
 
-    bumps: Bumps | None
+    bumps: sparse.csr_matrix | None
     turn: FloatArray
     square: FloatArray
     kappa: FloatArray
@@ -399,8 +400,8 @@ class Smooth:
         if self.bumps is None or self.kappa[axis] == 0:
             return np.asarray(columns / self.variance[axis])
         share = self.kappa[axis] / (1 + self.kappa[axis] * self.square)
-        inner = self.turn @ (share[:, None] * (self.turn.T @ (self.bumps.value.T @ columns)))
-        return np.asarray((columns - self.bumps.value @ inner) / self.variance[axis])
+        inner = self.turn @ (share[:, None] * (self.turn.T @ (self.bumps.T @ columns)))
+        return np.asarray((columns - self.bumps @ inner) / self.variance[axis])
 
 
 def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
@@ -423,11 +424,11 @@ def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
     return best
 
 
-def _variances(bumps: Bumps, left: FloatArray) -> tuple[Smooth, float]:
+def _variances(bumps: sparse.csr_matrix, left: FloatArray) -> tuple[Smooth, float]:
     """The most likely variances with these bumps, and the logarithm of their likelihood."""
-    square, turn = linalg.eigh(bumps.gram, check_finite=False)
+    square, turn = linalg.eigh(np.asarray((bumps.T @ bumps).todense()), check_finite=False)
     square = np.maximum(square, 0.0)
-    projected = (turn.T @ (bumps.value.T @ left)) ** 2  # (p, 3)
+    projected = (turn.T @ (bumps.T @ left)) ** 2  # (p, 3)
     n, total = len(left), (left**2).sum(axis=0)
     kappa, variance, likelihood = np.zeros(3), np.zeros(3), 0.0
     grown = 1 + KAPPAS[:, None] * square  # (kappas, p)

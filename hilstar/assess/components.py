@@ -31,7 +31,7 @@ import numpy as np
 from scipy import sparse
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.assess.places import Projector, Scale, bumps_at, centres_of, places_of, weights_at
+from hilstar.assess.places import Projector, Scale, bumps_at, centres_of, places_of
 from hilstar.rotation import conjugate, multiply, to_matrix, to_rotation_vector
 
 MIN_ROWS = 30
@@ -138,7 +138,7 @@ def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector
         centre = centres_of(place, spacing)
         if 2 < len(centre) <= min(MAX_BUMPS, n // ROWS_A_BUMP):
             detail = f"what repeats over {4 * spacing:.0f} px or more of the field"
-            return Projector(bumps_at(place, centre, spacing).value), detail
+            return Projector(bumps_at(place, centre, spacing)), detail
         spacing *= 1.25
     return None, "the attitudes are too far apart: field-of-view error cannot be told from noise"
 
@@ -293,11 +293,10 @@ def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) ->
     place = places_of(axes, scale.focal_px, scale.roll_px)
     centre = centres_of(place, spacing_px)
     direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)
-    near = weights_at(place, centre, spacing_px)
-    seen = np.einsum("nij,nj->ni", axes[near.sample], direction[near.bump])
+    near = bumps_at(place, centre, spacing_px).tocoo()
+    seen = np.einsum("nij,nj->ni", axes[near.row], direction[near.col])
     phase = Phases("", scale.focal_px * seen[:, :2] / seen[:, 2:]).columns(LOCAL_HARMONICS)
-    where, shape = (near.sample, near.bump), (len(place), len(centre))
-    parts = [sparse.csr_matrix((near.value * column, where), shape=shape) for column in phase.T]
+    parts = [sparse.csr_matrix((near.data * column, (near.row, near.col)), shape=near.shape) for column in phase.T]
     return sparse.csr_matrix(sparse.hstack(parts))
 
 

@@ -9,15 +9,13 @@ so that the same attitude is the same place however the run got there. A smooth 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy import linalg, sparse
 from scipy.spatial import cKDTree
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import FloatArray
 from hilstar.units import ARCSEC_PER_RAD
 
 ROLL_SHARE = 0.3  # usual distance of a star from the boresight, in sides of the detector
@@ -49,27 +47,6 @@ def places_of(axes: FloatArray, focal_px: float, roll_px: float) -> FloatArray:
     return np.concatenate([focal_px * axes[:, 2], roll_px * axes[:, 0]], axis=1)
 
 
-@dataclass(frozen=True)
-class Bumps:
-    """The values (n, p) of p bumps at n samples, and their centres (p, 6)."""
-
-    value: sparse.csr_matrix
-    centre: FloatArray
-
-    @cached_property
-    def gram(self) -> FloatArray:
-        """The normal matrix (p, p)."""
-        return np.asarray((self.value.T @ self.value).todense())
-
-
-class BumpValues(NamedTuple):
-    """Entries (m,) of the sparse matrix of bumps: the sample, the bump, and the bump's value there."""
-
-    sample: IntArray
-    bump: IntArray
-    value: FloatArray
-
-
 def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
     """Centres (p, 6) about a spacing apart that cover the places (n, 6)."""
     cell = np.floor(place / spacing_px).astype(np.int64)
@@ -93,19 +70,17 @@ def _numbers(cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return mixed.astype(np.int64)
 
 
-def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Bumps:
-    """The bumps with these centres (p, 6) at places (n, 6)."""
-    near = weights_at(place, centre, spacing_px)
-    return Bumps(sparse.csr_matrix((near.value, (near.sample, near.bump)), shape=(len(place), len(centre))), centre)
+def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> sparse.csr_matrix:
+    """The values (n, p) of bumps with centres (p, 6) at places (n, 6).
 
-
-def weights_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> BumpValues:
-    """The values of bumps at samples within their reach. The bumps of a sample add to 1, so a constant fits up to the edge."""
+    The bumps of a sample add to 1, so a constant fits up to the edge.
+    """
     near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
     r = near["v"] / (REACH * spacing_px)
     value = (1 - r) ** 4 * (4 * r + 1)
     total = np.bincount(near["i"], value, minlength=len(place))
-    return BumpValues(near["i"], near["j"], value / total[near["i"]])
+    entries = (value / total[near["i"]], (near["i"], near["j"]))
+    return sparse.csr_matrix(entries, shape=(len(place), len(centre)))
 
 
 class Projector:

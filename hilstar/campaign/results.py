@@ -344,8 +344,7 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     because = failures(table)
     cases = read_cases(table)
     budget, parts = case_budget(cases, file, np.random.default_rng(seed))
-    rows = [["" if value is None else value for value in row] for row in budget_rows(budget, parts)]
-    write_csv(table.with_name("budget.csv"), FigureRow._fields, rows)
+    write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_rows(budget, parts))
     found = costs(cases)
     write_costs(table.with_name("sensitivity.csv"), found)
     findings = []

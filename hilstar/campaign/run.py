@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,22 +22,13 @@ if TYPE_CHECKING:
     from hilstar.campaign.cluster import Cluster
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """The options of a campaign beside its plan."""
-
-    solver: str
-    timeout_s: float
-    images: bool
-
-
 class Campaign:
     """A campaign that is checked and ready to run; nothing is written yet. Raises InputError or MachineError."""
 
-    def __init__(self, path: Path, directory: Path, asked: Asked) -> None:
+    def __init__(self, path: Path, directory: Path, solver: str, timeout_s: float, images: bool) -> None:
         require_parquet()
         text = read_text(path, "give the path of a plan", MAX_TOML_BYTES)
-        self.path, self.directory, self.asked = path, directory, asked
+        self.path, self.directory = path, directory
         self.plan: Plan = parse_plan(path, text)
         self.file: BenchFile = read_bench_file(path.parent / self.plan.bench)
         self.job = Job(
@@ -48,11 +38,11 @@ class Campaign:
             bench_text=self.file.text,
             bench_sha256=self.file.sha256,
             files_sha256=files_sha256(self.plan, path.parent),
-            solver=asked.solver,
+            solver=solver,
             solver_folder=str(Path.cwd()),
-            timeout_s=asked.timeout_s,
+            timeout_s=timeout_s,
             directory=str(directory.resolve()),
-            images=asked.images,
+            images=images,
         )
         try:
             session = Session(self.job)  # errors of plan, bench and solver are reported once, here
@@ -72,7 +62,7 @@ class Campaign:
         """Everything that the rows depend on."""
         plan = msgspec.json.decode(msgspec.json.encode(self.plan, enc_hook=str))
         identity = msgspec.to_builtins(self.identity)
-        return About(plan, self.file.sha256, self.job.files_sha256, self.asked.solver, self.asked.images, identity)
+        return About(plan, self.file.sha256, self.job.files_sha256, self.job.solver, self.job.images, identity)
 
     def run(self, directory: Directory, workers: Pool | Cluster, on_done: Callable[[int], None]) -> None:
         """Run the missing cases, and write the table once none is missing. `on_done` gets the number of finished cases.

@@ -55,8 +55,7 @@ class CentroidErrors:
     """Centroids of one image against the truth: counts, and x and y errors (n,), px, measured minus true, of matched stars.
 
     `stars` are on the detector, `matched` of them were found within MATCH_PX, and `false` finds belong to no star. Errors are
-    those of stars that are neither clipped, nor at the edge, nor crowded; `x_px`, `y_px` (n,) are their true places, `v_mag`
-    (n,) their magnitudes.
+    those of stars that are neither clipped, nor at the edge, nor crowded; `v_mag` (n,) are their magnitudes.
     """
 
     stars: int
@@ -65,8 +64,6 @@ class CentroidErrors:
     false: int
     dx_px: FloatArray
     dy_px: FloatArray
-    x_px: FloatArray
-    y_px: FloatArray
     v_mag: FloatArray
 
 
@@ -129,25 +126,16 @@ class CentroidSolver:
         flux = truth["electrons_per_s"]
         if len(truth):
             good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, psf)
-        x_px, y_px = truth["x_px"][good], truth["y_px"][good]
-        seen_x_px, seen_y_px = found.x_px[index[good]], found.y_px[index[good]]
-        errors = CentroidErrors(
-            stars=len(truth),
-            found=len(found),
-            matched=int(is_matched.sum()),
-            false=len(found) - int(is_matched.sum()),
-            dx_px=seen_x_px - x_px,
-            dy_px=seen_y_px - y_px,
-            x_px=x_px,
-            y_px=y_px,
-            v_mag=truth["v_mag"][good],
-        )
+        x_px, y_px, matched = truth["x_px"][good], truth["y_px"][good], int(is_matched.sum())
+        dx_px, dy_px = found.x_px[index[good]] - x_px, found.y_px[index[good]] - y_px
+        counts = len(truth), len(found), matched, len(found) - matched
+        errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good])
         if len(x_px) < MIN_STARS:
             return Answer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
         # The turn from the true attitude's cam to that of the centroids: Wahba's problem by SVD (Markley 1988). Weights are the
         # stars' light, the inverse of photon noise's variance.
         true = normalise(tracker.camera.rays(x_px, y_px))
-        seen = normalise(tracker.camera.rays(x_px + errors.dx_px, y_px + errors.dy_px))
+        seen = normalise(tracker.camera.rays(x_px + dx_px, y_px + dy_px))
         u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", flux[good] / flux[good].sum(), seen, true))
         turn = from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
         return Answer(multiply(turn, exposure.view.q_icrs_to_cam), "", errors)

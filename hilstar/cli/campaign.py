@@ -62,7 +62,7 @@ def campaign(
 ) -> None:
     """Run a plan's cases over every core, or a cluster, into one Parquet table, a row a case."""
     from hilstar.campaign.cluster import Scheduler
-    from hilstar.campaign.run import Asked, Campaign
+    from hilstar.campaign.run import Campaign
     from hilstar.campaign.store import Directory
 
     check_directory("-o", output)
@@ -74,7 +74,7 @@ def campaign(
     elif tls_ca_file or tls_cert or tls_key:
         raise InputError("campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it")
     memory_bytes = None if memory is None else parse_memory(memory)
-    this = Campaign(plan, output, Asked(solver, solver_timeout, images is not None))
+    this = Campaign(plan, output, solver, solver_timeout, images is not None)
     directory = Directory(output)
     try:
         directory.claim(this.about())

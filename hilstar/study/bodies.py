@@ -75,15 +75,6 @@ FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
 FLOOR = 1e-6  # lower end of the chart's axis
 
 
-@dataclass(frozen=True, slots=True)
-class Boresight:
-    """Where a bench looks: its angle from a body's middle, or beyond the Earth's limb (negative: on it)."""
-
-    body: str
-    off_deg: float
-    t_ns: int = 0
-
-
 @contextmanager
 def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
     """The benches of these names, which end with the context. Raises InputError or MachineError."""
@@ -108,14 +99,14 @@ def _open(folder: Path, name: str) -> Bench:
     return study_bench(folder / f"{name.replace(' ', '_')}.toml", tables)
 
 
-def attitude(bench: Bench, aim: Boresight) -> FloatArray:
-    """The attitude (unit quaternion, scalar first) with the boresight at an aim, of a bench that has the body."""
+def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
+    """The attitude (unit quaternion) so far from a body's middle, or beyond the Earth's limb (negative: on it)."""
     if bench.moving is None:
         raise AssertionError("a bench with bodies moves")
-    disc = next(d for d in bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, aim.t_ns) if d.name == aim.body)
-    off_rad = np.radians(aim.off_deg) + (disc.radius_rad if aim.body == "Earth" else 0.0)
+    disc = next(d for d in bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, t_ns) if d.name == body)
+    off_rad = np.radians(off_deg) + (disc.radius_rad if body == "Earth" else 0.0)
     # Along declination, away from the near pole; the Earth towards the Sun, where its limb is lit
-    beside = disc.sun if aim.body == "Earth" else np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
+    beside = disc.sun if body == "Earth" else np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
     beside = beside - (beside @ disc.direction) * disc.direction
     beside /= np.linalg.norm(beside)
     x, y, z = np.cos(off_rad) * disc.direction + np.sin(off_rad) * beside
@@ -124,11 +115,13 @@ def attitude(bench: Bench, aim: Boresight) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class BodyScene:
-    """A bench by its name, where it looks, and how far its clock goes from frame to frame."""
+    """A bench by its name, its aim (see `attitude`) from `t_ns` on, and the step of its clock from frame to frame."""
 
     name: str
     bench: str
-    aim: Boresight
+    body: str
+    off_deg: float
+    t_ns: int = 0
     step_ns: int = FRAME_NS
 
 
@@ -150,31 +143,31 @@ class BodyCost:
 
 
 SCENES = (
-    BodyScene("from the Earth's centre, no body", "observer", Boresight("Moon", 60.0)),
-    BodyScene("planets, none in view", "planets", Boresight("Jupiter", 60.0)),
-    BodyScene("Uranus in view, a point", "planets", Boresight("Uranus", 0.3)),
-    BodyScene("Jupiter in view, 1.1 px", "planets", Boresight("Jupiter", 0.3)),
-    BodyScene("Moon, not in view", "Moon", Boresight("Moon", 60.0)),
-    BodyScene("Moon in view, 55 px", "Moon", Boresight("Moon", 0.3)),
-    BodyScene("Sun, not in view", "Sun", Boresight("Sun", 60.0)),
-    BodyScene("Sun in view, 57 px", "Sun", Boresight("Sun", 0.3)),
-    BodyScene("from a low orbit, no body", "low orbit", Boresight("Earth", 80.0, DAY_SIDE_NS)),
-    BodyScene("Earth, not in view", "Earth", Boresight("Earth", 80.0, DAY_SIDE_NS)),
-    BodyScene("Earth's limb across the middle", "Earth", Boresight("Earth", 0.0, DAY_SIDE_NS)),
-    BodyScene("Earth fills the field", "Earth", Boresight("Earth", -60.0, DAY_SIDE_NS)),
-    BodyScene("all of them, none in view", "all", Boresight("Earth", 80.0, DAY_SIDE_NS)),
-    BodyScene("the same, at a step of the orbit", "all", Boresight("Earth", 80.0, DAY_SIDE_NS), 2 * NS_PER_S),
+    BodyScene("from the Earth's centre, no body", "observer", "Moon", 60.0),
+    BodyScene("planets, none in view", "planets", "Jupiter", 60.0),
+    BodyScene("Uranus in view, a point", "planets", "Uranus", 0.3),
+    BodyScene("Jupiter in view, 1.1 px", "planets", "Jupiter", 0.3),
+    BodyScene("Moon, not in view", "Moon", "Moon", 60.0),
+    BodyScene("Moon in view, 55 px", "Moon", "Moon", 0.3),
+    BodyScene("Sun, not in view", "Sun", "Sun", 60.0),
+    BodyScene("Sun in view, 57 px", "Sun", "Sun", 0.3),
+    BodyScene("from a low orbit, no body", "low orbit", "Earth", 80.0, DAY_SIDE_NS),
+    BodyScene("Earth, not in view", "Earth", "Earth", 80.0, DAY_SIDE_NS),
+    BodyScene("Earth's limb across the middle", "Earth", "Earth", 0.0, DAY_SIDE_NS),
+    BodyScene("Earth fills the field", "Earth", "Earth", -60.0, DAY_SIDE_NS),
+    BodyScene("all of them, none in view", "all", "Earth", 80.0, DAY_SIDE_NS),
+    BodyScene("the same, at a step of the orbit", "all", "Earth", 80.0, DAY_SIDE_NS, 2 * NS_PER_S),
 )
 
 
 def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) -> BodyCost:
     """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all" and the scene's."""
     bench, nothing = benches[scene.bench], benches["nothing"]
-    knows = bench.moving is not None and scene.aim.body in bench.moving.names
-    q = attitude(bench if knows else benches["all"], scene.aim)
-    without, shown = fastest((nothing, bench), q, scene.aim.t_ns, scene.step_ns, rounds)
-    stars = bench.draw(q, t_ns=scene.aim.t_ns).star_count
-    discs = " ".join(disc.name for disc in bench.discs(bench.view(q, None, scene.aim.t_ns)))
+    knows = bench.moving is not None and scene.body in bench.moving.names
+    q = attitude(bench if knows else benches["all"], scene.body, scene.off_deg, scene.t_ns)
+    without, shown = fastest((nothing, bench), q, scene.t_ns, scene.step_ns, rounds)
+    stars = bench.draw(q, t_ns=scene.t_ns).star_count
+    discs = " ".join(disc.name for disc in bench.discs(bench.view(q, None, scene.t_ns)))
     cost = shown.wall_ms - without.wall_ms, shown.cpu_ms - without.cpu_ms
     return BodyCost(scene.name, shown.wall_ms, without.wall_ms, *cost, discs, stars)
 
@@ -321,7 +314,7 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
     """A body at one place. `benches` has "nothing" and the body's own."""
     bench, nothing = benches[body], benches["nothing"]
     start_ns = DAY_SIDE_NS if body == "Earth" else 0
-    q = attitude(bench, Boresight(body, off_deg, start_ns))
+    q = attitude(bench, body, off_deg, start_ns)
     without, shown = fastest((nothing, bench), q, start_ns, FRAME_NS, rounds)
     drawn = bench.draw(q, t_ns=start_ns)
     levels = drawn.levels.copy()

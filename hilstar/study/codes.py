@@ -115,15 +115,6 @@ def error_cells(errors: StarErrors) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class ShownStars:
-    """A panel, and a star so many magnitudes under white on it."""
-
-    name: str
-    response: Response
-    mag: float
-
-
-@dataclass(frozen=True, slots=True)
 class OverFrames:
     """A row of over_frames.csv: rms errors over phases and beginnings of exposures of so many frames, places along an axis.
 
@@ -141,22 +132,19 @@ class OverFrames:
     axis_rms_px_fit: float
 
 
-def panels() -> list[ShownStars]:
-    """The panels: monitors of 8 bits, and microdisplays whose levels are equal."""
-    equal = {bits: table_response(bits, np.linspace(0, 1, 2**bits)) for bits in (8, 2, 1)}
-    return [
-        ShownStars("sRGB, 8 bits", srgb_response(8), 6.0),
-        ShownStars("gamma 2.2, 8 bits", gamma_response(8), 6.0),
-        ShownStars("linear, 8 bits", equal[8], 6.0),
-        ShownStars("linear, 2 bits", equal[2], 2.0),
-        ShownStars("1 bit", equal[1], 2.0),
-    ]
-
-
 def study_frames(directory: Path, quick: bool) -> str:
     """Write over_frames.csv and its chart into `directory`; the finding."""
     phases, counts = (6, FRAMES[:4]) if quick else (16, FRAMES)
-    left = [row for shown in panels() for row in _left_by(shown, phases, counts)]
+    equal = {bits: table_response(bits, np.linspace(0, 1, 2**bits)) for bits in (8, 2, 1)}
+    # Monitors of 8 bits, and microdisplays whose levels are equal; a star so many magnitudes under white on each.
+    shown = (
+        ("sRGB, 8 bits", srgb_response(8), 6.0),
+        ("gamma 2.2, 8 bits", gamma_response(8), 6.0),
+        ("linear, 8 bits", equal[8], 6.0),
+        ("linear, 2 bits", equal[2], 2.0),
+        ("1 bit", equal[1], 2.0),
+    )
+    left = [row for panel in shown for row in _left_by(*panel, phases, counts)]
     write_records(directory / "over_frames.csv", left)
     draw(directory / "over_frames", left)
     at = (row for row in left if (row.frames, row.method) == (AIM_FRAMES, "temporal"))
@@ -164,12 +152,12 @@ def study_frames(directory: Path, quick: bool) -> str:
     return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {each}"
 
 
-def _left_by(shown: ShownStars, phases: int, counts: tuple[int, ...]) -> Iterator[OverFrames]:
-    panel, share = Panel(shown.response, WHITE), flux_ratio(shown.mag)
+def _left_by(name: str, response: Response, mag: float, phases: int, counts: tuple[int, ...]) -> Iterator[OverFrames]:
+    panel, share = Panel(response, WHITE), flux_ratio(mag)
     sprites, tile, bright, judge = judged_phases(phases)
-    stars, linear = fainter(sprites, shown.mag), (share * bright).astype(np.float32)
+    stars, linear = fainter(sprites, mag), (share * bright).astype(np.float32)
     quantiser = TemporalQuantiser(panel, (phases * tile, phases * tile), USUAL_PSF)
-    steps = float(stars.data["electrons_per_s"][0]) / (float(shown.response.light[1]) * WHITE)
+    steps = float(stars.data["electrons_per_s"][0]) / (float(response.light[1]) * WHITE)
     kinds: tuple[Centroider, ...] = ("moment", "window", "fit")
     for method in ("temporal", "dither"):
         whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))  # light up to the end of each frame
@@ -185,7 +173,7 @@ def _left_by(shown: ShownStars, phases: int, counts: tuple[int, ...]) -> Iterato
             errors = [judge.errors((until(begin + count) - until(begin)) / count, share, kinds) for begin in BEGINS]
             each = [(e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in kinds)) for e in errors]
             rms = np.sqrt(np.mean(np.square(each), axis=0)).tolist()
-            yield OverFrames(shown.name, shown.mag, steps, method, count, *rms)
+            yield OverFrames(name, mag, steps, method, count, *rms)
 
 
 def draw(path: Path, left: list[OverFrames]) -> None:

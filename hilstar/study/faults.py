@@ -123,8 +123,6 @@ def stray_light(bench: Bench, share: float) -> Stray:
     """Each star's light in the codes over even stray light: the frame with the stars, less the same without them."""
     white = bench.flux_at_white_e_per_s
     sprites = bench.light(bench.view(FIELD))
-    if sprites is None:
-        raise AssertionError("a frame with an attitude has sprites")
     glow = GlowLight(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)  # 100 rad wide: even
     lights = (glow,) if share else ()
     both, alone = (
@@ -155,22 +153,15 @@ def run(directory: Path, quick: bool = False) -> list[str]:
                 strays += [stray_light(bench, share) for share in shares]
     write_records(directory / "faults-cost.csv", costs)
     write_records(directory / "faults-stray.csv", strays)
-    findings = _findings(costs, strays)
     draw_stray(directory / "faults", strays)
     draw_costs(directory / "faults_cost", costs)
-    return findings
-
-
-def _findings(costs: list[FaultCost], strays: list[Stray]) -> list[str]:
     found = []
     for quantisation in QUANTISATIONS:
         mine = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
-        dearest = max(mine.values(), key=lambda cost: cost.cost_ms)
-        off = mine[NOWHERE]
+        off, star, dearest = mine[NOWHERE], mine["false star, on the sky"], max(mine.values(), key=lambda cost: cost.cost_ms)
         found.append(
             f"{quantisation}: of a frame of {off.without_ms:.1f} ms a scenario with nothing on takes {off.cost_ms:+.2f} ms, a"
-            f" false star {mine['false star, on the sky'].cost_ms:+.2f} ms; the dearest, {dearest.case},"
-            f" {dearest.cost_ms:+.1f} ms"
+            f" false star {star.cost_ms:+.2f} ms; the dearest, {dearest.case}, {dearest.cost_ms:+.1f} ms"
         )
     for quantisation in QUANTISATIONS:
         least = spoilt_from(strays, quantisation)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hilstar.arrays import FloatArray
 from hilstar.calibrate.geometric.calibration import matched
@@ -79,7 +78,11 @@ def observed_dots(
 
 def turned(a_deg: float, b_deg: float, c_deg: float = 0.0) -> FloatArray:
     """Rotation about x, then y, then z: columns are the turned axes."""
-    return np.asarray(Rotation.from_euler("xyz", (a_deg, b_deg, c_deg), degrees=True).as_matrix())
+    a, b, c = np.radians([a_deg, b_deg, c_deg])
+    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    return np.asarray(z @ y @ x)
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,29 +45,25 @@ SCENES = (
 
 def run(directory: Path) -> list[str]:
     """Write each scene's figure, noisy image (FITS) and truth (CSV); a line for each."""
-    return [_draw_scene(directory, scene) for scene in SCENES]
-
-
-def _draw_scene(directory: Path, scene: OutputScene) -> str:
-    with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
-        view = simulator.view(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
-        clean = simulator.expose(view, None)
-        sky_e, exposure_s = float(np.median(clean.mean_e)), simulator.config.tracker.exposure_s
-        total_e = math.sqrt(simulator.detector.settings.noise(sky_e, exposure_s).total_e2)
-        thesis_e = thesis_total_e(simulator.detector.settings, sky_e, exposure_s)
-        noise = FrameNoise(seed=SEED)
-        noisy = simulator.expose(view, noise.rng())
-        write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, noise)
-    truth = noisy.truth
-    write_csv(directory / f"{scene.name}.csv", truth.dtype.names or (), truth.tolist())
-    _figure(directory / scene.name, scene, clean, noisy)
-    background = float(np.median(noisy.dn))
-    v_mag, saturated = truth["v_mag"], int(truth["clipped"].sum())
-    return (
-        f"{scene.name}: {len(truth)} stars, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f};"
-        f" sky {background:.0f} DN, {saturated} stars saturated; n_TOT of a pixel of sky {total_e:.0f} e-"
-        f" (table 4.1: {thesis_e:.0f})"
-    )
+    lines, noise = [], FrameNoise(seed=SEED)
+    for scene in SCENES:
+        with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
+            view = simulator.view(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
+            clean, noisy = simulator.expose(view, None), simulator.expose(view, noise.rng())
+            sky_e, exposure_s = float(np.median(clean.mean_e)), simulator.config.tracker.exposure_s
+            total_e = math.sqrt(simulator.detector.settings.noise(sky_e, exposure_s).total_e2)
+            thesis_e = thesis_total_e(simulator.detector.settings, sky_e, exposure_s)
+            write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, noise)
+        truth = noisy.truth
+        write_csv(directory / f"{scene.name}.csv", truth.dtype.names or (), truth.tolist())
+        _figure(directory / scene.name, scene, clean, noisy)
+        v_mag, saturated = truth["v_mag"], int(truth["clipped"].sum())
+        lines.append(
+            f"{scene.name}: {len(truth)} stars, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f};"
+            f" sky {np.median(noisy.dn):.0f} DN, {saturated} stars saturated; n_TOT of a pixel of sky {total_e:.0f} e-"
+            f" (table 4.1: {thesis_e:.0f})"
+        )
+    return lines
 
 
 def thesis_total_e(detector: DetectorSettings, light_e: float, exposure_s: float) -> float:

@@ -22,7 +22,8 @@ SLEW_DEG, SLEW_S = 3.0, 20.0
 # Jitter per axis: amplitude, arcsec, and frequency, Hz, as wheels and structure shake a small satellite.
 JITTER = ((2.0, 3.1), (1.0, 11.0), (0.3, 37.0))
 RATE_STEP_NS = 100_000
-NEAR = 4
+NEAR = 4  # samples that a predictor has
+AXIS = np.array([0.6, 0.8, 0.0])  # of a steady turn: across rows and columns
 
 # From the last samples to the attitude at a time, ns.
 AttitudeAt = Callable[[int], FloatArray]
@@ -75,6 +76,47 @@ def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
     """The rate (3,) of a movement, from RATE_STEP_NS on both sides: 0.006 arcsec/s off at 37 Hz, 0.0003 arcsec predicted."""
     before, after = attitude(t_ns - RATE_STEP_NS), attitude(t_ns + RATE_STEP_NS)
     return rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Movement:
+    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a constant turn about AXIS, and, where it is `shaken`, JITTER on it.
+
+    A camera at rest is not shaken.
+    """
+
+    q_icrs_to_cam: FloatArray
+    rate_deg_s: float
+    packet_hz: int = 100
+    shaken: bool = True
+
+    @property
+    def turns(self) -> bool:
+        """Whether it is not at rest."""
+        return self.rate_deg_s != 0
+
+    @property
+    def turn_rad_s(self) -> FloatArray:
+        """The constant turn (3,) of cam in icrs, cam components."""
+        return np.asarray(math.radians(self.rate_deg_s) * AXIS)
+
+    def at(self, t_ns: int) -> FloatArray:
+        """The true q_icrs_to_cam."""
+        if not self.turns:
+            return self.q_icrs_to_cam
+        t_s = t_ns / NS_PER_S
+        q = propagate(self.q_icrs_to_cam, self.turn_rad_s, t_s)
+        return shaken(q, t_s) if self.shaken else q
+
+    def rate_rad_s(self, t_ns: int) -> FloatArray:
+        """The true rate (3,) of cam in icrs, cam components, jitter included."""
+        return rate_of(self.at, t_ns) if self.turns and self.shaken else self.turn_rad_s
+
+    def samples(self, until_ns: int) -> list[AttitudeSample]:
+        """The newest NEAR samples at time `until_ns`."""
+        last = until_ns * self.packet_hz // NS_PER_S
+        times_ns = [round(k * NS_PER_S / self.packet_hz) for k in range(last + 1 - NEAR, last + 1)]
+        return [AttitudeSample(t_ns, self.at(t_ns), self.rate_rad_s(t_ns)) for t_ns in times_ns]
 
 
 def attitude_at(timeline: Timeline, t_ns: int) -> Attitude:

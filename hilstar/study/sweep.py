@@ -152,38 +152,29 @@ def measured(step: Trials, budget_s: float) -> Trials:
     return replace(step, trials=sorted(found, key=lambda trial: trial.time_ms))
 
 
-class _CoreTimes(NamedTuple):
-    """Processor time since the machine started, s: of all cores, the busy part of it, and this process's part of that."""
-
-    all_s: float
-    busy_s: float
-    own_s: float
-
-
 class OtherWork:
     """Counts the cores that other processes take from its creation on; children of this process are its own."""
 
     def __init__(self) -> None:
-        self._before = self._times()
+        self._before = self._times_s()
 
     def cores(self) -> float:
         """How many cores the others took on average since creation; 0 where the system does not say."""
-        before, now = self._before, self._times()
-        passed_s = now.all_s - before.all_s
-        others_s = (now.busy_s - before.busy_s) - (now.own_s - before.own_s)
-        return max(others_s, 0.0) / passed_s * (os.cpu_count() or 1) if passed_s > 0 else 0.0
+        all_s, others_s = (now - before for now, before in zip(self._times_s(), self._before, strict=True))
+        return max(others_s, 0.0) / all_s * (os.cpu_count() or 1) if all_s > 0 else 0.0
 
     @staticmethod
-    def _times() -> _CoreTimes:
+    def _times_s() -> tuple[float, float]:
+        """Processor time since the machine started, s: of all cores, idle or busy, and that of other processes."""
         try:
             ticks = [int(word) for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
         except (OSError, ValueError):
-            return _CoreTimes(0.0, 0.0, 0.0)
+            return 0.0, 0.0
         each_s = 1 / os.sysconf("SC_CLK_TCK")
         user, nice, system, idle, waiting, *interrupts = ticks
         busy = user + nice + system + sum(interrupts)
         own = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-        return _CoreTimes((busy + idle + waiting) * each_s, busy * each_s, sum(used.ru_utime + used.ru_stime for used in own))
+        return (busy + idle + waiting) * each_s, busy * each_s - sum(used.ru_utime + used.ru_stime for used in own)
 
 
 def is_busy(others_cores: float) -> bool:

@@ -18,27 +18,25 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
-from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.cameras import tracker_camera
 from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
-from hilstar.rotation import from_radec_roll_deg, propagate
+from hilstar.rotation import from_radec_roll_deg
 from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
-from hilstar.study.predictors import attitude_at
+from hilstar.study.predictors import Movement, attitude_at
 from hilstar.study.settings import FULL_HD, GLASS, Isolation, Table, centroid_px, lone_windows, star_error, study_bench
 from hilstar.study.sweep import medians_ms
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
 
-AXIS = np.array([0.6, 0.8, 0.0])  # across rows and columns
 RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
-PACKET_HZ = 200.0
+PACKET_HZ = 200
 RATE_DEG_S = 1.0
 PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
 STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
@@ -49,29 +47,9 @@ QUICK_RATES_DEG_S = (2.0,)
 # A window reaches the largest error here and the PSF beyond a star's path.
 
 
-@dataclass(frozen=True, slots=True)
-class Slew:
-    """A turn at a constant rate from t = 0 on, and the packets that report it."""
-
-    rate_deg_s: float
-
-    @property
-    def rate_cam_rad_s(self) -> FloatArray:
-        """Rate of cam with respect to icrs, cam components."""
-        return np.asarray(math.radians(self.rate_deg_s) * AXIS)
-
-    def at(self, seconds: float) -> FloatArray:
-        """The true attitude."""
-        return propagate(from_radec_roll_deg(*RADEC_ROLL_DEG), self.rate_cam_rad_s, seconds)
-
-    def packets_until(self, seconds: float) -> Timeline:
-        """The packets received by then."""
-        timeline = Timeline(Policy(NS_PER_S, NS_PER_S))
-        last = math.floor(seconds * PACKET_HZ)
-        for number in range(last - 3, last + 1):
-            t_s = number / PACKET_HZ
-            timeline.add(AttitudeSample(round(t_s * NS_PER_S), self.at(t_s), self.rate_cam_rad_s, number))
-        return timeline
+def slew(rate_deg_s: float) -> Movement:
+    """A turn at a constant rate from t = 0 on, with the packets that report it."""
+    return Movement(from_radec_roll_deg(*RADEC_ROLL_DEG), rate_deg_s, PACKET_HZ, shaken=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,9 +112,11 @@ class ScanningPanel:
         self.optics = TwinOptics(BenchGeometry(self.bench.camera, self.camera), self.bench.tracker_psf)
         self.panel = self.bench.panel
 
-    def attitude(self, slew: Slew, swap_s: float) -> Attitude:
+    def attitude(self, movement: Movement, swap_s: float) -> Attitude:
         """The attitude that the display derives from the packets received when it starts the frame of a swap."""
-        timeline = slew.packets_until(swap_s - DRAW_TO_SWAP_S)
+        timeline = Timeline(Policy(NS_PER_S, NS_PER_S))
+        for sample in movement.samples(round((swap_s - DRAW_TO_SWAP_S) * NS_PER_S)):
+            timeline.add(sample)
         light_s = swap_s + self.period_s / 2
         if self.way == "no prediction":
             light_s = math.floor((swap_s - DRAW_TO_SWAP_S) * PACKET_HZ) / PACKET_HZ
@@ -147,7 +127,7 @@ class ScanningPanel:
         rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
         return self.bench.draw(attitude.q_icrs_to_cam, number, rate).levels
 
-    def exposed_e_per_s(self, slew: Slew) -> FloatArray:
+    def exposed_e_per_s(self, movement: Movement) -> FloatArray:
         """The tracker's image (h, w) of the screen, mean over an exposure."""
         height = self.bench.config.monitor.resolution_px[1]
         span_s = (self.start_s, self.start_s + self.exposure_s)
@@ -158,12 +138,12 @@ class ScanningPanel:
         light = np.zeros((height, self.bench.config.monitor.resolution_px[0]))
         for number, swap_s, weight in zip(numbers, swaps_s, weights, strict=True):
             if weight.any():
-                light += weight[:, None] * shown_light(self.levels(self.attitude(slew, swap_s), number), self.panel)
+                light += weight[:, None] * shown_light(self.levels(self.attitude(movement, swap_s), number), self.panel)
         return self.optics.image_e_per_s(light)
 
-    def cost_ms(self, slew: Slew) -> float:
+    def cost_ms(self, movement: Movement) -> float:
         """Median time of drawing a frame, from its attitude to its codes, ms."""
-        attitude = self.attitude(slew, 0.0)
+        attitude = self.attitude(movement, 0.0)
         return medians_ms({self.way: lambda number: self.levels(attitude, number)}, COST_ROUNDS)[self.way]
 
     def close(self) -> None:
@@ -179,16 +159,16 @@ class TimingSky:
         self._shown = shown
         self._renderer = Renderer(Target(shown.bench.config.monitor.resolution_px, shown.bench.psf))
 
-    def paths(self, slew: Slew) -> Sprites:
+    def paths(self, movement: Movement) -> Sprites:
         """Each star's path over the exposure, in monitor pixels."""
         middle_s = self._shown.start_s + self._shown.exposure_s / 2
-        motion = Motion(slew.at(middle_s), slew.rate_cam_rad_s, self._shown.exposure_s)
+        motion = Motion(movement.at(round(middle_s * NS_PER_S)), movement.turn_rad_s, self._shown.exposure_s)
         bench = self._shown.bench
         return smeared_sprites(bench.stars, motion, bench.camera, bench.psf)
 
-    def exposed_e_per_s(self, slew: Slew) -> FloatArray:
+    def exposed_e_per_s(self, movement: Movement) -> FloatArray:
         """The tracker's image (h, w), mean over the exposure."""
-        self._renderer.draw(self.paths(slew))
+        self._renderer.draw(self.paths(movement))
         return self._shown.optics.image_e_per_s(self._renderer.linear().astype(np.float64))
 
     def close(self) -> None:
@@ -236,7 +216,7 @@ class BeatPoint:
 
 def measure_beat(quick: bool = False) -> list[BeatPoint]:
     """Every case at 1 deg/s, by the virtual tracker."""
-    slew = Slew(RATE_DEG_S)
+    movement = slew(RATE_DEG_S)
     points: list[BeatPoint] = []
     for case in QUICK_CASES if quick else CASES:
         with TemporaryDirectory() as folder, ExitStack() as stack:
@@ -246,16 +226,17 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
             sky = stack.enter_context(closing(TimingSky(panel)))
             for number in range(STARTS):
                 panel.start_s = (number + 0.2) / STARTS * panel.period_s
-                points += _exposure_points(case, panel, sky, slew)
+                points += _exposure_points(case, panel, sky, movement)
     return points
 
 
-def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, slew: Slew) -> Iterator[BeatPoint]:
-    shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
-    paths, to_tracker, camera = sky.paths(slew), panel.optics.geometry.to_tracker, panel.bench.camera
+def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, movement: Movement) -> Iterator[BeatPoint]:
+    shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
+    paths, to_tracker, camera = sky.paths(movement), panel.optics.geometry.to_tracker, panel.bench.camera
     windows = list(lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
     # Where each star is on the monitor in the middle of the exposure, and just before and after: its row, and its speed.
-    middle = Motion(slew.at(panel.start_s + panel.exposure_s / 2), slew.rate_cam_rad_s, panel.exposure_s)
+    middle_ns = round((panel.start_s + panel.exposure_s / 2) * NS_PER_S)
+    middle = Motion(movement.at(middle_ns), movement.turn_rad_s, panel.exposure_s)
     vectors = panel.bench.stars.vectors[[star for star, _ in windows]]
     images = vectors @ middle.icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera).transpose(0, 2, 1)
     before, now, after = (camera.project(image) for image in images)
@@ -335,10 +316,10 @@ class TimingOutcome:
     draw_ms: float
 
 
-def compare(panel: ScanningPanel, sky: TimingSky, slew: Slew) -> TimingOutcome:
+def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingOutcome:
     """One compensation on one slew, against the sky."""
-    shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
-    paths = sky.paths(slew)
+    shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
+    paths = sky.paths(movement)
     places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
     windows = lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
     errors = [star_error(shown, true, window) for _, window in windows]
@@ -346,7 +327,7 @@ def compare(panel: ScanningPanel, sky: TimingSky, slew: Slew) -> TimingOutcome:
     off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / panel.camera.focal_length_px
     rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
     return TimingOutcome(
-        panel.way, slew.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(slew)
+        panel.way, movement.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(movement)
     )
 
 
@@ -355,7 +336,7 @@ def measure(quick: bool = False) -> list[TimingOutcome]:
     with TemporaryDirectory() as folder, ExitStack() as stack:
         panels = [stack.enter_context(closing(ScanningPanel(way, Path(folder) / f"{k}.toml"))) for k, way in enumerate(WAYS)]
         sky = stack.enter_context(closing(TimingSky(panels[0])))
-        return [compare(panel, sky, Slew(rate)) for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S) for panel in panels]
+        return [compare(panel, sky, slew(rate)) for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S) for panel in panels]
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:

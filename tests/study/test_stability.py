@@ -83,14 +83,6 @@ def rounded_codes(scene):
     return image.codes_of(scene, "round")
 
 
-JUDGED_CODES = (
-    image.stars_half_off,
-    image.stars_a_pixel_apart,
-    image.narrow_codes,
-    image.uneven_panel,
-    image.two_bits,
-    image.sixteen_bits,
-)
 # What a place would say if hilstar did as the method that fails there: the module's road is replaced by it.
 WRONG_ROADS = (
     (image.narrow_star, "by_renderer", rendered_by(image.point_sampled)),
@@ -100,7 +92,7 @@ WRONG_ROADS = (
     (image.star_on_pixel_edge, "by_renderer", rendered_by(image.nearest_pixel)),
     (image.star_on_image_edge, "by_renderer", rendered_by(image.nearest_pixel)),
     (image.popping_codes, "moving_code_fluxes", rounded),
-    *((visit, "exact_codes", rounded_codes) for visit in JUDGED_CODES),
+    *((visit, "exact_codes", rounded_codes) for visit in image.CODES),
 )
 
 

@@ -144,13 +144,13 @@ def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monk
     monkeypatch.setattr(predictors, "JITTER", ())
     scene, bench = scene_of(parts, 3), parts[0].own
     (judge,) = scene.judges
-    sample_ns, lead = NS_PER_S // choices.PACKET_HZ, lead_ns(bench.config)
+    sample_ns, lead = NS_PER_S // judge.movement.packet_hz, lead_ns(bench.config)
     ages_ns = [light - (light - lead) // sample_ns * sample_ns for light in judge.seen.light_ns]
     age_s = np.average(ages_ns, weights=judge.seen.weights.mean(axis=(1, 2))) / NS_PER_S
     true = judge.true[judge.judged]
     row_s = bench.scan.late_s(*bench.camera.project(true @ bench.camera.cam_to_image.T), bench.camera.resolution_px)
     late_s = age_s + row_s + bench.scan.hold_s / 2
-    expected = np.sqrt(np.mean((3600 * late_s * np.linalg.norm(np.cross(true, choices.AXIS), axis=1)) ** 2))
+    expected = np.sqrt(np.mean((3600 * late_s * np.linalg.norm(np.cross(true, predictors.AXIS), axis=1)) ** 2))
     held = Combination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
     assert scene.error(held).error_arcsec == pytest.approx(expected, rel=LATE_SHARE)
 
@@ -159,7 +159,7 @@ def test_a_star_that_runs_with_the_scan_loses_no_light(parts, monkeypatch):
     monkeypatch.setattr(predictors, "JITTER", ())
     scene, bench = scene_of(parts, 4), parts[0].own
     (judge,) = scene.judges
-    moved_px = math.radians(10.0) * choices.AXIS[0] * bench.camera.focal_length_px
+    moved_px = math.radians(10.0) * predictors.AXIS[0] * bench.camera.focal_length_px
     share = moved_px * bench.scan.scanout_s / bench.camera.resolution_px[1]
     # A star of equal light in each frame would be too faint by that share; what is left is its part of the ends' frames.
     ends = share * bench.scan.hold_s / judge.seen.length_s

@@ -16,11 +16,11 @@ from hilstar.study.timing import (
     QUICK_RATES_DEG_S,
     WAYS,
     ScanningPanel,
-    Slew,
     TimingSky,
     compare,
     frame_weights,
     measure,
+    slew,
 )
 from tests.support.pictures import assert_drawn, table
 
@@ -75,7 +75,7 @@ def test_a_scan_that_is_assumed_wrong_is_seen(tmp_path, outcomes, wrong):
     panel.bench = replace(panel.bench, scan=replace(panel.bench.scan, **wrong))
     sky = TimingSky(panel)
     try:
-        outcome = compare(panel, sky, Slew(RATE_DEG_S))
+        outcome = compare(panel, sky, slew(RATE_DEG_S))
     finally:
         panel.close()
         sky.close()

@@ -27,18 +27,15 @@ from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.monitor.quantisers import Quantisation
 from hilstar.process.closing import Closing
-from hilstar.rotation import normalise, propagate
+from hilstar.rotation import normalise
 from hilstar.sky.stars import split_by_rate
-from hilstar.study.predictors import rate_of, shaken
+from hilstar.study.predictors import Movement
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 # `held`: the newest sample's attitude. `rate`: carried on by the sample's rate. `two samples`: by the last two, from a sender
 # that tells no rates.
 Prediction = Literal["held", "rate", "two samples"]
 PREDICTIONS: tuple[Prediction, ...] = ("rate", "two samples", "held")
-AXIS = np.array([0.6, 0.8, 0.0])  # across rows and columns
-PACKET_HZ = 100
-KEPT = 4  # newest samples kept
 Sprite = Literal["full", "cut", "coarse"]
 Smear = Literal["path", "point"]
 QUANTISATIONS: tuple[Quantisation, ...] = ("round", "dither", "temporal", "exact")
@@ -54,36 +51,6 @@ START_S = 0.0037  # exposure start after a frame's first light, within a refresh
 MAX_FRAMES = 16
 DEG_PER_RAD = math.degrees(1.0)
 OWN = {"effort": "auto", "quantisation": "auto"}
-
-
-@dataclass(frozen=True, slots=True)
-class Movement:
-    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a constant turn about AXIS, and jitter on it where it turns."""
-
-    q_icrs_to_cam: FloatArray
-    rate_deg_s: float
-
-    @property
-    def turns(self) -> bool:
-        """Whether it is not at rest."""
-        return self.rate_deg_s != 0
-
-    def at(self, t_ns: int) -> FloatArray:
-        """The true q_icrs_to_cam."""
-        if not self.turns:
-            return self.q_icrs_to_cam
-        t_s = t_ns / NS_PER_S
-        return shaken(propagate(self.q_icrs_to_cam, math.radians(self.rate_deg_s) * AXIS, t_s), t_s)
-
-    def rate_rad_s(self, t_ns: int) -> FloatArray:
-        """The true rate (3,) of cam in icrs, cam components, jitter included."""
-        return rate_of(self.at, t_ns) if self.turns else np.zeros(3)
-
-    def samples(self, until_ns: int) -> list[AttitudeSample]:
-        """The newest KEPT samples at time `until_ns`."""
-        last = until_ns * PACKET_HZ // NS_PER_S
-        times_ns = [round(k * NS_PER_S / PACKET_HZ) for k in range(last + 1 - KEPT, last + 1)]
-        return [AttitudeSample(t_ns, self.at(t_ns), self.rate_rad_s(t_ns)) for t_ns in times_ns]
 
 
 def lead_ns(config: BenchConfig) -> int:

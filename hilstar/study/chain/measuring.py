@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude, Timeline
-from hilstar.bench.frame import Bench, Drawn
+from hilstar.bench.frame import Bench
 from hilstar.rotation import propagate
 from hilstar.scene.frame_motion import CameraTurn, swept_sprites
 from hilstar.sky.stars import Stars
@@ -26,7 +26,6 @@ from hilstar.study.chain.choices import (
     Combination,
     Lit,
     Marks,
-    Movement,
     PanelExposure,
     Parts,
     combinations,
@@ -35,7 +34,7 @@ from hilstar.study.chain.choices import (
     lead_ns,
 )
 from hilstar.study.chain.tracker import Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off, points
-from hilstar.study.predictors import attitude_at
+from hilstar.study.predictors import Movement, attitude_at
 from hilstar.study.sweep import Spent, spent
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
 
@@ -50,36 +49,36 @@ MIN_ROUNDS, MAX_ROUNDS = 4, 60
 SEED = 1
 STEPS = ("refresh", "prediction", "smear", "depth", "codes", "sprites")
 RSS, WHOLE = "rss", "whole"
-AUTO = "auto"
+DEFAULT, AUTO = "default", "auto"
 DIGITS, MS_PLACES = 4, 4  # significant digits of an error, decimal places of a time
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class DrawingChain:
-    """A combination on its bench, before a moving sky."""
+    """A combination on its bench, before a moving sky; `timed_frames` of its frames were timed, from samples to codes."""
 
     combination: Combination
     bench: Bench
     movement: Movement
+    timed_frames: int = 0
+
+    def timeline(self, movement: Movement, light_ns: int) -> Timeline:
+        """The samples received when the frame is started whose light is at `light_ns`."""
+        samples = movement.samples(light_ns - lead_ns(self.bench.config))
+        return filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
 
     def attitude(self, light_ns: int) -> Attitude:
         """The attitude at a frame's light, predicted from the samples received when the frame is started."""
-        samples = self.movement.samples(light_ns - lead_ns(self.bench.config))
-        timeline = filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
-        return attitude_at(timeline, light_ns)
+        return attitude_at(self.timeline(self.movement, light_ns), light_ns)
 
     def rate(self, attitude: Attitude) -> FloatArray | None:
         """The rate along which stars are drawn as paths, rad/s; None where they are drawn as points."""
         return attitude.rate_cam_rad_s if self.combination.smear == "path" else None
 
-    def draw(self, number: int, light_ns: int) -> Drawn:
-        """Draw the frame whose light is at `light_ns`."""
-        attitude = self.attitude(light_ns)
-        return self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude))
-
     def lit(self, number: int, light_ns: int) -> Lit:
         """The pixels that a frame's codes light, and the light of each, electrons per second."""
-        levels, panel = self.draw(number, light_ns).levels.ravel(), self.bench.panel
+        attitude, panel = self.attitude(light_ns), self.bench.panel
+        levels = self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude)).levels.ravel()
         place = np.flatnonzero(levels)
         light = panel.response.light[levels[place]] * panel.flux_at_white_e_per_s
         return place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
@@ -89,51 +88,43 @@ class DrawingChain:
         alike = not self.movement.turns and self.combination.quantisation != "temporal"
         return (seen.at_rest if alike else seen.mean)(self.lit, self.bench.camera.resolution_px)
 
-
-class Stopwatch:
-    """Times a chain's frames one after the other, from the samples to the codes in memory."""
-
-    def __init__(self, chain: DrawingChain) -> None:
-        self._chain = chain
-        self._lead_ns = lead_ns(chain.bench.config)
-        self._period_ns = round(NS_PER_S / chain.bench.config.monitor.refresh_hz)
-        self._number = 0
+    def sprite_px(self) -> str:
+        """The sides of its sprites, px."""
+        sides = [side.side_px for side in self.bench.renderer.target.sides] or [self.bench.psf.footprint_px]
+        low, high = min(sides), max(sides)
+        return f"{low}" if low == high else f"{low} to {high}"
 
     def frame_ms(self) -> Spent:
         """Wall and processor time of the next frame, ms."""
-        chain, (timeline, light_ns, number) = self._chain, self._next()
+        timeline, light_ns = self._next()
 
         def draw() -> object:
             attitude = attitude_at(timeline, light_ns)
-            return chain.bench.draw(attitude.q_icrs_to_cam, number, chain.rate(attitude)).levels
+            return self.bench.draw(attitude.q_icrs_to_cam, self.timed_frames, self.rate(attitude)).levels
 
         return spent(draw)
 
     def stages_ms(self) -> tuple[float, ...]:
         """The next frame's time by STAGES, with a wait for the GPU before its codes are read."""
-        chain, (timeline, light_ns, number) = self._chain, self._next()
-        bench = chain.bench
+        (timeline, light_ns), bench = self._next(), self.bench
         marks = [time.perf_counter()]
         attitude = attitude_at(timeline, light_ns)
         marks.append(time.perf_counter())
-        sprites = bench.light(bench.view(attitude.q_icrs_to_cam, chain.rate(attitude)))
+        sprites = bench.light(bench.view(attitude.q_icrs_to_cam, self.rate(attitude)))
         marks.append(time.perf_counter())
-        drawn = bench.draw_sprites(sprites, number)
+        drawn = bench.draw_sprites(sprites, self.timed_frames)
         bench.renderer.finish()
         marks.append(time.perf_counter())
         _ = drawn.levels
         marks.append(time.perf_counter())
         return tuple((np.diff(marks) * 1e3).tolist())
 
-    def _next(self) -> tuple[Timeline, int, int]:
-        """The timeline of the next frame, its moment of light, and its number."""
-        self._number += 1
-        chain = self._chain
-        light_ns = NS_PER_S + self._number * self._period_ns
-        own = propagate(chain.movement.q_icrs_to_cam, NUDGE_RAD, self._number)
-        samples = replace(chain.movement, q_icrs_to_cam=own).samples(light_ns - self._lead_ns)
-        timeline = filled_timeline(samples, chain.combination.prediction, chain.bench.config.attitude)
-        return timeline, light_ns, self._number
+    def _next(self) -> tuple[Timeline, int]:
+        """The timeline of the next frame and its moment of light."""
+        self.timed_frames += 1
+        light_ns = NS_PER_S + self.timed_frames * round(NS_PER_S / self.bench.config.monitor.refresh_hz)
+        own = propagate(self.movement.q_icrs_to_cam, NUDGE_RAD, self.timed_frames)
+        return self.timeline(replace(self.movement, q_icrs_to_cam=own), light_ns), light_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,13 +186,47 @@ class ErrorPart:
 
 
 @dataclass(frozen=True, slots=True)
-class CombinationOutcome:
-    """A combination as measured."""
+class CombinationRow:
+    """A combination in a scene; its fields are the columns of `chain.csv`.
 
-    combination: Combination
+    `exposure_s` is the measured part of the tracker's exposure. `error_arcsec` and `error_mag` are rms over the `stars` of all
+    exposures, `lost` of them not found. `on_front` and `on_front_mag` are the fronts of `time_ms` against these two.
+    `on_front_as_filed` is the first of them among the choices of effort: rows with the `bit_stealing`, `faintest_v_mag` and
+    `prediction` of the bench file.
+    """
+
+    scene: str
+    rate_deg_s: float
+    exposure_s: float
+    bits: int
+    bit_stealing: str
+    faintest_v_mag: float
+    sprite: str
     sprite_px: str
-    error: Error
-    times: Times
+    smear: str
+    prediction: str
+    quantisation: str
+    stars: int
+    lost: int
+    error_arcsec: float
+    error_mag: float
+    attitude_arcsec: float
+    roll_arcsec: float
+    time_ms: float
+    iqr_ms: float
+    noise_ms: float
+    cpu_ms: float
+    frames: int
+    on_front: str = ""
+    on_front_mag: str = ""
+    on_front_as_filed: str = ""
+    chosen: str = ""
+    as_filed: str = ""
+
+
+def said(flag: bool) -> str:
+    """A flag as it is written in the table."""
+    return "true" if flag else "false"
 
 
 class SceneMeasurement:
@@ -230,15 +255,29 @@ class SceneMeasurement:
         """A combination with the movement of one exposure."""
         return DrawingChain(combination, self.parts.bench(combination), self.judges[exposure_number].movement)
 
-    def outcomes(self) -> tuple[list[CombinationOutcome], list[StageTime]]:
+    def outcomes(self) -> tuple[list[CombinationRow], list[StageTime]]:
         """Every combination's error and time, and the times of the stages of `auto`."""
         chains = [self.chain(combination) for combination in self.combinations]
         times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
-        found = [
-            CombinationOutcome(chain.combination, sprite_px(chain), self.error(chain.combination), spent)
-            for chain, spent in zip(chains, times, strict=True)
-        ]
-        return found, [
+        rows = []
+        for chain, taken in zip(chains, times, strict=True):
+            own = chain.combination
+            marked = [name for name, at in ((DEFAULT, self.marks.default), (AUTO, self.marks.auto)) if own == at]
+            rows.append(
+                CombinationRow(
+                    scene=self.scene.name,
+                    rate_deg_s=self.scene.rate_deg_s,
+                    exposure_s=rounded(self.judges[0].seen.length_s),
+                    bits=self.parts.own.config.monitor.bits,
+                    sprite_px=chain.sprite_px(),
+                    chosen=" ".join(marked),
+                    as_filed=said(own == self.marks.as_filed),
+                    **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
+                    **asdict(self.error(own)),
+                    **asdict(taken),
+                )
+            )
+        return rows, [
             StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES)) for stage, ms in zip(STAGES, stages, strict=True)
         ]
 
@@ -268,35 +307,27 @@ def pooled(found: Sequence[Off]) -> tuple[float, float]:
     return math.sqrt(float(np.mean(arcsec**2))), math.sqrt(float(np.mean(mag**2)))
 
 
-def sprite_px(chain: DrawingChain) -> str:
-    """The sides of a chain's sprites, px."""
-    sides = [side.side_px for side in chain.bench.renderer.target.sides] or [chain.bench.psf.footprint_px]
-    low, high = min(sides), max(sides)
-    return f"{low}" if low == high else f"{low} to {high}"
-
-
 def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[list[Times], list[float]]:
     """The times of all chains, and the median times of STAGES, ms, of one of them.
 
     In rounds, each with an order of its own, so that other load on the machine affects all. A visit's first frame is not
     counted: it fills caches that the chain before has emptied.
     """
-    watches = [Stopwatch(chain) for chain in chains]
-    for watch in watches:
-        watch.frame_ms()
-    taken: list[list[Spent]] = [[] for _ in watches]
+    for chain in chains:
+        chain.frame_ms()
+    taken: list[list[Spent]] = [[] for _ in chains]
     stages: list[tuple[float, ...]] = []
     rng, begin = np.random.default_rng(SEED), time.perf_counter()
     for number in range(MAX_ROUNDS):
         if number >= MIN_ROUNDS and time.perf_counter() - begin > time_s:
             break
-        for k in rng.permutation(len(watches) + 1):
-            if k == len(watches):
-                watches[staged].frame_ms()
-                stages += [watches[staged].stages_ms() for _ in range(FRAMES_A_VISIT)]
-                continue
-            watches[k].frame_ms()
-            taken[k] += [watches[k].frame_ms() for _ in range(FRAMES_A_VISIT)]
+        for k in rng.permutation(len(chains) + 1):
+            chain = chains[staged if k == len(chains) else k]
+            chain.frame_ms()
+            if k == len(chains):
+                stages += [chain.stages_ms() for _ in range(FRAMES_A_VISIT)]
+            else:
+                taken[k] += [chain.frame_ms() for _ in range(FRAMES_A_VISIT)]
     return [_times(np.array(one)) for one in taken], np.median(stages, axis=0).tolist()
 
 

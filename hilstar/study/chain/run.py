@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,16 +34,17 @@ from hilstar.files import make_directory
 from hilstar.study.chain.choices import QUANTISATIONS, Parts, five_scenes, shortened_line
 from hilstar.study.chain.measuring import (
     AUTO,
+    DEFAULT,
     QUICK,
     RSS,
     WHOLE,
-    CombinationOutcome,
+    CombinationRow,
     ErrorPart,
     Rounds,
     SceneMeasurement,
     StageTime,
     error_budget,
-    rounded,
+    said,
 )
 from hilstar.study.chain.tracker import StudyTracker
 from hilstar.study.sweep import OtherWork, beaten_by, busy_line, is_busy, pareto_front
@@ -51,7 +52,6 @@ from hilstar.study.sweep import OtherWork, beaten_by, busy_line, is_busy, pareto
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DEFAULT = "default"
 NOT_JUDGED = "the times were taken on a busy machine: no combination is named the faster"
 COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (PURPLE, ORANGE, GREEN, BLUE), strict=True))
 PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
@@ -68,53 +68,9 @@ OUTPUTS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class CombinationRow:
-    """A combination in a scene; its fields are the columns of `chain.csv`.
-
-    `exposure_s` is the measured part of the tracker's exposure. `error_arcsec` and `error_mag` are rms over the `stars` of all
-    exposures, `lost` of them not found. `on_front` and `on_front_mag` are the fronts of `time_ms` against these two.
-    `on_front_as_filed` is the first of them among the choices of effort: rows with the `bit_stealing`, `faintest_v_mag` and
-    `prediction` of the bench file.
-    """
-
-    scene: str
-    rate_deg_s: float
-    exposure_s: float
-    bits: int
-    bit_stealing: str
-    faintest_v_mag: float
-    sprite: str
-    sprite_px: str
-    smear: str
-    prediction: str
-    quantisation: str
-    stars: int
-    lost: int
-    error_arcsec: float
-    error_mag: float
-    attitude_arcsec: float
-    roll_arcsec: float
-    time_ms: float
-    iqr_ms: float
-    noise_ms: float
-    cpu_ms: float
-    frames: int
-    on_front: str = ""
-    on_front_mag: str = ""
-    on_front_as_filed: str = ""
-    chosen: str = ""
-    as_filed: str = ""
-
-
-def said(flag: bool) -> str:
-    """A flag as it is written in the table."""
-    return "true" if flag else "false"
-
-
-def rows_of(scene: SceneMeasurement, outcomes: Sequence[CombinationOutcome]) -> list[CombinationRow]:
-    """The rows of a scene, the fastest first."""
-    rows = sorted((_row(scene, one) for one in outcomes), key=lambda row: (row.time_ms, row.error_arcsec))
+def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
+    """The rows of a scene, the fastest first, with their fronts."""
+    rows = sorted(rows, key=lambda row: (row.time_ms, row.error_arcsec))
     by_arcsec, by_mag = (front(rows, name) for name in ("error_arcsec", "error_mag"))
     filed = [k for k, row in enumerate(rows) if left_to_effort(row, rows[auto_of(rows)])]
     as_filed = dict(zip(filed, front([rows[k] for k in filed], "error_arcsec"), strict=True))
@@ -155,23 +111,6 @@ def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[lis
         noise_ms = 3 * math.hypot(own.noise_ms, row.noise_ms)
         (beyond if own.time_ms - row.time_ms > noise_ms or not noise_ms else within).append(row)
     return beyond, within
-
-
-def _row(scene: SceneMeasurement, one: CombinationOutcome) -> CombinationRow:
-    own, marks = one.combination, scene.marks
-    marked = [name for name, at in ((DEFAULT, marks.default), (AUTO, marks.auto)) if own == at]
-    return CombinationRow(
-        scene=scene.scene.name,
-        rate_deg_s=scene.scene.rate_deg_s,
-        exposure_s=rounded(scene.judges[0].seen.length_s),
-        bits=scene.parts.own.config.monitor.bits,
-        sprite_px=one.sprite_px,
-        chosen=" ".join(marked),
-        as_filed=said(own == marks.as_filed),
-        **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
-        **asdict(one.error),
-        **asdict(one.times),
-    )
 
 
 def scene_line(
@@ -335,13 +274,13 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
     note = "Each step is charged with what it changes when it is added to an exact display" + (
         f"; {' and '.join(none)} change nothing here." if none else "."
     )
-    said = []
+    most = []
     for scene in scenes:
         parts = [part for part in budget if part.scene == scene and part.step not in (RSS, WHOLE)]
         largest = max(parts, key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf)
-        said.append(f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'} {scene}")
+        most.append(f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'} {scene}")
     longest = max(stages, key=lambda one: one.time_ms)
-    finding = f"Of auto's error most is {', '.join(said)}; of its time most is {longest.stage}"
+    finding = f"Of auto's error most is {', '.join(most)}; of its time most is {longest.stage}"
     height = TITLE_INCH + BARS_INCH * len(scenes)
     with chart(path, finding, len(scenes), 3, note=note, share_x=False, height_inch=height) as grid:
         for k, scene in enumerate(scenes):
@@ -359,9 +298,7 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
             times.set_xlabel("time of a frame [ms]" if scene == last else "")
 
 
-def run(
-    file: BenchFile, directory: Path, quick: bool = False, advance: Callable[[int], object] | None = None
-) -> tuple[list[str], bool | None]:
+def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:
     """Measure a bench file's scenes; write OUTPUTS into `directory`.
 
     A line for each scene, and whether `auto` is on the front of all, or within the noise of it: None on a busy machine.
@@ -378,11 +315,10 @@ def run(
                 lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
                 continue
             outcomes, parts_of_time = measurement.outcomes()
-            own, parts_of_error = rows_of(measurement, outcomes), error_budget(measurement, measurement.marks.auto)
+            own, parts_of_error = rows_of(outcomes), error_budget(measurement, measurement.marks.auto)
             judged.append((own, parts_of_error, parts_of_time))
             rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
-            if advance is not None:
-                advance(number + 1)
+            advance(number + 1)
         machine = f"{parts.own.renderer.gl_renderer}, {os.cpu_count()} cores"
         shortened = shortened_line(parts.own)
     if not rows:

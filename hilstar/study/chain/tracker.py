@@ -21,7 +21,8 @@ from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars
-from hilstar.study.chain.choices import PACKET_HZ, Lit, Movement, PanelExposure, lead_ns
+from hilstar.study.chain.choices import Lit, PanelExposure, lead_ns
+from hilstar.study.predictors import Movement
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.verify.star_finder import MATCH_PX, StarFinder, crowded, seen_psf, shared, star_finder
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
@@ -29,7 +30,6 @@ from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
 # Gauss-Legendre over the exposure: 1.02 nodes to a sigma of path and three more are right to 1e-6 of a star in every pixel
 # (scene/exposure_motion.py); JITTER's 37 Hz over the longest exposure are well within the minimum.
 NODES_PER_SIGMA, MIN_NODES = 1.02, 24
-SPRITES_AT_ONCE = 20_000
 REACH_SIGMAS = 4.0
 LOST_SHARE = 0.1  # a star with a smaller share of its light in its pixels is lost
 LOST_MAG = MAG_PER_RELATIVE  # a lost star's flux is off by all of it
@@ -195,7 +195,7 @@ class StarJudge:
     @property
     def _late_s(self) -> float:
         """The largest delay of an attitude."""
-        return lead_ns(self.tracker.bench.config) / NS_PER_S + 1 / PACKET_HZ
+        return lead_ns(self.tracker.bench.config) / NS_PER_S + 1 / self.movement.packet_hz
 
     @property
     def _path_px(self) -> float:

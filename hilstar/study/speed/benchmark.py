@@ -63,6 +63,7 @@ FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 Sigma = tuple[float, float]
 _ONE = np.ones(1)
 FIRST = pack_sprites(_ONE, _ONE, _ONE, np.zeros(1, dtype=np.intp), (8, 8), 4)
+# The linear image, (height, width), of sprites with their sigma, px.
 Draw = Callable[[Sprites, Sigma, tuple[int, int]], Float32Array]
 FRESH = """
 import re, sys, time
@@ -144,19 +145,11 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
         tries *= 2
 
 
-@dataclass(frozen=True, slots=True)
-class OtherMethod:
-    """A method for a linear image: `draw` takes sprites, their sigma in px and the image's (height, width)."""
-
-    name: str
-    does: str
-    draw: Draw
-
-
-def other_methods() -> tuple[list[OtherMethod], dict[str, str]]:
+def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
     """The methods that are installed here, imported and compiled; and by name the remedy for each of the others."""
-    found, missing = [], {}
-    for name, does, make in METHODS:
+    found: dict[str, Draw] = {}
+    missing: dict[str, str] = {}
+    for name, _, make in METHODS:
         try:
             draw = make()
         except ImportError as error:
@@ -164,7 +157,7 @@ def other_methods() -> tuple[list[OtherMethod], dict[str, str]]:
             continue
         with held():  # numba compiles, and LLVM calls Python back meanwhile: an exception there is printed, and lost
             draw(FIRST, (0.85, 0.85), (8, 8))
-        found.append(OtherMethod(name, does, draw))
+        found[name] = draw
     return found, missing
 
 
@@ -295,7 +288,7 @@ class CellMeasurement:
         self.linear = Renderer(Target(bench.camera.resolution_px, GaussianPsf(self.sigma_px)))
         self.stage_ms: dict[str, list[float]] = {}
 
-    def measure(self, methods: list[OtherMethod], rounds: int, budget_s: float) -> None:
+    def measure(self, methods: dict[str, Draw], rounds: int, budget_s: float) -> None:
         """Time every method in turn, so that other load on the machine is in the times of all."""
         works: dict[str, Callable[[], object]] = {
             "whole_frame": lambda: self.bench.draw(self.q).levels,
@@ -305,12 +298,12 @@ class CellMeasurement:
             "python": self._python,
         }
         images: dict[str, Float32Array] = {}
-        for other in methods:
-            if (why := self._too_long(other, budget_s)) is not None:
-                self.result.skipped.append(Skipped(*self.cell_key, other.name, why))
+        for name, draw in methods.items():
+            if (why := self._too_long(draw, budget_s)) is not None:
+                self.result.skipped.append(Skipped(*self.cell_key, name, why))
                 continue
-            draw = partial(other.draw, self.sprites, self.sigma_px, self.shape)
-            works[other.name] = lambda name=other.name, draw=draw: images.update({name: draw()})  # type: ignore[misc]
+            whole = partial(draw, self.sprites, self.sigma_px, self.shape)
+            works[name] = lambda name=name, whole=whole: images.update({name: whole()})  # type: ignore[misc]
         self._keep(interleaved(works, rounds, budget_s))
         ours = self._draw_linear()
         for name, image in images.items():
@@ -328,7 +321,7 @@ class CellMeasurement:
         for method, kind, times in rows:
             self.result.rows.append(MethodTiming(*self.cell_key, method, kind, _spread(times)))
 
-    def _too_long(self, other: OtherMethod, budget_s: float) -> str | None:
+    def _too_long(self, draw: Draw, budget_s: float) -> str | None:
         """Why a method is skipped here: its time for all stars, estimated from that for one star and for a hundred more."""
         if len(self.sprites) <= 101:
             return None
@@ -336,7 +329,7 @@ class CellMeasurement:
         def fastest_s(count: int) -> float:
             few = {name: getattr(self.sprites, name)[:count] for name in ("data", "star", "x_px", "y_px")}
             part = replace(self.sprites, **few)
-            return min(_seconds(lambda: other.draw(part, self.sigma_px, self.shape)) for _ in range(2))
+            return min(_seconds(lambda: draw(part, self.sigma_px, self.shape)) for _ in range(2))
 
         one_s = fastest_s(1)
         frame_s = one_s + (fastest_s(101) - one_s) / 100 * len(self.sprites)
@@ -423,7 +416,7 @@ def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], 
     """Measure every cell of a plan; `advance` hears how many are done. Raises InputError, MachineError."""
     methods, missing = other_methods()
     others = OtherWork()
-    result = Result(this_machine(), does={method.name: method.does for method in methods})
+    result = Result(this_machine(), does={name: does for name, does, _ in METHODS if name in methods})
     result.skipped += [Skipped(method=name, why=why) for name, why in missing.items()]
     q_icrs_to_cam = from_radec_roll_deg(*RADEC_ROLL_DEG)
     with TemporaryDirectory() as folder:

@@ -490,7 +490,7 @@ def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
     return CodeScene(sprites_of(*both, np.repeat(mags, len(x_px)), SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE), 2)
 
 
-def _judged(case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR) -> FailureCase:
+def judged(case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR) -> FailureCase:
     """Rounding against `exact`, by the light of each group of stars."""
     fault, error = error_steps(codes_of(scene, "round"), scene), error_steps(exact_codes(scene), scene)
     return FailureCase(
@@ -503,59 +503,50 @@ def _judged(case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: floa
     )
 
 
-def stars_half_off() -> FailureCase:
+# Cases whose codes are rounded, or chosen by `exact`.
+CODES: tuple[Callable[[], FailureCase], ...] = (
+    lambda: judged(f"stars half off the screen, {FAINT_MAG:g} mag under white on 8 bits", half_off()),
+    lambda: judged(
+        f"two stars 1 px apart, {FAINT_MAG:g} mag under white",
+        neighbours((FAINT_MAG, FAINT_MAG), 1.0),
+        "a pixel is the star's that gives more than half of its light, and it is chosen for the light of both",
+    ),
+    lambda: judged(
+        f"codes of stars of sigma {NARROW_PX:g} px, {FAINT_MAG / 2:g} mag under white",
+        lone_stars(FAINT_MAG / 2, srgb_response(8), NARROW_PX),
+        steps_a_star=NARROW_STEPS,
+    ),
+    lambda: judged(
+        f"pixels 5 % apart, stars {FAINT_MAG:g} mag under white", uneven_panel(), "each pixel's own steps are weighed"
+    ),
+    lambda: judged("a panel of 2 bits, stars whose peak is white", lone_stars(0.0, srgb_response(2))),
+    lambda: judged("a panel of 16 bits, stars 10 mag under white", lone_stars(10.0, srgb_response(16))),
+)
+# Cases whose light over white goes to neighbours by error diffusion.
+SPILLED: tuple[Callable[[], FailureCase], ...] = (
+    lambda: spilled("a star 2.5 mag over white, 5 px from one 4 mag under it", neighbours((-2.5, 4.0), 5.0)),
+    lambda: spilled("every star 4 mag over white", lone_stars(-4.0, srgb_response(8))),
+)
+
+
+def half_off() -> CodeScene:
     """Stars whose middles lie on the screen's edges, at every phase along them and across."""
     along = middles()[0][1 : COUNT - 1]
     across = (np.roll(np.arange(COUNT - 2), 2) + 0.5) / (COUNT - 2) - 1.0
     x_px = np.concatenate([across, SIDE_PX - 1 - across, along, along])
     y_px = np.concatenate([along, along, across, SIDE_PX - 1 - across])
     sprites = sprites_of(x_px, y_px, np.full(len(x_px), FAINT_MAG), SIGMA_PX)
-    scene = CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
-    return _judged(f"stars half off the screen, {FAINT_MAG:g} mag under white on 8 bits", scene)
+    return CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
 
 
-def stars_a_pixel_apart() -> FailureCase:
-    """Two stars that share most of their pixels."""
-    why = "a pixel is the star's that gives more than half of its light, and it is chosen for the light of both"
-    return _judged(f"two stars 1 px apart, {FAINT_MAG:g} mag under white", neighbours((FAINT_MAG, FAINT_MAG), 1.0), why)
-
-
-def narrow_codes() -> FailureCase:
-    """Stars of less than a pixel."""
-    scene = lone_stars(FAINT_MAG / 2, srgb_response(8), NARROW_PX)
-    case = f"codes of stars of sigma {NARROW_PX:g} px, {FAINT_MAG / 2:g} mag under white"
-    return _judged(case, scene, steps_a_star=NARROW_STEPS)
-
-
-def uneven_panel() -> FailureCase:
-    """Pixels that differ by 5 %, and a fall to the corners."""
+def uneven_panel() -> CodeScene:
+    """Stars on pixels that differ by 5 %, with a fall to the corners."""
     y_px, x_px = np.mgrid[:SIDE_PX, :SIDE_PX] / SIDE_PX - 0.5
     uneven = 1 - 0.3 * np.hypot(x_px, y_px) + np.random.default_rng(CODES_SEED).normal(0, 0.05, x_px.shape)
-    scene = lone_stars(FAINT_MAG, srgb_response(8), uniformity=uneven.astype(np.float32))
-    return _judged(f"pixels 5 % apart, stars {FAINT_MAG:g} mag under white", scene, "each pixel's own steps are weighed")
+    return lone_stars(FAINT_MAG, srgb_response(8), uniformity=uneven.astype(np.float32))
 
 
-def two_bits() -> FailureCase:
-    """Four levels."""
-    return _judged("a panel of 2 bits, stars whose peak is white", lone_stars(0.0, srgb_response(2)))
-
-
-def sixteen_bits() -> FailureCase:
-    """65 536 levels."""
-    return _judged("a panel of 16 bits, stars 10 mag under white", lone_stars(10.0, srgb_response(16)))
-
-
-def clipped_neighbours() -> FailureCase:
-    """A star over white beside a faint one."""
-    return _spilled("a star 2.5 mag over white, 5 px from one 4 mag under it", neighbours((-2.5, 4.0), 5.0))
-
-
-def all_clipped() -> FailureCase:
-    """Every star over white."""
-    return _spilled("every star 4 mag over white", lone_stars(-4.0, srgb_response(8)))
-
-
-def _spilled(case: str, scene: CodeScene) -> FailureCase:
+def spilled(case: str, scene: CodeScene) -> FailureCase:
     """The largest excess of a pixel's light: error diffusion hands light over white to neighbours."""
     wanted = scene.wanted()
     corner = slice(2 * TILE_PX), slice(2 * TILE_PX)

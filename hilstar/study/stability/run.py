@@ -19,8 +19,7 @@ DRAWN: tuple[Callable[[], FailureCase], ...] = (
     *(image.narrow_star, image.wide_star, image.negative_wings, image.floored_wings, image.absurd_sigmas),
     *(image.star_on_pixel_edge, image.star_on_image_edge, image.many_stars, image.flux_range),
     *(image.popping, image.popping_codes),
-    *(image.stars_half_off, image.stars_a_pixel_apart, image.narrow_codes, image.uneven_panel, image.two_bits),
-    *(image.sixteen_bits, image.clipped_neighbours, image.all_clipped, image.no_stars),
+    *(*image.CODES, *image.SPILLED, image.no_stars),
 )
 
 

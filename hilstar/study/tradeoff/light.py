@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from itertools import count
@@ -42,7 +42,7 @@ from hilstar.sky.electrons import (
 )
 from hilstar.sky.spectrum import GAUSS_ORDER, PLANCK_J_S, TEMPERATURE_SCALES, Curve, blackbody_exitance_w_m2_m, load_curve
 from hilstar.sky.stars import Stars
-from hilstar.study.codes import AIMS, FRAME_PX, JUDGE, STARS, WAYS, Way, code_errors, response_of, star_field
+from hilstar.study.codes import AIMS, FRAME_PX, JUDGE, STARS, WAYS, code_errors, response_of, star_field
 from hilstar.study.predictors import ORION
 from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
 from hilstar.study.sweep import Figure, Trial, Trials
@@ -229,7 +229,26 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
 def psf(stack: ExitStack, quick: bool) -> Trials:
     """Methods that spread a star over pixels: flux error, mag, and centroid error, px, over PSF_PHASES^2 phases."""
     del quick  # every error is found in one draw
-    trials = [_exact_psf(), *(_drawn_psf(stack, name, variant) for name, variant in splat_variants().items())]
+    side = PSF_PHASES * TILE_PX
+    errors = _psf_errors(TILE_PX, lambda sprites: linear_image(sprites, (side, side), SPRITE_PSF))
+    work: Callable[[], object] = partial(linear_image, star_field(FRAME_PX, TILE_PX), FRAME_PX, SPRITE_PSF)
+    trials = [Trial("exact integral, erfc in float64", *errors, work, is_exact=True)]
+    for name, variant in splat_variants().items():
+        renderer = stack.enter_context(VariantRenderer(Target(FRAME_PX, SPRITE_PSF), variant))
+
+        def image(sprites: Sprites, renderer: VariantRenderer = renderer) -> FloatArray:
+            renderer.draw(sprites)
+            return renderer.linear()[:side, :side].astype(np.float64)
+
+        work = partial(renderer.draw_and_wait, star_field(FRAME_PX, renderer.footprint_px))
+        trials.append(Trial(name, *_psf_errors(renderer.footprint_px, image), work, variant == SplatVariant()))
+
+    def sampled_flux(phase_px: FloatArray) -> FloatArray:
+        offset_px = (np.arange(-TILE_PX, TILE_PX + 1) - phase_px[:, None]) / SMALL_SIGMA_PX
+        return np.asarray((np.exp(-0.5 * offset_px**2) / (SMALL_SIGMA_PX * np.sqrt(2 * np.pi))).sum(axis=1))
+
+    excess = 1 / (2 * np.pi * math.prod(SPRITE_PSF.width_px) * SPRITE_PSF.peak_share) - 1
+    worst = np.abs(magnitude(sampled_flux(np.arange(PSF_PHASES) / PSF_PHASES) ** 2)).max()
     return Trials(
         "psf",
         f"linear image of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}",
@@ -238,22 +257,8 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
         "methods this close change order from run to run; the default has the smallest footprint that cuts at most"
         f" {MAX_CUT:g} of a star's light at any phase, and needs no table",
         trials,
-        _centre_remark(),
-    )
-
-
-def _centre_remark() -> str:
-    """The error of a profile sampled at pixel centres that its sums hide."""
-
-    def flux(sigma_px: float, phase_px: np.ndarray) -> FloatArray:
-        offset_px = np.arange(-TILE_PX, TILE_PX + 1) - phase_px[:, None]
-        return np.asarray((np.exp(-0.5 * (offset_px / sigma_px) ** 2) / (sigma_px * np.sqrt(2 * np.pi))).sum(axis=1))
-
-    excess = 1 / (2 * np.pi * math.prod(SPRITE_PSF.width_px) * SPRITE_PSF.peak_share) - 1
-    worst = np.abs(magnitude(flux(SMALL_SIGMA_PX, np.arange(PSF_PHASES) / PSF_PHASES) ** 2)).max()
-    return (
         f"sampling at pixel centres gives a wide star the right sum and the wrong shape: its middle pixel is"
-        f" {100 * excess:.0f} % too bright, and at sigma {SMALL_SIGMA_PX:g} px its flux is off by {worst:.2f} mag"
+        f" {100 * excess:.0f} % too bright, and at sigma {SMALL_SIGMA_PX:g} px its flux is off by {worst:.2f} mag",
     )
 
 
@@ -268,26 +273,6 @@ def splat_variants() -> dict[str, SplatVariant]:
     variants |= {f"GL table of {size}, {own} px": SplatVariant("table", table_size=size) for size in TABLE_SIZES}
     variants |= {f"GL pixel centre, {own} px": SplatVariant("centre")}
     return variants
-
-
-def _drawn_psf(stack: ExitStack, name: str, variant: SplatVariant) -> Trial:
-    renderer = stack.enter_context(VariantRenderer(Target(FRAME_PX, SPRITE_PSF), variant))
-    side = PSF_PHASES * TILE_PX
-
-    def image(sprites: Sprites) -> FloatArray:
-        renderer.draw(sprites)
-        return renderer.linear()[:side, :side].astype(np.float64)
-
-    work = partial(renderer.draw_and_wait, star_field(FRAME_PX, renderer.footprint_px))
-    return Trial(name, *_psf_errors(renderer.footprint_px, image), work, variant == SplatVariant())
-
-
-def _exact_psf() -> Trial:
-    def image(sprites: Sprites) -> FloatArray:
-        return linear_image(sprites, (PSF_PHASES * TILE_PX,) * 2, SPRITE_PSF)
-
-    work = partial(linear_image, star_field(FRAME_PX, TILE_PX), FRAME_PX, SPRITE_PSF)
-    return Trial("exact integral, erfc in float64", *_psf_errors(TILE_PX, image), work, is_exact=True)
 
 
 def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[float, float]:
@@ -306,10 +291,17 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
     """From light to codes at the default depth: flux error, mag, and centroid error, px, of a star at its aim's faint end."""
     del quick  # every error is found at once
     bits = Monitor(resolution_px=FRAME_PX, pixel_pitch_um=1.0).bits
-    mag = AIMS[bits][1]
-    trials = [_quantised(stack, way, bits) for way in WAYS]
+    mag, stealing, trials = AIMS[bits][1], RenderSettings().bit_stealing, []
+    for way in WAYS:
+        found = code_errors(bits, way, PHASES, [mag])[0]
+        target = Target(FRAME_PX, SPRITE_PSF, response_of(bits, way), WHITE, way.method)
+        renderer = stack.enter_context(Renderer(target))
+        work = partial(_codes, renderer, star_field(FRAME_PX, renderer.footprint_px), count())
+        each = {f"max_px_{kind}": found.max_px(kind) for kind in FAMILY}
+        is_default = (way.method, way.stealing) == (TAKEN, stealing)
+        trials.append(Trial(way.name, found.flux_max_mag, found.max_px(JUDGE), work, is_default, more=each))
     taken = next(trial for trial in trials if trial.is_default)
-    each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
+    by_each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
     return Trials(
         "quantisation",
         f"codes of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, light to memory",
@@ -317,23 +309,13 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
         Figure("centroid error by a PSF fit, worst", "px"),
         "it needs no more than one frame and leaves no pattern that a tracker could take for a star",
         trials,
-        f"by each centroider '{taken.method}' is off by at most: {each} px",
+        f"by each centroider '{taken.method}' is off by at most: {by_each} px",
     )
 
 
-def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
-    response, mag = response_of(bits, way), AIMS[bits][1]
-    found = code_errors(bits, way, PHASES, [mag])[0]
-    renderer = stack.enter_context(Renderer(Target(FRAME_PX, SPRITE_PSF, response, WHITE, way.method)))
-    field, numbers = star_field(FRAME_PX, renderer.footprint_px), count()
-
-    def work() -> None:
-        renderer.draw(field, next(numbers))
-        renderer.levels()
-
-    is_default = (way.method, way.stealing) == (TAKEN, RenderSettings().bit_stealing)
-    each = {f"max_px_{kind}": found.max_px(kind) for kind in FAMILY}
-    return Trial(way.name, found.flux_max_mag, found.max_px(JUDGE), work, is_default, more=each)
+def _codes(renderer: Renderer, field: Sprites, numbers: Iterator[int]) -> None:
+    renderer.draw(field, next(numbers))
+    renderer.levels()
 
 
 def depth(stack: ExitStack, quick: bool) -> Trials:

@@ -22,6 +22,7 @@ from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
 from hilstar.bench.effort import BEST, CHEAP, HYSTERESIS, IN_TIME_SHARE, Effort, FieldCost, Light, plan_effort
 from hilstar.bench.frame import Bench
+from hilstar.bench.glass import glass_transmission
 from hilstar.errors import InputError
 from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
 from hilstar.frame.truth import StarInView, brightest_in_view
@@ -202,7 +203,7 @@ def seen_by(file: BenchFile, camera: Camera) -> Seen:
 def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
     """The tracker's light-gathering part by channel: what it tells apart; curve paths are relative to `folder`."""
     efficiencies = [load_curve(source, f"[tracker] {key}", folder) for key, source in tracker.quantum_efficiencies.items()]
-    transmission = load_curve(tracker.transmission, "[tracker] transmission", folder)
+    transmission = glass_transmission(tracker, folder)
     return tuple(
         Optics(tracker.aperture_mm, Curve(one.wavelength_nm, one.value * tracker.detector.fill_factor), transmission)
         for one in efficiencies
@@ -300,11 +301,12 @@ def star_rates(config: BenchConfig, folder: Path) -> StarRates:
 
 def star_flux(config: BenchConfig, folder: Path) -> StarRates:
     """The electron rates (n, channels) of stars on a bench's tracker, by tables that are made here, once."""
-    rates = [_channel_rates(config.sky, optics) for optics in bench_channels(config.tracker, folder)]
+    rates = [channel_rates(config.sky, optics) for optics in bench_channels(config.tracker, folder)]
     return lambda *columns: np.stack([channel(*columns) for channel in rates], axis=1)
 
 
-def _channel_rates(sky: SkySettings, optics: Optics) -> StarRates:
+def channel_rates(sky: SkySettings, optics: Optics) -> StarRates:
+    """The electron rates (n,) of stars in one channel, by a table that is made here, once. Raises InputError."""
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     if sky.brightness == "dgs" and sky.spectrum == "pickles":
         by_colour = tabulate_pickles(optics, photometry)

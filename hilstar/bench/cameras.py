@@ -18,6 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from hilstar.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, RenderSettings, Tracker
+from hilstar.bench.glass import bench_glass_psf, glass_in, through_glass
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import load_distortion, load_geometry, monitor_camera
 from hilstar.scene.camera import Camera, bounded
@@ -76,7 +77,8 @@ def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
         return GaussianPsf(tracker.psf_sigma_px)
     if tracker.psf_sigma_px != DEFAULT_PSF_SIGMA_PX:
         _say_once(f"[tracker] psf_sigma_px is not used: [tracker.optics] psf is {tracker.optics.psf}")
-    return read_psf(folder / tracker.optics.psf)
+    glass = glass_in(tracker, folder)
+    return read_psf(folder / tracker.optics.psf) if glass is None else bench_glass_psf(glass, tracker, folder)
 
 
 @lru_cache(maxsize=1)
@@ -91,14 +93,15 @@ def real_monitor(config: BenchConfig, path: Path) -> Camera:
 
 
 def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
-    """The tracker, with its flight model where it has one. Raises InputError."""
+    """The tracker, with its flight model where it has one, else its glass's distortion. Raises InputError."""
     camera = monitor_camera(
         tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_MISALIGNMENT, tracker.principal_point_px
     )
-    if tracker.distortion is None:
-        return camera
-    path = folder / tracker.distortion
-    return _bounded(load_distortion(path, camera), tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
+    path = folder / (tracker.distortion or tracker.optics.psf)
+    if tracker.distortion is not None:
+        camera = load_distortion(path, camera)
+    camera = through_glass(camera, tracker, folder)
+    return camera if camera.lens is None else _bounded(camera, tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
 
 
 def _bounded(camera: Camera, margin_px: float, path: Path) -> Camera:

@@ -26,6 +26,7 @@ from hilstar.cli.first_light import first_light
 from hilstar.cli.frame import frame
 from hilstar.cli.keys import keys
 from hilstar.cli.latency import latency
+from hilstar.cli.optics import map_
 from hilstar.cli.replay import replay
 from hilstar.cli.report import report
 from hilstar.cli.send import send
@@ -108,6 +109,7 @@ calibrate = typer.Typer(
     help="Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by stars."
 )
 sensor = typer.Typer(help="A tracker's sensor for the bench file, from its EMVA 1288 data sheet or its own frames.")
+optics = typer.Typer(help="A tracker's glass for `[tracker.optics] psf`: point spread functions by place, colour and focus.")
 service = typer.Typer()
 
 
@@ -141,6 +143,8 @@ app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")
 sensor.command("import")(import_)
 sensor.command()(measure)
 app.add_typer(sensor, name="sensor", rich_help_panel="Calibrate")
+optics.command("map")(map_)
+app.add_typer(optics, name="optics", rich_help_panel="Calibrate")
 service.command()(install)
 service.command()(uninstall)
 app.add_typer(service, name="service", rich_help_panel="This machine")

@@ -244,6 +244,7 @@ class SampledPsf(Psf):
     samples: FloatArray
     per_px: int = 1
     pixel_integrated: bool = False
+    max_negative = MAX_NEGATIVE
 
     def __post_init__(self) -> None:
         """Refuse what is no PSF."""
@@ -258,7 +259,7 @@ class SampledPsf(Psf):
         # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the largest of those below zero
         phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
         least, negative = min(float(part.sum()) for part in phases), max(float(-part.clip(max=0).sum()) for part in phases)
-        if negative > MAX_NEGATIVE:
+        if negative > self.max_negative:
             raise InputError(
                 f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample it more finely than "
                 f"{self.per_px} a pixel"

@@ -214,6 +214,11 @@ def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
     )
 
 
+def without_stars(sprites: Sprites) -> Sprites:
+    """The extended light of sprites alone."""
+    return replace(join_sprites([], sprites.footprint_px), extended=sprites.extended)
+
+
 def with_sprites(sprites: Sprites, parts: Sequence[Sprites]) -> Sprites:
     """Sprites and those of `parts`, which have the same footprint, end to end; the rest stays that of the first."""
     joined = join_sprites([sprites, *parts], sprites.footprint_px)

@@ -15,6 +15,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.monitor.quantise import Panel
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.process.closing import Closing
 from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
@@ -81,7 +82,7 @@ class TwinOptics(Closing):
         for begin in range(0, len(rows), at_once):
             part = slice(begin, begin + at_once)
             total += self._points(columns[part], rows[part], light_e_per_s[rows[part], columns[part]])
-        return total
+        return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total  # a measured PSF may be negative somewhere
 
     def _points(self, columns: IntArray, rows: IntArray, light_e_per_s: FloatArray) -> FloatArray:
         steps = (np.arange(SUB) - (SUB - 1) / 2) / SUB
@@ -89,7 +90,10 @@ class TwinOptics(Closing):
         x_px, y_px = self.geometry.to_tracker((columns[:, None] + dx).ravel(), (rows[:, None] + dy).ravel())
         light = np.repeat(light_e_per_s / SUB**2, SUB**2)
         star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
-        self._renderer.draw(pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px))
+        sprites = pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px)
+        if isinstance(self._psf, GlassPsf):  # a monitor's light has no spectrum here
+            return self._psf.image(sprites, self._psf.mean_shares, size_px).astype(np.float64)
+        self._renderer.draw(sprites)
         return self._renderer.linear().astype(np.float64)
 
     def glow_e_per_s(self, panel: Panel) -> FloatArray:

@@ -31,6 +31,7 @@ from hilstar.frame.faults import FaultLayer
 from hilstar.frame.layers import light_of, seen_in, sky_layers
 from hilstar.frame.truth import TRUTH_DTYPE, added_truth, truth_table
 from hilstar.frame.view import STILL, Canvas, View
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.process.closing import Closing
 from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
@@ -38,12 +39,13 @@ from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera, linear_shares
 from hilstar.scene.exposure_motion import MIDDLE_S
 from hilstar.scene.frame_motion import Scan
-from hilstar.scene.sprites import Sprites, join_sprites
+from hilstar.scene.sprites import Sprites, join_sprites, without_stars
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.sky.zodiacal import ZodiacalLight, sunward, tabled_light
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import MAX_E, DetectorSettings
+from hilstar.twin.glass import StarGlass
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 if TYPE_CHECKING:
@@ -55,6 +57,10 @@ log = logging.getLogger(__name__)
 # The attitude at a time of the run, ns.
 AttitudeAt = Callable[[int], FloatArray]
 LATTICE = 17  # places along each side of a detector at which zodiacal light is computed; it is linear between them
+# A row of TRUTH_DTYPE, and the place of its light, px, and its illumination, as the tracker's optics make them.
+EXPOSURE_DTYPE = np.dtype(
+    [*TRUTH_DTYPE.descr, ("x_centroid_px", "f8"), ("y_centroid_px", "f8"), ("relative_illumination", "f8")]
+)
 BODY_MAX_E = 0.5 * MAX_E  # room for dark current and cosmic rays
 Noise = Literal["full", "none"]
 
@@ -75,7 +81,7 @@ class FrameNoise:
 class Exposure:
     """One frame of the virtual tracker: DN (height, width), the electrons expected in it, and its stars.
 
-    `truth` has the rows of TRUTH_DTYPE: places are those at the middle of the exposure (NaN behind the camera), and
+    `truth` has the rows of EXPOSURE_DTYPE: places are those at the middle of the exposure (NaN behind the camera), and
     `clipped` stars reach full well or the ADC's last code. `capped` stars have paths coarser than they should be.
     """
 
@@ -111,6 +117,8 @@ class Simulator(Closing):
         tracker = self.config.tracker
         self.camera = tracker_camera(tracker, self.file.folder)
         self.canvas = detector_canvas(self.file, self.camera)
+        psf = self.canvas.psf
+        self._glass = StarGlass(self.file, psf) if isinstance(psf, GlassPsf) else None
         self._background = TrackerBackground(self.config, self.file.folder, self.camera, refuse=self._refuse)
         self.background_e = self._background.steady_e
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
@@ -161,17 +169,21 @@ class Simulator(Closing):
         layers = self._layers
         if faults is None:
             light = light_of(canvas, layers, stars, view)
-            mean_e = self._linear(light) * exposure_s + self._background.of_view_e(view)
+            mean_e = self._linear(light, stars) * exposure_s + self._background.of_view_e(view)
         else:
-            mean_e, open_s = faults.light_e(lambda part, layer: light_of(canvas, (*layers, layer), stars, part), self._linear)
+            mean_e, open_s = faults.light_e(
+                lambda part, layer: light_of(canvas, (*layers, layer), stars, part), lambda light: self._linear(light, stars)
+            )
             mean_e += self._background.of_view_e(faults.pieces[len(faults.pieces) // 2].view) * (open_s / exposure_s)
             light = faults.sprites()
         if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
             mean_e = np.minimum(mean_e, BODY_MAX_E)
-        dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e)
+        if self._glass is not None:  # a measured PSF may be negative somewhere
+            np.maximum(mean_e, 0.0, out=mean_e)
+        dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self._glass)
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
-        truth = np.concatenate([truth, faults.added_truth()])
+        truth = np.concatenate([truth, _exposed(faults.added_truth())])
         return Exposure(view, dn, mean_e, truth, light.capped, faults.names)
 
     def _digitised(self, mean_e: FloatArray, rng: np.random.Generator | None) -> npt.NDArray[np.uint16]:
@@ -180,10 +192,16 @@ class Simulator(Closing):
             return self.detector.expose_noiseless(mean_e, exposure_s)
         return self.detector.expose(mean_e, exposure_s, rng)
 
-    def _linear(self, sprites: Sprites) -> FloatArray:
-        """Electrons per second of each pixel (h, w) by sprites."""
-        self.renderer.draw(sprites)
-        return self.renderer.linear().astype(np.float64)
+    def _linear(self, sprites: Sprites, stars: Stars) -> FloatArray:
+        """Electrons per second of each pixel (h, w) by sprites of `stars`."""
+        if self._glass is None:
+            self.renderer.draw(sprites)
+            return self.renderer.linear().astype(np.float64)
+        image = self._glass.psf.image(sprites, self._glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
+        if sprites.extended:
+            self.renderer.draw(without_stars(sprites))
+            image += self.renderer.linear()
+        return image.astype(np.float64)
 
     def close(self) -> None:
         """Free the GL context."""
@@ -325,19 +343,37 @@ def detector_canvas(file: BenchFile, camera: Camera) -> Canvas:
     return Canvas(camera, tracker_psf(tracker, file.folder), full_e=full_e(tracker.detector))
 
 
-def exposure_truth(canvas: Canvas, view: View, stars: Stars, light: Sprites, mean_e: FloatArray) -> npt.NDArray[np.void]:
-    """The truth of an exposure (see `Exposure`): a row for each of `stars` that has a sprite in its light, and for discs."""
+def exposure_truth(
+    canvas: Canvas, view: View, stars: Stars, light: Sprites, mean_e: FloatArray, glass: StarGlass | None = None
+) -> npt.NDArray[np.void]:
+    """The truth of an exposure (see `Exposure`): a row for each of `stars` that has a sprite in its light, and for discs.
+
+    With a `glass` centroids and illumination are those of each star's light through it.
+    """
     star = np.append(np.unique(light.star), disc_stars(stars, light.discs))
     icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, canvas.camera)[0]
     x_px, y_px = canvas.camera.project(stars.directions(star) @ icrs_to_image.T)
-    truth = truth_table(stars, star, x_px, y_px)
+    truth = _exposed(truth_table(stars, star, x_px, y_px))
     height, width = mean_e.shape
     inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
     inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
     place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
     truth["clipped"][inside] = mean_e[place] > canvas.full_e
+    if glass is not None:
+        found = glass.psf.centroids_px(x_px[inside], y_px[inside], glass.shares(stars, star[inside]))
+        for name, value in zip(("x_centroid_px", "y_centroid_px", "relative_illumination"), found, strict=True):
+            truth[name][inside] = value
     truth["clipped"] |= np.isin(truth["name"], light.over_white)
     return truth[np.argsort(truth["v_mag"], kind="stable")]
+
+
+def _exposed(truth: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+    """Rows of EXPOSURE_DTYPE, of TRUTH_DTYPE: all light at its place, and no vignetting."""
+    found = np.zeros(len(truth), dtype=EXPOSURE_DTYPE)
+    for name in TRUTH_DTYPE.names or ():
+        found[name] = truth[name]
+    found["x_centroid_px"], found["y_centroid_px"], found["relative_illumination"] = truth["x_px"], truth["y_px"], 1.0
+    return found
 
 
 def full_e(detector: DetectorSettings) -> float:

@@ -39,11 +39,16 @@ class TrackerOptics(Table, frozen=True):
     psf: Annotated[
         str,
         Meta(
-            description='`"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file with one image of the point '
-            "spread function, the same all over the field and for all colours. Its header has `OVERSAMP`, samples a tracker "
-            "pixel (1 where it is missing), and `PIXINT`, whether the pixel is integrated in it (F where it is missing)."
+            description='`"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file. That of '
+            "[`hilstar optics`](optics.md) has point spread functions over field, wavelength and focus. Or it has one image of "
+            "the point spread function, the same all over the field and for all colours. Its header has `OVERSAMP`, samples a "
+            "tracker pixel (1 where it is missing), and `PIXINT`, whether the pixel is integrated (F where it is missing)."
         ),
     ] = GAUSSIAN
+    focus_um: Annotated[
+        float,
+        Meta(ge=-1e6, le=1e6, description="Where the detector stands along the axis, as the file of `psf` counts it."),
+    ] = 0.0
 
 
 class Tracker(Table, frozen=True):

@@ -34,7 +34,10 @@ def test_the_fits_has_dn_header_and_truth(tmp_path):
     assert header["RA_PNT"] == pytest.approx(283.021, abs=1e-9)
     first = ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
     last = ["variable", "range_mag", "period_d", "double", "separation_arcsec", "name", "sigma_pos_mas", "sigma_mag"]
-    assert list(truth.names) == [*first, *last]
+    optics = ["x_centroid_px", "y_centroid_px", "relative_illumination"]
+    assert list(truth.names) == [*first, *last, *optics]
+    assert (truth["x_centroid_px"] == truth["x_px"]).all()
+    assert (truth["relative_illumination"] == 1).all()
     # Background and dark: 3000 e- and 203 e-/s for 5 s, at 24 e-/DN.
     assert np.median(dn) == pytest.approx((3000 + 203 * 5) / 24, abs=1.0)
     vega = truth[truth["hip"] == 91262][0]

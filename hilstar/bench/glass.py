@@ -1,0 +1,106 @@
+"""A bench's glass: the PSFs of `[tracker.optics] psf` at its focus, and the lens and transmission that belong with them."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.config import GAUSSIAN, Tracker
+from hilstar.optics.glass_psf import GlassPsf, Spline, glass_psf
+from hilstar.optics.psf_file import Glass, read_glass
+from hilstar.scene.camera import Camera
+from hilstar.sky.electrons import Optics
+from hilstar.sky.spectrum import Curve, integration_nodes, load_curve
+
+log = logging.getLogger(__name__)
+MAX_UNSAID = 0.01  # share of a tracker's light beyond a file's wavelengths that is not worth a word
+SAID_PX = 1.0  # by how much a detector or another lens may differ from a file's without a word
+GRID = 9  # places along each side at which two lenses are compared
+
+
+def glass_in(tracker: Tracker, folder: Path) -> Glass | None:
+    """The glass of a tracker's file; None where its PSF is a Gaussian or one image. Raises InputError."""
+    if tracker.optics.psf == GAUSSIAN:
+        return None
+    found = read_glass(folder / tracker.optics.psf)
+    return found if isinstance(found, Glass) else None
+
+
+def bench_glass_psf(glass: Glass, tracker: Tracker, folder: Path) -> GlassPsf:
+    """A tracker's glass at its focus; the same again is the same object. Says what the file does not cover."""
+    shares = _mean_shares(glass, tracker, folder)
+    return _glass_psf(glass, tracker.optics.focus_um, tuple(shares.tolist()), tracker.resolution_px)
+
+
+@lru_cache(maxsize=4)
+def _glass_psf(glass: Glass, focus_um: float, shares: tuple[float, ...], resolution_px: tuple[int, int]) -> GlassPsf:
+    found = glass_psf(glass, focus_um, np.array(shares))
+    width, height = resolution_px
+    corners = np.array([(x, y) for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])
+    beyond_px = float(found.field.within(*corners.T)[1].max())
+    if len(glass.places_px) > 1 and beyond_px > SAID_PX:
+        say_once(f"the detector reaches {beyond_px:.0f} px beyond the file's points; there the nearest PSF is taken")
+    first, last = glass.focuses_um[[0, -1]]
+    if not first <= focus_um <= last:
+        say_once(f"focus_um = {focus_um:g} is beyond the file's {first:g} to {last:g}; the nearest is taken")
+    return found
+
+
+@lru_cache(maxsize=32)
+def say_once(line: str) -> None:
+    """Warn of what a glass does not cover or is not taken for, each line once."""
+    log.warning("[tracker.optics] psf: %s", line)
+
+
+def _mean_shares(glass: Glass, tracker: Tracker, folder: Path) -> FloatArray:
+    """The shares (L,) that a file's wavelengths have of as many photons at each wavelength, as the tracker detects them."""
+    if len(glass.wavelengths_nm) == 1:
+        return np.ones(1)
+    nm, weight = np.concatenate([_detected(tracker, key, folder) for key in tracker.quantum_efficiencies], axis=1)
+    shares = weight @ Spline(glass.wavelengths_nm)(nm) / weight.sum()
+    first, last = glass.wavelengths_nm[[0, -1]]
+    for side, share in (("under", weight[nm < first].sum()), ("over", weight[nm > last].sum())):
+        if share > MAX_UNSAID * weight.sum():
+            limit = first if side == "under" else last
+            say_once(f"{share / weight.sum():.0%} of the light is {side} the file's {limit:g} nm, whose PSF it is given")
+    return np.asarray(shares)
+
+
+def _detected(tracker: Tracker, key: str, folder: Path) -> FloatArray:
+    """Wavelengths and the tracker's relative response there, by the integration's nodes: (2, n)."""
+    efficiency = load_curve(tracker.quantum_efficiencies[key], f"[tracker] {key}", folder)
+    optics = Optics(tracker.aperture_mm, efficiency, glass_transmission(tracker, folder))
+    nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
+    return np.stack([nm, optics.quantum_efficiency(nm) * optics.transmission(nm) * weight_m])
+
+
+def glass_transmission(tracker: Tracker, folder: Path) -> Curve:
+    """The transmission of a tracker's optics: its own key where that is given, else its glass's, else 1. Raises InputError."""
+    glass = glass_in(tracker, folder)
+    if glass is None or glass.transmission is None:
+        return load_curve(tracker.transmission, "[tracker] transmission", folder)
+    if tracker.transmission == 1.0:
+        return glass.transmission
+    say_once(f"its transmission is not used: [tracker] transmission is {tracker.transmission}")
+    return load_curve(tracker.transmission, "[tracker] transmission", folder)
+
+
+def through_glass(camera: Camera, tracker: Tracker, folder: Path) -> Camera:
+    """The camera with its glass's distortion; one that has a lens keeps it, and a contradiction is said."""
+    glass = glass_in(tracker, folder)
+    if glass is None or glass.lens is None:
+        return camera
+    bent = replace(camera, lens=glass.lens)
+    if camera.lens is None:
+        return bent
+    places = camera.tangents(*camera.grid_px(GRID))
+    off = [a - b for a, b in zip(camera.places_px(*places), bent.places_px(*places), strict=True)]
+    off_px = float(np.nanmax(np.hypot(*off)))
+    if off_px > SAID_PX:
+        say_once(f"its distortion is up to {off_px:.1f} px from that of [tracker] distortion, which is taken")
+    return camera

@@ -1,0 +1,431 @@
+"""Stars through a tracker's glass: each by its place and its spectrum.
+
+A star's PSF is a sum of basis images, each by a weight that is smooth over the field (radial basis functions with polynomials
+up to the third degree), and over wavelength and focus (splines). All of it is linear, so flux, centroid and second moments
+are interpolated as the images are. What the pixels get at each place in a pixel is tabulated once, and reduced again to few
+stamps: a star's pixels are one product of a few numbers with these.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.errors import InputError
+from hilstar.optics.psf_file import MAX_NEGATIVE, TOLERANCE, Glass, moment_carriers, principal
+from hilstar.scene.psf import BLACK_SAMPLES, MAX_FOOTPRINT_PX, MAX_UNEVEN, SPLINE_DEGREE, SampledPsf
+from hilstar.scene.sprites import Sprites
+
+MAX_CUT = 3e-5  # share of any PSF's light that a footprint leaves out: at 10 px it moves a centroid by up to 3e-4 px
+MAX_STEPS_A_PX, MIN_STEPS_A_PX, TABLE_SIDE = 32, 12, 1024
+# What the reduced stamps leave out of all tabulated ones, rms, relative to them. Flux, centroids and second moments are kept.
+STAMP_TOLERANCE = 3e-4
+FIRST_STAMPS, MAX_STAMPS = 48, 400
+PHASE_TOLERANCE = 1e-4  # the same of the functions of a star's place in its pixel
+MAX_DEGREE = 3  # of the splines over wavelength and focus, and of the polynomials over a scattered field
+MAX_GRID_DEGREE = 4
+ON_EDGE_PX = 1e-6
+SPRITES_AT_ONCE_PX = 2_000_000
+
+
+Kernel = Literal["linear", "thin_plate_spline", "quintic"]
+
+
+class Spline:
+    """Functions of one variable, one of each of `nodes` (k,), rising: 1 there, 0 at the others.
+
+    Beyond the nodes the values at their ends count.
+    """
+
+    def __init__(self, nodes: FloatArray, max_degree: int = MAX_DEGREE) -> None:
+        from scipy.interpolate import make_interp_spline  # 0.2 s of every command that needs none of it
+
+        self._nodes = nodes
+        self._of = make_interp_spline(nodes, np.eye(len(nodes)), min(max_degree, len(nodes) - 1)) if len(nodes) > 1 else None
+
+    def __call__(self, at: FloatArray) -> FloatArray:
+        """The functions (n, k) at places (n,)."""
+        if self._of is None:
+            return np.ones((len(at), 1))
+        return np.asarray(self._of(np.clip(at, self._nodes[0], self._nodes[-1])))
+
+
+class Field:
+    """Functions over the field, one of each of its points (F, 2): 1 there, 0 at the others, smooth between.
+
+    On a full grid they are products of splines, elsewhere radial basis functions with polynomials. Beyond the points' convex
+    hull they have the values of its nearest place.
+    """
+
+    def __init__(self, places_px: FloatArray) -> None:
+        self.places_px = places_px
+        self._scale = max(1.0, float(np.abs(places_px - places_px.mean(axis=0)).max()))
+        self._degree = max((d for d in range(MAX_DEGREE + 1) if self._holds(d)), default=0)
+        self.hull_px = places_px[self._corners()]
+        columns, rows = (np.unique(axis) for axis in places_px.T)
+        grid = np.stack([part.T.ravel() for part in np.meshgrid(columns, rows)], axis=1)
+        self._grid = None  # `places_px` is sorted by x, then y
+        if grid.shape == places_px.shape and (grid == places_px).all():
+            self._grid = Spline(columns, MAX_GRID_DEGREE), Spline(rows, MAX_GRID_DEGREE)
+
+    def _scaled(self, places_px: FloatArray) -> FloatArray:
+        return np.asarray((places_px - self.places_px.mean(axis=0)) / self._scale)
+
+    def _holds(self, degree: int) -> bool:
+        """Whether the points determine a polynomial of that degree with some to spare."""
+        x, y = self._scaled(self.places_px).T
+        terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+        enough = terms.shape[1] * 1.4 <= len(x) if degree > 1 else terms.shape[1] <= len(x)
+        return bool(enough and np.linalg.matrix_rank(terms, tol=1e-6 * len(x)) == terms.shape[1])
+
+    def _corners(self) -> list[int]:
+        """The points at the corners of the hull, in order; the two ends of a line."""
+        if self._holds(1):
+            from scipy.spatial import ConvexHull
+
+            return [int(k) for k in ConvexHull(self.places_px).vertices]
+        along = self.places_px @ np.ptp(self.places_px, axis=0)
+        return sorted({int(along.argmin()), int(along.argmax())})
+
+    def within(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Places (n, 2) within the hull, the nearest for those beyond, and how far these are beyond it, px (n,)."""
+        places = np.stack([x_px, y_px], axis=1)
+        beyond_px = np.zeros(len(places))
+        begin, along = self.hull_px, np.roll(self.hull_px, -1, axis=0) - self.hull_px
+        off = places[:, None] - begin
+        left = along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]
+        outside = np.flatnonzero(
+            (left < -ON_EDGE_PX * self._scale).any(axis=1) if len(begin) > 2 else np.ones(len(places), bool)
+        )
+        if len(outside):
+            length2 = np.maximum((along * along).sum(axis=1), 1e-300)
+            part = np.clip((off[outside] * along).sum(axis=2) / length2, 0, 1)
+            nearest = begin + part[..., None] * along
+            far = np.linalg.norm(nearest - places[outside, None], axis=2)
+            which = far.argmin(axis=1)
+            beyond_px[outside] = far[np.arange(len(outside)), which]
+            places[outside] = nearest[np.arange(len(outside)), which]
+        return places, beyond_px
+
+    @cached_property
+    def _scattered(self) -> Callable[[FloatArray], FloatArray]:
+        from scipy.interpolate import RBFInterpolator
+
+        kernels: tuple[Kernel, ...] = "linear", "thin_plate_spline", "quintic", "quintic"
+        kernel = kernels[self._degree]
+        found: Callable[[FloatArray], FloatArray] = RBFInterpolator(
+            self._scaled(self.places_px), np.eye(len(self.places_px)), kernel=kernel, degree=self._degree
+        )
+        return found
+
+    def __call__(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """The functions (n, F) at places (n,)."""
+        places, _ = self.within(x_px, y_px)
+        if len(self.places_px) == 1 or not len(places):
+            return np.ones((len(places), len(self.places_px)))
+        if self._grid is not None:
+            across, down = (spline(place) for spline, place in zip(self._grid, places.T, strict=True))
+            return np.asarray((across[:, :, None] * down[:, None, :]).reshape(len(places), -1))
+        return np.asarray(self._scattered(self._scaled(places)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Stamps:
+    """What pixels get: `stamps` (R, side^2), whose coefficients are a sum over functions of a star's place in its pixel.
+
+    `phases` (S + 1, S + 1, Q) are these functions, y first, and `parts` (K, Q, R) what a basis image has of a stamp by each.
+    `sums` (R,) are those of the stamps.
+    """
+
+    stamps: Float32Array
+    phases: Float32Array
+    parts: Float32Array
+    sums: Float32Array
+
+
+@dataclass(frozen=True, slots=True)
+class Focused:
+    """A glass at one focus: `basis` (K, height, width), and by field point and wavelength the `weights` (F, L, K) of PSFs.
+
+    These sum to 1. `illumination` (F, L) is relative to the axis, and `inside` (F, L) the share of it within the images.
+    """
+
+    basis: FloatArray
+    weights: FloatArray
+    illumination: FloatArray
+    inside: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class GlassPsf(SampledPsf):
+    """A glass at one focus: stars are drawn each by place and spectrum, all else by the mean PSF in the field's middle.
+
+    `mean_shares` (L,) are the shares that each wavelength has of light without a spectrum of its own. Make it with `glass_psf`.
+    """
+
+    optics: Focused = dataclasses.field(kw_only=True)
+    field: Field = dataclasses.field(kw_only=True)
+    mean_shares: FloatArray = dataclasses.field(kw_only=True)
+    wavelengths_nm: FloatArray = dataclasses.field(kw_only=True)
+    by_place, by_colour = True, True
+    max_negative = MAX_NEGATIVE  # stars keep what is negative: noise of a measured map then moves none on average
+
+    def __post_init__(self) -> None:
+        """Refuse what is no PSF, the mean and each of the others."""
+        super().__post_init__()
+        stamps, weights = self._stamps, self.optics.weights.reshape(-1, len(self.optics.basis))
+        least = float((stamps.phases @ (stamps.parts @ stamps.sums).T @ weights.T).min())
+        if least < 1 - MAX_UNEVEN:
+            raise InputError(
+                f"a star's pixels get {least:.1%} of a PSF's light at one place in a pixel, and more at others: sample it more "
+                "finely, or write PIXINT = F where no pixel is integrated in it"
+            )
+
+    @cached_property
+    def width_px(self) -> tuple[float, float]:
+        """The smaller of the mean's and the sharpest PSF's: paths are sampled for all."""
+        flat = self.optics.weights.reshape(-1, len(self.optics.basis))
+        peak = (flat @ self.optics.basis.reshape(len(self.optics.basis), -1)).max(axis=1)
+        sharpest = np.tensordot(flat[peak.argmax()], self.optics.basis, axes=1).clip(min=0)
+        widths = [SampledPsf(samples, self.per_px, self.pixel_integrated).width_px for samples in (self.samples, sharpest)]
+        x, y = np.min(widths, axis=0).tolist()
+        return x, y
+
+    @cached_property
+    def footprint_px(self) -> int:
+        """The side of the smallest odd square outside which no PSF has more than MAX_CUT of its light."""
+        count, height, width = self.optics.basis.shape
+        y, x = np.indices((height, width))
+        ring = np.maximum(np.abs(y - height // 2), np.abs(x - width // 2)).ravel()
+        light = np.stack([np.bincount(ring, image.ravel()) for image in self.optics.basis])
+        left_out = np.abs(1 - np.cumsum(self.optics.weights.reshape(-1, count) @ light, axis=1)).max(axis=0)
+        wide = np.flatnonzero(left_out > MAX_CUT)
+        last = min(int(wide[-1]) + 1 if len(wide) else 0, len(left_out) - 1)
+        side = 2 * math.ceil((last + 0.5) / self.per_px + (0.5 if self.pixel_integrated else 0.0)) + 1
+        if side > MAX_FOOTPRINT_PX:
+            raise InputError(
+                f"a PSF's light reaches over {side} px, more than {MAX_FOOTPRINT_PX}; cut off what lies further out"
+            )
+        return side
+
+    @cached_property
+    def _phases(self) -> int:
+        return min(MAX_STEPS_A_PX, max(MIN_STEPS_A_PX, TABLE_SIDE // self.footprint_px))
+
+    @cached_property
+    def _stamps(self) -> _Stamps:
+        """The basis as pixels get it at (S + 1)^2 places of a star in its middle pixel, reduced to few stamps."""
+        steps, side = self._phases, self.footprint_px
+        at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
+        count, height, width = self.optics.basis.shape
+        down, across = (
+            _pixels_of(size, self.per_px, at_px.ravel(), self.pixel_integrated).astype(np.float32) for size in (height, width)
+        )
+        used = np.sqrt((self.optics.weights**2).mean(axis=(0, 1))).astype(np.float32)
+        table = np.empty((count, (steps + 1) ** 2, side * side), dtype=np.float32)
+        for image, scale, own in zip(self.optics.basis.astype(np.float32), used, table, strict=True):
+            pixels = (down @ (scale * image) @ across.T).reshape(steps + 1, side, steps + 1, side)
+            own[:] = pixels.transpose(0, 2, 1, 3).reshape(own.shape)
+        stamps, coefficients = _few(table.reshape(-1, side * side), side)
+        coefficients = coefficients.reshape(*table.shape[:2], -1) / np.maximum(used, 1e-30)[:, None, None]
+        flat = np.ascontiguousarray(coefficients.transpose(1, 0, 2)).reshape((steps + 1) ** 2, -1)
+        values, vectors = np.linalg.eigh((flat @ flat.T).astype(np.float64))
+        needed = int(np.argmax(values.sum() - np.cumsum(values[::-1]) <= PHASE_TOLERANCE**2 * values.sum())) + 1
+        phases = vectors[:, ::-1][:, :needed].astype(np.float32)
+        parts = (phases.T @ flat).reshape(needed, count, -1).transpose(1, 0, 2)
+        phases = phases.reshape(steps + 1, steps + 1, needed)
+        return _Stamps(stamps, phases, np.ascontiguousarray(parts), stamps.sum(axis=1))
+
+    def _mixed(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> Float32Array:
+        """How much stars at places (n,) have of each basis image (n, K); `shares` as in `of_stars`."""
+        optics, by_field = self.optics, self.field(x_px, y_px)
+        by_place = by_field @ self._light.reshape(len(by_field.T), -1)
+        by_place = by_place.reshape(len(x_px), -1, len(optics.basis))
+        return np.asarray(np.einsum("nlk,nl->nk", by_place, np.broadcast_to(shares, by_place.shape[:2])), dtype=np.float32)
+
+    @cached_property
+    def _sums(self) -> FloatArray:
+        return np.asarray(self.optics.basis.sum(axis=(1, 2)))
+
+    @cached_property
+    def _light(self) -> FloatArray:
+        """The weights of each point's light (F, L, K): a PSF's, times its illumination inside the image."""
+        optics = self.optics
+        return np.asarray(optics.weights * (optics.illumination * optics.inside)[..., None])
+
+    def _phased(self, x_px: FloatArray, y_px: FloatArray) -> Float32Array:
+        """The functions of a star's place in its pixel (n, Q), linear between the tabulated phases."""
+        steps, table = self._phases, self._stamps.phases
+        at = [((place - np.floor(place + 0.5) + 0.5) * steps).astype(np.float32) for place in (x_px, y_px)]
+        column, row = (np.minimum(place.astype(np.intp), steps - 1) for place in at)
+        x, y = (at[0] - column)[:, None].astype(np.float32), (at[1] - row)[:, None].astype(np.float32)
+        above, below = ((1 - x) * table[down, column] + x * table[down, column + 1] for down in (row, row + 1))
+        return np.asarray((1 - y) * above + y * below)
+
+    @cached_property
+    def _centroids_px(self) -> FloatArray:
+        """The centroid of each PSF from its chief ray (F, L, 2), px."""
+        _, height, width = self.optics.basis.shape
+        x, y = np.arange(width) - width // 2, np.arange(height) - height // 2
+        firsts = np.stack([self.optics.basis.sum(axis=1) @ x, self.optics.basis.sum(axis=2) @ y], axis=1)
+        return np.asarray(self.optics.weights @ firsts / self.per_px)
+
+    def centroids_px(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The centroids (n,) of the light of stars at places (n,), px, and their illumination relative to the axis.
+
+        What lies outside the images does not count. `shares` as in `of_stars`.
+        """
+        optics, by_field = self.optics, self.field(x_px, y_px)
+        falls = optics.illumination * optics.inside
+        total = ((by_field @ falls) * shares).sum(axis=1)
+        lit = total > 0
+        off = [((by_field @ (falls * off)) * shares).sum(axis=1) for off in np.moveaxis(self._centroids_px, 2, 0)]
+        x, y = (
+            place + np.where(lit, first / np.where(lit, total, 1), 0) for place, first in zip((x_px, y_px), off, strict=True)
+        )
+        return x, y, ((by_field @ optics.illumination) * shares).sum(axis=1)
+
+    def of_stars(
+        self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray, electrons_per_s: FloatArray | Float32Array
+    ) -> Float32Array:
+        """The light of stars at places (n,) in squares of pixels (n, side, side) about the pixels nearest to them.
+
+        Their light has `shares` (n, L) at each wavelength, or (L,) all of it.
+        """
+        weights = self._mixed(x_px, y_px, shares)
+        both = (weights[:, :, None] * self._phased(x_px, y_px)[:, None, :]).reshape(len(x_px), -1)
+        parts = both @ self._stamps.parts.reshape(both.shape[1], -1)
+        # Interpolated phases and reduced stamps keep all light but some 1e-5 of it; this restores the rest.
+        light, whole = weights @ self._sums, parts @ self._stamps.sums
+        scale = electrons_per_s * light / np.where(whole > 0, whole, np.inf)
+        stamps = (parts * scale.astype(np.float32)[:, None]) @ self._stamps.stamps
+        return np.asarray(stamps.reshape(-1, self.footprint_px, self.footprint_px))
+
+    def image(self, sprites: Sprites, shares: FloatArray, resolution_px: tuple[int, int]) -> Float32Array:
+        """The light of sprites (n,) in all pixels (height, width), electrons per second; `shares` as in `of_stars`."""
+        side, (width, height) = self.footprint_px, resolution_px
+        room = np.zeros((height + 2 * side, width + 2 * side), dtype=np.float32)
+        at_once = max(1, SPRITES_AT_ONCE_PX // side**2)
+        for begin in range(0, len(sprites), at_once):
+            part = slice(begin, begin + at_once)
+            x_px, y_px = sprites.x_px[part], sprites.y_px[part]
+            own = shares[part] if shares.ndim == 2 else shares
+            stamps = self.of_stars(x_px, y_px, own, sprites.data["electrons_per_s"][part])
+            columns, rows = (np.floor(place + 0.5).astype(np.intp) + side - side // 2 for place in (x_px, y_px))
+            for stamp, column, row in zip(stamps, columns.tolist(), rows.tolist(), strict=True):
+                room[row : row + side, column : column + side] += stamp
+        return room[side:-side, side:-side]
+
+    def blurred(self, sigma_px: float) -> GlassPsf:
+        """The basis convolved with a round Gaussian, with room for what spreads beyond it."""
+        from scipy.ndimage import fourier_gaussian
+
+        sigma = sigma_px * self.per_px
+        more = math.ceil(6 * sigma)
+        wide = np.pad(self.optics.basis, ((0, 0), (more, more), (more, more)))
+        spread = np.stack([np.fft.ifft2(fourier_gaussian(np.fft.fft2(image), sigma)).real for image in wide])
+        optics = replace(self.optics, basis=spread)
+        return replace(self, samples=_middle(optics, self.field, self.mean_shares), optics=optics)
+
+
+def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPsf:
+    """A glass at one of its focus positions, or between them. Raises InputError for PSFs that cannot be drawn."""
+    at_focus = Spline(glass.focuses_um)(np.array([focus_um]))[0]
+    weights, illumination, inside = (
+        np.tensordot(part, at_focus, axes=(2, 0)) for part in (glass.weights, glass.illumination, 1 - glass.outside)
+    )
+    lateral_px = np.tensordot(glass.lateral_px, at_focus, axes=(2, 0))
+    basis = glass.basis.astype(np.float64)
+    optics = Focused(basis, weights, illumination, inside)
+    if lateral_px.any() or len(glass.focuses_um) > 1:
+        optics = _rebased(optics, lateral_px * glass.per_px)
+    field = Field(glass.places_px)
+    return GlassPsf(
+        _middle(optics, field, mean_shares),
+        glass.per_px,
+        glass.pixel_integrated,
+        optics=optics,
+        field=field,
+        mean_shares=mean_shares,
+        wavelengths_nm=glass.wavelengths_nm,
+    )
+
+
+def _middle(optics: Focused, field: Field, shares: FloatArray) -> FloatArray:
+    """The PSF (height, width) in the middle of the field."""
+    middle = field(*field.places_px.mean(axis=0)[:, None])[0]
+    return np.asarray(np.tensordot(np.einsum("f,l,flk->k", middle, shares, optics.weights), optics.basis, axes=1))
+
+
+def _rebased(optics: Focused, lateral: FloatArray) -> Focused:
+    """PSFs moved by `lateral` (F, L, 2) samples, right and down, on a basis of their own: one focus needs fewer components."""
+    from scipy.ndimage import shift
+
+    room = math.ceil(float(np.abs(lateral).max()))
+    flat, moves = optics.weights.reshape(-1, len(optics.basis)), lateral.reshape(-1, 2)
+    padded = np.pad(optics.basis, ((0, 0), (room, room), (room, room)))
+    unmoved = (np.tensordot(weight, padded, axes=1) for weight in flat)
+    moved = [shift(image, move[::-1], order=5) if move.any() else image for image, move in zip(unmoved, moves, strict=True)]
+    images = np.stack(moved)
+    images /= images.sum(axis=(1, 2), keepdims=True)
+    basis, weights, _ = principal(images.reshape(len(images), -1), images.shape[1:], TOLERANCE)
+    weights /= (weights @ basis.sum(axis=1, dtype=np.float64))[:, None]
+    return replace(
+        optics,
+        basis=basis.reshape(-1, *images.shape[1:]).astype(np.float64),
+        weights=weights.reshape(*optics.weights.shape[:2], -1),
+    )
+
+
+def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> FloatArray:
+    """What pixels centred `at_px` (n,) along an axis get of each of `size` samples: (n, size), by `SampledPsf`'s spline."""
+    from scipy.interpolate import make_interp_spline
+
+    each = np.pad(np.eye(size), ((BLACK_SAMPLES, BLACK_SAMPLES), (0, 0)))
+    place_px = (np.arange(len(each)) - len(each) // 2) / per_px
+    spline, last_px = make_interp_spline(place_px, each, SPLINE_DEGREE), place_px[-1]
+    if integrated:
+        return np.asarray(spline(np.clip(at_px, -last_px, last_px)) * per_px)
+    light = spline.antiderivative()
+    low, high = (light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5))
+    return np.asarray((high - low) * per_px)
+
+
+def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
+    """Rows (R, side^2), and the coefficients (n, R) by which they make those of a table to STAMP_TOLERANCE.
+
+    Flux, centroids and second moments are kept exactly. Random projections find the principal components of the rest (Halko,
+    Martinsson and Tropp 2011, algorithm 4.4), always the same.
+    """
+    carriers, terms = (part.astype(np.float32) for part in moment_carriers((side, side), 1.0))
+    moments = table @ terms
+    rest = table - moments @ carriers
+    rng, total = np.random.default_rng(0), float(np.einsum("ij,ij->", table, table, dtype=np.float64))
+    wanted, left = FIRST_STAMPS, float(np.einsum("ij,ij->", rest, rest, dtype=np.float64))
+    while True:
+        wanted = min(wanted, *rest.shape)
+        random = rng.standard_normal((rest.shape[1], wanted), dtype=np.float32)
+        span = _orthonormal(rest.T @ _orthonormal(rest @ random))
+        held = (rest @ span).astype(np.float64)
+        found, turn = np.linalg.eigh(held.T @ held)
+        enough = np.flatnonzero(left - np.cumsum(found[::-1]) <= STAMP_TOLERANCE**2 * total)
+        if len(enough) or wanted in (MAX_STAMPS, *rest.shape):
+            turn = turn[:, ::-1][:, : int(enough[0]) + 1 if len(enough) else wanted].astype(np.float32)
+            break
+        wanted = min(2 * wanted, MAX_STAMPS)
+    stamps = (span @ turn).T
+    return np.concatenate([carriers, stamps]), np.concatenate([moments, rest @ stamps.T], axis=1)
+
+
+def _orthonormal(columns: Float32Array | FloatArray) -> Float32Array:
+    """Orthonormal columns that span those given, by their products with each other: QR takes far longer on long ones."""
+    values, vectors = np.linalg.eigh((columns.T @ columns).astype(np.float64))
+    good = values > 1e-9 * values[-1]
+    return np.asarray(columns @ (vectors[:, good] / np.sqrt(values[good])), dtype=np.float32)

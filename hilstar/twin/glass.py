@@ -1,0 +1,88 @@
+"""The spectra of a bench's stars as its glass sees them: what share of a star's electrons each of the file's wavelengths has.
+
+The tracker's band is cut into narrow ones, whose electrons come from the same tables as a star's total, so every model of
+spectra (`[sky] brightness`, `spectrum`, `temperature`) counts here too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import StarRates, bench_optics, channel_rates, star_kinds
+from hilstar.errors import InputError
+from hilstar.optics.glass_psf import GlassPsf, Spline
+from hilstar.sky.catalog import Catalog
+from hilstar.sky.spectrum import Curve
+from hilstar.sky.stars import Stars
+
+BAND_NM = 25.0  # twice as fine moves no star's shares by more than 1e-3 (tests/unit/twin/test_glass.py)
+KNOT_NM = 5.0
+
+
+class StarGlass:
+    """A `psf` and the shares of its wavelengths in the light of a bench's stars."""
+
+    def __init__(self, file: BenchFile, psf: GlassPsf, band_nm: float = BAND_NM) -> None:
+        self.psf, self._config = psf, file.config
+        self._catalog: Catalog | None = None
+        self._of_row = np.empty((0, 0))
+        self._bands: list[StarRates] = []
+        self._of_band = np.ones((0, 1))
+        if len(psf.wavelengths_nm) > 1:
+            self._cut(file, band_nm)
+
+    def _cut(self, file: BenchFile, band_nm: float) -> None:
+        """Bands that overlap as triangles do, so that they sum to the tracker's own."""
+        optics = bench_optics(file.config.tracker, file.folder)
+        low_nm, high_nm = optics.range_nm
+        nodes_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / band_nm) + 1)
+        fine_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / KNOT_NM) + 1)
+        own_nm = optics.quantum_efficiency.wavelength_nm
+        knots_nm = np.union1d(np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)])
+        efficiency = optics.quantum_efficiency(knots_nm)
+        shares, of_band = Spline(self.psf.wavelengths_nm)(knots_nm), []
+        for number in range(len(nodes_nm)):
+            part = efficiency * np.interp(knots_nm, nodes_nm, np.eye(len(nodes_nm))[number])
+            response = part * optics.transmission(knots_nm) * np.gradient(knots_nm)
+            if not response.any():
+                continue
+            try:
+                rates = channel_rates(file.config.sky, replace(optics, quantum_efficiency=Curve(knots_nm, part)))
+            except InputError:  # so little light that some spectrum has none: the bands beside it stand for it
+                continue
+            self._bands.append(rates)
+            of_band.append(response @ shares / response.sum())
+        self._of_band = np.array(of_band)
+
+    def shares(self, stars: Stars, which: IntArray) -> FloatArray:
+        """The shares (n, L) of stars at places (n,) of `stars`; those of light without a spectrum where a place is negative."""
+        if not self._bands:
+            return self.psf.mean_shares
+        if self._catalog is not stars.catalog:
+            self._catalog, self._of_row = stars.catalog, np.full((len(stars.catalog), self._of_band.shape[1]), np.nan)
+        found = np.tile(self.psf.mean_shares, (len(which), 1))
+        rows = np.where(which >= 0, stars.row[np.maximum(which, 0)], -1)
+        listed, body = rows >= 0, (rows < 0) & (which >= 0)
+        new = np.unique(rows[listed][np.isnan(self._of_row[rows[listed], 0])])
+        if len(new):
+            some = stars.catalog.taken(new)
+            self._of_row[new] = self._through(some.bv_mag, some.vi_mag, star_kinds(self._config, some))
+        found[listed] = self._of_row[rows[listed]]
+        if body.any():
+            bv_mag = stars.bv_mag[which[body]]
+            kind = (
+                np.full((len(bv_mag), 2), np.nan)
+                if star_kinds(self._config, stars.catalog.taken(np.arange(0))) is not None
+                else None
+            )
+            found[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
+        return found
+
+    def _through(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
+        rates = np.stack([band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1)
+        return np.asarray(rates @ self._of_band / rates.sum(axis=1, keepdims=True))

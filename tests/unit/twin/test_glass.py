@@ -1,0 +1,132 @@
+"""Stars' spectra through a glass, and where it acts: the virtual tracker, the display's twin, and benches that have none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.bench.build import bench_optics, bench_stars
+from hilstar.bench.cameras import tracker_camera, tracker_psf
+from hilstar.bench.glass import say_once
+from hilstar.optics.glass_psf import GlassPsf, Spline
+from hilstar.optics.psf_file import glass_of, write_glass
+from hilstar.scene.camera import Lens
+from hilstar.sky.electrons import electron_response
+from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m
+from hilstar.twin.glass import BAND_NM, StarGlass
+from hilstar.twin.simulator import Simulator
+from tests.support.benches import ORION_Q, bench_text
+from tests.support.glass import SIDE_PX, WAVELENGTHS_NM, illumination, moments, stack, truth
+
+SHARES = 1e-3  # bands of 25 nm against the integral: measured 4e-4
+TRACKER = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "exposure_s": 0.2, "transmission": None}
+
+
+@pytest.fixture
+def bench(tmp_path):
+    say_once.cache_clear()
+
+    def make(*changes, **glass):
+        write_glass(tmp_path / "psf.fits", glass_of(stack(), **glass))
+        tables = {"tracker": TRACKER, "tracker.optics": {"psf": "psf.fits"}, "sky": {"spectrum": "blackbody"}}
+        (tmp_path / "bench.toml").write_text(bench_text(tables, *changes))
+        return read_bench_file(tmp_path / "bench.toml")
+
+    return make
+
+
+def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(bench):
+    file = bench()
+    psf = tracker_psf(file.config.tracker, file.folder)
+    stars = bench_stars(file.config, file.folder)
+    which = np.array([int(np.abs(stars.bv_mag - bv).argmin()) for bv in (-0.25, 0.0, 0.6, 1.6)])
+    found = StarGlass(file, psf).shares(stars, which)
+    nm, response = electron_response(bench_optics(file.config.tracker, file.folder))
+    for temperature_k, shares in zip(stars.temperature_k[which], found, strict=True):
+        light = response * blackbody_exitance_w_m2_m(nm, np.array([temperature_k])[:, None])[0]
+        assert shares == pytest.approx(light @ Spline(np.array(WAVELENGTHS_NM))(nm) / light.sum(), abs=SHARES)
+    finer = StarGlass(file, psf, BAND_NM / 2).shares(stars, which)
+    assert found == pytest.approx(finer, abs=SHARES)
+
+
+@pytest.mark.parametrize("spectrum", ["pickles", "mk"])
+def test_every_model_of_spectra_makes_red_stars_redder(bench, spectrum):
+    file = bench({"sky": {"spectrum": spectrum}})
+    stars = bench_stars(file.config, file.folder)
+    which = np.array([int(np.abs(stars.bv_mag - bv).argmin()) for bv in (0.0, 1.5)])
+    blue, red = StarGlass(file, tracker_psf(file.config.tracker, file.folder)).shares(stars, which)
+    assert blue.sum() == pytest.approx(1)
+    assert red.sum() == pytest.approx(1)
+    assert blue[0] > red[0] + 0.1
+    added = StarGlass(file, tracker_psf(file.config.tracker, file.folder)).shares(stars, np.array([-1]))[0]
+    assert added.sum() == pytest.approx(1)
+
+
+def test_the_virtual_tracker_draws_each_star_by_its_place_and_colour(bench):
+    with Simulator(bench({"sky": {"faintest_v_mag": 5}})) as simulator:
+        exposure = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
+        shares = {}
+        for row in exposure.truth:
+            star = int(np.flatnonzero(simulator.stars.hip == row["hip"])[0])
+            shares[int(row["hip"])] = simulator._glass.shares(simulator.stars, np.array([star]))[0]
+    checked = 0
+    table = exposure.truth
+    for row in table:
+        far = np.hypot(table["x_px"] - row["x_px"], table["y_px"] - row["y_px"])
+        if np.sum(far < 20) > 1:
+            continue
+        column, line = round(row["x_px"]), round(row["y_px"])
+        part = exposure.mean_e[line - 7 : line + 8, column - 7 : column + 8]
+        if part.shape != (15, 15):
+            continue
+        wanted = moments(truth(row["x_px"], row["y_px"], shares[int(row["hip"])], 15))
+        light = row["electrons_per_s"] * TRACKER["exposure_s"]
+        own = moments(part)
+        assert own[0] == pytest.approx(wanted[0] * light * illumination(row["x_px"], row["y_px"]), rel=2e-3)
+        assert own[1:3] == pytest.approx(wanted[1:3], abs=5e-3)
+        assert column + own[1] == pytest.approx(row["x_centroid_px"], abs=5e-3)
+        assert line + own[2] == pytest.approx(row["y_centroid_px"], abs=5e-3)
+        assert row["relative_illumination"] == pytest.approx(illumination(row["x_px"], row["y_px"]), abs=1e-4)
+        checked += 1
+    assert checked > 8
+
+
+def test_smear_goes_along_with_it(bench):
+    """The mean of an exposure that turns is that of many still ones: 64 of them."""
+    with Simulator(bench({"sky": {"faintest_v_mag": 5}})) as simulator:
+        rate = np.radians([1.0, 0.7, 0.0])
+        turning = simulator.expose(simulator.view(np.array(ORION_Q), rate), None).mean_e
+        still = np.zeros_like(turning)
+        motion = simulator.view(np.array(ORION_Q), rate)
+        from hilstar.rotation import propagate
+
+        for k in range(64):
+            q = propagate(motion.q_icrs_to_cam, rate, ((k + 0.5) / 64 - 0.5) * TRACKER["exposure_s"])
+            still += simulator.expose(simulator.view(q, np.zeros(3)), None).mean_e / 64
+    assert np.abs(turning - still).max() < 2e-3 * turning.max()
+
+
+def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_none(bench, caplog):
+    lens, curve = Lens((0.05, 0.0, 0.0)), Curve(np.array([300.0, 1100.0]), np.array([0.5, 0.5]))
+    file = bench(lens=lens, transmission=curve)
+    assert tracker_camera(file.config.tracker, file.folder).lens.radial == (0.05, 0.0, 0.0)
+    assert bench_optics(file.config.tracker, file.folder).transmission(np.array([550.0]))[0] == 0.5
+    (file.folder / "flight.toml").write_text("k1 = 1.0\n")
+    own = bench({"tracker": {"distortion": "flight.toml", "transmission": 0.7}}, lens=lens, transmission=curve)
+    assert tracker_camera(own.config.tracker, own.folder).lens.radial == (1.0, 0.0, 0.0)
+    assert bench_optics(own.config.tracker, own.folder).transmission(np.array([550.0]))[0] == 0.7
+    assert "px from that of [tracker] distortion, which is taken" in caplog.text
+    assert "its transmission is not used" in caplog.text
+
+
+def test_what_the_file_does_not_cover_is_said(bench, caplog):
+    wide = bench({"tracker": {"resolution_px": [300, SIDE_PX]}, "tracker.optics": {"focus_um": 7.0}})
+    assert isinstance(tracker_psf(wide.config.tracker, wide.folder), GlassPsf)
+    for words in (
+        "44 px beyond the file's points",
+        "focus_um = 7 is beyond",
+        "under the file's 450 nm",
+        "over the file's 750 nm",
+    ):
+        assert words in caplog.text

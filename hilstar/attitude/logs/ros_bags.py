@@ -42,7 +42,7 @@ PIECE_BYTES = 1 << 20
 Encoding = Literal["ros1", "cdr"]
 MAX_TOPICS = 10_000
 VERSION = b"#ROSBAG V2.0\n"
-MESSAGE, BAG_HEADER, CHUNK, CONNECTION = 2, 3, 5, 7
+MESSAGE, CHUNK, CONNECTION = 2, 5, 7  # operations of records
 MAX_HEADER_BYTES = 1_000_000
 _u32, _u64, _time = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<II")
 # What the bytes of a record that is not one raise, in struct, in the fields and in the unpackers.

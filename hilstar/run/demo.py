@@ -13,7 +13,6 @@ from typing import Self
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.log_file import write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
@@ -62,20 +61,18 @@ def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
     for k in range(1, count):
         jitter[k] = keep * jitter[k - 1] + np.sqrt(1 - keep**2) * jitter[k]
     points = [from_radec_roll_deg(*waypoint) for waypoint in WAYPOINTS_DEG]
-    attitudes = [propagate(_on_path(points, min(t / duration_s, 1.0)), jitter[k], -1.0) for k, t in enumerate(times_s)]
-    samples = []
+    attitudes, samples = [], []
+    for k, t in enumerate(times_s):
+        progress = min(t / duration_s, 1.0) * (len(points) - 1)
+        leg = min(int(progress), len(points) - 2)
+        s = min((progress - leg) / (1 - SETTLE_FRACTION), 1.0)
+        path = slerp(points[leg], points[leg + 1], s**3 * (10 - 15 * s + 6 * s * s))
+        attitudes.append(propagate(path, jitter[k], -1.0))
     for k, q in enumerate(attitudes):
         before, after = attitudes[max(k - 1, 0)], attitudes[min(k + 1, count - 1)]
         rate = rate_between_rad_s(before, after, (min(k + 1, count - 1) - max(k - 1, 0)) / SEND_HZ)
         samples.append(AttitudeSample(round(times_s[k] * NS_PER_S), q, rate, k))
     return samples
-
-
-def _on_path(points: list[FloatArray], progress: float) -> FloatArray:
-    legs = len(points) - 1
-    leg = min(int(progress * legs), legs - 1)
-    s = min((progress * legs - leg) / (1 - SETTLE_FRACTION), 1.0)
-    return slerp(points[leg], points[leg + 1], s**3 * (10 - 15 * s + 6 * s * s))
 
 
 Watching = Callable[[Bench, str], AbstractContextManager[tuple[FrameSink, Outlet]]]

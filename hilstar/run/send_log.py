@@ -71,7 +71,10 @@ class BadCable:
             return
         if dice < faults.lose + faults.corrupt:
             tally.corrupted += 1
-            self._put(self._corrupted(packet))
+            # One to three of its bits flipped, before any framing: a CRC-32 always detects so few.
+            bits = np.unpackbits(np.frombuffer(packet, dtype=np.uint8))
+            bits[self._rng.choice(len(bits), size=self._rng.integers(1, 4), replace=False)] ^= 1
+            self._put(np.packbits(bits).tobytes())
             return
         if dice < faults.lose + faults.corrupt + faults.reorder and self._held is None:
             self._held = packet
@@ -89,12 +92,6 @@ class BadCable:
             held, self._held = self._held, None
             self.tally.sent += 1
             self._put(held)
-
-    def _corrupted(self, packet: bytes) -> bytes:
-        """One to three of its bits flipped, before any framing: a CRC-32 always detects so few."""
-        bits = np.unpackbits(np.frombuffer(packet, dtype=np.uint8))
-        bits[self._rng.choice(len(bits), size=self._rng.integers(1, 4), replace=False)] ^= 1
-        return np.packbits(bits).tobytes()
 
 
 def spin_samples(

@@ -88,7 +88,9 @@ class FrameWatch:
         if now_ns - self._told_ns > TOLD_EVERY_NS:
             self._told_ns = now_ns
             took_ms = (now_ns - stages[0][1]) / NS_PER_MS
-            self._notices.tell("frame-late", f"frame {self._number} took {took_ms:.0f} ms: {_told(stages, now_ns)}")
+            ends = zip(stages, [*(begin for _, begin in stages[1:]), now_ns], strict=True)
+            told = ", ".join(f"{name} {(end - begin) / NS_PER_MS:.1f}" for (name, begin), end in ends)
+            self._notices.tell("frame-late", f"frame {self._number} took {took_ms:.0f} ms: {told}")
 
     def idle(self) -> None:
         """No frame is due, and the loop waits for one."""
@@ -114,11 +116,6 @@ class FrameWatch:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join()
-
-
-def _told(stages: list[tuple[str, int]], end_ns: int) -> str:
-    ends_ns = [begin for _, begin in stages[1:]] + [end_ns]
-    return ", ".join(f"{name} {(end - begin) / NS_PER_MS:.1f}" for (name, begin), end in zip(stages, ends_ns, strict=True))
 
 
 GPU_LOST = "gpu-lost"

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.first_light.context import DarkSubtracted, StepContext
 from hilstar.calibrate.first_light.image_sources import Pattern, black
 from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, with_changes
@@ -257,7 +256,12 @@ def orientation(context: StepContext) -> StepOutcome:
     monitor = context.file.config.monitor
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
     first, measured = _way(context, "figure_000")
-    changes = _mounting_changes(context.file, before, corrected(before, first))
+    after = corrected(before, first)
+    pairs = [(key, getattr(before, key), getattr(after, key)) for key in ("flip_x", "flip_y", "rotate_deg")]
+    changes = tuple(KeyChange(table="monitor", key=key, before=old, after=new) for key, old, new in pairs if old != new)
+    if (before.rotate_deg - after.rotate_deg) % 180:
+        width, height = monitor.resolution_px
+        changes += (KeyChange(table="monitor", key="resolution_px", before=[width, height], after=[height, width]),)
     if changes:
         now, measured = _way(replace(context, file=with_changes(context.file, changes)), "figure_001")
         if now != UPRIGHT:
@@ -286,15 +290,6 @@ def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tu
     looked = context.looked(told, context.read(context.dark()))
     found = see_figure(looked.image, figure, geometry)
     return found.way, (found, looked)
-
-
-def _mounting_changes(file: BenchFile, before: ScreenMounting, after: ScreenMounting) -> tuple[KeyChange, ...]:
-    pairs = [(key, getattr(before, key), getattr(after, key)) for key in ("flip_x", "flip_y", "rotate_deg")]
-    changes = [KeyChange(table="monitor", key=key, before=old, after=new) for key, old, new in pairs if old != new]
-    if (before.rotate_deg - after.rotate_deg) % 180:
-        width, height = file.config.monitor.resolution_px
-        changes.append(KeyChange(table="monitor", key="resolution_px", before=[width, height], after=[height, width]))
-    return tuple(changes)
 
 
 def dots_for(context: StepContext) -> DotPlan:

@@ -147,7 +147,10 @@ def see_stars(context: StepContext) -> StarsSeen:
         attitudes = [q / np.linalg.norm(q) for q in rng.normal(size=(ATTITUDES, 4))]
         fullest = sorted(attitudes, key=lambda q: -len(bench.sprites(q)))[:FIELDS]
         for frame in [bench.frame(q) for q in fullest]:
-            levels = _levels(bench, frame)
+            levels: tuple[Levels, ...] = (frame.levels,)
+            exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)  # with `temporal` the frames of an exposure
+            if len(exposed) > 1:
+                levels = tuple(Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in exposed)
             codes = tuple(bench.code_values(each).astype(np.uint16) for each in levels)
             shown.append((codes, _alone(bench, context, frame, levels)))
     dark_path = context.dark()
@@ -168,14 +171,6 @@ def see_stars(context: StepContext) -> StarsSeen:
             " not there: expose longer, set a fainter [render] brightest_v_mag, or run the geometry again"
         )
     return seen
-
-
-def _levels(bench: Bench, frame: Frame) -> tuple[Levels, ...]:
-    """The levels of a frame, or with `temporal` of all frames of an exposure."""
-    exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)
-    if len(exposed) == 1:
-        return (frame.levels,)
-    return tuple(Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in exposed)
 
 
 def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...]) -> ExpectedStars:

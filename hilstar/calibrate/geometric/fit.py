@@ -92,8 +92,8 @@ def geometry_of(model: Model, nominal: Nominal, q_poses: FloatArray, numbers: Fl
     tracker, rest = nominal.tracker, numbers[len(model.names) :]
     if model.tracker_names:
         own = {name: TRACKER_STEPS[name] * float(n) for name, n in zip(model.tracker_names, rest, strict=False)}
-        round_, skew = (own["tracker_k1"], own["tracker_k2"], 0.0), (own["tracker_p1"], own["tracker_p2"])
-        tracker = replace(tracker, lens=Lens(round_, skew))
+        radial, tangential = (own["tracker_k1"], own["tracker_k2"], 0.0), (own["tracker_p1"], own["tracker_p2"])
+        tracker = replace(tracker, lens=Lens(radial, tangential))
     steps = POSE_STEP_RAD * rest[len(model.tracker_names) :].reshape(-1, 3)
     turned = [multiply(from_rotation_vector(step), pose) for step, pose in zip(steps, q_poses[1:], strict=True)]
     return Geometry(monitor, q, tracker, np.array([q_poses[0], *turned]))

@@ -279,24 +279,17 @@ class PicturePacker:
         sprites = np.frombuffer(data, SPRITE, head.sprites, PICTURE_HEAD_BYTES + count * head.item_bytes)
         if self._scene is not None and seen is not None and seen.overlay and not self._scene.aids_in_levels:
             levels = self._scene.aids.laid_over(levels, seen.overlay, seen.patch_share)
-        return PackedPicture(number, _message(head, levels), *self._truths(head, sprites, seen))
-
-    def _truths(self, head: PictureHead, sprites: np.ndarray, seen: RunState | None) -> tuple[str, str]:
-        """The truth of a picture as messages, without and with the grid."""
+        # The binary message: a length, a JSON head of that many bytes, and the deflated levels.
+        form = PictureFormat(w=head.width, h=head.height, frame=head.frame, dtype=f"u{head.item_bytes}")
+        text = msgspec.json.encode(form)
+        picture = struct.pack("<I", len(text)) + text + zlib.compress(np.ascontiguousarray(levels).tobytes(), LEVEL)
         truth = Truth(frame=head.frame, stars=[])
         if self._scene is not None:
             q = np.array([head.q_w, head.q_x, head.q_y, head.q_z])
             stars = stars_of(self._scene, sprites, seen)
             truth = self._scene.marks.truth(head.frame, stars, q if np.isfinite(q).all() else None, grid=True)
         without_grid = msgspec.structs.replace(truth, grid=msgspec.UNSET)
-        return PageText(truth=without_grid).json(), PageText(truth=truth).json()
-
-
-def _message(head: PictureHead, levels: Levels) -> bytes:
-    """A picture's binary message: a length, a JSON head of that many bytes, and the deflated levels."""
-    form = PictureFormat(w=head.width, h=head.height, frame=head.frame, dtype=f"u{head.item_bytes}")
-    text = msgspec.json.encode(form)
-    return struct.pack("<I", len(text)) + text + zlib.compress(np.ascontiguousarray(levels).tobytes(), LEVEL)
+        return PackedPicture(number, picture, PageText(truth=without_grid).json(), PageText(truth=truth).json())
 
 
 def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) -> list[StarMark]:

@@ -46,9 +46,12 @@ class Commanded:
         self._step = to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))  # frame k to k + 1
         turned = np.linalg.norm(self._step, axis=1)
         near = gap_s <= max(MAX_GAP_S, USUAL_INTERVALS * self.interval_s)
+        # A step is a jump where it is much faster than the one before and the one after it.
+        rate = np.nan_to_num(turned) / gap_s
+        before, after = np.append(0.0, rate[:-1]), np.append(rate[1:], 0.0)
+        jumps = (np.nan_to_num(turned) > JUMP_RAD) & (rate > JUMP_RATIO * np.maximum(before, after))
         with np.errstate(invalid="ignore"):
-            self.joined = np.isfinite(turned) & ((near & (turned <= MAX_STEP_RAD)) | (turned <= SAME_RAD))
-            self.joined &= ~_jumps(turned, gap_s)
+            self.joined = np.isfinite(turned) & ((near & (turned <= MAX_STEP_RAD)) | (turned <= SAME_RAD)) & ~jumps
         self._gap_s = gap_s
 
     @property
@@ -87,13 +90,6 @@ class Commanded:
         even = (ratio < UNEVEN) & (ratio > 1 / UNEVEN) & (other >= 0) & (other <= last) & self.joined[near]
         change = (self._step[near] / ratio[:, None] - self._step[interval]) / (1 + ratio[:, None])
         return np.where(even[:, None], change, 0.0)
-
-
-def _jumps(turned_rad: FloatArray, gap_s: FloatArray) -> npt.NDArray[np.bool_]:
-    """Which steps (n,) are much faster than the one before and the one after them."""
-    rate = np.nan_to_num(turned_rad) / gap_s
-    before, after = np.append(0.0, rate[:-1]), np.append(rate[1:], 0.0)
-    return np.asarray((np.nan_to_num(turned_rad) > JUMP_RAD) & (rate > JUMP_RATIO * np.maximum(before, after)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ import ctypes
 import functools
 import gc
 import importlib
+import io
 import json
 import os
 import resource
@@ -25,9 +26,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+from tests.support.benches import SCREEN_BENCH, SMALL_BENCH
+
 HILSTAR = [sys.executable, "-m", "hilstar"]
-# What a served, replayed or drawn bench imports before its first frame; no window, no browser, no thread.
-MODULES = ("cli", "bench.build", "run.loop", "run.open_link", "run.record.ledger", "run.serve", "render.numpy_backend")
+# What a bench imports before its first frame, and the commands that tests start most; no window, no browser, no thread.
+MODULES = ("bench.build", "console.publisher", "render.renderer", "run.loop", "run.open_link", "run.record.ledger", "run.serve")
+COMMANDS = (["serve", "none.toml"], ["replay", "none.toml", "none.csv"], ["frame", "none.toml"], ["--version"])
 LIMITS = (resource.RLIMIT_AS, resource.RLIMIT_CPU, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE)
 MAX_REQUEST_BYTES = 1 << 20
 ROOM = "a" * 2000  # of the nursery's command line, where the names of its copies stand
@@ -100,9 +104,18 @@ def main(made: socket.socket) -> None:
     """Import, and make copies until nobody asks any more."""
     for module in MODULES:
         importlib.import_module(f"hilstar.{module}")
+    from hilstar.bench.bench_file import bench_file_of
+    from hilstar.bench.cameras import bench_camera
+    from hilstar.cli import run_command
+    from hilstar.scene.paths import points_within
     from hilstar.sky.catalog import load_catalog
 
     load_catalog()
+    for text in (SMALL_BENCH, SCREEN_BENCH):
+        points_within(bench_camera(bench_file_of(Path("none.toml"), text).config, Path()), 1e-3)
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        for words in COMMANDS:
+            run_command(words)  # refused: their options are built
     gc.collect()
     gc.freeze()
     while True:

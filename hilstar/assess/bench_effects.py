@@ -19,9 +19,9 @@ from hilstar.assess.budget import Axes
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_stars
 from hilstar.bench.cameras import tracker_camera
-from hilstar.rotation import to_matrix
+from hilstar.rotation import normalise, to_matrix
 from hilstar.twin.noise import attitude_limits_arcsec
-from hilstar.twin.verify.star_finder import StarFinder, star_finder
+from hilstar.twin.verify.star_finder import star_finder
 from hilstar.twin.verify.twin import Twin
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
@@ -111,21 +111,19 @@ def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
 
     Raises InputError for a bench that cannot be built, and MachineError without OpenGL.
     """
+    errors = np.full((len(q_icrs_to_cam), 3), np.nan)
     with Twin(file) as twin:
         finder = star_finder(twin.bench, twin.monitor_px_per_px)
-        return np.array([_error(twin, finder, q, number) for number, q in enumerate(q_icrs_to_cam)]).reshape(-1, 3)
-
-
-def _error(twin: Twin, finder: StarFinder, q_icrs_to_cam: FloatArray, number: int) -> FloatArray:
-    field = twin.field(q_icrs_to_cam, number)
-    sky, shown = (finder.match(image, field.x_px, field.y_px) for image in (field.sky_e, field.shown_e))
-    both = (sky.index >= 0) & (shown.index >= 0)
-    if both.sum() < MIN_STARS:
-        return np.full(3, np.nan)
-    i, j = sky.index[both], shown.index[both]
-    true = _unit(twin.camera.rays(sky.found.x_px[i], sky.found.y_px[i]))
-    seen = _unit(twin.camera.rays(shown.found.x_px[j], shown.found.y_px[j]))
-    return ARCSEC_PER_RAD * turn_between(true, seen, sky.found.flux[i])
+        for number, q in enumerate(q_icrs_to_cam):
+            field = twin.field(q, number)
+            sky, shown = (finder.match(image, field.x_px, field.y_px) for image in (field.sky_e, field.shown_e))
+            both = (sky.index >= 0) & (shown.index >= 0)
+            if both.sum() >= MIN_STARS:
+                i, j = sky.index[both], shown.index[both]
+                true = normalise(twin.camera.rays(sky.found.x_px[i], sky.found.y_px[i]))
+                seen = normalise(twin.camera.rays(shown.found.x_px[j], shown.found.y_px[j]))
+                errors[number] = ARCSEC_PER_RAD * turn_between(true, seen, sky.found.flux[i])
+    return errors
 
 
 def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> FloatArray:
@@ -137,10 +135,6 @@ def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> Floa
     root = np.sqrt(weight)[:, None]
     found, *_ = np.linalg.lstsq((cross * root[:, :, None]).reshape(-1, 3), ((seen - true) * root).ravel(), rcond=None)
     return np.asarray(found)
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, slots=True)

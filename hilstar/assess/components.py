@@ -32,7 +32,7 @@ from scipy import sparse
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.assess.places import Projector, Scale, bumps_at, centres_of, places_of
-from hilstar.rotation import conjugate, multiply, to_matrix, to_rotation_vector
+from hilstar.rotation import conjugate, multiply, normalise, to_matrix, to_rotation_vector
 
 MIN_ROWS = 30
 TURNS = 3  # fits of bumps and waves by turns
@@ -307,85 +307,60 @@ def best_direction(residual_arcsec: FloatArray, axes: FloatArray, scale: Scale) 
     size = float(np.linalg.norm(mean))
     if size < MIN_FORWARD or (boresight @ mean).min() < 2 * MIN_FORWARD * size:
         return None
-    frame = _frame(mean / size)
+    # Directions are points (k, 2) in the tangent plane of the mean boresight.
+    z = mean / size
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    frame = np.stack([x, np.cross(z, x), z])
     seen = boresight @ frame.T
     trace = seen[:, :2] / seen[:, 2:]
     margin = 0.5 * max(scale.resolution_px) / scale.focal_px
     low, high = trace.min(axis=0) - margin, trace.max(axis=0) + margin
     step = (high - low) / (GRID - 1)
-    grid = np.stack(np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))), axis=-1).reshape(-1, 2)
+    best = np.stack(np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))), axis=-1).reshape(-1, 2)
     value = residual_arcsec / np.maximum(residual_arcsec.std(axis=0), 1e-9)
-    search = _Search(value, axes, frame, scale)
-    best = grid
+    steps = axes[1:] @ np.swapaxes(axes[:-1], 1, 2)
+    roll_rad = np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 0, 1]))])
     for level in range(LEVELS):
-        score = search.score(best, step, COARSE_ANSWERS if level == 0 else FINE_ANSWERS)
-        order = np.argsort(-score)
-        best = best[order[: KEPT if level < LEVELS - 1 else 1]]
+        start, rows = _stretches(roll_rad, float(np.max(step)) * scale.focal_px, FINE_ANSWERS if level else COARSE_ANSWERS)
+        score = _wave_power(value[rows], axes[rows], normalise(np.c_[best, np.ones(len(best))] @ frame), scale, start)
+        best = best[np.argsort(-score)[: KEPT if level < LEVELS - 1 else 1]]
         if float(np.max(step)) * scale.focal_px < FOUND_TO_PX:
             break
         step = step / 2
         around = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2) * step
         best = (best[:, None] + around).reshape(-1, 2)
-    return np.asarray(search.directions(best[:1])[0])
+    return normalise(np.append(best[0], 1.0) @ frame)
 
 
-def _frame(z: FloatArray) -> FloatArray:
-    """Axes (3, 3) of a right-handed frame with the third along `z` (3,)."""
-    aside = np.eye(3)[int(np.argmin(np.abs(z)))]
-    x = np.cross(aside, z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
+def _wave_power(value: FloatArray, axes: FloatArray, directions: FloatArray, scale: Scale, start: IntArray) -> FloatArray:
+    """The power (k,) of each direction's waves in values (n, 3), summed over stretches that begin at `start` (m,)."""
+    power = np.zeros(len(directions))
+    for k, direction in enumerate(directions):
+        seen = axes @ direction
+        angle = (2 * np.pi * scale.focal_px) * (seen[:, :2] / seen[:, 2:])
+        for wave in (np.cos(angle), np.sin(angle)):
+            sums = np.add.reduceat((value[:, :, None] * wave[:, None]).reshape(-1, 6), start, axis=0)
+            power[k] += float((sums**2).sum())
+    return power
 
 
-class _Search:
-    """The power of a direction's waves in residuals (n, 3), in units of their spread, with camera axes (n, 3, 3)."""
+def _stretches(roll_rad: FloatArray, cell_px: float, answers: int) -> tuple[IntArray, IntArray]:
+    """Stretches whose phase holds over a cell, spread over the run with about so many answers together.
 
-    def __init__(self, value: FloatArray, axes: FloatArray, frame: FloatArray, scale: Scale) -> None:
-        self.value, self.axes, self.frame, self.scale = value, axes, frame, scale
-        steps = axes[1:] @ np.swapaxes(axes[:-1], 1, 2)
-        self.roll = np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 0, 1]))])  # rad, accumulated
-
-    def directions(self, tangent: FloatArray) -> FloatArray:
-        """Unit vectors (k, 3), ICRS, of points (k, 2) in the tangent plane of the frame's third axis."""
-        vector = np.concatenate([tangent, np.ones((len(tangent), 1))], axis=1) @ self.frame
-        return np.asarray(vector / np.linalg.norm(vector, axis=1, keepdims=True))
-
-    def score(self, tangent: FloatArray, step: FloatArray, answers: int) -> FloatArray:
-        """The power (k,) of each direction's waves, summed over stretches as long as the grid's cells allow."""
-        start = self._stretches(float(np.max(step)) * self.scale.focal_px)
-        if answers < len(self.value):
-            start, rows = _some(start, len(self.value), answers)
-        else:
-            rows = np.arange(len(self.value))
-        value, axes = self.value[rows], self.axes[rows]
-        scores = np.zeros(len(tangent))
-        for k, direction in enumerate(self.directions(tangent)):
-            seen = axes @ direction
-            angle = (2 * np.pi * self.scale.focal_px) * (seen[:, :2] / seen[:, 2:])
-            for wave in (np.cos(angle), np.sin(angle)):
-                sums = np.add.reduceat((value[:, :, None] * wave[:, None]).reshape(-1, 6), start, axis=0)
-                scores[k] += float((sums**2).sum())
-        return scores
-
-    def _stretches(self, cell_px: float) -> IntArray:
-        """The first answers (m,) of stretches whose phase holds over a cell."""
-        turn = PHASE_CYCLES / cell_px
-        by_roll = np.floor(self.roll / turn).astype(np.int64)
-        longest = len(self.roll) if cell_px < 1 else MAX_STRETCH
-        by_count = np.arange(len(self.roll)) // longest
-        start = np.flatnonzero(np.diff(by_roll, prepend=-1) | np.diff(by_count, prepend=-1))
-        kept = [0]
-        for each in start[1:].tolist():
-            if each - kept[-1] >= MIN_STRETCH:
-                kept.append(each)
-        return np.array(kept)
-
-
-def _some(start: IntArray, total: int, answers: int) -> tuple[IntArray, IntArray]:
-    """Stretches spread over the run with about so many answers together: their first answers, and all their rows."""
+    Their first answers (m,) among the rows (n,) that they have.
+    """
+    total = len(roll_rad)
+    by_roll = np.floor(roll_rad / (PHASE_CYCLES / cell_px)).astype(np.int64)
+    by_count = np.arange(total) // (total if cell_px < 1 else MAX_STRETCH)
+    kept = [0]
+    for each in np.flatnonzero(np.diff(by_roll, prepend=-1) | np.diff(by_count, prepend=-1))[1:].tolist():
+        if each - kept[-1] >= MIN_STRETCH:
+            kept.append(each)
+    start = np.array(kept)
+    if answers >= total:
+        return start, np.arange(total)
     end = np.append(start[1:], total)
-    many = max(4, round(len(start) * answers / total))
-    chosen = np.unique(np.linspace(0, len(start) - 1, many).astype(int))
-    length = (end - start)[chosen]
+    chosen = np.unique(np.linspace(0, len(start) - 1, max(4, round(len(start) * answers / total))).astype(int))
     rows = np.concatenate([np.arange(start[k], end[k]) for k in chosen])
-    return np.concatenate([[0], np.cumsum(length)[:-1]]), rows
+    return np.concatenate([[0], np.cumsum((end - start)[chosen])[:-1]]), rows

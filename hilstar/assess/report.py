@@ -60,7 +60,7 @@ class FigureRow(NamedTuple):
 
 
 def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRow]:
-    """The rows of bias, field-of-view error, pixel error and noise; without values where there are no parts."""
+    """The rows of bias, field-of-view error, pixel error and noise; without values where `parts` is None."""
     for k, axis in enumerate("xyz"):
         value = None if parts is None else float(parts.bias_arcsec[k])
         yield FigureRow("bias", axis, value, "arcsec", *([] if parts is None else parts.intervals.bias[:, k].tolist()))

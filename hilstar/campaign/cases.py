@@ -293,8 +293,10 @@ class CaseTally:
             row |= dict(zip((f"solved_{name}" for name in Q), self.first_q.tolist(), strict=True))
         if self.errors_arcsec:
             errors = np.array(self.errors_arcsec)
-            spreads = {"error": errors.mean(axis=0)} | ({"scatter": errors.std(axis=0, ddof=1)} if len(errors) > 1 else {})
-            row |= {f"{what}_{axis}_arcsec": float(s[k]) for what, s in spreads.items() for k, axis in enumerate(AXES)}
+            row |= {f"error_{axis}_arcsec": float(value) for axis, value in zip(AXES, errors.mean(axis=0), strict=True)}
+            if len(errors) > 1:
+                scatter = errors.std(axis=0, ddof=1)
+                row |= {f"scatter_{axis}_arcsec": float(value) for axis, value in zip(AXES, scatter, strict=True)}
         return row | self._centroids() if self.with_centroids and self.star_errors else row
 
     def _centroids(self) -> Row:

@@ -22,6 +22,7 @@ from hilstar.attitude.wire.endpoint import check_use, parse_endpoint
 from hilstar.campaign.pool import Backlog, Done, Lost, Task
 from hilstar.campaign.session import Answered, Identity, Job, Session, difference
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
+from hilstar.process.closing import Closing
 
 _here = threading.local()
 INSTALL = "install it: pip install 'hilstar[dask]'"
@@ -126,7 +127,7 @@ class _Worker:
     tasks: deque[tuple[Any, Task]] = field(default_factory=deque)
 
 
-class Cluster:
+class Cluster(Closing):
     """The workers of a scheduler. Use it as a context manager.
 
     A worker of another version, bench or renderer is refused with a line through `say` and gets no case. Raises InputError as
@@ -304,10 +305,8 @@ class Cluster:
                 f"--scheduler {self._address}: no worker for this campaign in {MAX_WITHOUT_WORKER_S:g} s{refused}; {advice}"
             )
 
-    def __enter__(self) -> Cluster:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Cancel what is still asked for, and let the scheduler go."""
         with contextlib.suppress(Exception):
             self._client.cancel([future for worker in self._workers.values() for future, _ in worker.tasks])
             self._client.close(timeout=CLOSE_S)

@@ -335,11 +335,9 @@ class Design:
             with warnings.catch_warnings():  # that the number of points is no power of two: the plan decides it
                 warnings.simplefilter("ignore", UserWarning)
                 return np.asarray(self._engine.random(end - begin))
-        points = np.empty((end - begin, self.dimensions))
+        points, own = np.empty((end - begin, self.dimensions)), self.attitude_dimensions
         for row, case in zip(points, range(begin, end), strict=True):
-            row[: self.attitude_dimensions] = np.random.default_rng((self.seed, case, ATTITUDE_STREAM)).random(
-                self.attitude_dimensions
-            )
-            place = np.unravel_index(case % math.prod(self.levels), self.levels) if self.levels else ()
-            row[self.attitude_dimensions :] = (np.array(place) + 0.5) / self.levels
+            row[:own] = np.random.default_rng((self.seed, case, ATTITUDE_STREAM)).random(own)
+            level = np.unravel_index(case % math.prod(self.levels), self.levels) if self.levels else ()
+            row[own:] = (np.array(level) + 0.5) / self.levels
         return points

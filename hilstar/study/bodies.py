@@ -78,25 +78,21 @@ FLOOR = 1e-6  # lower end of the chart's axis
 @contextmanager
 def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
     """The benches of these names, which end with the context. Raises InputError or MachineError."""
-    with TemporaryDirectory() as folder, ExitStack() as stack:
-        (Path(folder) / "low.tle").write_text(TLE)
-        yield {name: stack.enter_context(_open(Path(folder), name)) for name in names}
-
-
-def _open(folder: Path, name: str) -> Bench:
-    bodies, observer = BODIES[name]
-    tables: dict[str, Table] = {
+    common: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
         "monitor": {**FULL_HD, "refresh_hz": REFRESH_HZ, "bits": 12},
         "collimator": {"focal_length_mm": 350.0},
         "sky": EPOCH,
         "render": {"quantisation": "round", "motion": "off", "brightest_v_mag": 2.0},
     }
-    if bodies:
-        tables["sky.bodies"] = bodies
-    if observer:
-        tables["spacecraft"] = observer
-    return study_bench(folder / f"{name.replace(' ', '_')}.toml", tables)
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        (Path(folder) / "low.tle").write_text(TLE)
+        benches = {}
+        for name in names:
+            own = {key: table for key, table in zip(("sky.bodies", "spacecraft"), BODIES[name], strict=True) if table}
+            path = Path(folder) / f"{name.replace(' ', '_')}.toml"
+            benches[name] = stack.enter_context(study_bench(path, {**common, **own}))
+        yield benches
 
 
 def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:

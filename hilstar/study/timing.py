@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +22,7 @@ from hilstar.bench.cameras import tracker_camera
 from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import Levels
+from hilstar.process.closing import Closing
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg
@@ -85,7 +86,7 @@ def frame_weights(rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s
     return np.asarray(np.maximum(lit, 0.0) / (span_s[1] - span_s[0]))
 
 
-class ScanningPanel:
+class ScanningPanel(Closing):
     """A bench that shows on a panel that scans, with one compensation, and a tracker in front of it. Free it with `close`.
 
     Rows stay lit for `lit` of a refresh, which the bench knows where it compensates smear.
@@ -152,7 +153,7 @@ class ScanningPanel:
         self.optics.close()
 
 
-class TimingSky:
+class TimingSky(Closing):
     """The same tracker's image of the sky itself, spread by the sprites' width. Free it with `close`."""
 
     def __init__(self, shown: ScanningPanel) -> None:
@@ -220,10 +221,9 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
     points: list[BeatPoint] = []
     for case in QUICK_CASES if quick else CASES:
         with TemporaryDirectory() as folder, ExitStack() as stack:
-            panel = stack.enter_context(
-                closing(ScanningPanel("+ smear", Path(folder) / "beat.toml", case.refreshes / 60.0, case.lit))
-            )
-            sky = stack.enter_context(closing(TimingSky(panel)))
+            path = Path(folder) / "beat.toml"
+            panel = stack.enter_context(ScanningPanel("+ smear", path, case.refreshes / 60.0, case.lit))
+            sky = stack.enter_context(TimingSky(panel))
             for number in range(STARTS):
                 panel.start_s = (number + 0.2) / STARTS * panel.period_s
                 points += _exposure_points(case, panel, sky, movement)
@@ -334,8 +334,8 @@ def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingO
 def measure(quick: bool = False) -> list[TimingOutcome]:
     """Every compensation at every rate."""
     with TemporaryDirectory() as folder, ExitStack() as stack:
-        panels = [stack.enter_context(closing(ScanningPanel(way, Path(folder) / f"{k}.toml"))) for k, way in enumerate(WAYS)]
-        sky = stack.enter_context(closing(TimingSky(panels[0])))
+        panels = [stack.enter_context(ScanningPanel(way, Path(folder) / f"{k}.toml")) for k, way in enumerate(WAYS)]
+        sky = stack.enter_context(TimingSky(panels[0]))
         return [compare(panel, sky, slew(rate)) for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S) for panel in panels]
 
 

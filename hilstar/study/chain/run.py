@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -308,7 +307,7 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
     budget: list[ErrorPart] = []
     stages: list[StageTime] = []
     lines, judged, others = [], [], OtherWork()
-    with Parts(file) as parts, closing(StudyTracker(parts.own)) as tracker:
+    with Parts(file) as parts, StudyTracker(parts.own) as tracker:
         for number, scene in enumerate(five_scenes(parts.own)):
             measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Rounds())
             if not measurement.star_count:

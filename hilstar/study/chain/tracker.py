@@ -16,8 +16,9 @@ from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.assess.bench_effects import turn_between
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame import Bench
+from hilstar.process.closing import Closing
 from hilstar.render.reference import add_stars
-from hilstar.rotation import to_matrix
+from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars
@@ -88,7 +89,7 @@ class Off:
     lost: BoolArray
 
 
-class StudyTracker:
+class StudyTracker(Closing):
     """A bench's virtual tracker. Free it with `close`."""
 
     def __init__(self, bench: Bench) -> None:
@@ -127,6 +128,12 @@ class StarJudge:
         self._x_px, self._y_px = tracker.camera.project(self.true @ tracker.camera.cam_to_image.T)
         self.judged = np.zeros(0, dtype=np.intp)
         self.sky = MeasuredStars(np.zeros((0, 3)), np.zeros(0))
+        # Distance from a path within which its star's light is summed.
+        self._reach_px = math.ceil(REACH_SIGMAS * max(tracker.psf.width_px)) + 1
+        # The largest delay of an attitude, and the length of a star's path, extended at both ends by that.
+        self._late_s = lead_ns(bench.config) / NS_PER_S + 1 / movement.packet_hz
+        path_rad = math.radians(abs(movement.rate_deg_s)) * (seen.length_s + 2 * self._late_s)
+        self._path_px = path_rad * tracker.camera.scales_px_rad()[1]
         self.lost_arcsec = max(MATCH_PX, self._path_px) * tracker.arcsec_per_px
         places_px = self._paths() if movement.turns else (self._x_px, self._y_px)
         # Distance from the detector's edge beyond which a star is complete.
@@ -158,7 +165,7 @@ class StarJudge:
         if not found.any():
             return MeasuredStars(np.full((len(index), 3), np.nan), np.zeros(len(index)))
         index = np.where(found, index, 0)
-        directions = self._directions(match.found.x_px[index], match.found.y_px[index])
+        directions = normalise(self.tracker.camera.rays(match.found.x_px[index], match.found.y_px[index]))
         return MeasuredStars(np.where(found[:, None], directions, np.nan), np.where(found, match.found.flux[index], 0.0))
 
     def _whole(self, star: IntArray) -> BoolArray:
@@ -168,11 +175,6 @@ class StarJudge:
         white = bench.flux_at_white_e_per_s * bench.darkest
         clips = rates * bench.psf.peak_share > white
         return np.asarray((rates >= bench.calibration.response.half_step * white) & ~clips)
-
-    @property
-    def _reach_px(self) -> int:
-        """Distance from a path within which its star's light is summed."""
-        return math.ceil(REACH_SIGMAS * max(self.tracker.psf.width_px)) + 1
 
     def _choose_paths(self, sky_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> None:
         """Choose the stars whose paths (k, n), extended for a late attitude, receive hardly any light from other stars."""
@@ -192,17 +194,6 @@ class StarJudge:
         self._pixels = np.concatenate(pixels) if pixels else np.zeros(0, dtype=np.intp)
         self._begins = np.cumsum([0, *(len(own) for own in pixels)])[:-1]
 
-    @property
-    def _late_s(self) -> float:
-        """The largest delay of an attitude."""
-        return lead_ns(self.tracker.bench.config) / NS_PER_S + 1 / self.movement.packet_hz
-
-    @property
-    def _path_px(self) -> float:
-        """Length of a star's path over the exposure, extended at both ends by the largest delay of an attitude."""
-        span_s = self.seen.length_s + 2 * self._late_s
-        return math.radians(abs(self.movement.rate_deg_s)) * span_s * self.tracker.camera.scales_px_rad()[1]
-
     def _paths(self) -> tuple[FloatArray, FloatArray]:
         """Places (k, n) of the stars on the tracker along their whole paths, px."""
         tracker, seen = self.tracker, self.seen
@@ -221,12 +212,8 @@ class StarJudge:
         total, by_x, by_y = (np.add.reduceat(part, self._begins) for part in (light, light * column, light * row))
         found = total > LOST_SHARE * self._e[self.judged]
         divisor = np.where(found, total, 1.0)
-        directions = self._directions(by_x / divisor, by_y / divisor)
+        directions = normalise(self.tracker.camera.rays(by_x / divisor, by_y / divisor))
         return MeasuredStars(np.where(found[:, None], directions, np.nan), np.where(found, total, 0.0))
-
-    def _directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        rays = self.tracker.camera.rays(x_px, y_px)
-        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def _inside(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> BoolArray:
         """Places on the tracker whose neighbourhood is whole on the detector and on the monitor."""

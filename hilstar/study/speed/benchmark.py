@@ -29,6 +29,7 @@ from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.build import open_bench
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
+from hilstar.process.closing import Closing
 from hilstar.process.interrupts import held
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
@@ -273,7 +274,7 @@ def this_machine() -> Machine:
     )
 
 
-class CellMeasurement:
+class CellMeasurement(Closing):
     """One image size and star count, measured into `result`; close it to free its two GL contexts."""
 
     def __init__(self, bench: Bench, q_icrs_to_cam: FloatArray, cell: Cell, result: Result) -> None:
@@ -361,10 +362,8 @@ class CellMeasurement:
             self.bench.sprites(self.q), GaussianPsf(self.sigma_px), white, size_px, self.bench.uniformity, self.bench.darkest
         )
 
-    def __enter__(self) -> CellMeasurement:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
+    def close(self) -> None:
+        """Free the GL contexts."""
         self.staged.close()
         self.linear.close()
 

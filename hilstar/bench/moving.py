@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,9 +22,6 @@ from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.stars import total_and_colours
 from hilstar.units import ARCSEC_PER_RAD
 
-if TYPE_CHECKING:
-    from hilstar.sky.bodies.passes import Satellites
-
 log = logging.getLogger(__name__)
 
 MAX_ORBIT_BYTES = 20_000_000  # states for each minute of a year
@@ -35,9 +31,9 @@ MAX_ARCSEC, MANY_PX = 7200.0, 1000.0  # wider bodies are given in degrees, and w
 
 
 def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) -> MovingSky:
-    """The bodies of a bench file that has a date, and its observer.
+    """The bodies and satellites of a bench file that has a date, and its observer.
 
-    Raises InputError for an orbit or a date that cannot be used, MachineError where the extra is not installed.
+    Raises InputError for an orbit, a list or a date that cannot be used, MachineError where the extra is not installed.
     """
     utc_ns = epoch_utc_ns(config)
     if utc_ns is None:
@@ -60,7 +56,20 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
     shares = (None, None) if colours is None else (colours[:-1], colours[-1])
     bodies = BodyLight(names, bodies_bv_mag(names), rates[:-1], *shares)
     moving = MovingSky(Kernel(), observer, utc_ns, bodies, start_ns, unix)
-    moving.satellites = bench_satellites(config, folder, observer, (utc_ns, utc_ns + start_ns), float(rates[-1]))
+    if shown.satellites is not None:
+        from hilstar.sky.bodies.passes import Satellites
+        from hilstar.sky.bodies.satellites import LIST_FORM, TABLE_FORM, brightness_of, read_satellites, read_table
+
+        path, v0_e_per_s, rows = folder / shown.satellites, float(rates[-1]), {}
+        found = read_satellites(read_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), utc_ns + start_ns)
+        if shown.satellite_magnitudes is not None:
+            table = folder / shown.satellite_magnitudes
+            rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
+        brightness = brightness_of(found, rows, shown.satellite_standard_mag, v0_e_per_s)
+        satellites = moving.satellites = Satellites(found, brightness, v0_e_per_s, observer, utc_ns)
+        satellites.listed = sum(one.number in rows for one in found)
+        satellites.file = str(path)
+        satellites.place(utc_ns + start_ns)
     return moving
 
 
@@ -85,35 +94,6 @@ def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
             abs(age_days),
         )
     return orbit
-
-
-def bench_satellites(
-    config: BenchConfig, folder: Path, orbit: Orbit, zero_and_start_ns: tuple[int, int], v0_e_per_s: float
-) -> Satellites | None:
-    """The satellites that a bench file names, None where it names none; UTCs of t_ns = 0 and of the start.
-
-    `v0_e_per_s` is the electron rate of sunlight of V = 0.
-
-    Raises InputError for a list or a table that is wrong, MachineError without SGP4.
-    """
-    from hilstar.sky.bodies.passes import Satellites
-    from hilstar.sky.bodies.satellites import LIST_FORM, TABLE_FORM, brightness_of, read_satellites, read_table
-
-    bodies, (zero_ns, start_ns) = config.sky.bodies, zero_and_start_ns
-    if bodies.satellites is None:
-        return None
-    path = folder / bodies.satellites
-    found = read_satellites(read_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), start_ns)
-    rows = {}
-    if bodies.satellite_magnitudes is not None:
-        table = folder / bodies.satellite_magnitudes
-        rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
-    brightness = brightness_of(found, rows, bodies.satellite_standard_mag, v0_e_per_s)
-    satellites = Satellites(found, brightness, v0_e_per_s, orbit, zero_ns)
-    satellites.listed = sum(one.number in rows for one in found)
-    satellites.file = str(path)
-    satellites.place(start_ns)
-    return satellites
 
 
 def observer_lines(config: BenchConfig) -> list[str]:

@@ -36,16 +36,20 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
+# Functions whose tests together took over 0.3 s of CPU when all were measured (`--durations=0`); one a line.
+SLOW = frozenset((Path(__file__).parent / "slow.txt").read_text().split())
 MARKERS = {"study": "study", "gpu": "gpu", "screen": "screen", "e2e": "e2e", "examples": "e2e"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what lies in a folder; a test elsewhere that starts processes, or runs a study, marks itself."""
+    """Mark what lies in a folder, and what is slow; a test elsewhere that starts processes, or runs a study, marks itself."""
     here = Path(__file__).parent
     for item in items:
         folder = item.path.relative_to(here).parts[0]
         if folder in MARKERS:
             item.add_marker(MARKERS[folder])
+        if item.nodeid.partition("[")[0] in SLOW:
+            item.add_marker("slow")
 
 
 def pytest_collection_finish() -> None:

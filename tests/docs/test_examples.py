@@ -23,6 +23,7 @@ from hilstar.cli.app import app
 from hilstar.cli.options import with_values
 from tests.docs.pages import Block, blocks_of, differs
 from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.forks import Started
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -136,7 +137,7 @@ def other_program(words: list[str]) -> str:
 @contextlib.contextmanager
 def running(words: list[str]) -> Iterator[None]:
     """A hilstar command beside the others, until the block is done."""
-    with subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.DEVNULL) as process:
+    with Started([sys.executable, "-m", *words], stdout=subprocess.DEVNULL) as process:
         try:
             yield
         finally:

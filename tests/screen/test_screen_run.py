@@ -15,7 +15,8 @@ from PIL import Image
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.resources import resource_path
 from hilstar.rotation import angle_between_rad, propagate
-from tests.support.commands import HILSTAR, run_hilstar, run_hilstar_here
+from tests.support.commands import run_hilstar, run_hilstar_here
+from tests.support.forks import HILSTAR, Started
 from tests.support.ledgers import read_run
 from tests.support.live_runs import MAX_EXTRAPOLATION_NS
 from tests.support.run_page import run_data_of
@@ -46,7 +47,7 @@ def run(tmp_path_factory) -> tuple[dict, Path]:
     serve = [*HILSTAR, "serve", str(bench), "--json", "--duration", str(DURATION_S), "--ledger", str(ledger)]
     to = ["--to", f"tcp://127.0.0.1:{port}", "--connect", "--duration", str(DURATION_S + PATIENCE_S)]
     send = [*HILSTAR, "send", "--spin", f"x,{RATE_DEG_S}", "--rate", str(PACKET_HZ), *to]
-    with xvfb(folder, "1920x1080x24") as screen, subprocess.Popen(send, stderr=subprocess.DEVNULL) as sender:
+    with xvfb(folder, "1920x1080x24") as screen, Started(send, stderr=subprocess.DEVNULL) as sender:
         try:
             patience_s = DURATION_S + 2 * PATIENCE_S
             done = subprocess.run(serve, env=screen.env, capture_output=True, text=True, timeout=patience_s, check=False)

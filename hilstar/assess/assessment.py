@@ -108,7 +108,7 @@ class WrongAnswer:
 class Assessment:
     """The whole assessment. `noise_arcsec` excludes the display's own error where the answers show it.
 
-    `limit_arcsec` is the least noise that the tracker's stars allow, None where the bench cannot be read.
+    `limit_arcsec` is the smallest noise that the tracker's stars allow, None where the bench cannot be read.
 
     `offset_s` is the tracker's clock minus the run's at the run's start.
     """

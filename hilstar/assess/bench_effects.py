@@ -97,7 +97,7 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
 
 
 def noise_limit(file: BenchFile, q_icrs_to_cam: FloatArray) -> Axes:
-    """The least noise of an answer that the bench's tracker allows, by Cramer and Rao: the median along attitudes (n, 4).
+    """The smallest noise of an answer by the bench's tracker (Cramer and Rao): the median along attitudes (n, 4).
 
     One exposure at rest, arcsec; None for fields of too few stars. Raises InputError.
     """

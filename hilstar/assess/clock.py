@@ -39,7 +39,7 @@ COMPARED = 400  # attitudes compared at each
 STARTS = 40  # rotations that are tried as the one with half of all nearest to it
 SCANNED = 3000  # offsets of the scan by attitudes
 AS_GOOD, SMALL_RAD = 1.2, 1e-4  # a spread up to this factor and this angle above the smallest is as good
-MOST = 0.8  # offsets with a smaller share of the largest overlap are dropped
+OVERLAP_SHARE = 0.8  # offsets with a smaller share of the largest overlap are dropped
 TURN_RAD = np.radians(0.5)  # a tracker reports nearly the commanded attitude; a run that repeats itself elsewhere does not
 # Fine.
 CUT_SIGMAS = 8.0
@@ -87,7 +87,7 @@ def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
         return None
     limit = AS_GOOD * min(each.spread_rad for each in known) + SMALL_RAD
     good = [each for each in known if each.spread_rad <= limit]
-    many = MOST * max(each.compared for each in good)
+    many = OVERLAP_SHARE * max(each.compared for each in good)
     best = min((each for each in good if each.compared >= many), key=lambda each: each.turn_rad)
     as_they_are = _spread_at(commanded, t, q, 0.0)
     if as_they_are is not None and as_they_are.compared >= many and as_they_are.spread_rad <= limit:
@@ -101,7 +101,6 @@ def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
 
 
 def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float, reach_s: float) -> CoarseClock | None:
-    """The best offset within `reach_s` of `offset_s`."""
     first = _spread_at(commanded, t_s, reported, offset_s)
     if first is None:
         return first

@@ -73,13 +73,13 @@ def part_rows(parts: Decomposed | None, noise_arcsec: Axes) -> Iterator[FigureRo
 
 
 def limit_rows(limit: Axes | None) -> Iterator[FigureRow]:
-    """The rows of the least noise that the tracker's stars allow."""
+    """The rows of the smallest noise that the tracker's stars allow."""
     for axis in ("cross", "roll") if limit is not None else ():
         yield FigureRow("limit of the tracker's stars", axis, getattr(limit, axis), "arcsec")
 
 
 def limit_text(limit: Axes | None) -> str:
-    """The least noise that a tracker's stars allow, in words."""
+    """The smallest noise that a tracker's stars allow, in words."""
     if limit is None or limit.cross is None or limit.roll is None:
         return "not known"
     return f"{limit.cross:.3g} arcsec across, {limit.roll:.3g} about the boresight (Cramer-Rao, one exposure at rest)"

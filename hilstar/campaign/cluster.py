@@ -194,7 +194,6 @@ class Cluster(Closing):
             self._hear_tasks(backlog, done, lost)
 
     def _look(self, backlog: Backlog, lost: Lost) -> None:
-        """Look for workers that have come or gone."""
         if time.monotonic() - self._looked_s < LOOK_S:
             return
         self._looked_s = time.monotonic()

@@ -50,7 +50,6 @@ class Backlog:
         self._deaths: dict[int, int] = {}
 
     def _missing_runs(self, journal: Journal) -> Iterator[tuple[int, int]]:
-        """Begin and end of each run of missing cases."""
         for block in range(journal.blocks):
             missing = np.array(journal.missing(block), dtype=np.int64)
             for part in np.split(missing, np.flatnonzero(np.diff(missing) != 1) + 1):
@@ -190,6 +189,5 @@ class Pool:
 
 
 def _start_session(job: Job) -> tuple[Identity, Callable[[int, FloatArray], Answered]]:
-    """In a worker: its identity, and its work."""
     session = Session(job)
     return session.identity(), session.run

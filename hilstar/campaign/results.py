@@ -285,19 +285,6 @@ def _bins(name: str, cases: Columns, good: npt.NDArray[np.bool_]) -> tuple[tuple
     return (tuple(values.tolist()), index) if enough else ((), index)
 
 
-def write_costs(path: Path, found: list[Cost]) -> None:
-    """The costs as a table. Raises InputError where it cannot be written."""
-    names = ("measure", "unit", "parameter", "overall", "cost", "share", "sure", "best", "at_best", "worst", "at_worst")
-    rows = [
-        (
-            *(each.measure, each.unit, each.parameter, each.overall, each.cost, each.share, str(each.sure).lower()),
-            *(each.places[each.best], float(each.level[each.best]), each.places[each.worst], float(each.level[each.worst])),
-        )
-        for each in found
-    ]
-    write_csv(path, names, rows)
-
-
 def finding(found: list[Cost]) -> str:
     """The parameter that costs most of a measure, in one line."""
     first, what = found[0], WORDS[found[0].measure]
@@ -346,7 +333,15 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     budget, parts = case_budget(cases, file, np.random.default_rng(seed))
     write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_rows(budget, parts))
     found = costs(cases)
-    write_costs(table.with_name("sensitivity.csv"), found)
+    names = ("measure", "unit", "parameter", "overall", "cost", "share", "sure", "best", "at_best", "worst", "at_worst")
+    rows = [
+        (
+            *(each.measure, each.unit, each.parameter, each.overall, each.cost, each.share, str(each.sure).lower()),
+            *(each.places[each.best], float(each.level[each.best]), each.places[each.worst], float(each.level[each.worst])),
+        )
+        for each in found
+    ]
+    write_csv(table.with_name("sensitivity.csv"), names, rows)
     findings = []
     for measure in dict.fromkeys(cost.measure for cost in found):
         of_it = [cost for cost in found if cost.measure == measure]

@@ -58,7 +58,7 @@ FOCAL_PX = 6000.0
 RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
 QUICK_RADII_PX = (0.1, 2.0, 12.0)
 PHASES_DEG = (0.0, 60.0, 120.0, 150.0)
-FEWEST_RAYS, RAYS_A_PX, MOST_RAYS = 600, 16, 2400  # along each side: at most 0.07 px apart, under a tenth of sigma
+MIN_RAYS, RAYS_A_PX, MAX_RAYS = 600, 16, 2400  # along each side: at most 0.07 px apart, under a tenth of sigma
 LIMB_PX = 4.0  # a smaller disc has no edge that falls from a middle
 PLACES = 60
 MARGIN_PX = 8
@@ -249,7 +249,7 @@ def traced(disc: Disc, camera: Camera) -> FloatArray:
     from scipy.special import ndtr
 
     radius_px = np.tan(disc.radius_rad) * camera.focal_length_px * 1.001
-    count = int(np.clip(RAYS_A_PX * 2 * radius_px, FEWEST_RAYS, MOST_RAYS))
+    count = int(np.clip(RAYS_A_PX * 2 * radius_px, MIN_RAYS, MAX_RAYS))
     step_px = 2 * radius_px / count
     (x_mid,), (y_mid,) = camera.project(disc.direction[None])
     along = (np.arange(count) + 0.5) * step_px - radius_px

@@ -164,22 +164,22 @@ def run(directory: Path, quick: bool = False) -> list[str]:
             f" false star {star.cost_ms:+.2f} ms; the dearest, {dearest.case}, {dearest.cost_ms:+.1f} ms"
         )
     for quantisation in QUANTISATIONS:
-        least = spoilt_from(strays, quantisation)
-        limit = "no stray light here" if least is None else f"stray light of {least:g} of white"
+        share = spoilt_from(strays, quantisation)
+        limit = "no stray light here" if share is None else f"stray light of {share:g} of white"
         found.append(f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from {limit} on")
     return found
 
 
 def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
-    """The least stray light, share of white, from which on stars are off by more than SPOILT_MAG; None where it is none."""
+    """The stray light, share of white, above which stars are off by more than SPOILT_MAG; None where none spoils them."""
     worst = [stray for stray in strays if stray.quantisation == quantisation and stray.p95_mag > SPOILT_MAG]
     return min((stray.share_of_white for stray in worst if stray.share_of_white), default=None)
 
 
 def draw_stray(path: Path, strays: list[Stray]) -> None:
     """The error of stars under even stray light."""
-    least = {name: spoilt_from(strays, name) for name in QUANTISATIONS}
-    said = [f"from {value:g} of white on with {name}" for name, value in least.items() if value is not None]
+    shares = {name: spoilt_from(strays, name) for name in QUANTISATIONS}
+    said = [f"from {share:g} of white on with {name}" for name, share in shares.items() if share is not None]
     finding = (
         f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {', and '.join(said)}"
         if said

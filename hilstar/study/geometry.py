@@ -209,7 +209,12 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         f" by the model that held-out dots choose ({best.model}) {best.stars_rms_arcsec:.2g}"
     )
     _draw(directory / "geometry", finding, outcomes)
-    return [finding, *(_line(outcome) for outcome in usual)]
+    lines = []
+    for o in usual:
+        fails = "" if o.stars_max_arcsec < FAIL_ARCSEC else f"; FAILS: over {FAIL_ARCSEC:g} arcsec"
+        stars = f"stars {o.stars_rms_arcsec:.3g} arcsec rms, {o.stars_max_arcsec:.3g} maximum"
+        lines.append(f"{o.model}: {stars}; held-out dots {o.held_out_arcsec:.3g} rms{fails}")
+    return [finding, *lines]
 
 
 def ideal_arcsec() -> float:
@@ -224,7 +229,6 @@ def _nominal() -> Nominal:
 
 
 def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
-    """Every model on the same centroids."""
     rng = np.random.default_rng(SEED)
     plan = plan_dots(BENCH.resolution_px, frames.count, frames.dots, rng)
     x_px, y_px = TRACKER.project(BENCH.directions(plan.x_px, plan.y_px))
@@ -247,12 +251,6 @@ def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float
     monitor = geometry.monitor
     shown_x, shown_y = monitor.project(BENCH.directions(x, y) @ monitor.cam_to_image.T)
     return np.asarray(np.hypot(shown_x - x, shown_y - y) * ARCSEC_PER_RAD / monitor.focal_length_px)
-
-
-def _line(outcome: CalibrationOutcome) -> str:
-    fails = "" if outcome.stars_max_arcsec < FAIL_ARCSEC else f"; FAILS: over {FAIL_ARCSEC:g} arcsec"
-    stars = f"stars {outcome.stars_rms_arcsec:.3g} arcsec rms, {outcome.stars_max_arcsec:.3g} maximum"
-    return f"{outcome.model}: {stars}; held-out dots {outcome.held_out_arcsec:.3g} rms{fails}"
 
 
 def _draw(path: Path, finding: str, outcomes: list[CalibrationOutcome]) -> None:

@@ -86,7 +86,13 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         f"{default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
     )
     _draw(directory / "prediction", finding, outcomes)
-    shaken_by = measure_shaken(quick)
+    cells, frequencies = (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
+    shaken_by = []
+    for rates, (packet_hz, age_ms), way, jitter_hz in product((True, False), cells, WAYS, frequencies):
+        if jitter_hz < packet_hz / 2:  # a faster one looks like a slow one
+            residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, rates)
+            packets = "with rates" if rates else "without rates"
+            shaken_by.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
     write_records(directory / "prediction_jitter.csv", shaken_by)
     given, derived = (crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS) for packets in ("with rates", "without rates"))
     told = (
@@ -112,18 +118,6 @@ class Shaken:
     jitter_hz: float
     gain: float
     residual: float
-
-
-def measure_shaken(quick: bool) -> list[Shaken]:
-    """Every way at every frequency, packets with rates and without."""
-    cells, frequencies = (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
-    found = []
-    for rates, (packet_hz, age_ms), way, jitter_hz in product((True, False), cells, WAYS, frequencies):
-        if jitter_hz < packet_hz / 2:  # a faster one looks like a slow one
-            residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, rates)
-            packets = "with rates" if rates else "without rates"
-            found.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
-    return found
 
 
 def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rates: bool) -> tuple[float, float]:

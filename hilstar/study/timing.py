@@ -343,14 +343,14 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `timing` and `beat`, each as csv and png; the findings, a line each. Raises InputError."""
     outcomes = measure(quick)
     write_records(directory / "timing.csv", outcomes)
-    at = {(o.way, o.rate_deg_s): o for o in outcomes}
     finding = draw(directory / "timing", outcomes)
-    return [finding, *(_line(at[way, 2.0]) for way in WAYS), *beat_findings(measure_beat(quick), directory)]
-
-
-def _line(outcome: TimingOutcome) -> str:
-    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} maximum, {outcome.flux_rms_mag:.2g} mag rms"
-    return f"{outcome.way}: {errors}, {outcome.draw_ms:.1f} ms a frame ({outcome.stars} stars)"
+    lines = [
+        f"{o.way}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum, {o.flux_rms_mag:.2g} mag rms,"
+        f" {o.draw_ms:.1f} ms a frame ({o.stars} stars)"
+        for o in outcomes
+        if o.rate_deg_s == QUICK_RATES_DEG_S[0]
+    ]
+    return [finding, *lines, *beat_findings(measure_beat(quick), directory)]
 
 
 def draw(path: Path, outcomes: list[TimingOutcome]) -> str:

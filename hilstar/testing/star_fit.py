@@ -304,7 +304,6 @@ def _places_px(truth: Truth) -> FloatArray:
 
 
 def _nearest(known_px: FloatArray, places_px: FloatArray) -> tuple[FloatArray, IntArray]:
-    """For each of places (n, 2): the distance to the nearest known one, px, and its index."""
     distance_px, nearest = cKDTree(known_px).query(places_px)
     return np.asarray(distance_px), np.asarray(nearest, dtype=np.intp)
 

@@ -188,7 +188,6 @@ def why_not(own: CombinationRow, other: CombinationRow) -> str:
 
 
 def _nearest(rows: Sequence[CombinationRow]) -> CombinationRow:
-    """The row with the smallest error; the fastest of several."""
     return min(rows, key=lambda row: (row.error_arcsec, row.time_ms))
 
 

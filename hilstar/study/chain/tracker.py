@@ -177,7 +177,7 @@ class StarJudge:
         return np.asarray((rates >= bench.calibration.response.half_step * white) & ~clips)
 
     def _choose_paths(self, sky_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> None:
-        """Choose the stars whose paths (k, n), extended for a late attitude, receive hardly any light from other stars."""
+        """Choose the stars whose paths (k, n), extended for a late attitude, are nearly free of other stars' light."""
         reach_px = self._reach_px
         y, x = np.mgrid[-reach_px : reach_px + 1, -reach_px : reach_px + 1]
         disc = (x * x + y * y <= reach_px**2).nonzero()

@@ -454,7 +454,6 @@ def own_bench_file(path: Path, size_px: Size, **render: Value) -> BenchFile:
 
 
 def _aims(result: Result) -> list[Aim]:
-    """The aims that this run can judge."""
     at = {(row.size, row.stars, row.method, row.kind): row.ms.median for row in result.rows}
     aims = []
     for (size, stars, method, kind), ms in at.items():

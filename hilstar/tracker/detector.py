@@ -156,7 +156,7 @@ class Detector:
             expected_e *= self.gain_map[part]
             expected_e += self.dark_map_e_per_s[part] * np.float32(exposure_s)
             self._check_largest(expected_e)
-            shot, read = normal_pairs(words)
+            shot, read = (number.reshape(expected_e.shape) for number in normal_pairs(words))
             charge_e = poisson(expected_e, shot)
             if rays_e is not None:
                 charge_e += rays_e[part]

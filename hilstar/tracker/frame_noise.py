@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array
+from hilstar.arrays import Float32Array, IntArray
 
 Word64Array = npt.NDArray[np.int64]
 
@@ -41,20 +41,24 @@ ERROR_PER_BEND2, ERROR_E_TIMES_MEAN = 3.0, 0.03
 FINER_ERROR_PER_BEND3, FINER_ERROR_E = 7.5, 0.03
 
 
-def normal_pairs(words: Word64Array) -> tuple[Float32Array, Float32Array]:
+def normal_pairs(words: Word64Array, which: IntArray | None = None) -> tuple[Float32Array, Float32Array]:
     """Two independent standard normal numbers for each random word: two arrays of its shape, up to 6.77 sigmas.
 
     Of words (n,), or of each part of words (parts, rows, width), the first half makes radii and the second angles.
+    `which` (k,) asks for some alone, by their places in the flat array: arrays (k,).
     """
     parts = words.shape[0] if words.ndim == 3 else 1
-    halves = words.view(np.uint32).reshape(parts, 2, -1)
-    radius = halves[:, 0].astype(np.float32).reshape(words.shape)
+    halves, shape = words.view(np.uint32).reshape(parts, 2, -1), words.shape
+    if which is not None:
+        part, place = np.divmod(which, halves.shape[2])
+        halves, shape = np.stack([halves[part, 0, place], halves[part, 1, place]])[None], which.shape
+    radius = halves[:, 0].astype(np.float32).reshape(shape)
     radius += np.float32(0.5)
     radius *= np.float32(2.0**-32)
     np.log(radius, out=radius)
     radius *= np.float32(-2.0)
     np.sqrt(radius, out=radius)
-    angle = halves[:, 1].view(np.int32).astype(np.float32).reshape(words.shape)
+    angle = halves[:, 1].view(np.int32).astype(np.float32).reshape(shape)
     angle *= np.float32(2.0**-31 * np.pi)
     sine = np.sin(angle)
     np.cos(angle, out=angle)
@@ -63,20 +67,29 @@ def normal_pairs(words: Word64Array) -> tuple[Float32Array, Float32Array]:
     return angle, sine
 
 
-def poisson(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
-    """Poisson counts of `mean_e` at the quantiles of standard normal numbers; all of one shape."""
-    large = np.flatnonzero(mean_e >= TABLE_BELOW_E)
-    if not len(large):
+def poisson(mean_e: Float32Array, normal: Float32Array, smallest_e: float | None = None) -> Float32Array:
+    """Poisson counts of `mean_e` at the quantiles of standard normal numbers; all of one shape.
+
+    `smallest_e` is the smallest mean beside which these stand (None: of these alone).
+    """
+    if np.count_nonzero(mean_e) < mean_e.size / 2:
+        lit, counts = np.flatnonzero(mean_e), np.zeros_like(mean_e)
+        counts.ravel()[lit] = poisson(mean_e.ravel()[lit], normal.ravel()[lit], 0.0)
+        return counts
+    is_large = mean_e >= TABLE_BELOW_E
+    large_count = np.count_nonzero(is_large)
+    if not large_count:
         return _by_table(mean_e, normal)
-    if len(large) == mean_e.size:
-        return _by_expansion(mean_e, normal, float(mean_e.min()))
+    if large_count == mean_e.size:
+        return _by_expansion(mean_e, normal, max(TABLE_BELOW_E, float(mean_e.min()) if smallest_e is None else smallest_e))
     # The many all at once, and the few again by themselves.
-    if len(large) < mean_e.size / 2:
+    if large_count < mean_e.size / 2:
+        large = np.flatnonzero(is_large)
         counts = _by_table(np.minimum(mean_e, np.nextafter(np.float32(TABLE_BELOW_E), np.float32(0))), normal)
         counts.ravel()[large] = _by_expansion(mean_e.ravel()[large], normal.ravel()[large], TABLE_BELOW_E)
         return counts
     counts = _by_expansion(np.maximum(mean_e, np.float32(TABLE_BELOW_E)), normal, TABLE_BELOW_E)
-    small = np.flatnonzero(mean_e < TABLE_BELOW_E)
+    small = np.flatnonzero(~is_large)
     counts.ravel()[small] = _by_table(mean_e.ravel()[small], normal.ravel()[small])
     return counts
 

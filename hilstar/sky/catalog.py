@@ -251,16 +251,12 @@ def _parse_row(row: list[str], where: str) -> list[int] | None:
             shown = shortened(text)
             raise InputError(f"{where}: field {column} ({name}) is {shown!r}; write a number from {low:g} to {high:g}")
         steps[name] = round(value * per_unit)
-    return [
-        *steps.values(),
-        *(_letter(row[column].strip(), f"{where}: field {column} ({name})") for name, column in LETTERS.items()),
-    ]
-
-
-def _letter(text: str, what: str) -> int:
-    if len(text) > 1 or not text.isascii():
-        raise InputError(f"{what} is {shortened(text)!r}; write one letter, or none")
-    return ord(text) if text else 0
+    for name, column in LETTERS.items():
+        text = row[column].strip()
+        if len(text) > 1 or not text.isascii():
+            raise InputError(f"{where}: field {column} ({name}) is {shortened(text)!r}; write one letter, or none")
+        steps[name] = ord(text) if text else 0
+    return [*steps.values()]
 
 
 def unpack(columns: dict[str, npt.NDArray[np.int64]], rows_read: int) -> Catalog:

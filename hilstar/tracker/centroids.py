@@ -122,10 +122,10 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     at least rounding's, step / sqrt 12. That of a noiseless float image is 0, and then every pixel over the level belongs to
     a star: give a `LocalBackground` for such an image.
     """
-    checked = _checked(image)
     if step is None:
         step = 1.0 if image.dtype.kind in "iu" else 0.0
-    values, counts = _counted(image) if image.dtype in COUNTED_TYPES else (checked.ravel(), None)
+    _check(image)
+    values, counts = _counted(image) if image.dtype in COUNTED_TYPES else (image.astype(np.float64).ravel(), None)
     median = _median(values, counts)
     sigma = MAD_TO_SIGMA * _median(np.abs(values - median), counts)
     # Where the noise is under a step, a cut at 3 sigma would keep a code on one side and drop its counterpart on the other.
@@ -179,8 +179,9 @@ def find_stars(
     pulls the centre towards itself.
     """
     settings = settings or CentroidSettings()
+    _check(image)
     under = background or estimate_background(image)
-    signal = _checked(image) - under.level
+    signal = np.subtract(image, under.level, dtype=np.float64)
     blobs = _find_blobs(signal, settings.threshold_sigma * under.noise, settings.minimum_pixels)
     padded = _padded(signal, settings)
     x_px, y_px = _refine(padded, blobs, settings)
@@ -200,12 +201,12 @@ def find_stars(
     return Centroids(x_px[order], y_px[order], flux[order], blobs.peak[order], blobs.pixels[order], ~inside[order])
 
 
-def _checked(image: npt.NDArray[Any]) -> FloatArray:
+def _check(image: npt.NDArray[Any]) -> None:
+    """Refuse (InputError) what is no image of finite numbers."""
     if image.ndim != 2 or 0 in image.shape or image.dtype.kind not in "fiu":
         raise InputError(f"centroids: an image of type {image.dtype}, shape {image.shape}; give numbers (height, width)")
-    if not np.isfinite(image).all():
+    if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise InputError("centroids: the image has a pixel that is NaN or infinite; give finite numbers")
-    return image.astype(np.float64)
 
 
 def _find_blobs(signal: FloatArray, threshold: float, minimum_pixels: int) -> _Blobs:

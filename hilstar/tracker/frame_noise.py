@@ -21,11 +21,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array
+from hilstar.arrays import Float32Array, IntArray
 
 Word64Array = npt.NDArray[np.int64]
 
-BLOCK_PX = 1 << 16  # the arrays of a block stay in a core's cache
+PART_PX = 1 << 15  # two parts are drawn at once: their arrays stay in a core's cache
 
 EXACT_BELOW_E = 64.0
 TABLE_BELOW_E = 8.0
@@ -41,16 +41,24 @@ ERROR_PER_BEND2, ERROR_E_TIMES_MEAN = 3.0, 0.03
 FINER_ERROR_PER_BEND3, FINER_ERROR_E = 7.5, 0.03
 
 
-def normal_pairs(words: Word64Array) -> tuple[Float32Array, Float32Array]:
-    """Two independent standard normal numbers from each random word: two arrays of its shape, up to 6.77 sigmas."""
-    halves = words.view(np.uint32).reshape(2, *words.shape)
-    radius = halves[0].astype(np.float32)
+def normal_pairs(words: Word64Array, which: IntArray | None = None) -> tuple[Float32Array, Float32Array]:
+    """Two independent standard normal numbers for each random word: two arrays of its shape, up to 6.77 sigmas.
+
+    Of words (n,), or of each part of words (parts, rows, width), the first half makes radii and the second angles.
+    `which` (k,) asks for some alone, by their places in the flat array: arrays (k,).
+    """
+    parts = words.shape[0] if words.ndim == 3 else 1
+    halves, shape = words.view(np.uint32).reshape(parts, 2, -1), words.shape
+    if which is not None:
+        part, place = np.divmod(which, halves.shape[2])
+        halves, shape = np.stack([halves[part, 0, place], halves[part, 1, place]])[None], which.shape
+    radius = halves[:, 0].astype(np.float32).reshape(shape)
     radius += np.float32(0.5)
     radius *= np.float32(2.0**-32)
     np.log(radius, out=radius)
     radius *= np.float32(-2.0)
     np.sqrt(radius, out=radius)
-    angle = halves[1].view(np.int32).astype(np.float32)
+    angle = halves[:, 1].view(np.int32).astype(np.float32).reshape(shape)
     angle *= np.float32(2.0**-31 * np.pi)
     sine = np.sin(angle)
     np.cos(angle, out=angle)
@@ -59,14 +67,29 @@ def normal_pairs(words: Word64Array) -> tuple[Float32Array, Float32Array]:
     return angle, sine
 
 
-def poisson(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
-    """Poisson counts of `mean_e` at the quantiles of standard normal numbers; all of one shape."""
-    small = np.flatnonzero(mean_e < TABLE_BELOW_E)
-    if len(small) == mean_e.size:
+def poisson(mean_e: Float32Array, normal: Float32Array, smallest_e: float | None = None) -> Float32Array:
+    """Poisson counts of `mean_e` at the quantiles of standard normal numbers; all of one shape.
+
+    `smallest_e` is the smallest mean beside which these stand (None: of these alone).
+    """
+    if np.count_nonzero(mean_e) < mean_e.size / 2:
+        lit, counts = np.flatnonzero(mean_e), np.zeros_like(mean_e)
+        counts.ravel()[lit] = poisson(mean_e.ravel()[lit], normal.ravel()[lit], 0.0)
+        return counts
+    is_large = mean_e >= TABLE_BELOW_E
+    large_count = np.count_nonzero(is_large)
+    if not large_count:
         return _by_table(mean_e, normal)
-    if not len(small):
-        return _by_expansion(mean_e, normal)
-    counts = _by_expansion(np.maximum(mean_e, np.float32(TABLE_BELOW_E)), normal)
+    if large_count == mean_e.size:
+        return _by_expansion(mean_e, normal, max(TABLE_BELOW_E, float(mean_e.min()) if smallest_e is None else smallest_e))
+    # The many all at once, and the few again by themselves.
+    if large_count < mean_e.size / 2:
+        large = np.flatnonzero(is_large)
+        counts = _by_table(np.minimum(mean_e, np.nextafter(np.float32(TABLE_BELOW_E), np.float32(0))), normal)
+        counts.ravel()[large] = _by_expansion(mean_e.ravel()[large], normal.ravel()[large], TABLE_BELOW_E)
+        return counts
+    counts = _by_expansion(np.maximum(mean_e, np.float32(TABLE_BELOW_E)), normal, TABLE_BELOW_E)
+    small = np.flatnonzero(~is_large)
     counts.ravel()[small] = _by_table(mean_e.ravel()[small], normal.ravel()[small])
     return counts
 
@@ -91,7 +114,7 @@ def _by_table(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
     return counts
 
 
-def _by_expansion(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
+def _by_expansion(mean_e: Float32Array, normal: Float32Array, smallest_e: float) -> Float32Array:
     root = np.sqrt(mean_e)
     square = normal * normal
     bend = square + np.float32(2.0)
@@ -104,7 +127,6 @@ def _by_expansion(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
     square *= np.float32(1 / 6)
     quantile += square
     quantile -= bend
-    smallest_e = float(mean_e.min(initial=np.inf))
     if smallest_e >= EXACT_BELOW_E:
         quantile += np.float32(1 / 3)
         return np.floor(quantile, out=quantile)
@@ -174,21 +196,24 @@ def _count_table() -> CountTable:
 
 
 def draw_blocks(shape: tuple[int, int], rng: np.random.Generator, draw: Callable[[slice, Word64Array], None]) -> None:
-    """Call `draw` for the rows of each block of an image (height, width) with random words, (rows, width), on every core.
+    """Call `draw` for the rows of each block of an image (height, width) with random words, on every core.
 
-    One seed gives each block the same words on any number of threads. `OMP_NUM_THREADS` bounds them.
+    Words are (parts, rows, width): two parts, or at the image's end what is left of each. One seed gives each block the same
+    words on any number of threads. `OMP_NUM_THREADS` bounds them.
     """
     height, width = shape
-    rows = 2 * max(1, BLOCK_PX // 2 // width)
+    rows = max(1, PART_PX // width)
     key = int(rng.integers(2**63))
 
     def draw_block(first: int) -> None:
         stream = np.random.Generator(np.random.SFC64(np.random.SeedSequence((key, first))))
-        block = slice(first, min(first + rows, height))
-        words = stream.integers(-(2**63), 2**63, size=(block.stop - first) * width, dtype=np.int64)
-        draw(block, words.reshape(-1, width))
+        whole = first + 2 * rows <= height
+        for top in (first,) if whole else range(first, height, rows):
+            part = slice(top, min(top + (2 * rows if whole else rows), height))
+            words = stream.integers(-(2**63), 2**63, size=(part.stop - top) * width, dtype=np.int64)
+            draw(part, words.reshape(2 if whole else 1, -1, width))
 
-    blocks = range(0, height, rows)
+    blocks = range(0, height, 2 * rows)
     asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
     threads = min(len(blocks), int(asked) if asked.isdecimal() and int(asked) else len(os.sched_getaffinity(0)))
     if threads == 1:

@@ -6,7 +6,6 @@ Every error is measured: single stars at a grid of sub-pixel phases through the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,7 +19,6 @@ from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, read_primaries
 from hilstar.monitor.quantise import Panel
-from hilstar.scene.psf import Psf
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
@@ -102,13 +100,22 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     # A star of rate r has V = zero_mag + magnitude(r).
     zero_mag = zero_point_mag(bench)
     clips = zero_mag + magnitude(white * bench.darkest / bench.psf.peak_share)
-    nothing = zero_mag + magnitude(nothing_below_e_per_s(bench))
+    # Below this a star lights no pixel, wherever it is; for dithers, it lights one in half of the frames.
+    dark = bench.faintest_shown_e_per_s or bench.calibration.response.half_step * white
+    nothing = zero_mag + magnitude(dark)
+    half = np.array([-0.5, 0.5])
+    corner_share = float(bench.psf.shares(half, half[:, None]).max())  # of a star's brightest pixel, on a corner of four
+    file, tracker = bench.config.monitor.primaries.file, bench.config.tracker
+    primaries = None
+    if file is not None:
+        channels = dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, bench.file.folder), strict=True))
+        primaries = channel_matrix(read_primaries(bench.file.folder / file), channels, white)
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return LightBudget(
         method=render.quantisation + (" with bit stealing" if render.bit_stealing else ""),
         bits=bench.config.monitor.bits,
         clips_v_mag=clips,
-        clips_v_mag_at_best=zero_mag + magnitude(white / corner_share(bench.psf)),
+        clips_v_mag_at_best=zero_mag + magnitude(white / corner_share),
         nothing_v_mag=nothing,
         range_mag=nothing - clips,
         within=_within(rows),
@@ -118,17 +125,8 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         rows=rows,
         centroider=by,
         centroid_rms_px=next((row.axis_rms_px for row in rows if row.below_white_mag == COMPARED_MAG), dict.fromkeys(FAMILY)),
-        primaries=primaries_matrix(bench),
+        primaries=primaries,
     )
-
-
-def primaries_matrix(bench: Bench) -> ChannelMatrix | None:
-    """What the tracker's channels have of the monitor's primaries; None where their spectra are not known."""
-    tracker, file = bench.config.tracker, bench.config.monitor.primaries.file
-    if file is None:
-        return None
-    channels = dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, bench.file.folder), strict=True))
-    return channel_matrix(read_primaries(bench.file.folder / file), channels, bench.flux_at_white_e_per_s)
 
 
 def zero_point_mag(bench: Bench) -> float:
@@ -142,18 +140,6 @@ def zero_point_mag(bench: Bench) -> float:
     distance = np.abs(bv_mag - SOLAR_BV)
     alike = distance <= max(LIKE_SOLAR_BV, float(distance.min()))
     return float(np.median(v_mag[alike] - magnitude(rates_e_per_s[alike])))
-
-
-def corner_share(psf: Psf) -> float:
-    """The share of a star's brightest pixel when it is on a corner of four: the minimum that a peak can be."""
-    half = np.array([-0.5, 0.5])
-    return float(psf.shares(half, half[:, None]).max())
-
-
-def nothing_below_e_per_s(bench: Bench) -> float:
-    """The rate below which a star lights no pixel, wherever it is; for dithers, where it lights one in half of the frames."""
-    drawn = bench.faintest_shown_e_per_s
-    return drawn or bench.calibration.response.half_step * bench.flux_at_white_e_per_s
 
 
 def not_drawn(bench: Bench) -> NotDrawn:
@@ -260,7 +246,7 @@ def budget_lines(found: LightBudget) -> list[str]:
     """The budget for a person."""
     within = ", ".join(f"{_number(value, 'g')} mag within {limit.replace('_', ' ')}" for limit, value in found.within.items())
     each = ", ".join(f"{kind} {_number(value, '.4f')}" for kind, value in found.centroid_rms_px.items())
-    return [
+    lines = [
         f"{'method':22}{found.method}, {found.bits} bits",
         f"{'clips at':22}V = {found.clips_v_mag:.2f} in the middle of a pixel, {found.clips_v_mag_at_best:.2f} on a corner",
         f"{'shows nothing':22}from V = {found.nothing_v_mag:.2f}, a range of {found.range_mag:.1f} mag",
@@ -270,34 +256,26 @@ def budget_lines(found: LightBudget) -> list[str]:
         f"{'clipped stars':22}{named(found.clipped_hip, MAX_NAMED)}",
         f"{'not drawn':22}{found.left_out.stars} stars, too faint: {found.left_out.flux_share:.2e} of all light",
         f"{'black':22}{found.black_e_per_s_px:.4g} e-/s in a monitor pixel",
-        *([] if found.primaries is None else _primaries_lines(found.primaries)),
-        "",
-        *(_by_each(found) if found.centroider == "all" else _by_one(found)),
     ]
-
-
-def _primaries_lines(found: ChannelMatrix) -> Iterator[str]:
-    yield f"{'condition number':22}{_number(found.condition, '.2f')}, electrons of each channel by each primary at full light:"
-    for channel, rates in zip(found.channels, found.e_per_s.tolist(), strict=True):
-        yield f"{channel:22}" + ", ".join(f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True))
-
-
-def _by_one(found: LightBudget) -> Iterator[str]:
-    yield f"{'V':>6}{'flux rms':>12}{'max mag':>10}{'centroid rms':>14}{'max px':>9}{'max arcsec':>12}"
+    if found.primaries is not None:
+        one = found.primaries
+        figure = _number(one.condition, ".2f")
+        lines.append(f"{'condition number':22}{figure}, electrons of each channel by each primary at full light:")
+        for channel, rates in zip(one.channels, one.e_per_s.tolist(), strict=True):
+            shares = (f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True))
+            lines.append(f"{channel:22}{', '.join(shares)}")
+    every = found.centroider == "all"
+    kinds = f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}" if every else f"{'centroid rms':>14}"
+    lines += ["", f"{'V':>6}{'flux rms':>12}{'max mag':>10}{kinds}{'max px':>9}" + ("" if every else f"{'max arcsec':>12}")]
     for row in found.rows:
-        yield (
-            f"{row.v_mag:6.2f}{_number(row.flux_rms_mag, '.4f'):>12}{_number(row.flux_max_mag, '.4f'):>10}"
-            f"{_number(row.centroid_rms_px, '.4f'):>14}{_number(row.centroid_max_px, '.4f'):>9}"
-            f"{_number(row.centroid_max_arcsec, '.2f'):>12}"
-        )
-
-
-def _by_each(found: LightBudget) -> Iterator[str]:
-    yield f"{'V':>6}{'flux rms':>12}{'max mag':>10}{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}{'max px':>9}"
-    for row in found.rows:
-        each = "".join(f"{_number(row.axis_rms_px[kind], '.4f'):>9}" for kind in FAMILY)
-        flux = f"{_number(row.flux_rms_mag, '.4f'):>12}{_number(row.flux_max_mag, '.4f'):>10}"
-        yield f"{row.v_mag:6.2f}{flux}{'':4}{each}{_number(row.centroid_max_px, '.4f'):>9}"
+        line = f"{row.v_mag:6.2f}{_number(row.flux_rms_mag, '.4f'):>12}{_number(row.flux_max_mag, '.4f'):>10}"
+        if every:
+            line += " " * 4 + "".join(f"{_number(row.axis_rms_px[kind], '.4f'):>9}" for kind in FAMILY)
+        else:
+            line += f"{_number(row.centroid_rms_px, '.4f'):>14}"
+        line += f"{_number(row.centroid_max_px, '.4f'):>9}"
+        lines.append(line if every else f"{line}{_number(row.centroid_max_arcsec, '.2f'):>12}")
+    return lines
 
 
 def _number(value: float | None, form: str) -> str:

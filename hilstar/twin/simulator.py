@@ -169,10 +169,12 @@ class Simulator(Closing):
         layers = self._layers
         if faults is None:
             light = light_of(canvas, layers, stars, view)
-            mean_e = self._linear(light, stars) * exposure_s + self._background.of_view_e(view)
+            mean_e = self._exposed_e(light, stars, exposure_s)
+            mean_e += self._background.of_view_e(view)
         else:
             mean_e, open_s = faults.light_e(
-                lambda part, layer: light_of(canvas, (*layers, layer), stars, part), lambda light: self._linear(light, stars)
+                lambda part, layer: light_of(canvas, (*layers, layer), stars, part),
+                lambda light, seconds: self._exposed_e(light, stars, seconds),
             )
             mean_e += self._background.of_view_e(faults.pieces[len(faults.pieces) // 2].view) * (open_s / exposure_s)
             light = faults.sprites()
@@ -192,16 +194,16 @@ class Simulator(Closing):
             return self.detector.expose_noiseless(mean_e, exposure_s)
         return self.detector.expose(mean_e, exposure_s, rng)
 
-    def _linear(self, sprites: Sprites, stars: Stars) -> FloatArray:
-        """Electrons per second of each pixel (h, w) by sprites of `stars`."""
+    def _exposed_e(self, sprites: Sprites, stars: Stars, seconds: float) -> FloatArray:
+        """Electrons of each pixel (h, w) by sprites of `stars` in some time."""
         if self._glass is None:
             self.renderer.draw(sprites)
-            return self.renderer.linear().astype(np.float64)
+            return np.multiply(self.renderer.linear(), seconds, dtype=np.float64)
         image = self._glass.psf.image(sprites, self._glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
         if sprites.extended:
             self.renderer.draw(without_stars(sprites))
             image += self.renderer.linear()
-        return image.astype(np.float64)
+        return np.multiply(image, seconds, dtype=np.float64)
 
     def close(self) -> None:
         """Free the GL context."""
@@ -257,11 +259,11 @@ class FaultyExposure:
         self._rows: list[tuple[npt.NDArray[np.void], float]] = []
 
     def light_e(
-        self, light_of: Callable[[View, FaultLayer], Sprites], linear: Callable[[Sprites], FloatArray]
+        self, light_of: Callable[[View, FaultLayer], Sprites], exposed_e: Callable[[Sprites, float], FloatArray]
     ) -> tuple[FloatArray, float]:
         """Electrons (h, w) of the whole exposure, and the seconds of it in which the field is not blank.
 
-        `light_of` makes the light of a view with faults, `linear` its image, electrons per second.
+        `light_of` makes the light of a view with faults, `exposed_e` the electrons of its image in some seconds.
         """
         total: FloatArray | None = None
         open_s = 0.0
@@ -269,7 +271,7 @@ class FaultyExposure:
         for piece in self.pieces:
             layer, piece_s = FaultLayer(self._view, piece.now), piece.view.exposure_s
             sprites = light_of(layer.turned(piece.view), layer)
-            light = linear(sprites) * piece_s
+            light = exposed_e(sprites, piece_s)
             total = light if total is None else total + light
             open_s += 0.0 if layer.blank else piece_s
             self._note(sprites, piece_s / exposure_s)

@@ -84,8 +84,22 @@ def body_v_mag(name: str, sun_to_body_km: FloatArray, observer_to_body_km: Float
     phase_deg = phase_angle_deg(sun_to_body_km, observer_to_body_km)
     if name == "Moon":
         return moon_v_mag(sun_au, distance_au * KM_PER_AU, phase_deg)
-    latitudes = [latitude_deg(_POLES[name], v) for v in (sun_to_body_km, observer_to_body_km)] if name in _POLES else []
-    return _at_unit_distance(name, phase_deg, latitudes, jyear) + 5 * float(np.log10(sun_au * distance_au))
+    if name in _POLES:
+        sun_deg, observer_deg = (latitude_deg(_POLES[name], v) for v in (sun_to_body_km, observer_to_body_km))
+    if name == "Saturn":  # globe and rings (eq. 10); rings that are lit from the other side do not count
+        sine = float(np.sin(np.radians(np.sqrt(max(0.0, sun_deg * observer_deg)))))
+        mag = -8.914 - 1.825 * sine + 0.026 * phase_deg - 0.378 * sine * float(np.exp(-2.25 * phase_deg))
+    elif name == "Uranus":
+        mag = URANUS_MAG + URANUS_PER_DEG * (abs(sun_deg) + abs(observer_deg)) / 2
+    elif name == "Neptune":  # eq. 16: it brightened from 1980 to 2000
+        mag = float(np.clip(-6.89 - 0.0054 * (jyear - 1980.0), -7.00, -6.89))
+    elif name == "Earth":
+        mag = float(polyval(min(phase_deg, EARTH_CURVE_DEG), EARTH_TERMS))
+    else:
+        curves = {"Mercury": MERCURY, "Venus": VENUS, "Mars": MARS, "Jupiter": JUPITER}
+        crescent = name == "Venus" and phase_deg >= VENUS_CRESCENT_DEG
+        mag = float(polyval(phase_deg, VENUS_CRESCENT if crescent else curves[name]))
+    return mag + 5 * float(np.log10(sun_au * distance_au))
 
 
 def phase_angle_deg(sun_to_body: FloatArray, observer_to_body: FloatArray) -> float:
@@ -106,27 +120,6 @@ def moon_v_mag(sun_au: float, distance_km: float, phase_deg: float) -> float:
 def latitude_deg(pole: FloatArray, towards_body: FloatArray) -> float:
     """The planetocentric latitude below the far end of a vector to the body, degrees."""
     return float(np.degrees(np.arcsin(np.clip(-pole @ towards_body / np.linalg.norm(towards_body), -1, 1))))
-
-
-def _at_unit_distance(name: str, phase_deg: float, latitudes_deg: list[float], jyear: float) -> float:
-    if name == "Saturn":
-        return _saturn_mag(phase_deg, *latitudes_deg)
-    if name == "Uranus":
-        return URANUS_MAG + URANUS_PER_DEG * (abs(latitudes_deg[0]) + abs(latitudes_deg[1])) / 2
-    if name == "Neptune":  # eq. 16: it brightened from 1980 to 2000
-        return float(np.clip(-6.89 - 0.0054 * (jyear - 1980.0), -7.00, -6.89))
-    if name == "Earth":
-        return float(polyval(min(phase_deg, EARTH_CURVE_DEG), EARTH_TERMS))
-    curves = {"Mercury": MERCURY, "Venus": VENUS, "Mars": MARS, "Jupiter": JUPITER}
-    curve = VENUS_CRESCENT if name == "Venus" and phase_deg >= VENUS_CRESCENT_DEG else curves[name]
-    return float(polyval(phase_deg, curve))
-
-
-def _saturn_mag(phase_deg: float, sun_latitude_deg: float, observer_latitude_deg: float) -> float:
-    """Globe and rings (eq. 10); rings that are lit from the other side do not count."""
-    open_deg = np.sqrt(max(0.0, sun_latitude_deg * observer_latitude_deg))
-    sine = float(np.sin(np.radians(open_deg)))
-    return -8.914 - 1.825 * sine + 0.026 * phase_deg - 0.378 * sine * float(np.exp(-2.25 * phase_deg))
 
 
 _POLES = {"Saturn": direction_of(*SATURN_POLE_DEG), "Uranus": direction_of(*URANUS_POLE_DEG)}

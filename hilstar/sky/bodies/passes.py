@@ -189,7 +189,10 @@ class Satellites:
         if sky.place_km is not None:
             place_km = place_km + sky.place_km
             velocity_km_s = velocity_km_s if sky.velocity_km_s is None else velocity_km_s + sky.velocity_km_s
-        return _falling(place_km, velocity_km_s)
+        # It falls about the Earth; at rest where it is the Earth's centre.
+        distance = float(np.linalg.norm(place_km))
+        pull = -EARTH_GM_KM3_S2 / distance**3 if distance > 0 else 0.0
+        return np.stack([place_km, velocity_km_s, pull / 2 * place_km, pull / 6 * velocity_km_s])
 
     def _watched(self, cone: Cone, sky: SkyAt, observer: FloatArray) -> IntArray:
         """The satellites that can be in a cone, from the list that is kept for some time."""
@@ -315,13 +318,6 @@ def _within(along_km: FloatArray, range_km: FloatArray, radius_rad: float, reach
     moved = np.arcsin(np.minimum(1.0, reach_km / np.maximum(range_km, reach_km + OWN_KM)))
     limit = np.cos(np.minimum(np.pi, radius_rad + moved))
     return np.asarray((along_km >= limit * range_km) | (range_km <= reach_km))
-
-
-def _falling(place_km: FloatArray, velocity_km_s: FloatArray) -> FloatArray:
-    """The cubic (4, 3) of an observer that falls about the Earth, by its state; at rest where it is the Earth's centre."""
-    distance = float(np.linalg.norm(place_km))
-    pull = -EARTH_GM_KM3_S2 / distance**3 if distance > 0 else 0.0
-    return np.stack([place_km, velocity_km_s, pull / 2 * place_km, pull / 6 * velocity_km_s])
 
 
 def _light_cubics(place_km: FloatArray, observer_km: FloatArray, earth_km_s: FloatArray) -> tuple[FloatArray, FloatArray]:

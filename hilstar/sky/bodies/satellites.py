@@ -115,13 +115,11 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
     if not found:
         raise InputError(f"{file}: no element set in it; {LIST_FORM}")
     shared = Counter(one.name for one in found.values())
-    return [Satellite(_called(one, shared[one.name]), one.number, one.satrec) for one in found.values()]
-
-
-def _called(one: Satellite, bearers: int) -> str:
-    if not one.name:
-        return f"NORAD {one.number}"
-    return one.name if bearers == 1 else f"{one.name} {one.number}"
+    names = (
+        (one.name if shared[one.name] == 1 else f"{one.name} {one.number}") if one.name else f"NORAD {one.number}"
+        for one in found.values()
+    )
+    return [Satellite(name, one.number, one.satrec) for name, one in zip(names, found.values(), strict=True)]
 
 
 def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:

@@ -85,6 +85,7 @@ class _Key:
     values: tuple[float | str | bool, ...]
 
     def at(self, place: int) -> KeyProposal:
+        """The key with one of its values."""
         return KeyProposal(self.table, self.key, self.values[place])
 
 
@@ -105,10 +106,22 @@ def propose(
     keys = _keys(verdict)
     for count in range(1, len(keys) + 1):
         for chosen in combinations(keys, count):
-            if trials.passes(_strongest(chosen)):
-                changes = _mildest(chosen, trials)
-                return BenchProposal(changes, _verified(trials.verdicts[changes]), (), trials.tried, None)
-    return _none_passes(verdict, trials)
+            changes = tuple(key.at(-1) for key in chosen)
+            if not trials.passes(changes):
+                continue
+            for place in reversed(range(count)):  # each brought to its mildest value that passes, the last key first
+                for step in range(len(chosen[place].values) - 1):
+                    milder = (*changes[:place], chosen[place].at(step), *changes[place + 1 :])
+                    if trials.passes(milder):
+                        changes = milder
+                        break
+            return BenchProposal(changes, _verified(trials.verdicts[changes]), (), trials.tried, None)
+    judged = [changes for changes, one in trials.verdicts.items() if one.errors.stars]
+    if not judged:
+        return BenchProposal((), None, (), trials.tried, f"none of {trials.tried} changes can be judged: {verdict.reasons[0]}")
+    best = min(judged, key=lambda changes: _excess(trials.verdicts[changes]))
+    cannot = f"none of {trials.tried} changes passes; {_what_fails(trials.verdicts[best])}"
+    return BenchProposal((), _verified(trials.verdicts[best]), best, trials.tried, cannot)
 
 
 def changed_text(text: str, changes: tuple[KeyProposal, ...]) -> str:
@@ -158,19 +171,16 @@ class _Trials:
         if changes not in self.verdicts:
             self.tried += 1
             try:
-                self.verdicts[changes] = self._verdict(changes)
+                file = bench_file_of(self.file.path, changed_text(self.file.text, changes))
+                # `with_key` cannot set a key of a table that is not in plain form.
+                if any(getattr(getattr(file.config, one.table), one.key) != one.value for one in changes):
+                    return False
+                self.verdicts[changes] = verify(file, self.fields, np.random.default_rng(self.seed))
             except InputError:
                 return False
             finally:
                 self.on_try(self.tried)
         return self.verdicts[changes].passed
-
-    def _verdict(self, changes: tuple[KeyProposal, ...]) -> Verdict:
-        file = bench_file_of(self.file.path, changed_text(self.file.text, changes))
-        for change in changes:  # `with_key` cannot set a key of a table that is not in plain form
-            if getattr(getattr(file.config, change.table), change.key) != change.value:
-                raise InputError(f"{file.path}: [{change.table}] {change.key} cannot be set")
-        return verify(file, self.fields, np.random.default_rng(self.seed))
 
 
 def _keys(verdict: Verdict) -> list[_Key]:
@@ -184,47 +194,17 @@ def _keys(verdict: Verdict) -> list[_Key]:
     if render.flux_at_white_e_per_s is None:  # a measured scale is not changed
         brightest = DEFAULT_BRIGHTEST_V_MAG if render.brightest_v_mag is None else render.brightest_v_mag
         keys.append(_Key("render", "brightest_v_mag", tuple(round(brightest + step, 3) for step in BRIGHTER_MAG)))
-    limits = _faintest_v_mag(verdict)
-    return [*keys, _Key("sky", "faintest_v_mag", limits)] if limits else keys
-
-
-def _faintest_v_mag(verdict: Verdict) -> tuple[float, ...]:
-    """Smaller magnitude limits of the sky, the largest first, that leave enough of the stars that were looked for."""
+    # Smaller magnitude limits of the sky, the largest first, that leave enough of the stars that were looked for.
     v_mag = np.array([star.v_mag for star in verdict.errors.stars + verdict.errors.lost])
     seen = math.ceil(float(v_mag.max()) * STEPS_PER_MAG) / STEPS_PER_MAG
-    faintest = min(verdict.measured.config.sky.faintest_v_mag, seen)
-    limits = (round(faintest + step, 3) for step in FAINTER_MAG)
-    return tuple(limit for limit in limits if (v_mag <= limit).sum() >= MIN_STARS)
-
-
-def _strongest(keys: tuple[_Key, ...]) -> tuple[KeyProposal, ...]:
-    return tuple(key.at(-1) for key in keys)
-
-
-def _mildest(keys: tuple[_Key, ...], trials: _Trials) -> tuple[KeyProposal, ...]:
-    """The changes of keys that pass at their strongest, each brought to its mildest value that passes, the last key first."""
-    changes = _strongest(keys)
-    for place in reversed(range(len(keys))):
-        for step in range(len(keys[place].values) - 1):
-            milder = (*changes[:place], keys[place].at(step), *changes[place + 1 :])
-            if trials.passes(milder):
-                changes = milder
-                break
-    return changes
+    faintest = (round(min(measured.config.sky.faintest_v_mag, seen) + step, 3) for step in FAINTER_MAG)
+    limits = tuple(limit for limit in faintest if (v_mag <= limit).sum() >= MIN_STARS)
+    return [*keys, _Key("sky", "faintest_v_mag", limits)] if limits else keys
 
 
 def _verified(verdict: Verdict) -> Verified:
     summary = summarise(verdict)
     return Verified(**{entry.name: summary[entry.name] for entry in fields(Verified)})
-
-
-def _none_passes(verdict: Verdict, trials: _Trials) -> BenchProposal:
-    judged = [changes for changes, one in trials.verdicts.items() if one.errors.stars]
-    if not judged:
-        return BenchProposal((), None, (), trials.tried, f"none of {trials.tried} changes can be judged: {verdict.reasons[0]}")
-    best = min(judged, key=lambda changes: _excess(trials.verdicts[changes]))
-    cannot = f"none of {trials.tried} changes passes; {_what_fails(trials.verdicts[best])}"
-    return BenchProposal((), _verified(trials.verdicts[best]), best, trials.tried, cannot)
 
 
 def _excess(verdict: Verdict) -> float:

@@ -161,7 +161,7 @@ def test_one_seed_gives_one_frame_on_any_number_of_threads(monkeypatch):
 def test_words_repeat_nowhere_in_a_frame():
     seen = []
     draw_blocks((500, 300), np.random.default_rng(1), lambda part, words: seen.append((part.start, words.copy())))
-    words = np.concatenate([words for _, words in sorted(seen, key=lambda item: item[0])])
+    words = np.concatenate([words.reshape(-1, 300) for _, words in sorted(seen, key=lambda item: item[0])])
     assert words.shape == (500, 300)
     assert len(np.unique(words)) == words.size
 

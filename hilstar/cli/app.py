@@ -26,7 +26,7 @@ from hilstar.cli.first_light import first_light
 from hilstar.cli.frame import frame
 from hilstar.cli.keys import keys
 from hilstar.cli.latency import latency
-from hilstar.cli.optics import map_
+from hilstar.cli.optics import map_, zernike
 from hilstar.cli.replay import replay
 from hilstar.cli.report import report
 from hilstar.cli.send import send
@@ -144,6 +144,7 @@ sensor.command("import")(import_)
 sensor.command()(measure)
 app.add_typer(sensor, name="sensor", rich_help_panel="Calibrate")
 optics.command("map")(map_)
+optics.command()(zernike)
 app.add_typer(optics, name="optics", rich_help_panel="Calibrate")
 service.command()(install)
 service.command()(uninstall)

@@ -1,4 +1,4 @@
-"""hilstar optics: the file of a tracker's glass, from a map of images, from aberrations, or from a lens prescription."""
+"""hilstar optics: the file of a tracker's glass, from a map of images, or from a pupil's aberrations."""
 
 from __future__ import annotations
 
@@ -40,6 +40,26 @@ def map_(
     check_ending("-o", output, FITS)
     check_files([stack, points], [output])
     _tell(output, glass_of_map(stack, points, oversampling, pixel_integrated, tolerance), as_json)
+
+
+def zernike(
+    pupil: Annotated[
+        Path, typer.Argument(metavar="FILE.toml", help="Aperture, aberrations, field points, wavelengths, focus.")
+    ],
+    output: Output,
+    oversampling: Annotated[
+        int | None,
+        typer.Option(help="Samples a tracker pixel along each axis; by default as diffraction needs.", min=1, max=64),
+    ] = None,
+    tolerance: Tolerance = 1e-3,
+    as_json: Json = False,
+) -> None:
+    """Make a tracker's glass of an aperture and Zernike or Seidel coefficients, by diffraction (needs hilstar[optics])."""
+    from hilstar.optics.zernike import glass_of_pupil
+
+    check_ending("-o", output, FITS)
+    check_files([pupil], [output])
+    _tell(output, glass_of_pupil(pupil, oversampling, tolerance), as_json)
 
 
 def _tell(output: Path, glass: Glass, as_json: bool) -> None:

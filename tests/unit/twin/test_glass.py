@@ -9,14 +9,18 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import bench_optics, bench_stars
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import say_once
+from hilstar.monitor.geometry import monitor_camera
 from hilstar.optics.glass_psf import GlassPsf, Spline
 from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.scene.camera import Lens
 from hilstar.sky.electrons import electron_response
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m
 from hilstar.twin.glass import BAND_NM, StarGlass
+from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.simulator import Simulator
 from tests.support.benches import ORION_Q, bench_text
+from tests.support.campaigns import plan_text, read_columns
+from tests.support.commands import run_hilstar
 from tests.support.glass import SIDE_PX, WAVELENGTHS_NM, illumination, moments, stack, truth
 
 SHARES = 1e-3  # bands of 25 nm against the integral: measured 4e-4
@@ -105,6 +109,32 @@ def test_smear_goes_along_with_it(bench):
             q = propagate(motion.q_icrs_to_cam, rate, ((k + 0.5) / 64 - 0.5) * TRACKER["exposure_s"])
             still += simulator.expose(simulator.view(q, np.zeros(3)), None).mean_e / 64
     assert np.abs(turning - still).max() < 2e-3 * turning.max()
+
+
+def test_the_monitor_s_light_goes_through_the_glass_by_place(bench):
+    """A monitor pixel of 0.4 tracker pixels has the centroid of the mean PSF of its place, and is dimmed as that is."""
+    file = bench()
+    tracker, psf = tracker_camera(file.config.tracker, file.folder), tracker_psf(file.config.tracker, file.folder)
+    monitor = monitor_camera((320, 240), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
+    light = np.zeros((240, 320))
+    light[200, 20] = 5e4
+    with TwinOptics(BenchGeometry(monitor, tracker), psf) as optics:
+        image = optics.image_e_per_s(light)
+        (x_px,), (y_px,) = optics.geometry.to_tracker(np.array([20.0]), np.array([200.0]))
+    part = moments(image[round(y_px) - 9 : round(y_px) + 10, round(x_px) - 9 : round(x_px) + 10])
+    (x,), (y,), (dimmed,) = psf.centroids_px(np.array([x_px]), np.array([y_px]), psf.mean_shares)
+    assert abs(x - x_px) > 0.02
+    assert (round(x_px) + part[1], round(y_px) + part[2]) == pytest.approx((x, y), abs=3e-3)
+    assert part[0] == pytest.approx(5e4 * dimmed, rel=1e-3)
+
+
+def test_a_campaign_varies_the_focus(bench, tmp_path):
+    bench({"tracker.detector": {"gain_e_per_dn": 5, "full_well_e": 70000}})
+    write_glass(tmp_path / "psf.fits", glass_of(stack(3, focuses_um=(0.0, 10.0))))
+    (tmp_path / "plan.toml").write_text(plan_text({"key": "tracker.optics.focus_um", "values": [0.0, 8.0]}, cases=2))
+    result = run_hilstar("campaign", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1")
+    assert result.returncode == 0, result.stderr
+    assert len(read_columns(tmp_path / "out" / "cases.parquet")["case"]) == 2
 
 
 def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_none(bench, caplog):

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
 
 S_PER_MS = 1e-3
-# Codes are timed in fields that are spread evenly over the sky, turning at 1 deg/s, as often as these times allow: of each field
+# Codes are timed in fields spread evenly over the sky, turning at 1 deg/s, as often as these times allow: of each field
 # the fastest counts, for other programs slow a frame down and nothing speeds it up.
 TIMED_FIELDS = [from_radec_roll_deg(*place, 0.0) for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
 TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])

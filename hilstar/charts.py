@@ -55,7 +55,7 @@ DARK = {
     TEAL: "#56cfe0",
     RED: "#ff7b7b",
 }
-_SIDE_NAMES: WeakKeyDictionary[Any, list[tuple[Any, SideNames]]] = WeakKeyDictionary()  # of figures that are being drawn
+_SIDE_NAMES: WeakKeyDictionary[Any, list[tuple[Any, SideNames]]] = WeakKeyDictionary()  # by figure, while it is drawn
 STYLE: Any = {
     "font.size": TEXT_PT,
     "text.color": INK,

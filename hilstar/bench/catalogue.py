@@ -25,8 +25,8 @@ from hilstar.units import ARCSEC_PER_RAD, magnitude
 
 MIN_PARALLAX_SIGMAS = 5.0  # beyond which a distance is within 20 %
 FAINTER_MAG = 3.0  # by this a neighbour may be fainter
-COLOUR_STEP_MAG = 0.01  # of the derivative of a rate by a colour
-DECIMALS = 9  # of a place in degrees: 4 microarcseconds
+COLOUR_STEP_MAG = 0.01  # step of the derivative of a rate by a colour
+DECIMALS = 9  # places in degrees: 4 microarcseconds
 ENDINGS = (".csv", ".fits", ".parquet", ".vot")
 PARQUET = "parquet needs pyarrow: pip install 'hilstar[campaign]', or write .csv, .fits or .vot"
 

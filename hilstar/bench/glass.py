@@ -11,7 +11,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import GAUSSIAN, Tracker
-from hilstar.optics.glass_psf import GlassPsf, Spline, glass_psf
+from hilstar.optics.glass_psf import GlassPsf, NodeSpline, glass_psf
 from hilstar.optics.psf_file import Glass, read_glass
 from hilstar.scene.camera import Camera
 from hilstar.sky.electrons import Optics
@@ -62,7 +62,7 @@ def _mean_shares(glass: Glass, tracker: Tracker, folder: Path) -> FloatArray:
     if len(glass.wavelengths_nm) == 1:
         return np.ones(1)
     nm, weight = np.concatenate([_detected(tracker, key, folder) for key in tracker.quantum_efficiencies], axis=1)
-    shares = weight @ Spline(glass.wavelengths_nm)(nm) / weight.sum()
+    shares = weight @ NodeSpline(glass.wavelengths_nm)(nm) / weight.sum()
     first, last = glass.wavelengths_nm[[0, -1]]
     for side, share in (("under", weight[nm < first].sum()), ("over", weight[nm > last].sum())):
         if share > MAX_UNSAID * weight.sum():

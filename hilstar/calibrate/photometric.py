@@ -309,7 +309,7 @@ def calibrate_photometric(
     head = CalibrationHead(kind="photometric", bits=data.bits, response=output.with_suffix(".csv").name, **stated)
     table = write_calibration(output, head, columns, noise, NotesTable(drift=drift_note, text=text))
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
-    additivity = None  # of r + g + b to w at white, above black
+    additivity = None  # ratio of r + g + b to w at white, above black
     if len(fits) == len(CHANNELS):
         additivity = 100 * (sum(fits[name].white for name in PRIMARIES) / fits["w"].white - 1)
     return channels[next(iter(columns))] | {

@@ -32,7 +32,7 @@ EMVA_ADVICE = "write rows quantity,value,unit, such as K,0.25,DN/e- and eta@530n
 ICE_K = 273.15
 MAX_EXPOSURE_S = 1e6
 ROUNDING_DN2 = 1 / 12
-LINEAR_SHARE = 0.7  # of saturation: the standard's range for the slope of variance over signal
+LINEAR_SHARE = 0.7  # share of saturation: the standard's range for the slope of variance over signal
 
 
 class Quantity(NamedTuple):

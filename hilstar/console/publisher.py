@@ -254,7 +254,7 @@ MAX_MARK_CHARACTERS = 200
 MAX_WHO_CHARACTERS = 60
 
 
-Done = tuple[int, str]  # of an order: an HTTP status and a line
+Done = tuple[int, str]  # what became of an order: an HTTP status and a line
 
 
 class OrderHandler:

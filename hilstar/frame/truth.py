@@ -16,7 +16,7 @@ from hilstar.sky.catalog import Catalog
 from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag
 from hilstar.sky.stars import Stars
 
-ERROR_DECIMALS = 4  # of the errors of a table that is written
+ERROR_DECIMALS = 4  # errors in a written table
 
 TRUTH_DTYPE = np.dtype(
     [

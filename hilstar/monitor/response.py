@@ -108,7 +108,7 @@ def bit_stealing_response(channels: tuple[Response, Response, Response], weights
     for place in range(1, len(light)):
         if light[place] > light[kept[-1]] * (1 + SAME_LIGHT):
             kept.append(place)
-        elif grey[place]:  # of equal lights the grey one is kept
+        elif grey[place]:  # where lights are equal the grey one is kept
             kept[-1] = place
     light = light[kept] / light[kept][-1]
     return Response(bits, light, _midway(light), black, rgb[kept].astype(np.uint16))

@@ -29,7 +29,7 @@ MAX_STEPS_A_PX, MIN_STEPS_A_PX, TABLE_SIDE = 32, 12, 1024
 STAMP_TOLERANCE = 3e-4
 FIRST_STAMPS, MAX_STAMPS = 48, 400
 PHASE_TOLERANCE = 1e-4  # the same of the functions of a star's place in its pixel
-MAX_DEGREE = 3  # of the splines over wavelength and focus, and of the polynomials over a scattered field
+MAX_DEGREE = 3  # splines over wavelength and focus, polynomials over a scattered field
 MAX_GRID_DEGREE = 4
 ON_EDGE_PX = 1e-6
 SPRITES_AT_ONCE_PX = 2_000_000
@@ -38,7 +38,7 @@ SPRITES_AT_ONCE_PX = 2_000_000
 Kernel = Literal["linear", "thin_plate_spline", "quintic"]
 
 
-class Spline:
+class NodeSpline:
     """Functions of one variable, one of each of `nodes` (k,), rising: 1 there, 0 at the others.
 
     Beyond the nodes the values at their ends count.
@@ -73,7 +73,7 @@ class Field:
         grid = np.stack([part.T.ravel() for part in np.meshgrid(columns, rows)], axis=1)
         self._grid = None  # `places_px` is sorted by x, then y
         if grid.shape == places_px.shape and (grid == places_px).all():
-            self._grid = Spline(columns, MAX_GRID_DEGREE), Spline(rows, MAX_GRID_DEGREE)
+            self._grid = NodeSpline(columns, MAX_GRID_DEGREE), NodeSpline(rows, MAX_GRID_DEGREE)
 
     def _scaled(self, places_px: FloatArray) -> FloatArray:
         return np.asarray((places_px - self.places_px.mean(axis=0)) / self._scale)
@@ -337,7 +337,7 @@ class GlassPsf(SampledPsf):
 
 def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPsf:
     """A glass at one of its focus positions, or between them. Raises InputError for PSFs that cannot be drawn."""
-    at_focus = Spline(glass.focuses_um)(np.array([focus_um]))[0]
+    at_focus = NodeSpline(glass.focuses_um)(np.array([focus_um]))[0]
     weights, illumination, inside = (
         np.tensordot(part, at_focus, axes=(2, 0)) for part in (glass.weights, glass.illumination, 1 - glass.outside)
     )

@@ -42,8 +42,8 @@ FACTS = ("relative_illumination", "outside_share", "lateral_x_px", "lateral_y_px
 TOLERANCE = 1e-3  # share of a PSF's light that its basis may put elsewhere
 MAX_FILE_BYTES, MAX_IMAGES = 500_000_000, 20_000
 FEW_IMAGES = 7  # no basis has fewer components
-MAX_OFF = 0.25  # of a stamp's side: a PSF whose centroid lies farther from the middle is not centred on its chief ray
-MAX_NEGATIVE = 0.1  # of a PSF's light, summed over pixels
+MAX_OFF = 0.25  # share of a stamp's side; a PSF whose centroid lies farther from the middle is not centred on its chief ray
+MAX_NEGATIVE = 0.1  # share of a PSF's light, summed over pixels
 SUM_TOLERANCE = 2e-3
 ADVICE = "give a FITS file with one image, or one that `hilstar optics` wrote"
 

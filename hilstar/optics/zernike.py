@@ -26,7 +26,7 @@ MAX_BYTES = 1_000_000
 ADVICE = "give a TOML file as docs/optics.md has it"
 PUPIL, FINER = 256, 4  # samples across the pupil, and of each of them along an axis at its edges
 MIN_SAMPLES, MAX_SAMPLES = 4, 32  # a tracker pixel, where --oversampling does not say
-MAX_STEP_WAVES = 0.5  # of the wavefront from one pupil sample to the next: beyond it the PSF is an alias
+MAX_STEP_WAVES = 0.5  # wavefront step between pupil samples; beyond it the PSF is an alias
 CAN_INSTALL = "pip install 'hilstar[optics]'"
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
 Nm = Annotated[float, Meta(ge=-1e6, le=1e6)]

@@ -45,7 +45,7 @@ SPLINE_DEGREE, BLACK_SAMPLES = 5, 12  # the spline through the samples, and how 
 # at a sigma of 0.5 px. An Airy pattern with a core of 0.6 px is off by 3e-4 in a footprint of 100 px, by 1.2e-3 in one of 200.
 MAX_STEPS_A_PX, FINE_STEPS_A_PX, MAX_TABLE_SIDE = 64, 20, 1024
 MAX_FOOTPRINT_PX = 255  # as any OpenGL draws
-MIN_WIDTH_PX, WIDTH_ROUNDS = 0.05, 60  # of the Gaussian nearest to a sampled PSF, and how often it is fitted anew
+MIN_WIDTH_PX, WIDTH_ROUNDS = 0.05, 60  # the Gaussian nearest to a sampled PSF; how often it is fitted anew
 
 
 class ShareShader(NamedTuple):

@@ -265,7 +265,7 @@ def clipped_sprites(
     if sprites.per_star * sprites.data["electrons_per_s"].max(initial=0.0) <= bright_e_per_s:
         return np.empty(0, dtype=np.intp)  # most frames: no star is that bright, however its light is divided
     rates: Float32Array | FloatArray = sprites.data["electrons_per_s"]
-    if sprites.per_star > 1:  # of each sprite's whole star
+    if sprites.per_star > 1:  # the light of each sprite's whole star
         _, star = np.unique(sprites.star, return_inverse=True)
         rates = np.asarray(np.bincount(star, rates)[star], dtype=np.float64)
     bright = (rates > bright_e_per_s).nonzero()[0]

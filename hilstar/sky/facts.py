@@ -44,7 +44,7 @@ LETTER_FACTS = {"v_source": 7, "bv_source": 39, "vi_source": 42, "spectral_type_
 # A user's table (U) gives the error of V itself.
 V_SCATTER_MAG = {b"H": (0.004, 0.004), b"G": (0.010, 0.025), b"T": (0.010, 0.025), b"U": (0.0, 0.0)}
 RED_BV_MAG = 1.0
-STEP = 1e-30  # of the complex-step derivatives: exact to rounding
+STEP = 1e-30  # complex-step derivatives: exact to rounding
 
 
 @cache

@@ -43,7 +43,7 @@ MIN_PARALLAX_SIGMAS = 2.0  # a parallax counts as no smaller than this: a star i
 # Mean extinction of the Galaxy, A/E(B-V) at 1/micrometre: Fitzpatrick 1999 (PASP 111, 63), table 3, R = 3.1, a cubic spline.
 DUST_PER_UM = (0.0, 0.377, 0.820, 1.667, 1.828, 2.141, 2.433, 3.704, 3.846)
 DUST_MAG = (0.0, 0.265, 0.829, 2.688, 3.055, 3.806, 4.315, 6.265, 6.591)
-DUST_EBV_MAG = 0.5  # of the reddened copies; the rates of 0 to 0.8 are interpolated between them and the bare spectra
+DUST_EBV_MAG = 0.5  # the reddened copies have it; rates from 0 to 0.8 are interpolated between them and the bare spectra
 
 # Lengths over which the rates' departures from the trend are alike, in subclasses and classes, and in V-I; what a type's
 # departure has for every V-I; the noise of a library star, in units of the departures of early types; how much more those of

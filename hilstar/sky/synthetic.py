@@ -43,7 +43,7 @@ BANDS = ("u", "b", "r", "i", "g")
 VEGA_V_MAG = 0.03  # the V and the instrument magnitude of Vega (thesis 2.4.3)
 AB_0_W_M2_HZ = 3.631e-23  # Oke and Gunn 1983: 3631 Jy
 TORRES_BV_MAG = (-0.35, 1.8)
-END_NM = 10.0  # of a library spectrum, to which the black body beyond it is fitted
+END_NM = 10.0  # the end of a library spectrum to which the black body beyond it is fitted
 
 Spectrum = Literal["blackbody", "pickles", "mk"]
 # Magnitudes (n,) less V of stars by their B-V, V-I and type (n, 2) or None.

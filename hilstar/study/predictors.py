@@ -23,7 +23,7 @@ SLEW_DEG, SLEW_S = 3.0, 20.0
 JITTER = ((2.0, 3.1), (1.0, 11.0), (0.3, 37.0))
 RATE_STEP_NS = 100_000
 NEAR = 4  # samples that a predictor has
-AXIS = np.array([0.6, 0.8, 0.0])  # of a steady turn: across rows and columns
+AXIS = np.array([0.6, 0.8, 0.0])  # axis of a steady turn: across rows and columns
 
 # From the last samples to the attitude at a time, ns.
 AttitudeAt = Callable[[int], FloatArray]

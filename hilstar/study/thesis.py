@@ -102,7 +102,7 @@ def passbands(directory: Path) -> ChartFinding:
     light = vega()
     curves = {b: read_curve_csv(DATA_DIR / f"{'johnson' if b == 'v' else 'bessell'}-{b}.csv") for b in TABLE_2_5}
     in_v = curve_mean(light, curves["v"])
-    scale = ZERO_W_M2_M["v"] / in_v  # of a star of Vega's spectrum and V = 0
+    scale = ZERO_W_M2_M["v"] / in_v  # a star with Vega's spectrum and V = 0
     rows = []
     for band, (johnson, bessell, printed_nm) in TABLE_2_5.items():
         weighted = Curve(light.wavelength_nm, light.value * light.wavelength_nm / light.wavelength_nm.max())

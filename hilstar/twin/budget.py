@@ -104,7 +104,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     dark = bench.faintest_shown_e_per_s or bench.calibration.response.half_step * white
     nothing = zero_mag + magnitude(dark)
     half = np.array([-0.5, 0.5])
-    corner_share = float(bench.psf.shares(half, half[:, None]).max())  # of a star's brightest pixel, on a corner of four
+    corner_share = float(bench.psf.shares(half, half[:, None]).max())  # a star on the corner of four pixels
     file, tracker = bench.config.monitor.primaries.file, bench.config.tracker
     primaries = None
     if file is not None:

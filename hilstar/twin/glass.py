@@ -15,7 +15,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import StarRates, bench_optics, channel_rates, star_kinds
 from hilstar.errors import InputError
-from hilstar.optics.glass_psf import GlassPsf, Spline
+from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import Stars
@@ -45,7 +45,7 @@ class StarGlass:
         own_nm = optics.quantum_efficiency.wavelength_nm
         knots_nm = np.union1d(np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)])
         efficiency = optics.quantum_efficiency(knots_nm)
-        shares, of_band = Spline(self.psf.wavelengths_nm)(knots_nm), []
+        shares, of_band = NodeSpline(self.psf.wavelengths_nm)(knots_nm), []
         for number in range(len(nodes_nm)):
             part = efficiency * np.interp(knots_nm, nodes_nm, np.eye(len(nodes_nm))[number])
             response = part * optics.transmission(knots_nm) * np.gradient(knots_nm)

@@ -46,12 +46,12 @@ SLOPE_STEP_PX = 1e-3
 CHUNK = 64  # stars at once
 UNSEEN = 0.01  # the probability of detection at which the table of magnitudes ends
 MAX_ROWS, BETWEEN = 80, 5  # rows, and steps from one to the next by which stars are interpolated
-NO_INFORMATION = NO_NOISE_E2 = 1e-12  # of a star whose pixels all clip, of a pixel without light
+NO_INFORMATION = NO_NOISE_E2 = 1e-12  # a star whose pixels all clip; a pixel without light
 TRIALS, MIN_FOUND = 20, 40  # simulated stars of a magnitude along a side of an image; found ones that give an error
 SKY_FIELDS = 100
 LIMIT_STEP_MAG = 0.25
 TURN_RAD = 1e-6
-NO_PLACE_PX = 1e3  # of a star whose light never leaves one pixel, or is all clipped
+NO_PLACE_PX = 1e3  # a star whose light never leaves one pixel, or is all clipped
 MIN_STARS = 2  # for an attitude
 SOURCES = ("shot", "background", "dark", "read", "reset", "quantisation", "prnu", "dsnu")
 WHO = ("limit", *FAMILY)

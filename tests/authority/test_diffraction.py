@@ -7,7 +7,7 @@ import pytest
 from scipy.special import j1
 
 from hilstar.errors import InputError
-from hilstar.optics.glass_psf import Spline, glass_psf
+from hilstar.optics.glass_psf import NodeSpline, glass_psf
 from hilstar.optics.psf_file import glass_of
 from hilstar.optics.zernike import Pupil, PupilField, Term, diffracted, psf_of
 from hilstar.sky.spectrum import blackbody_exitance_w_m2_m
@@ -142,7 +142,7 @@ def test_stars_of_five_spectra_over_field_and_focus_are_as_poppy_diffracts_them(
         for temperature_k, place in zip(TEMPERATURES_K, rng.integers(0, 512, (5, 2)).astype(float), strict=True):
             light = blackbody_exitance_w_m2_m(fine_nm, np.array([temperature_k])[:, None])[0] * fine_nm
             light /= light.sum()
-            found = psf.of_stars(*place[:, None], light @ Spline(np.array(nodes_nm))(fine_nm), np.ones(1))[0]
+            found = psf.of_stars(*place[:, None], light @ NodeSpline(np.array(nodes_nm))(fine_nm), np.ones(1))[0]
             wanted = 0.0
             for share, nm in zip(light, fine_nm, strict=True):
                 image, outside = psf_of(pupil, field(place - 255.5, nm, focus_um), nm, 24)

@@ -365,7 +365,7 @@ class McapWriter:
         first_ns, last_ns = min(times_ns), max(times_ns)
         packed = self._compressor.compress(data)
         chunk = _bytes_of(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data)))
-        entries: dict[int, list[tuple[int, int]]] = {}  # of each channel, the times of its messages and where they begin
+        entries: dict[int, list[tuple[int, int]]] = {}  # by channel: the times of its messages and where they begin
         offset = 0
         for channel, time_ns, record in self._pending:
             entries.setdefault(channel, []).append((time_ns, offset))

@@ -269,7 +269,7 @@ def _boot_utc(path: Path, stated: Stated, topics: dict[_ULogTopic, _Series], tol
     Raises InputError where there is neither.
     """
     offsets_us = np.array([], dtype=np.int64)  # UTC less the boot clock (n,), microseconds
-    for series in _of(topics, GPS):  # of the first receiver that has dates
+    for series in _of(topics, GPS):  # the first receiver that has dates
         utc_us = series.columns.get("time_utc_usec", np.zeros(len(series.t_us)))
         good = (utc_us >= FIRST_DATE_US) & (utc_us < LAST_DATE_US)
         if good.any():

@@ -76,7 +76,7 @@ def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple
     if cells < MIN_DOTS:
         raise InputError("the tracker sees too little of the monitor for the response; look at focal lengths and pixel pitches")
     (x,), (y,) = geometry.to_monitor(*(np.array([(size - 1) / 2]) for size in geometry.tracker.resolution_px))
-    corner = []  # of a square about the middle of what is seen, kept on the screen
+    corner = []  # the top left of a square about the middle of what is seen, kept on the screen
     for middle, size in zip((x, y), geometry.monitor.resolution_px, strict=True):
         wanted = middle if math.isfinite(middle) else (size - 1) / 2
         corner.append(int(np.clip(round(wanted - (cells * sparsest - 1) / 2), 0, size - cells * sparsest)))

@@ -260,7 +260,7 @@ def _spot_sigma_px(context: StepContext) -> tuple[float, float]:
 
 VERIFY_FIELDS, VERIFY_SEED = 3, 0
 LOST_SHARE = 0.1
-LIMITS = ("flux_mag", "centroid_px", "lost_share", "black_e_per_s_px")  # of [verify], also before a truth
+LIMITS = ("flux_mag", "centroid_px", "lost_share", "black_e_per_s_px")  # keys of [verify], also before a truth
 GRID = 21  # places along each side of the screen at which a truth is compared
 
 

@@ -24,7 +24,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 
 HELP = "keys: q quit, b blank, space pause, c crosshair, g grid, t next test patch, h this line"
 KEYS = {"b": "blank", "c": "crosshair", "g": "grid", "t": "patch", "space": "pause"}
-CODE_BITS = 7  # of the photodiode square: its light in any 7 successive frames tells which frames they are
+CODE_BITS = 7  # bits of the photodiode square: its light in any 7 successive frames tells which frames they are
 log = logging.getLogger(__name__)
 
 

@@ -10,7 +10,7 @@ from hilstar.bench.build import bench_optics, bench_stars
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import say_once
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.optics.glass_psf import GlassPsf, Spline
+from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.scene.camera import Lens
 from hilstar.sky.electrons import electron_response
@@ -49,7 +49,7 @@ def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(bench):
     nm, response = electron_response(bench_optics(file.config.tracker, file.folder))
     for temperature_k, shares in zip(stars.temperature_k[which], found, strict=True):
         light = response * blackbody_exitance_w_m2_m(nm, np.array([temperature_k])[:, None])[0]
-        assert shares == pytest.approx(light @ Spline(np.array(WAVELENGTHS_NM))(nm) / light.sum(), abs=SHARES)
+        assert shares == pytest.approx(light @ NodeSpline(np.array(WAVELENGTHS_NM))(nm) / light.sum(), abs=SHARES)
     finer = StarGlass(file, psf, BAND_NM / 2).shares(stars, which)
     assert found == pytest.approx(finer, abs=SHARES)
 

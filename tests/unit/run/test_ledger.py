@@ -47,7 +47,10 @@ def bench(small_bench_file):
         file=SimpleNamespace(path=small_bench_file, text=small_bench_file.read_text(), sha256="0" * 64),
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
         output={},
-        renderer=SimpleNamespace(gl_renderer="none", gl_version="none", path="NumPy"),
+        renderer=SimpleNamespace(
+            gl_renderer="none", gl_version="none", path="NumPy", target=SimpleNamespace(quantisation="exact")
+        ),
+        config=SimpleNamespace(render=SimpleNamespace(codes_ms=None)),
     )
 
 

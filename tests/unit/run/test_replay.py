@@ -46,7 +46,10 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
         file=SimpleNamespace(path=small_bench_file, text=SMALL_BENCH, sha256="0" * 64),
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
         output={},
-        renderer=SimpleNamespace(gl_renderer="none", gl_version="none", path="NumPy"),
+        renderer=SimpleNamespace(
+            gl_renderer="none", gl_version="none", path="NumPy", target=SimpleNamespace(quantisation="exact")
+        ),
+        config=SimpleNamespace(render=SimpleNamespace(codes_ms=None)),
     )
     with Ledger(path, bench) as kept:
         for k in range(10):

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import StarRates, bench_optics, star_kinds, star_rates
+from hilstar.charts import write_csv
 from hilstar.errors import InputError, MachineError
 from hilstar.files import whole_file
 from hilstar.sky.catalog import Catalog
@@ -256,9 +257,7 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
         formats = dict.fromkeys(("ra_deg", "dec_deg"), f".{DECIMALS}f")
         formats |= {n: ".6g" for n, c in catalogue.columns.items() if c.values.dtype.kind == "f" and n not in formats}
         texts = [[format(v, formats.get(n, "")) for v in c.values.tolist()] for n, c in catalogue.columns.items()]
-        lines = [",".join(catalogue.columns), *(",".join(row) for row in zip(*texts, strict=True)), ""]
-        with whole_file(path) as file:
-            file.write("\n".join(lines).encode())
+        write_csv(path, list(catalogue.columns), zip(*texts, strict=True))  # MK types such as "S5,1" have commas
     elif ending == ".vot":
         from astropy.io.votable import from_table
 

@@ -256,16 +256,12 @@ def _dropped(figures: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.int8]:
     reason[~(np.isfinite(figures["v_mag"]) & np.isfinite(figures["bv_mag"]))] = 2
     reason[~(np.isfinite(figures["ra_deg"]) & np.isfinite(figures["dec_deg"]))] = 1
     stars = np.flatnonzero(reason == 0)
-    reason[stars[_repeated({name: figures[name][stars] for name in ("ra_deg", "dec_deg", "v_mag")})]] = 4
+    # Rows that stand in the table before, with the same place and magnitude.
+    alike = [figures[name][stars] for name in ("v_mag", "dec_deg", "ra_deg")]
+    order = np.lexsort(alike)
+    repeated = np.all([np.diff(values[order]) == 0 for values in alike], axis=0)
+    reason[stars[order[1:][repeated]]] = 4
     return reason
-
-
-def _repeated(figures: dict[str, FloatArray]) -> npt.NDArray[np.bool_]:
-    """Rows that stand in the table before, with the same place and magnitude."""
-    order = np.lexsort((figures["v_mag"], figures["dec_deg"], figures["ra_deg"]))
-    repeated = np.zeros(len(order), dtype=np.bool_)
-    repeated[order[1:]] = np.all([np.diff(values[order]) == 0 for values in figures.values()], axis=0)
-    return repeated
 
 
 def _reasons(reason: npt.NDArray[np.int8]) -> str:
@@ -427,7 +423,9 @@ def kept(path: Path) -> Kept | None:
     try:
         with open_regular(path, "", MAX_STORED_BYTES) as file:
             status = os.fstat(file.fileno())
-            if status.st_uid != os.getuid() or not _is_plain(zipfile.ZipFile(file)):
+            # Nothing in it is packed, so that it cannot unfold into more than the file is long.
+            plain = all(entry.compress_type == zipfile.ZIP_STORED for entry in zipfile.ZipFile(file).infolist())
+            if status.st_uid != os.getuid() or not plain:
                 return None
             file.seek(0)
             with np.load(file, allow_pickle=False) as packed:
@@ -439,11 +437,6 @@ def kept(path: Path) -> Kept | None:
     except Exception:  # whatever a damaged file raises in the layers of zipfile, NumPy and json
         return None
     return found if _is_sound(catalog) else None
-
-
-def _is_plain(archive: zipfile.ZipFile) -> bool:
-    """Whether nothing in an archive is packed, so that it cannot unfold into more than the file is long."""
-    return all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist())
 
 
 def _is_sound(catalog: Catalog) -> bool:
@@ -501,7 +494,7 @@ def choose_catalog(choice: TableChoice) -> Catalog:
         path.name,
         file_sha256(path, FILE_WANTED),
         repr(choice.epoch_jyear),
-        _packaged_sha256() if choice.with_hipparcos else "",
+        hashlib.sha256(PACKAGED_CATALOG.read_bytes()).hexdigest() if choice.with_hipparcos else "",
     )
     place = store_path(made_of)
     made = kept(place) if place is not None else None
@@ -560,7 +553,3 @@ def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArra
 def _is_hip_main(path: Path) -> bool:
     with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
         return file.read(2) == b"H|"
-
-
-def _packaged_sha256() -> str:
-    return hashlib.sha256(PACKAGED_CATALOG.read_bytes()).hexdigest()

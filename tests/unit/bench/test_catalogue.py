@@ -136,6 +136,16 @@ def test_a_file_is_read_back_with_units_and_ucds(bright, tmp_path, ending):
             assert [str(v).strip() for v in values[name]] == [str(v).strip() for v in column.values], name
 
 
+def test_a_type_with_a_comma_stays_in_its_field(bench, tmp_path):
+    made = bench_catalogue(bench, 6.0, None)
+    assert "C0,0 (F8pe)" in made.columns["spectral_type"].values  # HIP 77442
+    write_catalogue(tmp_path / "stars.csv", made)
+    with (tmp_path / "stars.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for name in ("spectral_type", "variable", "double", "neighbour"):
+        assert [row[name] for row in rows] == made.columns[name].values.tolist()
+
+
 def _unit(unit):
     from astropy import units
 

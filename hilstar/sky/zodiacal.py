@@ -96,14 +96,10 @@ def relative_spectrum(wavelength_nm: FloatArray, slopes: tuple[float, float] = F
     over_sun = np.log(table.value / blackbody_exitance_w_m2_m(nodes, np.array(SUN_TEMPERATURE_K)))
     found = blackbody_exitance_w_m2_m(wavelength_nm, np.array(SUN_TEMPERATURE_K))
     found = found * np.exp(np.interp(np.log(wavelength_nm), np.log(nodes), over_sun))
-    return np.asarray(found / table(np.array([TABLE_NM])) * _redder(wavelength_nm, slopes))
-
-
-def _redder(wavelength_nm: FloatArray, slopes: tuple[float, float]) -> FloatArray:
-    """Equation 22 with some slopes over that of 90 degrees."""
+    # Equation 22 with these slopes over that of 90 degrees.
     decades = np.log10(wavelength_nm / TABLE_NM)
-    blue = decades < 0
-    return np.asarray((1 + np.where(blue, *slopes) * decades) / (1 + np.where(blue, *FAR_SLOPES) * decades))
+    redder, far = (1 + np.where(decades < 0, *pair) * decades for pair in (slopes, FAR_SLOPES))
+    return np.asarray(found / table(np.array([TABLE_NM])) * (redder / far))
 
 
 @dataclass(frozen=True, slots=True)

@@ -118,7 +118,9 @@ class Detector:
         self.shape = (height, width)
         streams = map(np.random.default_rng, np.random.SeedSequence(settings.device_seed).spawn(7))
         prnu, dsnu, hot, dead, column, column_dark, offset = streams
-        gain_map: ChargeArray = _gain_map(settings, self.shape, prnu)
+        gain_map: ChargeArray = np.ones(self.shape)
+        if settings.prnu:  # a map of ones needs no million draws
+            gain_map = np.maximum(1.0 + settings.prnu * prnu.standard_normal(self.shape), 0.0)
         dark_map_e_per_s = _dark_map_e_per_s(settings, self.shape, dsnu, hot, column_dark)
         if settings.dead_pixel_fraction:
             alive = dead.random(self.shape) >= settings.dead_pixel_fraction
@@ -241,13 +243,6 @@ class Detector:
         np.minimum(codes, 2**self.settings.bits - 1, out=codes)
         np.maximum(codes, 0, out=codes)
         return codes.astype(np.uint16)
-
-
-def _gain_map(settings: DetectorSettings, shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
-    """1 + N(0, prnu), never negative."""
-    if not settings.prnu:  # a map of ones needs no million draws
-        return np.ones(shape)
-    return np.maximum(1.0 + settings.prnu * rng.standard_normal(shape), 0.0)
 
 
 def _dark_map_e_per_s(

@@ -101,7 +101,9 @@ def fit_geometry(displaced: Sequence[Displaced], tracker: Camera, limit_px: floa
     seen = (rows[:, :2] + rows[:, 2:] - tracker.principal_point_px) / focal_px
     back = -rows[:, 2:] / focal_px
     for _ in range(TRIMS):
-        kept = _consistent(_fits(seen, back)[-1].rest, limit_px / focal_px)
+        # Another star that was found near a star's place is none of these.
+        off = _lengths(_fits(seen, back)[-1].rest)
+        kept = off <= max(WILD * float(np.median(off)), limit_px / focal_px)
         if kept.sum() < MIN_STARS:
             break
         seen, back = seen[kept], back[kept]
@@ -115,12 +117,6 @@ def _fits(seen: FloatArray, back: FloatArray) -> list[_MotionFit]:
     parts, wanted = _parts(*seen.T), back.T.ravel()
     fits = [_MotionFit.of({name: parts[name] for name in model}, wanted) for model in MODELS]
     return [fit for fit in fits if MIN_RESIDUALS * fit.unknowns <= len(wanted)]
-
-
-def _consistent(rest: FloatArray, limit: float) -> npt.NDArray[np.bool_]:
-    """The stars that a model leaves where most are: another one that was found near a star's place is none of them."""
-    off = _lengths(rest)
-    return np.asarray(off <= max(WILD * float(np.median(off)), limit))
 
 
 def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
@@ -323,7 +319,11 @@ class Comparison:
         seen = with_blends_as_one(seen, self.finder.psf)
         tally.summed += stars_listed - len(seen.truth)
         windowed = [self.finder.find(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e)]
-        each = {kind: self._placed(seen, windowed, kind) for kind in FAMILY}
+        images_e, true_px = (seen.sky_e, seen.shown_e), (seen.x_px, seen.y_px)
+        each = {
+            kind: [self.finder.placed(of, image_e, true_px, kind) for of, image_e in zip(windowed, images_e, strict=True)]
+            for kind in FAMILY
+        }
         sky, shown = each[self.finder.centroider]
         assumed = shown if seen.assumed_e is seen.shown_e else self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
         inside, drawn, clipped = self._inside(seen), seen.truth["drawn"], seen.truth["clipped"]
@@ -387,12 +387,6 @@ class Comparison:
             floor_px=math.hypot(*floor_px),
             name=str(row["name"]),
         )
-
-    def _placed(self, seen: TwinField, windowed: list[Matched], kind: Centroider) -> list[Matched]:
-        """The stars of the sky's image and of the display's where a centroider finds them."""
-        images_e = seen.sky_e, seen.shown_e
-        true_px = seen.x_px, seen.y_px
-        return [self.finder.placed(of, image_e, true_px, kind) for of, image_e in zip(windowed, images_e, strict=True)]
 
     def _catalogue(self, seen: TwinField) -> Matched:
         """The catalogue as if it had been found in an image."""

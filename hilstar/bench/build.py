@@ -20,7 +20,7 @@ from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, 
 from hilstar.bench.config.bench_config import epoch_utc_ns, has_observer, sky_jd
 from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
-from hilstar.bench.effort import BEST, CHEAP, HYSTERESIS, IN_TIME_SHARE, Effort, FieldCost, Light, plan_effort
+from hilstar.bench.effort import BEST, CHEAP, IN_TIME_SHARE, SURELY_IN_TIME, Effort, FieldCost, Light, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.bench.glass import glass_transmission
 from hilstar.errors import InputError
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
 
 S_PER_MS = 1e-3
-# Codes are timed in fields spread evenly over the sky, turning at 1 deg/s, as often as these times allow: of each field
-# the fastest counts, for other programs slow a frame down and nothing speeds it up.
+# Codes are timed in fields spread evenly over the sky, turning at 1 deg/s, as often as these times allow. The fastest frame of
+# each field counts.
 TIMED_FIELDS = [from_radec_roll_deg(*place, 0.0) for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
 TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])
 TIMED_EXACT_S, TIMED_ROUND_S, MAX_TIMED = 0.1, 0.05, 10
@@ -170,7 +170,7 @@ def measured_cost(frame_ms: Callable[[Quantisation, float], float], table: Field
     Where `exact` is clearly in time, `round` is not timed: its share of that is the table's.
     """
     best_ms = frame_ms(BEST, TIMED_EXACT_S)
-    if best_ms > limit_ms / HYSTERESIS:
+    if best_ms > limit_ms * SURELY_IN_TIME:
         cheap_ms = frame_ms(CHEAP, TIMED_ROUND_S)
     else:
         cheap_ms = best_ms * (table.cheap_ms / table.best_ms if table.best_ms else 1.0)

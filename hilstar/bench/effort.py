@@ -36,9 +36,9 @@ UNLIT = 0.25
 CUT_PHASES = 51
 IN_TIME_SHARE = 0.5  # share of a refresh period that a frame may take
 CHEAP, BEST = BY_COST[0], BY_COST[-1]
-# A measured time that is within this factor of the limit leaves the choice as the table has it: two starts of a run, of which
-# another program slows one, have the same codes.
-HYSTERESIS = 1.25
+# Between these times, in limits, a measured frame leaves the choice as the table has it: two starts of a run then have the same
+# codes. Other programs slow frames down, and nothing speeds them up: the upper time is a whole refresh.
+SURELY_IN_TIME, SURELY_LATE = 0.8, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,7 +262,7 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
 def exact_in_time(table: FieldCost, measured: FieldCost | None, limit_ms: float) -> bool:
     """Whether `auto` may take `exact`: by the measured cost where that is clear of the limit, and else by the table's."""
     if measured is not None:
-        clear = {measured.in_time(limit_ms / HYSTERESIS), measured.in_time(limit_ms * HYSTERESIS)}
+        clear = {measured.in_time(limit_ms * factor) for factor in (SURELY_IN_TIME, 1.0, SURELY_LATE)}
         if len(clear) == 1:
             return clear.pop()
     return table.in_time(limit_ms)

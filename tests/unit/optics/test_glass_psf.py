@@ -132,6 +132,18 @@ def test_light_outside_the_stamps_is_missing_from_a_star(glass):
     assert psf.centroids_px(*at, MEAN)[2] == pytest.approx(full.centroids_px(*at, MEAN)[2])
 
 
+def test_a_corner_that_is_vignetted_whole_is_dark(glass):
+    dark = glass.illumination.copy()
+    dark[0] = 0.0
+    psf = glass_psf(replace(glass, illumination=dark), 0.0, MEAN)
+    at = np.array([0.0, 255.0]), np.array([0.0, 255.0])
+    light = psf.of_stars(*at, MEAN, np.ones(2)).sum(axis=(1, 2))
+    assert light[0] == pytest.approx(0, abs=1e-9)
+    assert light[1] == pytest.approx(illumination(255, 255), rel=1e-5)
+    x, y, relative = psf.centroids_px(*at, MEAN)
+    assert (x[0], y[0], relative[0]) == pytest.approx((0, 0, 0), abs=1e-9)
+
+
 def test_noise_of_a_measured_map_and_its_negative_lobes_move_no_star(rng):
     """The noise of 1e-4 of the light a pixel moves one image's centroid by 1e-4 sqrt(sum of x^2) over 15 x 15 px, 6.5e-3 px."""
     plain = stack(integrated=True, per_px=1)

@@ -1,8 +1,8 @@
 """hilstar's commands in processes of their own that begin where the imports are over: half of what a start costs.
 
-A process that has imported hilstar, the nursery, makes each as a copy of itself (fork). The copy is the caller's child, with
-its own number, streams, session, folder and environment; it runs `hilstar/__main__.py` and ends as any command does. Imports,
-and what a shell limits, are tested by `subprocess.Popen` of `HILSTAR`.
+A fork server has imported hilstar and forks itself for each command. The fork is the caller's child, with its own number,
+streams, session, folder and environment; it runs `hilstar/__main__.py` and ends as any command does. Imports, and what a
+shell limits, are tested by `subprocess.Popen` of `HILSTAR`.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ MODULES = ("bench.build", "console.publisher", "render.renderer", "run.loop", "r
 COMMANDS = (["serve", "none.toml"], ["replay", "none.toml", "none.csv"], ["frame", "none.toml"], ["--version"])
 LIMITS = (resource.RLIMIT_AS, resource.RLIMIT_CPU, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE)
 MAX_REQUEST_BYTES = 1 << 20
-ROOM = "a" * 2000  # of the nursery's command line, where the names of its copies stand
+ROOM = "a" * 2000  # room in the command line for those of its forks
 
 
 class Started(subprocess.Popen):
-    """A command that starts with `HILSTAR`, forked from the nursery; any other command as `subprocess.Popen` starts it."""
+    """A command that starts with `HILSTAR`, forked from the fork server; any other command as `subprocess.Popen` starts it."""
 
     def _execute_child(self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, pass_fds: Any, cwd: Any, env: Any,
                        startupinfo: Any, creationflags: Any, shell: Any, *more: Any) -> None:  # fmt: skip
@@ -50,9 +50,9 @@ class Started(subprocess.Popen):
                                    shell, *more)  # fmt: skip
             return
         request = {"words": list(map(str, args[len(HILSTAR) :])), "folder": str(cwd or Path.cwd()), "new_session": new_session}
-        request |= {"environment": environment, "heritage": heritage()}
+        request |= {"environment": environment, "inherited": inherited_settings()}
         streams = [own if own >= 0 else number for number, own in enumerate((p2cread, c2pwrite, errwrite))]
-        self.pid = nursery().fork(request, streams)
+        self.pid = fork_server().fork(request, streams)
         self._child_created = True
         self._close_pipe_fds(p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite)
 
@@ -62,7 +62,7 @@ def python_of(environment: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in environment.items() if name.startswith(("PYTHON", "LD_"))}
 
 
-def heritage() -> dict[str, Any]:
+def inherited_settings() -> dict[str, Any]:
     """What else a child has of its parent: its priority, its cores and its limits."""
     return {
         "priority": (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority),
@@ -71,7 +71,7 @@ def heritage() -> dict[str, Any]:
     }
 
 
-class Nursery:
+class ForkServer:
     """The process that has imported hilstar; it ends with this one."""
 
     def __init__(self) -> None:
@@ -90,14 +90,14 @@ class Nursery:
         """Begin a command with these streams; its process' number."""
         socket.send_fds(self._socket, [json.dumps(request).encode()], streams)
         answer = self._socket.recv(100)
-        assert answer, "the nursery has ended"
+        assert answer, "the fork server has ended"
         return int(answer)
 
 
 @functools.cache
-def nursery() -> Nursery:
+def fork_server() -> ForkServer:
     """This process' own."""
-    return Nursery()
+    return ForkServer()
 
 
 def main(made: socket.socket) -> None:
@@ -129,7 +129,7 @@ def main(made: socket.socket) -> None:
             if not os.fork():
                 made.close()
                 os.close(read)
-                become(json.loads(data), streams, write)
+                become_command(json.loads(data), streams, write)
             os._exit(0)
         os.close(write)
         number = os.read(read, 100)
@@ -139,15 +139,15 @@ def main(made: socket.socket) -> None:
         made.send(number)
 
 
-def become(request: dict[str, Any], streams: list[int], told: int) -> NoReturn:
-    """Be that command, in this copy of the nursery."""
+def become_command(request: dict[str, Any], streams: list[int], told: int) -> NoReturn:
+    """Run the command in this forked process, with the streams and settings of the caller."""
     if request["new_session"]:
         os.setsid()
     for number, stream in enumerate(streams):
         os.dup2(stream, number)
         os.close(stream)
-    inherited = request["heritage"]
-    if inherited != json.loads(json.dumps(heritage())):
+    inherited = request["inherited"]
+    if inherited != json.loads(json.dumps(inherited_settings())):
         os.sched_setaffinity(0, inherited["cores"])
         for kind, limits in inherited["limits"]:
             resource.setrlimit(kind, tuple(limits))
@@ -158,14 +158,14 @@ def become(request: dict[str, Any], streams: list[int], told: int) -> NoReturn:
     os.environ.update(request["environment"])
     tempfile.tempdir = None  # which the environment may say
     sys.argv = ["hilstar", *request["words"]]
-    be_named([*HILSTAR, *request["words"]])
+    show_command_line([*HILSTAR, *request["words"]])
     os.write(told, str(os.getpid()).encode())
     os.close(told)
     runpy.run_module("hilstar", run_name="__main__", alter_sys=True)
     sys.exit(0)
 
 
-def be_named(command: list[str]) -> None:
+def show_command_line(command: list[str]) -> None:
     """Make this the command line that /proc shows (its fields 48 and 49 are where the kernel reads it)."""
     begin, end = map(int, Path("/proc/self/stat").read_text().rpartition(")")[2].split()[45:47])
     text = b"".join(word.encode(errors="surrogateescape") + b"\0" for word in command)[: end - begin - 1]

@@ -1,0 +1,1 @@
+"""What a star tracker answers while it runs: its bytes, decoded and read in a process apart."""

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import pytest
 
+from hilstar.render.context import gpus
 from hilstar.render.star_passes import LightUnits
+
+
+@pytest.fixture
+def on_llvmpipe() -> None:
+    """For what only a software OpenGL does: its threads, its image, the version that it is told to give."""
+    if not (drawn_by := gpus()[0].renderer).startswith("llvmpipe"):
+        pytest.skip(f"{drawn_by} draws here")
 
 
 @pytest.fixture

@@ -44,6 +44,7 @@ def test_a_gpu_that_is_not_there_is_refused_in_one_line_that_lists_those_that_ar
         create_context(json.loads(wrong))
 
 
+@pytest.mark.usefixtures("on_llvmpipe")
 def test_another_driver_s_devices_are_named_as_that_driver_names_them():
     environment = os.environ | {"GALLIUM_DRIVER": "softpipe", "LIBGL_ALWAYS_SOFTWARE": "1"}
     ran = run_hilstar("doctor", "--json", env=environment)

@@ -43,6 +43,7 @@ def threads(before: str = "", **environment: str) -> list[tuple[str, list[int]]]
     return json.loads(subprocess.run(run, capture_output=True, check=True, env=env, text=True).stdout)
 
 
+@pytest.mark.usefixtures("on_llvmpipe")
 @pytest.mark.parametrize("before", ["", NAMED_LATE], ids=["at once", "named late"])
 def test_each_has_one_and_each_core_has_one_that_rasterises_and_one_that_computes(before):
     """Where there are as many threads as cores: one core has nothing to part, and llvmpipe begins so many at most."""

@@ -68,6 +68,7 @@ def test_few_stars_on_a_large_image_are_made_black_without_a_clear(rng, monkeypa
             assert np.array_equal(gl.linear(), fresh.linear())
 
 
+@pytest.mark.usefixtures("on_llvmpipe")
 def test_the_same_stars_give_the_same_bits_in_any_number_of_bands(gl, rng, monkeypatch):
     """Thousands meet in each pixel, so that another order would round otherwise."""
     pixels = rng.uniform([100, 80], [110, 90], size=(9000, 2))
@@ -105,6 +106,7 @@ def test_extended_light_and_stars_alone_take_turns(gl, rng):
             assert np.abs(gl.linear() - raster.linear()).max() <= WAYS_LIMIT * raster.linear().max()
 
 
+@pytest.mark.usefixtures("on_llvmpipe")
 def test_the_image_outlives_its_renderer_and_cannot_be_written_to(rng):
     with Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as gl:
         gl.draw(sprites_at(np.array([[500.0, 400.0]]), np.array([1e6]), gl.footprint_px))

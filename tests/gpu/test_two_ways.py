@@ -195,6 +195,7 @@ with hilstar.load("bench.toml") as bench:
 """
 
 
+@pytest.mark.usefixtures("on_llvmpipe")
 @pytest.mark.parametrize("quantisation", ["round", "dither", "exact", "temporal"])
 def test_another_driver_s_codes_are_within_what_replay_says(tmp_path, quantisation):
     (tmp_path / "bench.toml").write_text(bench_text({"render": {"quantisation": quantisation}}))

@@ -39,6 +39,7 @@ def at_version(version: str, command: list[str], folder) -> str:
     return ran.stdout
 
 
+@pytest.mark.usefixtures("on_llvmpipe")
 @pytest.mark.parametrize(
     ("version", "paths"), [("3.3", WITHOUT), ("4.2", WITHOUT), ("4.3", WITH_COMPUTE), ("4.5", WITH_COMPUTE)]
 )
@@ -51,6 +52,7 @@ def test_the_newest_version_is_taken_and_each_path_is_named(tmp_path, version, p
     assert path == paths[chosen]
 
 
+@pytest.mark.usefixtures("on_llvmpipe")
 @pytest.mark.parametrize(("version", "exact"), [("3.3", "NumPy (slow"), ("4.5", "compute shaders")])
 def test_doctor_says_by_what_codes_are_chosen(tmp_path, version, exact):
     said = at_version(version, [*HILSTAR, "doctor"], tmp_path)

@@ -14,6 +14,7 @@ from hilstar.monitor.quantise import Panel, PixelQuantiser, code_table, level_dt
 from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides
+from hilstar.render.context import is_software
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import Psf
@@ -89,6 +90,8 @@ PLACES = "2i 8x 1f"  # SPRITE_DTYPE's places and rates
 SPRITE_PIXEL_COST = 4  # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
 # Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
 MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
+# On a graphics card: an H100 cleared 7680 x 4320 in 4 ms, and erased 10 000 sprites on it in 0.1 ms.
+MAX_ERASED_BY_CARD = 1.0
 IMAGES_VERSION = 420  # the OpenGL that has images in shaders
 # A level is missed only where the wings of more stars than this meet outside all of their own squares (see `lit_sides`).
 MEETING_WINGS = 16
@@ -147,7 +150,8 @@ class Eraser:
     def __init__(self, ctx: moderngl.Context, size_px: tuple[int, int], of_levels: bool) -> None:
         self._ctx = ctx
         self._size_px = size_px
-        self._most_px = size_px[0] * size_px[1] * (MAX_ERASED_LEVELS if of_levels else MAX_ERASED_LIGHT)
+        on_processor = MAX_ERASED_LEVELS if of_levels else MAX_ERASED_LIGHT
+        self._most_px = size_px[0] * size_px[1] * (on_processor if is_software(ctx) else MAX_ERASED_BY_CARD)
         self._program = build_program(ctx, "star.vert", "erase.frag", ("LEVELS",) if of_levels else ())
         self._program["resolution_px"] = size_px
         self._triangle = ctx.vertex_array(build_program(ctx, "full.vert", "erase.frag", ("LEVELS",) if of_levels else ()), [])

@@ -61,7 +61,8 @@ class Packet:
     @property
     def direction(self) -> str:
         """Who sends it to whom."""
-        return {"simulator": "simulator to hilstar", "hilstar": "hilstar to simulator"}.get(self.sender, "either way")
+        ways = {"simulator": "simulator to hilstar", "hilstar": "hilstar to simulator", "tracker": "tracker to hilstar"}
+        return ways.get(self.sender, "either way")
 
     @property
     def variable(self) -> list[Field]:

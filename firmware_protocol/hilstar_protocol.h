@@ -50,10 +50,13 @@ extern "C" {
 /** What is on the screen, and hilstar's health. */
 #define HILSTAR_KIND_STATUS 4
 #define HILSTAR_STATUS_BYTES 40
+/** Which attitude the star tracker found. */
+#define HILSTAR_KIND_ANSWER 5
+#define HILSTAR_ANSWER_BYTES 68
 
-#define HILSTAR_LONGEST_PACKET 64
+#define HILSTAR_LONGEST_PACKET 68
 /** On the wire, its COBS byte and its 0x00 among them. */
-#define HILSTAR_LONGEST_FRAME 66
+#define HILSTAR_LONGEST_FRAME 70
 
 /** The rate is known; without this bit rate_cam_rad_s is ignored. */
 #define HILSTAR_FLAG_RATE_VALID 1u
@@ -84,6 +87,19 @@ extern "C" {
 #define HILSTAR_HEALTH_SECOND_SENDER 1024u
 /** The sender repeats itself, or its clock has stopped. */
 #define HILSTAR_HEALTH_SOURCE_FROZEN 2048u
+
+/** The rate is known; without this bit rate_cam_rad_s is ignored. */
+#define HILSTAR_ANSWER_RATE_VALID 1u
+/** The attitude is good; without this bit q_icrs_to_cam is not looked at. */
+#define HILSTAR_ANSWER_VALID 2u
+/** The tracker looks for its attitude without knowing it before. */
+#define HILSTAR_ANSWER_LOST_IN_SPACE 4u
+/** The tracker follows an attitude that it knew. */
+#define HILSTAR_ANSWER_TRACKING 8u
+/** Fewer stars were found than an attitude needs. */
+#define HILSTAR_ANSWER_TOO_FEW_STARS 16u
+/** The detector is blinded, as by the Sun. */
+#define HILSTAR_ANSWER_BLINDED 32u
 
 /** How far the quaternion's norm may be from 1 before the packet is refused (norm). */
 #define HILSTAR_NORM_TOLERANCE 0.001
@@ -155,6 +171,22 @@ typedef struct {
     /** messages refused so far, wraps */
     uint32_t refused;
 } hilstar_status;
+
+/** answer (tracker to hilstar, 68 bytes): which attitude the star tracker found. */
+typedef struct {
+    /** sum of the flags below; unknown bits are ignored (HILSTAR_ANSWER_...) */
+    uint16_t flags;
+    /** answers sent so far; wraps to 0 after 2^32 - 1 */
+    uint32_t sequence;
+    /** the tracker's clock at the middle of the exposure ([answers] stamp says otherwise) [ns] */
+    int64_t t_ns;
+    /** unit quaternion (w, x, y, z), Hamilton: turns ICRS components into camera components */
+    double q_icrs_to_cam[4];
+    /** angular velocity of cam with respect to icrs, in cam components [rad/s] */
+    float rate_cam_rad_s[3];
+    /** how many stars the attitude was found by */
+    uint32_t stars;
+} hilstar_answer;
 
 /* ---- bytes and bits ---- */
 
@@ -232,6 +264,7 @@ static inline size_t hilstar_packet_bytes(int kind)
     case HILSTAR_KIND_TIME_REQUEST: return HILSTAR_TIME_REQUEST_BYTES;
     case HILSTAR_KIND_TIME_REPLY: return HILSTAR_TIME_REPLY_BYTES;
     case HILSTAR_KIND_STATUS: return HILSTAR_STATUS_BYTES;
+    case HILSTAR_KIND_ANSWER: return HILSTAR_ANSWER_BYTES;
     default: return 0;
     }
 }
@@ -364,6 +397,42 @@ static inline int hilstar_decode_status(const uint8_t *packet, size_t length, hi
     out->attitude_sequence = (uint32_t)hilstar_get(packet + 24, 4);
     out->accepted = (uint32_t)hilstar_get(packet + 28, 4);
     out->refused = (uint32_t)hilstar_get(packet + 32, 4);
+    return kind;
+}
+
+/** Writes 68 bytes to `out`. */
+static inline size_t hilstar_encode_answer(const hilstar_answer *in, uint8_t *out)
+{
+    size_t i;
+    hilstar_put(out, 1, 1);
+    hilstar_put(out + 1, 5, 1);
+    hilstar_put(out + 2, in->flags, 2);
+    hilstar_put(out + 4, in->sequence, 4);
+    hilstar_put(out + 8, (uint64_t)in->t_ns, 8);
+    for (i = 0; i < 4; i++)
+        hilstar_put(out + 16 + 8 * i, hilstar_bits_of_f64(in->q_icrs_to_cam[i]), 8);
+    for (i = 0; i < 3; i++)
+        hilstar_put_f32(out + 48 + 4 * i, &in->rate_cam_rad_s[i]);
+    hilstar_put(out + 60, in->stars, 4);
+    hilstar_put(out + 64, hilstar_crc32(out, 64), 4);
+    return 68;
+}
+
+/** HILSTAR_KIND_ANSWER, or a negative error with `out` left unchanged. */
+static inline int hilstar_decode_answer(const uint8_t *packet, size_t length, hilstar_answer *out)
+{
+    const int kind = hilstar_check(packet, length);
+    size_t i;
+    if (kind != HILSTAR_KIND_ANSWER)
+        return kind < 0 ? kind : HILSTAR_ERROR_FORMAT;
+    out->flags = (uint16_t)hilstar_get(packet + 2, 2);
+    out->sequence = (uint32_t)hilstar_get(packet + 4, 4);
+    out->t_ns = hilstar_i64_of(hilstar_get(packet + 8, 8));
+    for (i = 0; i < 4; i++)
+        out->q_icrs_to_cam[i] = hilstar_f64_of(hilstar_get(packet + 16 + 8 * i, 8));
+    for (i = 0; i < 3; i++)
+        hilstar_get_f32(packet + 48 + 4 * i, &out->rate_cam_rad_s[i]);
+    out->stars = (uint32_t)hilstar_get(packet + 60, 4);
     return kind;
 }
 

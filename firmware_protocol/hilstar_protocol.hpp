@@ -68,6 +68,17 @@ struct Status {
     bool is(unsigned bit) const { return (health & bit) != 0; }
 };
 
+/** What a star tracker found; `flags` is the sum of HILSTAR_ANSWER_ bits, and says whether attitude and rate are good. */
+struct Answer {
+    static constexpr int kind = HILSTAR_KIND_ANSWER;
+    std::uint16_t flags = 0;
+    std::uint32_t sequence = 0;
+    std::int64_t t_ns = 0;
+    std::array<double, 4> q_icrs_to_cam = {1.0, 0.0, 0.0, 0.0};
+    std::array<float, 3> rate_cam_rad_s = {};
+    std::uint32_t stars = 0;
+};
+
 namespace detail {
 
 inline hilstar_attitude plain(const Attitude &in)
@@ -128,6 +139,23 @@ inline int read(const std::uint8_t *packet, std::size_t length, Status &out)
     return result;
 }
 
+inline int read(const std::uint8_t *packet, std::size_t length, Answer &out)
+{
+    hilstar_answer in = {};
+    const int result = hilstar_decode_answer(packet, length, &in);
+    if (result < 0)
+        return result;
+    out.flags = in.flags;
+    out.sequence = in.sequence;
+    out.t_ns = in.t_ns;
+    for (std::size_t i = 0; i < 4; i++)
+        out.q_icrs_to_cam[i] = in.q_icrs_to_cam[i];
+    for (std::size_t i = 0; i < 3; i++)
+        out.rate_cam_rad_s[i] = in.rate_cam_rad_s[i];
+    out.stars = in.stars;
+    return result;
+}
+
 } // namespace detail
 
 /** Why hilstar would refuse this attitude; none where it would accept it. Ask before sending if you doubt your own numbers. */
@@ -171,6 +199,18 @@ inline Bytes<HILSTAR_STATUS_BYTES> encode(const Status &status)
     return packet;
 }
 
+inline Bytes<HILSTAR_ANSWER_BYTES> encode(const Answer &answer)
+{
+    hilstar_answer plain = {answer.flags, answer.sequence, answer.t_ns, {}, {}, answer.stars};
+    for (std::size_t i = 0; i < 4; i++)
+        plain.q_icrs_to_cam[i] = answer.q_icrs_to_cam[i];
+    for (std::size_t i = 0; i < 3; i++)
+        plain.rate_cam_rad_s[i] = answer.rate_cam_rad_s[i];
+    Bytes<HILSTAR_ANSWER_BYTES> packet = {};
+    hilstar_encode_answer(&plain, packet.data());
+    return packet;
+}
+
 /** The packet of that kind, as UDP and ZeroMQ bring it; none where the bytes are anything else. */
 template <typename Packet>
 std::optional<Packet> decode(const std::uint8_t *bytes, std::size_t count)
@@ -180,7 +220,7 @@ std::optional<Packet> decode(const std::uint8_t *bytes, std::size_t count)
 }
 
 /** Any packet, or why the bytes are none. */
-using Event = std::variant<Fault, Attitude, TimeRequest, TimeReply, Status>;
+using Event = std::variant<Fault, Attitude, TimeRequest, TimeReply, Status, Answer>;
 
 inline Event decode(const std::uint8_t *bytes, std::size_t count)
 {
@@ -190,6 +230,7 @@ inline Event decode(const std::uint8_t *bytes, std::size_t count)
     case HILSTAR_KIND_TIME_REQUEST: return *decode<TimeRequest>(bytes, count);
     case HILSTAR_KIND_TIME_REPLY: return *decode<TimeReply>(bytes, count);
     case HILSTAR_KIND_STATUS: return *decode<Status>(bytes, count);
+    case HILSTAR_KIND_ANSWER: return *decode<Answer>(bytes, count);
     default: return static_cast<Fault>(kind);
     }
 }

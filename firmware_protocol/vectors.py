@@ -67,7 +67,7 @@ REFUSED_ATTITUDES: dict[str, tuple[str, Attitude]] = {
     "refused: a norm too large to square": ("norm", Attitude(1, 1, 1, (1e200, 0.0, 0.0, 0.0), STILL)),
     "refused: a rate of 2e6 rad/s": ("format", Attitude(1, 1, 1, Q, (0.0, 0.0, -2e6))),
 }
-OTHERS: dict[str, tuple[str, dict[str, int]]] = {
+OTHERS: dict[str, tuple[str, dict[str, Any]]] = {
     "time_request: ordinary": ("time_request", {"sequence": 1, "t1_ns": 2_000_000_000}),
     "time_request: all zeros": ("time_request", {"sequence": 0, "t1_ns": 0}),
     "time_request: extremes": ("time_request", {"sequence": U32_MAX, "t1_ns": I64_MIN}),
@@ -85,6 +85,26 @@ OTHERS: dict[str, tuple[str, dict[str, int]]] = {
     "status: before any attitude": (
         "status",
         {"health": 5, "frame": 0, "light_t_ns": 0, "attitude_age_ns": -1, "attitude_sequence": 0, "accepted": 0, "refused": 0},
+    ),
+    "answer: tracking on 12 stars": (
+        "answer",
+        {
+            "flags": 11,
+            "sequence": 1,
+            "t_ns": 3_000_000_000,
+            "q_icrs_to_cam": Q,
+            "rate_cam_rad_s": (0.0, 0.0, 0.125),
+            "stars": 12,
+        },
+    ),
+    "answer: lost in space, blinded, no attitude": (
+        "answer",
+        {"flags": 36, "sequence": U32_MAX, "t_ns": -1, "q_icrs_to_cam": (0.0,) * 4, "rate_cam_rad_s": STILL, "stars": 0},
+    ),
+    "answer: extremes, all flags": (
+        "answer",
+        {"flags": 0xFFFF, "sequence": 0, "t_ns": I64_MIN, "q_icrs_to_cam": NEGATED_Q, "rate_cam_rad_s": (TINY32, -1e6, -0.0)}
+        | {"stars": U32_MAX},
     ),
     "status: extremes, all health bits": (
         "status",
@@ -166,7 +186,8 @@ def _damaged(whole: bytes, packets: dict[str, Packet]) -> list[dict[str, Any]]:
         _refused("refused: 64 bytes of zeros", bytes(64), "crc"),
         _refused("refused: version 2", sealed(b"\x02" + body[1:]), "format"),
         _refused("refused: kind 0", sealed(b"\x01\x00" + body[2:]), "format"),
-        _refused("refused: kind 5", sealed(b"\x01\x05" + body[2:]), "format"),
+        _refused("refused: kind 6", sealed(b"\x01\x06" + body[2:]), "format"),
+        _refused("refused: the length of an attitude, the kind of an answer", sealed(b"\x01\x05" + body[2:]), "format"),
         _refused("refused: the length of an attitude, the kind of a status", sealed(b"\x01\x04" + body[2:]), "format"),
         _refused("refused: a byte is missing", whole[:-1], "format"),
         _refused("refused: a byte too many", whole + b"\x07", "format"),

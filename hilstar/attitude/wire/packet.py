@@ -117,7 +117,19 @@ class Status:
     refused: int
 
 
-Packet = AttitudeSample | TimeRequest | TimeReply | Status
+@dataclass(frozen=True, slots=True)
+class AnswerPacket:
+    """What a star tracker found, as it is on the wire; `flags` is the sum of protocol.ANSWER_ bits."""
+
+    sequence: int
+    flags: int
+    t_ns: int
+    q_icrs_to_cam: tuple[float, ...]
+    rate_cam_rad_s: tuple[float, ...] = (0.0, 0.0, 0.0)
+    stars: int = 0
+
+
+Packet = AttitudeSample | TimeRequest | TimeReply | Status | AnswerPacket
 Event = Packet | Refusal
 
 
@@ -149,6 +161,9 @@ def encode(packet: Packet) -> bytes:
             counts = (packet.attitude_sequence % U32, packet.accepted % U32, packet.refused % U32)
             held = (min(max(t_ns, INT64[0]), INT64[-1]) for t_ns in (packet.light_t_ns, packet.attitude_age_ns))
             body = protocol.STATUS_BODY.pack(VERSION, protocol.KIND_STATUS, packet.health, packet.frame % U32, *held, *counts)
+        case AnswerPacket():
+            head = (VERSION, protocol.KIND_ANSWER, packet.flags, packet.sequence % U32, packet.t_ns)
+            body = protocol.ANSWER_BODY.pack(*head, *packet.q_icrs_to_cam, *packet.rate_cam_rad_s, packet.stars)
     return body + CRC.pack(zlib.crc32(body))
 
 
@@ -185,6 +200,9 @@ def _decode_body(kind: int, message: bytes) -> Event:
         return TimeReply(*protocol.TIME_REPLY_BODY.unpack_from(message)[3:])
     if kind == protocol.KIND_STATUS:
         return Status(*protocol.STATUS_BODY.unpack_from(message)[2:])
+    if kind == protocol.KIND_ANSWER:
+        _, _, flags, sequence, t_ns, *numbers = protocol.ANSWER_BODY.unpack_from(message)
+        return AnswerPacket(sequence, flags, t_ns, tuple(numbers[:4]), tuple(numbers[4:7]), numbers[7])
     _, _, flags, sequence, t_ns, w, x, y, z, *rate = protocol.ATTITUDE_BODY.unpack_from(message)
     known_rate = tuple(rate) if flags & protocol.FLAG_RATE_VALID else None
     return checked_sample(t_ns, (w, x, y, z), known_rate, sequence, bool(flags & protocol.FLAG_DISCONTINUITY))

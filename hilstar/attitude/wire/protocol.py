@@ -7,6 +7,7 @@ KIND_ATTITUDE = 1  # where the tracker's camera points at t_ns
 KIND_TIME_REQUEST = 2  # asks the other side for its clock
 KIND_TIME_REPLY = 3  # answers a time_request
 KIND_STATUS = 4  # what is on the screen, and hilstar's health
+KIND_ANSWER = 5  # which attitude the star tracker found
 
 # Everything but the CRC-32, in order:
 # version | kind | flags | sequence | t_ns | q_icrs_to_cam | rate_cam_rad_s
@@ -17,12 +18,15 @@ TIME_REQUEST_BODY = struct.Struct("<BBHIq")
 TIME_REPLY_BODY = struct.Struct("<BBHIqqq")
 # version | kind | health | frame | light_t_ns | attitude_age_ns | attitude_sequence | accepted | refused
 STATUS_BODY = struct.Struct("<BBHIqqIII")
+# version | kind | flags | sequence | t_ns | q_icrs_to_cam | rate_cam_rad_s | stars
+ANSWER_BODY = struct.Struct("<BBHIq4d3fI")
 
 ATTITUDE_BYTES = 64
 TIME_REQUEST_BYTES = 20
 TIME_REPLY_BYTES = 36
 STATUS_BYTES = 40
-PACKET_BYTES = {1: 64, 2: 20, 3: 36, 4: 40}
+ANSWER_BYTES = 68
+PACKET_BYTES = {1: 64, 2: 20, 3: 36, 4: 40, 5: 68}
 
 FLAG_RATE_VALID = 1  # the rate is known; without this bit rate_cam_rad_s is ignored
 FLAG_DISCONTINUITY = 2  # the attitude jumped since the previous packet: do not interpolate across
@@ -39,6 +43,13 @@ HEALTH_OPERATOR_OVERRIDE = 256  # an operator's key changes what is shown: blank
 HEALTH_HIDDEN = 512  # the window is minimised, covered, off the screen, or its display is gone: the frame is not fully visible
 HEALTH_SECOND_SENDER = 1024  # attitudes also arrive from another sender, and are not shown
 HEALTH_SOURCE_FROZEN = 2048  # the sender repeats itself, or its clock has stopped
+
+ANSWER_RATE_VALID = 1  # the rate is known; without this bit rate_cam_rad_s is ignored
+ANSWER_VALID = 2  # the attitude is good; without this bit q_icrs_to_cam is not looked at
+ANSWER_LOST_IN_SPACE = 4  # the tracker looks for its attitude without knowing it before
+ANSWER_TRACKING = 8  # the tracker follows an attitude that it knew
+ANSWER_TOO_FEW_STARS = 16  # fewer stars were found than an attitude needs
+ANSWER_BLINDED = 32  # the detector is blinded, as by the Sun
 
 NORM_TOLERANCE = 0.001  # how far the quaternion's norm may be from 1 before the packet is refused (norm)
 FASTEST_RAD_S = 1000000.0  # the largest magnitude of a valid rate; beyond it the packet is refused (format)

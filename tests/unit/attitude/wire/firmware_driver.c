@@ -105,6 +105,23 @@ static size_t encode_status(char *text, uint8_t *out)
     return hilstar_encode_status(&in, out);
 }
 
+static size_t encode_answer(char *text, uint8_t *out)
+{
+    hilstar_answer in;
+    size_t i;
+    in.flags = (uint16_t)next_bits(&text);
+    in.sequence = (uint32_t)next_bits(&text);
+    in.t_ns = hilstar_i64_of(next_bits(&text));
+    for (i = 0; i < 4; i++)
+        in.q_icrs_to_cam[i] = hilstar_f64_of(next_bits(&text));
+    for (i = 0; i < 3; i++) {
+        const uint32_t bits = (uint32_t)next_bits(&text);
+        memcpy(&in.rate_cam_rad_s[i], &bits, sizeof bits);
+    }
+    in.stars = (uint32_t)next_bits(&text);
+    return hilstar_encode_answer(&in, out);
+}
+
 static void encode(char *text)
 {
     const int kind = (int)strtol(text, &text, 10);
@@ -116,6 +133,7 @@ static void encode(char *text)
     case HILSTAR_KIND_TIME_REQUEST: written = encode_time_request(text, packet); break;
     case HILSTAR_KIND_TIME_REPLY: written = encode_time_reply(text, packet); break;
     case HILSTAR_KIND_STATUS: written = encode_status(text, packet); break;
+    case HILSTAR_KIND_ANSWER: written = encode_answer(text, packet); break;
     default: fail("no such kind");
     }
     if (written != length || hilstar_frame(packet, length, frame) != length + 2)
@@ -160,21 +178,40 @@ static void print_status(const hilstar_status *status)
     print_bits(status->refused);
 }
 
+static void print_answer(const hilstar_answer *answer)
+{
+    size_t i;
+    printf(" 0");
+    print_bits(answer->flags);
+    print_bits(answer->sequence);
+    print_bits((uint64_t)answer->t_ns);
+    for (i = 0; i < 4; i++)
+        print_bits(hilstar_bits_of_f64(answer->q_icrs_to_cam[i]));
+    for (i = 0; i < 3; i++) {
+        uint32_t bits;
+        memcpy(&bits, &answer->rate_cam_rad_s[i], sizeof bits);
+        print_bits(bits);
+    }
+    print_bits(answer->stars);
+}
+
 static void decode(const char *text)
 {
     size_t length;
     uint8_t *packet = parse_hex(text, &length);
-    hilstar_attitude attitude;
-    hilstar_time_request request;
-    hilstar_time_reply reply;
-    hilstar_status status;
+    static hilstar_attitude attitude;
+    static hilstar_time_request request;
+    static hilstar_time_reply reply;
+    static hilstar_status status;
+    static hilstar_answer answer;
     const int result = hilstar_check(packet, length);
     /* Each takes its own kind and no other. */
     const int as_attitude = hilstar_decode_attitude(packet, length, &attitude);
     const int as_request = hilstar_decode_time_request(packet, length, &request);
     const int as_reply = hilstar_decode_time_reply(packet, length, &reply);
     const int as_status = hilstar_decode_status(packet, length, &status);
-    const int taken = (as_attitude > 0) + (as_request > 0) + (as_reply > 0) + (as_status > 0);
+    const int as_answer = hilstar_decode_answer(packet, length, &answer);
+    const int taken = (as_attitude > 0) + (as_request > 0) + (as_reply > 0) + (as_status > 0) + (as_answer > 0);
     if (taken != (result > 0))
         fail("taken for another kind, or for none");
     printf("%d", result);
@@ -192,6 +229,8 @@ static void decode(const char *text)
     }
     if (as_status == HILSTAR_KIND_STATUS)
         print_status(&status);
+    if (as_answer == HILSTAR_KIND_ANSWER)
+        print_answer(&answer);
     free(packet);
 }
 

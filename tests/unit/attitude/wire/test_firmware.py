@@ -23,7 +23,7 @@ FOLDER = ROOT / "firmware_protocol"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())
 ACCEPTED = [vector for vector in VECTORS if "refused" not in vector]
 REFUSED = [vector for vector in VECTORS if "refused" in vector]
-SIZES = {1: 64, 2: 20, 3: 36, 4: 40}
+SIZES = {1: 64, 2: 20, 3: 36, 4: 40, 5: 68}
 STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]
 C99 = ["gcc", "-std=c99", *STRICT, "-Wconversion", "-Wshadow"]
 CPP = ["g++", "-x", "c++", *STRICT, "-Wconversion", "-Wshadow"]
@@ -46,6 +46,8 @@ int e(const uint8_t *in, size_t length, hilstar_attitude *out) { return hilstar_
 int f(const uint8_t *in, size_t length, hilstar_time_request *out) { return hilstar_decode_time_request(in, length, out); }
 int g(const uint8_t *in, size_t length, hilstar_time_reply *out) { return hilstar_decode_time_reply(in, length, out); }
 int h(const uint8_t *in, size_t length, hilstar_status *out) { return hilstar_decode_status(in, length, out); }
+size_t m(const hilstar_answer *in, uint8_t *out) { return hilstar_encode_answer(in, out); }
+int n(const uint8_t *in, size_t length, hilstar_answer *out) { return hilstar_decode_answer(in, length, out); }
 int i(const hilstar_attitude *in) { return hilstar_check_attitude(in); }
 size_t j(const uint8_t *in, size_t length, uint8_t *out) { return hilstar_frame(in, length, out); }
 void k(hilstar_decoder *decoder) { hilstar_decoder_init(decoder); }

@@ -36,13 +36,14 @@ VECTORS = json.loads((FOLDER / "vectors.json").read_text())
 ACCEPTED = [vector for vector in VECTORS if "refused" not in vector]
 REFUSED = [vector for vector in VECTORS if "refused" in vector]
 # Put together from the ICD alone, the CRC-32 at the end among them; nothing of this comes from hilstar or from the generator.
-FORMATS = {1: "<BBHIq4d3fI", 2: "<BBHIqI", 3: "<BBHIqqqI", 4: "<BBHIqqIIII"}
-SIZES = {1: 64, 2: 20, 3: 36, 4: 40}
+FORMATS = {1: "<BBHIq4d3fI", 2: "<BBHIqI", 3: "<BBHIqqqI", 4: "<BBHIqqIIII", 5: "<BBHIq4d3fII"}
+SIZES = {1: 64, 2: 20, 3: 36, 4: 40, 5: 68}
 FIELDS = {
     1: ["flags", "sequence", "t_ns", "q_icrs_to_cam", "rate_cam_rad_s"],
     2: ["sequence", "t1_ns"],
     3: ["sequence", "t1_ns", "t2_ns", "t3_ns"],
     4: ["health", "frame", "light_t_ns", "attitude_age_ns", "attitude_sequence", "accepted", "refused"],
+    5: ["flags", "sequence", "t_ns", "q_icrs_to_cam", "rate_cam_rad_s", "stars"],
 }
 # The division of a quaternion by its norm rounds norm and quotient: each by half of 2.2e-16.
 ROUNDED_NORM = 4.5e-16
@@ -71,6 +72,8 @@ def wire_fields(message: bytes) -> tuple[int, dict]:
     assert crc == zlib.crc32(message[:-4])
     if kind == 1:
         values = [*values[:3], values[3:7], values[7:]]
+    elif kind == 5:
+        values = [*values[:3], values[3:7], values[7:10], values[10]]
     elif kind in (2, 3):
         assert values.pop(0) == 0
     return kind, dict(zip(FIELDS[kind], values, strict=True))
@@ -110,7 +113,11 @@ def test_a_changed_definition_makes_every_file_stale_and_generating_mends_it(cop
     definition = copy / "firmware_protocol" / "protocol.toml"
     text = definition.read_text()
     assert regenerated(copy, "--check").returncode == 0
-    definition.write_text(text.replace('"f32", count = 3', '"f64", count = 3').replace("size_bytes = 64", "size_bytes = 76"))
+    definition.write_text(
+        text.replace('"f32", count = 3', '"f64", count = 3')
+        .replace("size_bytes = 64", "size_bytes = 76")
+        .replace("size_bytes = 68", "size_bytes = 80")
+    )
     stale = regenerated(copy, "--check")
     assert stale.returncode == 1
     assert [line for line in stale.stderr.splitlines() if line.startswith("stale")] == [f"stale: {name}" for name in GENERATED]
@@ -144,13 +151,21 @@ def test_a_definition_that_contradicts_itself_is_refused(copy):
 
 
 def test_the_table_has_the_icd_s_sizes_and_bits():
-    bodies = (protocol.ATTITUDE_BODY, protocol.TIME_REQUEST_BODY, protocol.TIME_REPLY_BODY, protocol.STATUS_BODY)
+    bodies = (
+        protocol.ATTITUDE_BODY,
+        protocol.TIME_REQUEST_BODY,
+        protocol.TIME_REPLY_BODY,
+        protocol.STATUS_BODY,
+        protocol.ANSWER_BODY,
+    )
     assert {kind: struct.calcsize(form) for kind, form in FORMATS.items()} == SIZES == protocol.PACKET_BYTES
     assert [body.format + "I" for body in bodies] == list(FORMATS.values())
     health = "NO_ATTITUDE STALE BLANK CLOCK_SYNCHRONISED MISSED REFUSED CLIPPED LEDGER_FAILED"
     health += " OPERATOR_OVERRIDE HIDDEN SECOND_SENDER SOURCE_FROZEN"
     assert [getattr(protocol, f"HEALTH_{name}") for name in health.split()] == [1 << bit for bit in range(12)]
     assert (protocol.FLAG_RATE_VALID, protocol.FLAG_DISCONTINUITY) == (1, 2)
+    answer = "RATE_VALID VALID LOST_IN_SPACE TRACKING TOO_FEW_STARS BLINDED"
+    assert [getattr(protocol, f"ANSWER_{name}") for name in answer.split()] == [1 << bit for bit in range(6)]
     assert (protocol.NORM_TOLERANCE, protocol.FASTEST_RAD_S) == (1e-3, 1e6)
 
 
@@ -182,7 +197,8 @@ def test_hilstar_reads_a_vector_and_writes_it_again(vector):
     assert not isinstance(event, Refusal)
     fields = vector["fields"]
     if not isinstance(event, AttitudeSample):
-        assert {name: getattr(event, name) for name in fields} == fields
+        got = {name: getattr(event, name) for name in fields}
+        assert {name: list(value) if isinstance(value, tuple) else value for name, value in got.items()} == fields
         assert encode(event) == message
         assert frame(event).hex() == vector["frame_hex"]
         return

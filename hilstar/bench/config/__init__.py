@@ -3,6 +3,7 @@
 Each key's type, limits, default and meaning stand once, in the class of its table; docs/bench-file.md is made from them.
 """
 
+from hilstar.bench.config.answers import AnswersSettings
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings
 from hilstar.bench.config.bench_config import BenchConfig, config_of, parse_config, read_config
 from hilstar.bench.config.hardware import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, Collimator, Monitor, SyncSettings, Tracker, Verify
@@ -16,6 +17,7 @@ __all__ = [
     "GAUSSIAN",
     "GEOCENTRE",
     "SOURCE",
+    "AnswersSettings",
     "AttitudeSettings",
     "Background",
     "BenchConfig",

@@ -13,6 +13,7 @@ import numpy as np
 
 from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.bench.config.answers import AnswersSettings, check_answers
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
 from hilstar.bench.config.hardware import Collimator, Monitor, SyncSettings, Tracker, Verify, check_channels, check_sync
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES, RenderSettings
@@ -47,6 +48,7 @@ class BenchConfig(Table, frozen=True):
     verify: Verify = msgspec.field(default_factory=Verify)
     sync: SyncSettings = msgspec.field(default_factory=SyncSettings)
     faults: FaultSettings = msgspec.field(default_factory=FaultSettings)
+    answers: AnswersSettings | None = None
 
     @property
     def exposure_frames(self) -> int:
@@ -231,6 +233,18 @@ def _check_meaning(config: BenchConfig) -> None:
         check_road(config.attitude)
     except InputError as error:
         raise InputError(f"[attitude] {error}") from error
+    _check_answers(config)
+
+
+def _check_answers(config: BenchConfig) -> None:
+    if config.answers is None:
+        return
+    try:
+        check_answers(config.answers)
+    except InputError as error:
+        raise InputError(f"[answers] {error}") from error
+    if config.answers.convention.frame == "body" and config.tracker.q_body_to_cam is None:
+        raise InputError('[answers] convention = { frame = "body" } needs [tracker] q_body_to_cam; write how the camera sits')
 
 
 def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:

@@ -83,22 +83,25 @@ def page() -> str:
 def tables_of(table: Any, prefix: str) -> Iterator[tuple[str, Any]]:
     """Each table inside `table` by its name in the file, outer ones first: ("tracker", Tracker), ("tracker.detector", ...)."""
     for field in msgspec.structs.fields(table):
-        inner = plain(field.type)
-        if is_table(inner):
+        inner = table_in(field.type)
+        if inner is not None:
             yield prefix + field.name, inner
             yield from tables_of(inner, f"{prefix}{field.name}.")
 
 
-def is_table(kind: Any) -> bool:
-    """Whether a key's type is a table."""
-    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+def table_in(hint: Any) -> type[msgspec.Struct] | None:
+    """The table that a key is, or may be (`X | None`); None for any other key."""
+    kind = plain(hint)
+    parts = [part for part in get_args(kind) if part is not type(None)] if is_optional(kind) else [kind]
+    only = parts[0] if len(parts) == 1 else None
+    return only if isinstance(only, type) and issubclass(only, msgspec.Struct) else None
 
 
 def section(name: str, table: Any) -> str:
     """A table of the file: what it is for, its keys, and what else there is to know."""
     summary, _, notes = (inspect.getdoc(table) or "").partition("\n\n")
     hints = get_type_hints(table, include_extras=True)
-    rows = [row(field, hints[field.name]) for field in msgspec.structs.fields(table) if not is_table(plain(field.type))]
+    rows = [row(field, hints[field.name]) for field in msgspec.structs.fields(table) if table_in(field.type) is None]
     lines = [f"## `[{name}]`", "", summary, "", "| key | value | default | meaning |", "|---|---|---|---|", *rows, ""]
     return "\n".join([*lines, notes, ""] if notes else lines)
 

@@ -126,8 +126,10 @@ class ReaderProcess:
     `generation` counts its starts.
     """
 
-    def __init__(self, notices: Notices, module: str = CHILD, clock: HostClock = HOST_CLOCK) -> None:
-        self.generation = 0
+    def __init__(
+        self, notices: Notices, module: str = CHILD, clock: HostClock = HOST_CLOCK, name: str = "the attitude receiver"
+    ) -> None:
+        self.generation, self._name = 0, name
         self._notices, self._module, self._clock = notices, module, clock
         self._order, self._file = ReadOrder(0), -1
         self._process: subprocess.Popen[bytes] | None = None
@@ -239,7 +241,7 @@ class ReaderProcess:
         self._again = self._clock.within(self._back_off_s)
         self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
         why = self._why or why or (f"signal {-code}" if code < 0 else f"exit code {code}")
-        self._notices.tell("receiver-failed", f"the attitude receiver stopped ({why}); restarting it")
+        self._notices.tell("receiver-failed", f"{self._name} stopped ({why}); restarting it")
 
     def _stop(self, patience_s: float) -> int:
         """Let the process end, within `patience_s` in order; its exit code."""

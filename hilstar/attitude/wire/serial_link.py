@@ -85,7 +85,7 @@ class SerialLink(StreamLink):
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
-            raise InputError(f"{self.endpoint}: {_opening_fault(error, port)}") from error
+            raise InputError(f"{self.endpoint}: {opening_fault(error, port)}") from error
 
     @property
     def reconnects(self) -> int:
@@ -247,7 +247,7 @@ class SerialApart(SerialLink):
         self._reader.close()
 
 
-def _opening_fault(error: BaseException, port: str) -> str:
+def opening_fault(error: BaseException, port: str) -> str:
     """Why a port could not be opened, and what to do."""
     text = str(error).lower()
     if "permission" in text:
@@ -270,7 +270,7 @@ def read_lines(port: str, baud: int, seconds: float, clock: HostClock = HOST_CLO
     try:
         device = serial.Serial(port, baud, timeout=READ_S, exclusive=True)
     except (OSError, ValueError, OverflowError) as error:
-        raise InputError(f"{name}: {_opening_fault(error, port)}") from error
+        raise InputError(f"{name}: {opening_fault(error, port)}") from error
     with device:
         device.reset_input_buffer()
         end, line = clock.within(seconds), b""
@@ -301,7 +301,7 @@ class RtsLine:
         try:
             self.open()
         except (*LOST, OverflowError) as error:
-            fault = _opening_fault(error, port)
+            fault = opening_fault(error, port)
             if self._device is not None:
                 self.close()
                 fault = f"has no line RTS ({one_line(str(error))}); write a serial port with modem lines, such as /dev/ttyUSB0"

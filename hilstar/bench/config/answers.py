@@ -54,7 +54,7 @@ class FrameField(Table, frozen=True):
     type: str
     scale: Signed = 1.0
     add: Signed = 0.0
-    mask: Annotated[int, Meta(ge=1, lt=2**63)] | None = None
+    mask: Annotated[int, Meta(ge=1, le=2**63 - 1)] | None = None
 
 
 class FrameLength(Table, frozen=True):

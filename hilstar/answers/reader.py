@@ -1,0 +1,223 @@
+"""A tracker's answers, read by a process apart: a tracker that is dead, silent, babbling or lying never disturbs a frame.
+
+The other process (`hilstar.attitude.wire.apart_child`) opens the road, asks, stamps, decodes, and hands over answers and counts
+of what it refused. It reads at most MAX_BYTES_PER_S and gives at most MAX_ANSWERS_PER_S; the rest is counted as `flood`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from hilstar.answers.answer import Answer, ReportedStar
+from hilstar.answers.formats import AnswerDecoder, RefusedAnswer
+from hilstar.attitude.wire.apart import ReaderProcess
+from hilstar.attitude.wire.byte_links import ByteLink, FileBytes, SerialBytes, TcpBytes, UdpBytes, ZmqBytes
+from hilstar.attitude.wire.keys import CurveKeys
+from hilstar.attitude.wire.links import RawMessage
+from hilstar.attitude.wire.source import Components
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.bench.config import BenchConfig
+from hilstar.bench.config.answers import AnswersSettings, answers_place, host_and_port
+from hilstar.errors import InputError
+from hilstar.notices import Notices
+from hilstar.process.closing import Closing
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.units import NS_PER_S
+
+ZMQ_ENDPOINT = "tcp://127.0.0.1:5562"
+MAX_BYTES_PER_S, MAX_BURST_BYTES = 500_000, 250_000
+MAX_ANSWERS_PER_S = 1000
+FLOOD = "flood"
+MAX_DETAILS = 20  # reasons whose newest example is kept
+
+
+class HandedOver(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What the other process decoded: an answer's numbers, or counts of refusals with an example."""
+
+    t_ns: int | None = None
+    q: list[float] | None = None
+    rate: list[float] | None = None
+    valid: bool = True
+    mode: str = ""
+    stars: int | None = None
+    rms_arcsec: float | None = None
+    centroids: tuple[ReportedStar, ...] = ()
+    refused: dict[str, int] = {}
+    details: dict[str, str] = {}
+
+
+@dataclass(frozen=True)
+class ReadPlan:
+    """What the other process is to read, and how."""
+
+    settings: AnswersSettings
+    folder: Path
+    q_body_to_cam: Components | None
+
+    def open(self, notices: Notices) -> ByteLink:
+        """The road. Raises InputError where it cannot be opened."""
+        settings = self.settings
+        if settings.source == "serial":
+            return SerialBytes(str(settings.port), settings.baud, notices)
+        if settings.source == "file":
+            return FileBytes(self.folder / str(settings.path), notices)
+        if settings.source == "zmq":
+            names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
+            keys = CurveKeys(*(None if name is None else self.folder / name for name in names))
+            endpoint, bind = settings.endpoint or ZMQ_ENDPOINT, settings.bind is True
+            try:
+                return ZmqBytes(ZmqReceiver(endpoint, bind=bind, keys=keys, notices=notices), notices)
+            except InputError as error:
+                raise InputError(f"[answers] endpoint: {error}") from error
+        if settings.connect is not None:
+            place: Any = host_and_port(settings.connect)
+            _, allowed = answers_place(msgspec.structs.replace(settings, listen=None, bind=None, port="", endpoint=None))
+        else:
+            place, allowed = answers_place(settings)
+        return (TcpBytes if settings.source == "tcp" else UdpBytes)(place, allowed, notices)
+
+    def decoder(self, messages: bool) -> AnswerDecoder:
+        """The decoder of what comes. Raises InputError."""
+        return AnswerDecoder(self.settings, self.q_body_to_cam, messages, self.folder)
+
+
+class DecodingLink:
+    """In the other process: the road, its bounds, its questions, and what the bytes say, as messages of [raw, HandedOver]."""
+
+    def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        self._link, self._clock = plan.open(notices), clock
+        self.link_counts = self._link.link_counts
+        self._decoder = plan.decoder(self._link.messages)
+        settings = plan.settings
+        self._question = None if settings.poll_hex is None else bytes.fromhex(settings.poll_hex)
+        self._period_s = 1 / settings.poll_hz
+        self._next_question = clock.within(0.0)
+        self._bytes_left, self._answers_left = float(MAX_BURST_BYTES), float(MAX_ANSWERS_PER_S)
+        self._seen_ns = clock.now_ns()
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """Never known before it is read."""
+        return False
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """What came and what it says; waits at most `timeout_ms`."""
+        if self._question is not None and self._next_question.over:
+            self._link.put(self._question)
+            self._next_question = self._clock.within(self._period_s)
+        if self._question is not None:
+            timeout_ms = min(timeout_ms, max(int(self._next_question.left_s * 1000), 1))
+        chunks = self._link.taken(timeout_ms)
+        now_ns = self._clock.now_ns()
+        passed_s, self._seen_ns = (now_ns - self._seen_ns) / NS_PER_S, now_ns
+        self._bytes_left = min(self._bytes_left + passed_s * MAX_BYTES_PER_S, MAX_BURST_BYTES)
+        self._answers_left = min(self._answers_left + passed_s * MAX_ANSWERS_PER_S, MAX_ANSWERS_PER_S)
+        refused: Counter[str] = Counter()
+        details: dict[str, str] = {}
+        given: list[RawMessage] = []
+        for chunk in chunks:
+            data = chunk.parts[-1]
+            if len(data) > self._bytes_left:
+                refused[FLOOD] += 1
+                details[FLOOD] = f"over {MAX_BYTES_PER_S} bytes a second: dropped unread"
+                continue
+            self._bytes_left -= len(data)
+            for found in self._decoder.feed(chunk.host_ns, data):
+                if isinstance(found, RefusedAnswer):
+                    refused[found.reason] += 1
+                    details[found.reason] = found.detail
+                elif self._answers_left < 1:
+                    refused[FLOOD] += 1
+                    details[FLOOD] = f"over {MAX_ANSWERS_PER_S} answers a second"
+                else:
+                    self._answers_left -= 1
+                    given.append(chunk._replace(parts=[found.raw, msgspec.msgpack.encode(handed_over(found))], sender=None))
+        if refused:
+            counted = HandedOver(refused=dict(refused), details=details)
+            given.append(RawMessage(now_ns, [b"", msgspec.msgpack.encode(counted)]))
+        return given
+
+    def close(self) -> None:
+        """Close the road."""
+        self._link.close()
+
+
+def handed_over(answer: Answer) -> HandedOver:
+    """An answer's numbers."""
+    q, rate = answer.q_icrs_to_cam, answer.rate_cam_rad_s
+    return HandedOver(
+        t_ns=answer.t_ns,
+        q=None if q is None else q.tolist(),
+        rate=None if rate is None else rate.tolist(),
+        valid=answer.valid,
+        mode=answer.mode,
+        stars=answer.star_count,
+        rms_arcsec=answer.rms_arcsec,
+        centroids=answer.centroids,
+    )
+
+
+class AnswersApart(Closing):
+    """A bench's answers, an `AnswerSource`: the other process is started at once, and restarted where it ends.
+
+    Raises InputError where the road cannot be opened, or a Python function cannot be loaded.
+    """
+
+    def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        with plan.open(notices) as tried:
+            self.endpoint, messages = tried.endpoint, tried.messages
+        plan.decoder(messages)
+        self._refused: Counter[str] = Counter()
+        self.details: dict[str, str] = {}
+        self._notices = notices
+        self._decode = msgspec.msgpack.Decoder(HandedOver).decode
+        self._process = ReaderProcess(notices, clock=clock, name="the reader of the tracker's answers")
+        self._process.read(stream=partial(DecodingLink, plan))
+
+    def await_ready(self) -> None:
+        """Wait until the process reads; not for long."""
+        self._process.await_ready()
+
+    def take(self, timeout_ms: float = 0.0) -> list[Answer]:
+        """The answers since the last call, oldest first; waits at most `timeout_ms` for the first."""
+        found: list[Answer] = []
+        for record in self._process.take() if self._process.wait(timeout_ms) else ():
+            if record.notice is not None:
+                kind, detail, who = record.notice
+                if record.lasting:
+                    self._notices.tell(kind, detail, who)
+                else:
+                    self._notices.mention(kind, detail)
+            if record.message is None:
+                continue
+            raw, packed = record.message.parts
+            said = self._decode(packed)
+            if said.refused:
+                self._refused.update(said.refused)
+                self.details = dict(list({**self.details, **said.details}.items())[-MAX_DETAILS:])
+                continue
+            q, rate = (None if numbers is None else np.array(numbers) for numbers in (said.q, said.rate))
+            more = (said.valid, said.mode, said.stars, said.rms_arcsec, said.centroids)
+            found.append(Answer(record.message.host_ns, raw, said.t_ns, q, rate, *more))
+        return found
+
+    def refusals(self) -> dict[str, int]:
+        """How much was refused so far, by reason."""
+        return dict(self._refused)
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.close()
+
+
+def open_answers(config: BenchConfig, folder: Path, notices: Notices) -> AnswersApart:
+    """The answers that a bench file in `folder` names. Raises InputError where it names none, or they cannot be opened."""
+    if config.answers is None:
+        raise InputError('the bench file has no [answers]; write [answers] with source = "serial" or the like')
+    return AnswersApart(ReadPlan(config.answers, folder, config.tracker.q_body_to_cam), notices)

@@ -1,0 +1,331 @@
+"""Bytes as they come: serial lines, UDP, TCP, ZeroMQ and growing files, each reopened where it is lost; what asks is sent.
+
+For the process that reads a tracker's answers (see `hilstar.answers.reader`). What comes is not looked at here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import socket
+from abc import abstractmethod
+from pathlib import Path
+
+import serial
+
+from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
+from hilstar.attitude.wire.links import LinkCounts, RawMessage
+from hilstar.attitude.wire.serial_link import LOST, opening_fault
+from hilstar.attitude.wire.udp import Datagrams
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.errors import InputError, one_line
+from hilstar.notices import Notices
+from hilstar.process.closing import Closing
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
+
+MAX_READ_BYTES = 65_536
+MAX_DATAGRAMS = 200
+MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.05, 0.5
+CONNECT_S = 0.5
+FILE_LOOK_S = 0.005
+Place = tuple[str, int]
+
+
+class ByteLink(Closing):
+    """A road by which bytes come; `messages` says that each chunk is whole by itself. Losing the other side raises nothing."""
+
+    messages = False
+
+    def __init__(self, endpoint: str, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        self.endpoint, self.link_counts = endpoint, LinkCounts()
+        self._notices, self._clock = notices, clock
+        self._back_off_s, self._retry = MIN_BACK_OFF_S, clock.within(0.0)
+
+    @abstractmethod
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """What has come, in order; waits at most `timeout_ms`."""
+
+    def put(self, data: bytes) -> None:
+        """Send to the other side, never waiting; lost where nobody is there."""
+
+    def _lose(self, why: str) -> None:
+        self.link_counts.lost += 1
+        self._notices.tell("answers-lost", f"{self.endpoint}: the tracker's line is lost ({one_line(why)}); waiting for it")
+        self._back_off_s = MIN_BACK_OFF_S
+        self._retry = self._clock.within(self._back_off_s)
+
+    def _failed(self) -> None:
+        self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
+        self._retry = self._clock.within(self._back_off_s)
+
+    def _opened(self) -> None:
+        self.link_counts.connections += 1
+        if self.link_counts.connections > 1:
+            self._notices.tell("answers-back", f"{self.endpoint}: the tracker's line is back")
+
+    def _rest(self, timeout_ms: int) -> list[RawMessage]:
+        self._clock.sleep(min(self._retry.left_s, timeout_ms / 1000))
+        return []
+
+    def _chunk(self, data: bytes) -> list[RawMessage]:
+        return [RawMessage(self._clock.now_ns(), [data])]
+
+    def close(self) -> None:
+        """Close it."""
+
+
+class SerialBytes(ByteLink):
+    """A serial port. Raises InputError where it cannot be opened at the start."""
+
+    def __init__(self, port: str, baud: int, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        super().__init__(f"serial:{port}@{baud}", notices, clock)
+        self._port, self._baud = port, baud
+        try:
+            self._device: serial.Serial | None = self._open()
+        except (OSError, ValueError, OverflowError) as error:
+            raise InputError(f"[answers] {self.endpoint}: {opening_fault(error, port)}") from error
+
+    def _open(self) -> serial.Serial:
+        device = serial.Serial(self._port, self._baud, timeout=0, exclusive=True)
+        with contextlib.suppress(OSError, ValueError):  # else a USB adapter buffers for 16 ms; a pty has no such mode
+            device.set_low_latency_mode(True)
+        self._opened()
+        return device
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """See `ByteLink.taken`."""
+        try:
+            if self._device is None:
+                if not self._retry.over:
+                    return self._rest(timeout_ms)
+                self._device = self._open()
+            if not select.select([self._device.fileno()], [], [], timeout_ms / 1000)[0]:
+                return []
+            data = os.read(self._device.fileno(), MAX_READ_BYTES)
+            if not data:
+                raise OSError(errno.EIO, "it was readable, and nothing came")
+            return self._chunk(data)
+        except BlockingIOError:
+            return []
+        except LOST as error:
+            if self._device is None:
+                self._failed()
+            else:
+                self._lose(str(getattr(error, "strerror", None) or error))
+                self.close()
+            return []
+
+    def put(self, data: bytes) -> None:
+        """See `ByteLink.put`."""
+        with contextlib.suppress(*LOST):
+            if self._device is not None:
+                os.write(self._device.fileno(), data)
+
+    def close(self) -> None:
+        """Close the port."""
+        device, self._device = self._device, None
+        if device is not None:
+            with contextlib.suppress(*LOST):
+                device.close()
+
+
+class UdpBytes(ByteLink):
+    """UDP: bound to a place, with the senders that are allowed, or connected to a tracker that is asked. Raises InputError."""
+
+    messages = True
+
+    def __init__(
+        self, place: UdpPlace | Place, allowed: AllowedSenders, notices: Notices, clock: HostClock = HOST_CLOCK
+    ) -> None:
+        super().__init__(f"udp://{place}" if isinstance(place, UdpPlace) else f"udp://{place[0]}:{place[1]}", notices, clock)
+        self._allowed = allowed if isinstance(place, UdpPlace) else None
+        try:
+            self._datagrams = Datagrams.bound(place, clock) if isinstance(place, UdpPlace) else Datagrams.connected(*place)
+        except OSError as error:
+            raise InputError(f"[answers] {self.endpoint}: {error.strerror}; write the tracker's address") from error
+        except InputError as error:
+            raise InputError(f"[answers] {error}") from error
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """See `ByteLink.taken`."""
+        if not self._datagrams.wait(timeout_ms):
+            return []
+        found = []
+        for datagram in self._datagrams.take(MAX_DATAGRAMS):
+            host = (datagram.sender or ("",))[0]
+            if self._allowed is None or self._allowed.admits(host):
+                found.append(datagram)
+                continue
+            self.link_counts.rejected += 1
+            said = f"datagrams from {host} are dropped: it is not in [answers] allow; further ones are only counted"
+            self._notices.begin("sender-not-allowed", said)
+        return found
+
+    def put(self, data: bytes) -> None:
+        """See `ByteLink.put`."""
+        if self._allowed is None:
+            self._datagrams.put(data)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._datagrams.close()
+
+
+class TcpBytes(ByteLink):
+    """TCP: connects to a tracker, or listens for the one that connects; the newest connection counts. Raises InputError."""
+
+    def __init__(
+        self, place: UdpPlace | Place, allowed: AllowedSenders, notices: Notices, clock: HostClock = HOST_CLOCK
+    ) -> None:
+        host, port = (str(place.host), place.port) if isinstance(place, UdpPlace) else place
+        super().__init__(f"tcp://{f'[{host}]' if ':' in host else host}:{port}", notices, clock)
+        self._place, self._allowed = (host, port), allowed
+        self._listener = self._connection = None
+        if isinstance(place, UdpPlace):
+            try:
+                family = socket.AF_INET6 if place.host.version == 6 else socket.AF_INET
+                self._listener = socket.create_server((host, port), family=family)
+            except OSError as error:
+                said = f"cannot listen ({error.strerror}); write an address of this machine and a free port"
+                raise InputError(f"[answers] listen: {self.endpoint}: {said}") from error
+            self._listener.setblocking(False)
+
+    _listener: socket.socket | None
+    _connection: socket.socket | None
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """See `ByteLink.taken`."""
+        if self._listener is None and self._connection is None:
+            if not self._retry.over:
+                return self._rest(timeout_ms)
+            self._connect()
+        ends = [end for end in (self._listener, self._connection) if end is not None]
+        try:
+            ready = select.select(ends, [], [], timeout_ms / 1000)[0] if ends else []
+            if self._listener in ready:
+                self._accept()
+            connection = self._connection
+            if connection is None or connection not in ready:
+                return []
+            data = connection.recv(MAX_READ_BYTES)
+        except BlockingIOError:
+            return []
+        except OSError as error:
+            self._shut(error.strerror or str(error))
+            return []
+        if not data:
+            self._shut("the other side closed it")
+            return []
+        return self._chunk(data)
+
+    def _connect(self) -> None:
+        try:
+            self._take(socket.create_connection(self._place, CONNECT_S))
+        except OSError:
+            self._failed()
+
+    def _accept(self) -> None:
+        if self._listener is None:
+            return
+        made, (host, *_) = self._listener.accept()
+        if not self._allowed.admits(host):
+            self.link_counts.rejected += 1
+            self._notices.begin("sender-not-allowed", f"a connection from {host} is refused: it is not in [answers] allow")
+            made.close()
+            return
+        if self._connection is not None:
+            self._connection.close()
+        self._take(made)
+
+    def _take(self, made: socket.socket) -> None:
+        made.setblocking(False)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._connection = made
+        self._opened()
+
+    def _shut(self, why: str) -> None:
+        if self._connection is not None:
+            self._lose(why)
+            self._connection.close()
+            self._connection = None
+
+    def put(self, data: bytes) -> None:
+        """See `ByteLink.put`."""
+        with contextlib.suppress(OSError):
+            if self._connection is not None:
+                self._connection.send(data)
+
+    def close(self) -> None:
+        """Close both sockets."""
+        for end in (self._listener, self._connection):
+            if end is not None:
+                end.close()
+
+
+class ZmqBytes(ByteLink):
+    """A ZeroMQ SUB socket: the last part of each message."""
+
+    messages = True
+
+    def __init__(self, receiver: ZmqReceiver, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        super().__init__(receiver.endpoint, notices, clock)
+        self._receiver, self.link_counts = receiver, receiver.link_counts
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """See `ByteLink.taken`."""
+        return [message._replace(parts=message.parts[-1:]) for message in self._receiver.taken(timeout_ms)]
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._receiver.close()
+
+
+class FileBytes(ByteLink):
+    """What is appended to a file after the start; one that is made anew or cut is read from its beginning."""
+
+    def __init__(self, path: Path, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        super().__init__(str(path), notices, clock)
+        if path.is_dir():
+            raise InputError(f"[answers] path = {path}: a directory; write the file to which answers are appended")
+        self._path, self._file = path, -1
+        if path.is_file():
+            self._open()
+            os.lseek(self._file, 0, os.SEEK_END)
+
+    def _open(self) -> None:
+        with contextlib.suppress(OSError):
+            self._file = os.open(self._path, os.O_RDONLY | os.O_NONBLOCK)
+            self._opened()
+
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """See `ByteLink.taken`."""
+        end = self._clock.within(timeout_ms / 1000)
+        while True:
+            with contextlib.suppress(OSError):
+                if self._file >= 0 and (data := os.read(self._file, MAX_READ_BYTES)):
+                    return self._chunk(data)
+                self._follow()
+            if end.over:
+                return []
+            self._clock.sleep(min(FILE_LOOK_S, end.left_s))
+
+    def _follow(self) -> None:
+        """Look whether the file was made anew or cut."""
+        named = self._path.stat()
+        if self._file < 0:
+            self._open()
+            return
+        held = os.fstat(self._file)
+        if (held.st_ino, held.st_dev) != (named.st_ino, named.st_dev):
+            self.close()
+            self._open()
+        elif named.st_size < os.lseek(self._file, 0, os.SEEK_CUR):
+            os.lseek(self._file, 0, os.SEEK_SET)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1

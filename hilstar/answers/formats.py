@@ -2,27 +2,31 @@
 
 Laws:
 1. Nothing that a tracker sends raises. Bytes that are no answer give a `RefusedAnswer`, which says why.
-2. However a stream is cut into chunks, the answers are the same. (`fixed` without a checksum also looks at pauses.)
+2. However a stream is cut into chunks, the answers are the same, while no pause lasts PAUSE_NS. After one a frame begins anew:
+   what was kept is then looked through for whole frames, and dropped.
 3. At most MAX_KEPT_BYTES are kept between chunks.
 4. A frame whose checksum is wrong is never an answer.
 """
 
 from __future__ import annotations
 
+import binascii
 import importlib
 import math
 import struct
 import sys
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import chain
+from operator import xor
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from cobs import cobs
-from crccheck.checksum import Checksum8, ChecksumXor8
-from crccheck.crc import Crc16CcittFalse, Crc16Xmodem, Crc32
 
 from hilstar.answers.answer import Answer, ReportedStar
 from hilstar.arrays import FloatArray
@@ -36,15 +40,15 @@ from hilstar.units import NS_PER_S
 
 MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
 MAX_JSON_BYTES = 65_536  # with the centroids of a thousand stars
-PAUSE_NS = NS_PER_S // 10  # after it a frame begins, where nothing else tells
+PAUSE_NS = NS_PER_S // 10
 CCSDS_HEADER_BYTES, CCSDS_VERSION_MASK = 6, 0xE0
 SLIP_END, SLIP_ESC, SLIP_ESC_END, SLIP_ESC_ESC = b"\xc0", b"\xdb", b"\xdc", b"\xdd"
 CHECKSUMS: dict[str, tuple[Callable[[bytes], int], int]] = {
-    "crc16-ccitt-false": (Crc16CcittFalse.calc, 2),
-    "crc16-xmodem": (Crc16Xmodem.calc, 2),
-    "crc32": (Crc32.calc, 4),
-    "sum8": (Checksum8.calc, 1),
-    "xor8": (ChecksumXor8.calc, 1),
+    "crc16-ccitt-false": (lambda data: binascii.crc_hqx(data, 0xFFFF), 2),
+    "crc16-xmodem": (lambda data: binascii.crc_hqx(data, 0), 2),
+    "crc32": (zlib.crc32, 4),
+    "sum8": (lambda data: sum(data) & 0xFF, 1),
+    "xor8": (lambda data: reduce(xor, data, 0), 1),
 }
 MODES = (
     (protocol.ANSWER_BLINDED, "blinded"),
@@ -194,10 +198,14 @@ class Measured:
         self._check, self._certain = check, certain
         self._kept, self._lost = bytearray(), False
 
-    def pause(self) -> None:
-        """Nothing came for a while: where nothing tells where a frame begins, one begins now."""
+    def pause(self) -> Iterator[Cut]:
+        """Nothing came for a while: what is kept is no frame from its beginning on, or one whose end is lost."""
         if not self._certain and not self._sync and not self._ccsds:
             self._kept.clear()
+        while self._kept:
+            yield from self._lose(bytes(self._kept), "its end has not come")
+            del self._kept[:1]
+            yield from self._cut()
 
     def cut(self, chunk: bytes) -> Iterator[Cut]:
         """The frames that `chunk` completes."""
@@ -245,7 +253,8 @@ class Measured:
             if len(kept) - at < CCSDS_HEADER_BYTES:
                 return None
             size = CCSDS_HEADER_BYTES + 1 + int.from_bytes(kept[at + 4 : at + 6], "big")
-            return size if not kept[at] & CCSDS_VERSION_MASK and size <= MAX_FRAME_BYTES else 0
+            wanted = self._length if isinstance(self._length, int) else size
+            return size if not kept[at] & CCSDS_VERSION_MASK and size == wanted and size <= MAX_FRAME_BYTES else 0
         if not isinstance(self._length, FrameLength):
             return self._length
         end = self._length.at + (field_format(self._length.type) or ("u", 1, False))[1]
@@ -344,7 +353,10 @@ class AnswerDecoder:
     def __init__(
         self, settings: AnswersSettings, q_body_to_cam: Components | None, messages: bool, folder: Path | None = None
     ) -> None:
-        self.settings, self.conventions = settings, Conventions(settings.convention, q_body_to_cam)
+        convention = settings.convention
+        if settings.format == "frame":  # whose fields say by their names which of them is the scalar
+            convention = msgspec.structs.replace(convention, scalar="first")
+        self.settings, self.conventions = settings, Conventions(convention, q_body_to_cam)
         self._messages, self._last_ns = messages, 0
         self.frames = FrameDecoder(settings)
         self._function = _load(settings.format, folder) if settings.format.startswith("python:") else None
@@ -367,14 +379,15 @@ class AnswerDecoder:
     def feed(self, host_ns: int, chunk: bytes) -> list[Answer | RefusedAnswer]:
         """What `chunk` completes, which came at a host time, ns."""
         cutter = self._cutter
-        if isinstance(cutter, Measured) and host_ns - self._last_ns > PAUSE_NS:
-            cutter.pause()
-        self._last_ns = host_ns
         if cutter is None:
             return [self._answer(host_ns, said, chunk) for said in self._said(chunk)]
-        whole = chunk + self._end() if self._messages else chunk
+        cuts = cutter.cut(chunk + self._end() if self._messages else chunk)
+        # A program that writes a file may leave a frame in two for as long as it likes.
+        if isinstance(cutter, Measured) and host_ns - self._last_ns > PAUSE_NS and self.settings.source != "file":
+            cuts = chain(cutter.pause(), cuts)
+        self._last_ns = host_ns
         found: list[Answer | RefusedAnswer] = []
-        for cut in cutter.cut(whole):
+        for cut in cuts:
             if cut.reason:
                 found.append(RefusedAnswer(cut.reason, cut.detail, cut.body))
             else:

@@ -7,6 +7,7 @@ of what it refused. It reads at most MAX_BYTES_PER_S and gives at most MAX_ANSWE
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,12 +30,14 @@ from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.process.closing import Closing
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.reading import open_regular
 from hilstar.units import NS_PER_S
 
 ZMQ_ENDPOINT = "tcp://127.0.0.1:5562"
 MAX_BYTES_PER_S, MAX_BURST_BYTES = 500_000, 250_000
 MAX_ANSWERS_PER_S = 1000
 FLOOD = "flood"
+CHUNK_BYTES, LOOK_MS = 65_536, 100
 MAX_DETAILS = 20  # reasons whose newest example is kept
 
 
@@ -214,6 +217,35 @@ class AnswersApart(Closing):
     def close(self) -> None:
         """End the process."""
         self._process.close()
+
+
+def recorded_answers(plan: ReadPlan, decoder: AnswerDecoder, path: Path) -> Iterator[Answer | RefusedAnswer]:
+    """The answers in a file of recorded bytes. Raises InputError where it cannot be read."""
+    with open_regular(path, "give the bytes that were recorded from the tracker's line") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            yield from decoder.feed(0, chunk)
+    if plan.settings.format == "json":  # the last line may lack its end
+        yield from decoder.feed(0, b"\n")
+
+
+def live_answers(
+    plan: ReadPlan,
+    link: ByteLink,
+    decoder: AnswerDecoder,
+    seconds: float,
+    stopped: Callable[[], bool],
+    clock: HostClock = HOST_CLOCK,
+) -> Iterator[Answer | RefusedAnswer]:
+    """The answers of an open road, read in this process for so long; the tracker is asked where it has to be."""
+    settings, begun_ns = plan.settings, clock.now_ns()
+    question = None if settings.poll_hex is None else bytes.fromhex(settings.poll_hex)
+    due = clock.within(0.0)
+    while not stopped() and clock.now_ns() - begun_ns < seconds * NS_PER_S:
+        if question is not None and due.over:
+            link.put(question)
+            due = clock.within(1 / settings.poll_hz)
+        for chunk in link.taken(LOOK_MS if question is None else min(LOOK_MS, max(int(due.left_s * 1000), 1))):
+            yield from decoder.feed(chunk.host_ns, chunk.parts[-1])
 
 
 def open_answers(config: BenchConfig, folder: Path, notices: Notices) -> AnswersApart:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from hilstar.cli.answers import answers
 from hilstar.cli.assess import assess
 from hilstar.cli.attitude import attitude
 from hilstar.cli.benchmark import benchmark
@@ -40,7 +41,7 @@ from hilstar.version import __version__
 
 COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
-    "Attitude streams": (send, attitude, convert, keys),
+    "Attitude streams": (send, attitude, convert, answers, keys),
     "Check what is shown": (simulate, verify, compare, budget, catalogue, report),
     "Test the tracker": (assess, campaign),
     "Calibrate": (first_light, latency),

@@ -1,0 +1,170 @@
+"""hilstar answers: what a star tracker says, decoded and explained."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hilstar.cli import options
+from hilstar.console.terminal import print_json, say
+from hilstar.errors import InputError
+
+if TYPE_CHECKING:
+    from collections import Counter
+    from collections.abc import Iterator
+
+    from hilstar.answers.answer import Answer
+    from hilstar.answers.formats import AnswerDecoder, RefusedAnswer
+    from hilstar.answers.reader import ReadPlan
+    from hilstar.arrays import FloatArray
+    from hilstar.bench.bench_file import BenchFile
+
+SHOWN_WITHIN_S = 2.0
+MAX_ROWS = 100_000  # of the JSON object: the newest
+
+
+def answers(
+    bench: options.BenchFile,
+    recorded: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="FILE", help="Bytes recorded from the tracker's line; by default the live link."),
+    ] = None,
+    explain: Annotated[
+        bool,
+        typer.Option("--explain", help="Show which bytes became which field, and each answer under every convention."),
+    ] = False,
+    radec: options.RadecText = None,
+    quaternion: options.QuaternionText = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", metavar="S", help="End after so long; by default with Ctrl-C.", min=0.1, max=1e7),
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Decode a tracker's answers by [answers], live or recorded: each as a line, and why bytes were refused.
+
+    With --explain each answer is compared with what is shown: --radec or --quaternion, or else what the sender of [attitude]
+    says now, where that is a ZeroMQ stream.
+    """
+    from collections import Counter, deque
+
+    from hilstar.answers.reader import ReadPlan, recorded_answers
+    from hilstar.bench.bench_file import read_bench_file
+
+    file = read_bench_file(bench)
+    if file.config.answers is None:
+        raise InputError(f'{bench}: has no [answers]; write the table, with source = "serial" or the like')
+    shown = options.parse_attitude("answers", radec, quaternion) if radec or quaternion else None
+    plan = ReadPlan(file.config.answers, file.folder, file.config.tracker.q_body_to_cam)
+    counts: Counter[str] = Counter()
+    if shown is None and explain and recorded is None:
+        shown = _shown_now(file)
+    if recorded is None:
+        decoder, found = _live(plan, seconds)
+    else:
+        decoder = plan.decoder(messages=False)
+        found = recorded_answers(plan, decoder, recorded)
+    rows: deque[dict[str, Any]] = deque(maxlen=MAX_ROWS)
+    for each in found:
+        _count(each, counts)
+        if as_json:
+            rows.append(_row(each))
+            continue
+        for line in [_line(each), *(_explained(each, decoder, shown) if explain else ())]:
+            if line:
+                typer.echo(line)
+    if as_json:
+        print_json({"answers": list(rows), "counts": dict(counts)})
+    else:
+        refused = ", ".join(f"{count} {reason}" for reason, count in counts.items() if reason not in {"answers", "valid"})
+        say(f"{counts['answers']} answers, {counts['valid']} valid" + (f"; refused: {refused}" if refused else ""))
+
+
+def _explained(found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: FloatArray | None) -> list[str]:
+    from hilstar.answers.explain import lines_of
+
+    return lines_of(found, decoder, shown)
+
+
+def _shown_now(file: BenchFile) -> FloatArray | None:
+    """What the sender of the attitude says now; None where that road has room for one listener only, or nobody sends."""
+    from hilstar.run.open_link import first_attitude, open_link
+
+    settings = file.config.attitude
+    if settings.source != "zmq" or settings.bind is True or settings.lockstep:
+        return None
+    try:
+        with open_link(file.config, file.folder) as link:
+            return None if link.steps else first_attitude(link, SHOWN_WITHIN_S).q_icrs_to_cam
+    except InputError:
+        say(f"{settings.address}: no attitude comes; give what is shown by --radec RA,DEC,ROLL")
+        return None
+
+
+def _live(plan: ReadPlan, seconds: float | None) -> tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]:
+    """The answers of the live link, read here."""
+    import threading
+
+    from hilstar.answers.reader import live_answers
+    from hilstar.notices import Notices
+    from hilstar.process.interrupts import stop_on_signal
+
+    link = plan.open(Notices())
+    decoder, stop = plan.decoder(link.messages), threading.Event()
+    say(f"listening at {link.endpoint}; Ctrl-C ends it")
+
+    def found() -> Iterator[Answer | RefusedAnswer]:
+        with link, stop_on_signal(stop):
+            yield from live_answers(plan, link, decoder, math.inf if seconds is None else seconds, stop.is_set)
+
+    return decoder, found()
+
+
+def _count(found: Answer | RefusedAnswer, counts: Counter[str]) -> None:
+    from hilstar.answers.formats import RefusedAnswer
+
+    if isinstance(found, RefusedAnswer):
+        counts[found.reason] += 1
+        return
+    counts["answers"] += 1
+    counts["valid"] += found.valid
+
+
+def _row(found: Answer | RefusedAnswer) -> dict[str, Any]:
+    """For a program."""
+    from hilstar.answers.formats import RefusedAnswer
+
+    if isinstance(found, RefusedAnswer):
+        return {"refused": found.reason, "detail": found.detail, "raw": found.raw.hex()}
+    return {
+        "t_ns": found.t_ns,
+        "q_icrs_to_cam": None if found.q_icrs_to_cam is None else found.q_icrs_to_cam.tolist(),
+        "rate_cam_rad_s": None if found.rate_cam_rad_s is None else found.rate_cam_rad_s.tolist(),
+        "valid": found.valid,
+        "mode": found.mode,
+        "stars": found.star_count,
+        "rms_arcsec": found.rms_arcsec,
+        "centroids": [list(star) for star in found.centroids],
+        "raw": found.raw.hex(),
+    }
+
+
+def _line(found: Answer | RefusedAnswer) -> str:
+    """For a person."""
+    from hilstar.answers.formats import RefusedAnswer
+    from hilstar.rotation import to_radec_roll_deg
+
+    if isinstance(found, RefusedAnswer):
+        return f"refused ({found.reason}): {found.detail}"
+    words = [f"t {'-' if found.t_ns is None else f'{found.t_ns / 1e9:.6f}'} s"]
+    if found.q_icrs_to_cam is not None:
+        ra_deg, dec_deg, roll_deg = to_radec_roll_deg(found.q_icrs_to_cam)
+        words.append("q " + " ".join(f"{part:+.7f}" for part in found.q_icrs_to_cam))
+        words.append(f"RA {ra_deg:.4f} Dec {dec_deg:+.4f} roll {roll_deg:.4f}")
+    words += [] if found.valid else ["not valid"]
+    words += [found.mode] if found.mode else []
+    words += [] if found.star_count is None else [f"{found.star_count} stars"]
+    return ", ".join(words)

@@ -241,10 +241,11 @@ class Measured:
         del kept[:at]
 
     def _lose(self, raw: bytes, detail: str) -> Iterator[Cut]:
-        """Say once in a stretch of lost bytes what was wrong."""
-        if raw and not self._lost:
+        """Say what was wrong: each wrong checksum, and other bytes once until a frame is right."""
+        of_checksum = "checksum" in detail
+        if raw and (of_checksum or not self._lost):
             self._lost = True
-            yield Cut(raw, "checksum" if "checksum" in detail else "framing", detail)
+            yield Cut(raw, "checksum" if of_checksum else "framing", detail)
 
     def _size(self, at: int) -> int | None:
         """Bytes of the frame that begins there; 0 where none can, None where too few have come to tell."""

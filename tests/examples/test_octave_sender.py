@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from hilstar.attitude.wire.packet import AttitudeSample, encode
+from hilstar.attitude.wire.packet import AnswerPacket, AttitudeSample, encode
 from tests.examples.support import section
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.senders import free_port
@@ -47,6 +47,12 @@ def test_its_packets_are_those_of_python_bit_for_bit(rng):
         lines.append(f"printf('%02x', {call}); printf('\\n');\n")
     result = octave("".join(lines))
     assert result.stdout.split() == [encode(sample).hex() for sample in samples], result.stderr
+
+
+def test_its_answers_are_those_of_python_bit_for_bit():
+    answer = AnswerPacket(7, 1 | 2 | 8, 42, (0.6, 0.0, 0.8, 0.0), (0.0, 0.25, -1.5), 12)
+    result = octave("printf('%02x', hilstar_answer(7, int64(42), [0.6 0 0.8 0], [0 0.25 -1.5], 10, 12));")
+    assert result.stdout.strip() == encode(answer).hex(), result.stderr
 
 
 def test_its_stream_is_taken(tmp_path):

@@ -1,0 +1,185 @@
+"""Answers over real roads: a pty, UDP, TCP both ways, ZeroMQ and a growing file, read by a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from hilstar.answers.answer import Answer
+from hilstar.answers.reader import AnswersApart, open_answers
+from hilstar.attitude.wire.packet import AnswerPacket, encode, framed
+from hilstar.bench.config import parse_config
+from hilstar.errors import InputError
+from hilstar.notices import Notices
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.waiting import PATIENCE_S, wait_for
+
+Q = (0.6, 0.0, 0.8, 0.0)
+PACKETS = [encode(AnswerPacket(k, 2, 10 + k, Q, stars=3)) for k in range(3)]
+STREAM = b"\0" + b"".join(map(framed, PACKETS))
+
+
+@contextlib.contextmanager
+def reading(folder: Path, keys: str, notices: Notices | None = None) -> Iterator[AnswersApart]:
+    config = parse_config(folder / "bench.toml", f"{SMALL_BENCH}\n[answers]\n{keys}\n")
+    with open_answers(config, folder, notices or Notices()) as source:
+        source.await_ready()
+        yield source
+
+
+def gathered(source: AnswersApart, count: int, again: Callable[[], object] = lambda: None) -> list[Answer]:
+    """So many answers; `again` sends where what was sent may have been lost before the road stood."""
+    found: list[Answer] = []
+
+    def enough() -> bool:
+        if not found:
+            again()
+        found.extend(source.take(50))
+        return len(found) >= count
+
+    wait_for(enough, "answers")
+    return found
+
+
+def free_port() -> int:
+    with socket.socket() as made:
+        made.bind(("127.0.0.1", 0))
+        return int(made.getsockname()[1])
+
+
+def assert_answers(found: list[Answer]) -> None:
+    assert [answer.t_ns for answer in found[:3]] == [10, 11, 12]
+    for answer in found:
+        assert np.array_equal(answer.q_icrs_to_cam, Q)
+        assert (answer.star_count, answer.valid) == (3, True)
+
+
+def test_a_serial_line_is_read_asked_and_comes_back(tmp_path):
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    port = tmp_path / "port"
+    port.symlink_to(os.ttyname(slave))
+    with reading(tmp_path, f'source = "serial"\nport = "{port}"\npoll_hex = "55 AA"\npoll_hz = 50') as source:
+        os.write(master, STREAM + b"\x05nonsense\0")
+        assert_answers(gathered(source, 3))
+        wait_for(lambda: source.take(20) == [] and source.refusals() == {"framing": 1}, "the refusal")
+        assert os.read(master, 2) == b"\x55\xaa"
+        os.close(slave)
+        os.close(master)
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        port.unlink()
+        port.symlink_to(os.ttyname(slave))
+        assert_answers(gathered(source, 3, lambda: os.write(master, STREAM)))
+    os.close(slave)
+    os.close(master)
+
+
+def test_udp_takes_each_datagram_from_who_may_send(tmp_path):
+    port = free_port()
+    with (
+        reading(tmp_path, f'source = "udp"\nbind = "127.0.0.1:{port}"') as source,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        found = gathered(source, 3, lambda: [sender.sendto(packet, ("127.0.0.1", port)) for packet in PACKETS])
+        assert_answers(found)
+
+
+def test_tcp_listens_and_takes_the_newest_connection(tmp_path):
+    port = free_port()
+    with reading(tmp_path, f'source = "tcp"\nlisten = "127.0.0.1:{port}"') as source:
+        for _ in range(2):
+            made: list[socket.socket] = []
+
+            def connected(made=made) -> bool:
+                with contextlib.suppress(OSError):
+                    made.append(socket.create_connection(("127.0.0.1", port)))
+                return bool(made)
+
+            wait_for(connected, "the listener")
+            made[0].sendall(STREAM)
+            assert_answers(gathered(source, 3))
+            made[0].close()
+
+
+def test_tcp_connects_to_a_tracker_that_starts_later_and_asks_it(tmp_path):
+    port = free_port()
+    with (
+        reading(tmp_path, f'source = "tcp"\nconnect = "127.0.0.1:{port}"\npoll_hex = "3f"\nformat = "json"') as source,
+        socket.create_server(("127.0.0.1", port)) as server,
+    ):
+        server.settimeout(PATIENCE_S)
+        tracker, _ = server.accept()
+        tracker.settimeout(PATIENCE_S)
+        assert tracker.recv(1) == b"?"
+        tracker.sendall(json.dumps({"t_ns": 10, "q": Q, "stars": 3, "centroids": [[1, 2, 3, 4]]}).encode() + b"\n")
+        (answer,) = gathered(source, 1)
+        assert tuple(answer.centroids[0]) == (1.0, 2.0, 3.0, 4)
+        tracker.close()
+
+
+def test_zeromq_takes_the_last_part(tmp_path):
+    with zmq.Context() as context, context.socket(zmq.PUB) as sender:
+        port = sender.bind_to_random_port("tcp://127.0.0.1")
+        with reading(tmp_path, f'source = "zmq"\nendpoint = "tcp://127.0.0.1:{port}"') as source:
+            assert_answers(gathered(source, 3, lambda: [sender.send_multipart([b"topic", packet]) for packet in PACKETS]))
+
+
+def test_a_growing_file_counts_from_the_start_on_and_again_when_it_is_made_anew(tmp_path):
+    path = tmp_path / "tracker.bin"
+    path.write_bytes(STREAM)
+    with reading(tmp_path, 'source = "file"\npath = "tracker.bin"') as source:
+
+        def append() -> None:
+            with path.open("ab") as file:
+                file.write(STREAM)
+
+        first = gathered(source, 3, append)
+        assert_answers(first)
+        path.unlink()
+        path.write_bytes(STREAM)
+        assert_answers(gathered(source, 3))
+
+
+def test_a_babbling_tracker_is_bounded_and_its_good_answers_still_come(tmp_path, rng):
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    with reading(tmp_path, f'source = "serial"\nport = "{os.ttyname(slave)}"') as source:
+        for _ in range(40):
+            os.write(master, rng.bytes(3000) + STREAM)
+        found = gathered(source, 100)
+        assert all(np.array_equal(answer.q_icrs_to_cam, Q) for answer in found)
+        wait_for(lambda: source.take(20) == [] and sum(source.refusals().values()) > 100, "refusals")
+        assert set(source.refusals()) <= {"framing", "crc", "format"}
+    os.close(slave)
+    os.close(master)
+
+
+def test_a_road_that_is_not_there_is_refused_before_the_run(tmp_path):
+    for keys in ('source = "serial"\nport = "/dev/no-such-port"', f'source = "file"\npath = "{tmp_path}"'):
+        with pytest.raises(InputError, match=r"\[answers\]"), reading(tmp_path, keys):
+            pass
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH)
+    assert_refused(run_hilstar_here("answers", tmp_path / "bench.toml"), 2, "has no [answers]", "bench.toml")
+
+
+def test_a_recorded_file_is_decoded_and_explained(tmp_path):
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH + '\n[answers]\nsource = "udp"\n')
+    (tmp_path / "line.bin").write_bytes(STREAM + b"\x05nonsense\0")
+    given = ("answers", tmp_path / "bench.toml", "--from", tmp_path / "line.bin")
+    said = json.loads(run_hilstar_here(*given, "--json").stdout)
+    assert said["counts"] == {"answers": 3, "valid": 3, "framing": 1}
+    assert [row["t_ns"] for row in said["answers"][:3]] == [10, 11, 12]
+    explained = run_hilstar_here(*given, "--explain", "--quaternion", "0.6,0,-0.8,0").stdout
+    assert 'write [answers] convention = { scalar = "first", direction = "cam_to_icrs", frame = "cam" }' in explained
+    assert_refused(run_hilstar_here(*given[:3], tmp_path / "none.bin"), 2, "none.bin")

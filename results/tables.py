@@ -1,6 +1,6 @@
 """Tables of README and docs/ from the CSV files beside this script: `python results/tables.py` writes them between their marks.
 
-bench.csv is written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by `hilstar study NAME -o`,
+bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by `hilstar study NAME -o`,
 quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on which machine.
 """
 
@@ -35,21 +35,26 @@ def table(head: list[str], body: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def bench_table() -> str:
+def bench_table(name: str = "bench.csv", counts: tuple[int, ...] = COUNTS, others: tuple[str, ...] = OTHERS) -> str:
     """Medians of the whole frame by image size, and of the linear image beside the others at 1080p."""
-    rows = rows_of("bench.csv")
+    rows = rows_of(name)
     at = {(r["width"], r["height"], int(r["stars"]), r["method"], r["kind"]): float(r["median_ms"]) for r in rows}
     sizes = list(dict.fromkeys((r["width"], r["height"]) for r in rows))
 
     def line(name: str, size: tuple[str, str], method: str, kind: str) -> list[str]:
-        values = (at.get((*size, count, method, kind)) for count in COUNTS)
+        values = (at.get((*size, count, method, kind)) for count in counts)
         return [name, *("-" if v is None else figure(v) for v in values)]
 
     body = [line(f"whole frame, {w} x {h}", (w, h), "hilstar", "whole_frame") for w, h in sizes]
     full_hd = ("1920", "1080")
     body.append(line("linear image alone, 1920 x 1080", full_hd, "hilstar", "linear_only"))
-    body += [line(f"the same by {name}", full_hd, name, "linear_only") for name in OTHERS]
-    return table(["ms, median", *(f"{count} stars" for count in COUNTS)], body)
+    body += [line(f"the same by {other}", full_hd, other, "linear_only") for other in others]
+    return table(["ms, median", *(f"{count} stars" for count in counts)], body)
+
+
+def card_table() -> str:
+    """The same on a graphics card."""
+    return bench_table("bench_h100.csv", COUNTS[1:], OTHERS[:2])
 
 
 def tradeoff_table() -> str:
@@ -161,6 +166,7 @@ TABLES = {
     "quantisation": quantisation_table,
     "centroiders": centroider_table,
     "bench": bench_table,
+    "card": card_table,
     "tradeoff": tradeoff_table,
     "economy": economy_table,
     "timing": timing_table,

@@ -1,0 +1,242 @@
+"""A tracker's answers judged as they come: when each looked, how far it is off, and the figures of the last minute; no I/O.
+
+**When.** A stamp on the tracker's own clock is followed as a sender's clock is (`SenderClock`), from arrivals alone. That tells
+times up to the shortest delay D from an exposure's middle to its answer. D is found from the motion: reading the lit attitude
+too late by delta turns a residual by omega delta, so that e_i = b + omega_i delta. Bias b and delta are fitted together to the
+answers of the last minute. Before the rate has changed enough, D is what is guessed: half an exposure and GUESSED_DELAY_S.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+
+from hilstar.answers.answer import Answer
+from hilstar.answers.pairing import Lit, LitFrames, residual_arcsec
+from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.sender_clock import SenderClock
+from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
+
+Verdict = Literal["right", "wrong", "invalid", "unpaired"]
+Stamp = Literal["start", "middle", "end", "arrival"]
+TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # from the stamp to the middle, in exposures
+WINDOW_S = 60.0
+MAX_IN_WINDOW = 4096  # at over 68 answers a second less than a minute
+GUESSED_DELAY_S, GUESSED_SIGMA_S = 0.1, 0.1
+FIT_EACH_NS, MIN_FITTED = NS_PER_S, 10
+CUT_SIGMAS = 8.0
+MIN_NOISE_ARCSEC = 0.1  # of the fit: answers without noise have errors of the pairing
+SURE = 3.0  # sigmas of the time by which an answer may be off for its rate
+JUMP_NS, JUMPS = NS_PER_S, 3  # answers in a row that are later by so much: the tracker's clock was set
+SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0  # without an answer; before the first one
+
+
+@dataclass(frozen=True, slots=True)
+class AnswerRules:
+    """What the bench file says of answers' times, and from which angle on one is wrong. `latency_s` None: not known."""
+
+    exposure_s: float
+    stamp: Stamp = "middle"
+    clock: Literal["own", "unix", "host"] = "own"
+    wrong_arcsec: float = 3600.0
+    latency_s: float | None = None
+
+
+class Judged(NamedTuple):
+    """An answer, its exposure's middle (host time, ns, with its sigma, s), what was lit, and the residual (3,), arcsec, cam."""
+
+    answer: Answer
+    verdict: Verdict
+    middle_ns: int
+    sigma_s: float
+    lit: Lit | None = None
+    residual: FloatArray | None = None
+
+
+class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """A tracker's answers: counts of the run, the newest answer, and the last minute's figures; arcsec about x, y, z (cam).
+
+    `rms_arcsec` is about zero, `sigma3_arcsec` three standard deviations about the mean, both of right answers.
+    `latency_ms` is from the exposure's middle to the last byte, known to `latency_sigma_ms` (null: not known). `availability`
+    is right answers over those due while a sky was shown. `silent` says that no answer comes, "" while they do.
+    """
+
+    answers: int = 0
+    right: int = 0
+    wrong: int = 0
+    invalid: int = 0
+    unpaired: int = 0
+    refused: dict[str, int] = {}
+    residual_arcsec: list[float] | None = None
+    verdict: str = ""
+    mode: str = ""
+    stars: int | None = None
+    rate_hz: float | None = None
+    availability: float | None = None
+    mean_arcsec: list[float] | None = None
+    rms_arcsec: list[float] | None = None
+    sigma3_arcsec: list[float] | None = None
+    latency_ms: float | None = None
+    latency_sigma_ms: float | None = None
+    age_s: float | None = None
+    silent: str = ""
+
+
+class AnswerTimes:
+    """When the tracker looked: the middle of an answer's exposure on the host's clock."""
+
+    def __init__(
+        self, rules: AnswerRules, unix_ahead_ns: Callable[[], int] = lambda: time.time_ns() - time.monotonic_ns()
+    ) -> None:
+        self._rules, self._unix_ahead_ns = rules, unix_ahead_ns
+        self._clock = SenderClock()
+        self._late = 0
+        self.guess_s = rules.exposure_s / 2 + GUESSED_DELAY_S if rules.latency_s is None else rules.latency_s
+        self.fits = rules.latency_s is None and (rules.clock == "own" or rules.stamp == "arrival")
+        self.delay_s, self.sigma_s = self.guess_s, GUESSED_SIGMA_S if self.fits else 0.0
+
+    def middle(self, answer: Answer) -> tuple[int, float]:
+        """The middle of the exposure, host time, ns, and its sigma, s."""
+        rules = self._rules
+        if answer.t_ns is None or rules.stamp == "arrival":
+            return answer.host_ns - round(self.delay_s * NS_PER_S), self.sigma_s
+        t_ns = answer.t_ns + round(TO_MIDDLE[rules.stamp] * rules.exposure_s * NS_PER_S)
+        if rules.clock == "host":
+            return t_ns, 0.0
+        if rules.clock == "unix":
+            return t_ns - self._unix_ahead_ns(), 0.0
+        late_ns = self._clock.latency_ns(t_ns, answer.host_ns)
+        self._late = self._late + 1 if late_ns is not None and late_ns > JUMP_NS else 0
+        if self._late == JUMPS:
+            self._clock, self._late = SenderClock(), 0
+        self._clock.observe(t_ns, answer.host_ns)
+        late_ns = max(self._clock.latency_ns(t_ns, answer.host_ns) or 0.0, 0.0)
+        known_ms = self._clock.summary().uncertainty_ms
+        sigma_s = self.sigma_s + (0.0 if known_ms is None else known_ms / 1e3)
+        return answer.host_ns - round(late_ns + self.delay_s * NS_PER_S), sigma_s
+
+
+VERDICTS: tuple[Verdict, ...] = ("right", "wrong", "invalid", "unpaired")
+# Columns of the last minute: host time, s; place in VERDICTS; how long it was dark until then, s; residual; rate, arcsec/s.
+HOST_S, VERDICT, DARK_S, ERROR, RATE, COLUMNS = 0, 1, 2, slice(3, 6), slice(6, 9), 9
+
+
+class AnswerJudge:
+    """Judges answers against the lit frames, and keeps the last minute's figures."""
+
+    def __init__(self, rules: AnswerRules, frames: LitFrames) -> None:
+        self.counts: Counter[Verdict] = Counter()
+        self.times = AnswerTimes(rules)
+        self._rules, self._frames = rules, frames
+        self._rows = np.full((MAX_IN_WINDOW, COLUMNS), np.nan)
+        self._count = 0
+        self._fitted_ns = 0
+        self._newest: Judged | None = None
+        self._begun_ns: int | None = None
+
+    def judge(self, answer: Answer) -> Judged:
+        """Judge one answer."""
+        middle_ns, sigma_s = self.times.middle(answer)
+        verdict: Verdict = "invalid"
+        lit = residual = None
+        half_ns = round(self._rules.exposure_s * NS_PER_S / 2)
+        if answer.valid and answer.q_icrs_to_cam is not None:
+            verdict = "unpaired"
+            lit = self._frames.over(middle_ns - half_ns, middle_ns + half_ns)
+            if lit is not None:
+                residual = residual_arcsec(answer.q_icrs_to_cam, lit.q)
+                rate = ARCSEC_PER_RAD * lit.rate_rad_s
+                bound = self._rules.wrong_arcsec + SURE * sigma_s * float(np.linalg.norm(rate))
+                verdict = "wrong" if float(np.linalg.norm(residual)) > bound else "right"
+        found = Judged(answer, verdict, middle_ns, sigma_s, lit, residual)
+        row = self._rows[self._count % MAX_IN_WINDOW]
+        row[:] = np.nan
+        row[:3] = answer.host_ns / NS_PER_S, VERDICTS.index(verdict), self._frames.dark_ns / NS_PER_S
+        if lit is not None and residual is not None:
+            row[ERROR], row[RATE] = residual, ARCSEC_PER_RAD * lit.rate_rad_s
+        self._count += 1
+        self.counts[verdict] += 1
+        self._newest = found
+        if self.times.fits and answer.host_ns - self._fitted_ns > FIT_EACH_NS:
+            self._fitted_ns = answer.host_ns
+            self._fit(answer.host_ns)
+        return found
+
+    def _lately(self, now_ns: int) -> FloatArray:
+        """The rows of the last minute, in their order."""
+        at = self._count % MAX_IN_WINDOW
+        rows = self._rows[: self._count] if self._count < MAX_IN_WINDOW else np.roll(self._rows, -at, axis=0)
+        return rows[rows[:, HOST_S] >= now_ns / NS_PER_S - WINDOW_S]
+
+    def _fit(self, now_ns: int) -> None:
+        """Find the delay, together with the bias, from the last minute's right answers."""
+        rows = self._lately(now_ns)
+        rows = rows[rows[:, VERDICT] == 0]
+        if len(rows) < MIN_FITTED:
+            return
+        error, rate = rows[:, ERROR], rows[:, RATE]
+        design = np.zeros((len(rows), 3, 4))
+        design[:, range(3), range(3)], design[:, :, 3] = 1.0, rate
+        prior = np.diag([0.0, 0.0, 0.0, 1 / GUESSED_SIGMA_S**2])
+        left, weight = error - np.median(error, axis=0), np.ones(len(rows))
+        for _ in range(3):  # answers that are off by less than the bound, and far more than the others, do not count
+            noise = max(MAD_TO_SIGMA * float(np.median(np.abs(left[weight > 0]))), MIN_NOISE_ARCSEC)
+            scaled = design * (weight / noise**2)[:, None, None]
+            normal = np.einsum("nij,nik->jk", scaled, design) + prior
+            pull = np.array([0.0, 0.0, 0.0, prior[3, 3] * (self.times.guess_s - self.times.delay_s)])
+            fitted = np.linalg.solve(normal, np.einsum("nij,ni->j", scaled, error) + pull)
+            left = error - design @ fitted
+            weight = (np.linalg.norm(left, axis=1) < CUT_SIGMAS * noise).astype(np.float64)
+        shift_s = max(float(fitted[3]), self._rules.exposure_s / 2 - self.times.delay_s)
+        self.times.delay_s += shift_s
+        self.times.sigma_s = float(np.sqrt(np.linalg.inv(normal)[3, 3]))
+        self._rows[:, ERROR] -= self._rows[:, RATE] * shift_s
+
+    def figures(self, now_ns: int, refused: dict[str, int]) -> TrackerFigures:
+        """The figures at a host time; `refused` counts bytes or messages that were no answer, by reason."""
+        self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
+        rows, newest = self._lately(now_ns), self._newest
+        told: dict[str, Any] = {verdict: self.counts[verdict] for verdict in VERDICTS}
+        cycle_s = cycle_of(rows[:, HOST_S])
+        since_s = (now_ns - (self._begun_ns if newest is None else newest.answer.host_ns)) / NS_PER_S
+        limit_s = FIRST_S if newest is None else max(SILENT_S, SILENT_CYCLES * (cycle_s or 0.0))
+        if newest is not None:
+            late_s = (newest.answer.host_ns - newest.middle_ns) / NS_PER_S
+            told |= {"mode": newest.answer.mode, "stars": newest.answer.star_count, "verdict": newest.verdict}
+            told |= {"latency_ms": round(1e3 * late_s, 3), "latency_sigma_ms": round(1e3 * newest.sigma_s, 3)}
+            told |= {
+                "residual_arcsec": None if newest.residual is None else _rounded(newest.residual),
+                "age_s": round(since_s, 3),
+            }
+        error = rows[rows[:, VERDICT] == 0][:, ERROR]
+        if len(error):
+            told |= {"mean_arcsec": _rounded(error.mean(axis=0)), "rms_arcsec": _rounded(np.sqrt((error**2).mean(axis=0)))}
+        if len(error) > 1:
+            told |= {"sigma3_arcsec": _rounded(3 * error.std(axis=0, ddof=1))}
+        if cycle_s is not None:  # arrivals jitter by less than half a cycle
+            dark_s = self._frames.dark_ns / NS_PER_S - rows[0, DARK_S]
+            due = math.floor((now_ns / NS_PER_S - rows[0, HOST_S] - dark_s) / cycle_s - 0.5) + 1
+            told |= {"rate_hz": round(1 / cycle_s, 3), "availability": round(min(len(error) / max(due, 1), 1.0), 4)}
+        words = "the tracker has not answered" + (" yet" if newest is None else f" for {since_s:.1f} s")
+        return TrackerFigures(
+            answers=sum(self.counts.values()),
+            refused=refused,
+            silent=words if since_s > limit_s else "",
+            **told,
+        )
+
+
+def cycle_of(at_s: FloatArray) -> float | None:
+    """The usual time between answers at rising times (n,), s; None for fewer than three."""
+    return max(float(np.median(np.diff(at_s))), 1e-4) if len(at_s) > 2 else None
+
+
+def _rounded(values: FloatArray) -> list[float]:
+    return [round(value, 3) for value in values.tolist()]

@@ -1,0 +1,151 @@
+"""A tracker's answers against the frames that were lit while it looked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.answers.answer import Answer
+from hilstar.answers.judge import AnswerJudge, AnswerRules
+from hilstar.answers.pairing import LitFrame, LitFrames, residual_arcsec
+from hilstar.rotation import from_rotation_vector, from_rotation_vectors, multiply, propagate
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+
+PERIOD_NS = NS_PER_S // 60
+EXPOSURE_S, ANSWER_HZ = 0.1, 10.0
+START = np.array([0.5, 0.5, -0.5, 0.5])
+
+
+def attitude(t_s: float) -> np.ndarray:
+    """A turn about two axes, whose rate changes by 0.6 deg/s."""
+    turn = np.radians(0.3) * np.array([2.0 * np.sin(0.5 * t_s), 1.5 * np.sin(0.8 * t_s), t_s])
+    return multiply(from_rotation_vector(turn), START)
+
+
+def lit_until(t_s: float, **keys) -> LitFrames:
+    frames = LitFrames(PERIOD_NS, **keys)
+    for k in range(int(t_s * 60)):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, attitude(k * PERIOD_NS / NS_PER_S)))
+    return frames
+
+
+def test_the_lit_attitude_of_an_exposure_is_that_of_its_middle_for_a_steady_turn():
+    frames, rate = LitFrames(PERIOD_NS), np.radians([0.2, -0.4, 1.0])
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, propagate(START, rate, k * PERIOD_NS / NS_PER_S)))
+    lit = frames.over(round(1.0 * NS_PER_S), round(1.2 * NS_PER_S))
+    truth = propagate(START, rate, 1.1)
+    # Frames stand for the time about their moment, and ends of the exposure cut two of them: within 0.01 of a frame's turn.
+    assert np.abs(residual_arcsec(truth, lit.q)).max() < 0.01 * 3600 / 60
+    assert lit.rate_rad_s == pytest.approx(rate, rel=1e-3, abs=1e-7)
+    assert lit.light_ns == round(1.1 * NS_PER_S) + 7
+    assert (lit.first, lit.last) == (60, 72)
+
+
+def test_a_screen_that_holds_still_frames_shows_them_half_a_frame_late():
+    frames, rate = LitFrames(PERIOD_NS, centred=False), np.radians([0.0, 1.0, 0.0])
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, propagate(START, rate, k * PERIOD_NS / NS_PER_S)))
+    lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
+    assert np.abs(residual_arcsec(propagate(START, rate, 1.1 - 0.5 / 60), lit.q)).max() < 0.01 * 3600 / 60
+
+
+def test_frames_drawn_in_motion_have_the_attitude_of_the_middle_of_their_light():
+    frames, rate = LitFrames(PERIOD_NS, hold_s=1 / 60, centred=True), np.radians([0.0, 1.0, 0.0])
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, propagate(START, rate, k * PERIOD_NS / NS_PER_S), rate))
+    lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
+    assert np.abs(residual_arcsec(propagate(START, rate, 1.1), lit.q)).max() < 0.01 * 3600 / 60
+
+
+def test_an_exposure_of_a_dark_or_a_jumping_sky_has_no_attitude():
+    dark, jumping = LitFrames(PERIOD_NS), LitFrames(PERIOD_NS)
+    away = from_rotation_vector(np.radians([0.0, 30.0, 0.0]))
+    for k in range(60):
+        dark.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, None if k > 30 else START))
+        jumping.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START if k < 30 else multiply(away, START)))
+    assert dark.over(0, NS_PER_S // 4) is not None
+    assert dark.over(round(0.6 * NS_PER_S), round(0.9 * NS_PER_S)) is None
+    assert dark.dark_ns == 28 * PERIOD_NS
+    assert jumping.over(round(0.4 * NS_PER_S), round(0.6 * NS_PER_S)) is None
+    assert jumping.over(round(0.6 * NS_PER_S), round(0.9 * NS_PER_S)) is not None
+    assert jumping.over(-NS_PER_S, 0) is None
+
+
+BIAS_ARCSEC, NOISE_ARCSEC = np.array([12.0, -7.0, 30.0]), np.array([3.0, 3.0, 20.0])
+LATENCY_S, JITTER_S, DRIFT, EPOCH_NS = 0.18, 0.004, 40e-6, 123 * NS_PER_S
+
+
+def judged(clock: str, seconds: float = 60.0, wild: float = 0.01, **rules) -> tuple[AnswerJudge, list]:
+    """A minute of a planted tracker: bias, noise, a clock that runs fast, late by LATENCY_S and more, and wild answers."""
+    rng = np.random.default_rng(3)
+    frames = LitFrames(PERIOD_NS)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock=clock, **rules), frames)
+    found, k = [], 0
+    for i in range(int(seconds * ANSWER_HZ)):
+        middle_s = 0.2 + i / ANSWER_HZ
+        host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
+        while k * PERIOD_NS < host_ns:
+            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S)))
+            k += 1
+        error = (BIAS_ARCSEC + NOISE_ARCSEC * rng.standard_normal(3)) / ARCSEC_PER_RAD
+        if rng.random() < wild:
+            error = rng.uniform(0.1, 1.0, 3)
+        q = multiply(from_rotation_vector(error), attitude(middle_s))
+        middle_ns = round(middle_s * NS_PER_S)
+        t_ns = middle_ns if clock == "host" else round(middle_ns * (1 + DRIFT)) + EPOCH_NS
+        found.append((judge.judge(Answer(host_ns, b"", t_ns, q)), np.linalg.norm(error) > 0.1))
+    return judge, found
+
+
+@pytest.mark.parametrize("clock", ["host", "own"])
+def test_the_last_minutes_residual_is_the_planted_error(clock):
+    judge, found = judged(clock)
+    figures = judge.figures(found[-1][0].answer.host_ns + NS_PER_S // 20, {"checksum": 3})
+    wild = [is_wild for _, is_wild in found]
+    assert [each.verdict == "wrong" for each, _ in found] == wild
+    assert figures.wrong == sum(wild) > 0
+    # The mean of n answers within four of its sigmas, and of the rate (0.3 deg/s rms) times the time's 2 ms.
+    sigma = 4 * NOISE_ARCSEC / np.sqrt(600) + 1080 * 0.002
+    assert np.abs(np.array(figures.mean_arcsec) - BIAS_ARCSEC).max() < sigma.max()
+    assert np.array(figures.sigma3_arcsec) == pytest.approx(3 * NOISE_ARCSEC, rel=0.2)
+    assert figures.latency_ms / 1e3 == pytest.approx(LATENCY_S, abs=0.02 if clock == "own" else 4 * JITTER_S)
+    assert figures.availability == pytest.approx(1 - sum(wild) / len(wild), abs=0.004)
+    assert figures.rate_hz == pytest.approx(ANSWER_HZ, rel=0.01)
+    assert figures.refused == {"checksum": 3}
+    assert figures.silent == ""
+    assert judge.figures(found[-1][0].answer.host_ns + 3 * NS_PER_S, {}).silent.endswith("has not answered for 3.0 s")
+
+
+def test_a_stated_latency_is_taken_and_not_fitted():
+    judge, _ = judged("own", 5.0, latency_s=0.1)
+    assert judge.times.delay_s == 0.1 and not judge.times.fits
+
+
+def test_an_answer_without_attitude_or_of_a_dark_sky_is_neither_right_nor_wrong():
+    frames = lit_until(1.0)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    at_ns = NS_PER_S // 2
+    assert judge.judge(Answer(at_ns, b"", at_ns, START, valid=False)).verdict == "invalid"
+    assert judge.judge(Answer(at_ns, b"", at_ns)).verdict == "invalid"
+    assert judge.judge(Answer(at_ns, b"", 30 * NS_PER_S, START)).verdict == "unpaired"
+    assert judge.judge(Answer(at_ns, b"", at_ns, attitude(0.5))).verdict == "right"
+    assert judge.judge(Answer(at_ns, b"", at_ns, -attitude(0.5))).verdict == "right"
+    figures = judge.figures(at_ns, {})
+    assert (figures.answers, figures.right, figures.invalid, figures.unpaired) == (5, 2, 2, 1)
+
+
+def test_a_silent_tracker_is_told_before_its_first_answer():
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), LitFrames(PERIOD_NS))
+    assert judge.figures(0, {}).silent == ""
+    assert judge.figures(4 * NS_PER_S, {}).silent == "the tracker has not answered yet"
+
+
+def test_many_answers_a_second_cost_the_same_each():
+    frames = lit_until(2.0)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    q = multiply(from_rotation_vectors(np.zeros((1, 3)))[0], attitude(1.0))
+    for k in range(5000):
+        judge.judge(Answer(NS_PER_S + k * 1_000_000, b"", NS_PER_S, q))
+    figures = judge.figures(6 * NS_PER_S, {})
+    assert figures.right == 5000 and figures.rate_hz == pytest.approx(1000)

@@ -19,6 +19,7 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from hilstar.answers.judge import TrackerFigures
 from hilstar.console.protocol import (
     PATCH_SHARE,
     AttitudeSource,
@@ -93,6 +94,15 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     faults: list[str] = []
     rates: str = ""
     failed: list[str] = []
+    tracker: TrackerFigures | None = None
+
+
+class NewAnswer(msgspec.Struct, frozen=True):
+    """The tracker's newest answer: its figures, the attitude that was lit, and places of stars in the tracker's pixels."""
+
+    figures: TrackerFigures
+    q_lit: tuple[float, float, float, float] | None = None
+    centroids: list[tuple[float, float]] = []
 
 
 class RunEvent(msgspec.Struct, frozen=True):
@@ -153,6 +163,7 @@ _PAGE = 4096
 FRAMES, FRAME_BYTES = 512, 128  # 8 s at 60 Hz
 STATES, STATE_BYTES = 4, 60_000
 EVENTS, EVENT_BYTES = 512, 2_000
+ANSWERS, ANSWER_BYTES = 16, 12_000
 PICTURES = 3
 MAX_SPRITES = 20_000
 SPRITE = np.dtype([("star", "<i4"), ("x_px", "<f4"), ("y_px", "<f4")])
@@ -243,12 +254,18 @@ class PictureRequest:
 
 
 class SharedMemory:
-    """The rings of a run (frames, states, events, pictures) and the page's request for pictures; `fd` is the memory's."""
+    """The rings of a run (frames, states, events, answers, pictures), and the page's request for pictures; `fd` is its file."""
 
     def __init__(self, fd: int, picture_bytes: int) -> None:
         self.fd = fd
         slot_bytes = PICTURE_HEAD_BYTES + picture_bytes + MAX_SPRITES * SPRITE.itemsize
-        shapes = [(FRAMES, FRAME_BYTES), (STATES, STATE_BYTES), (EVENTS, EVENT_BYTES), (PICTURES, slot_bytes)]
+        shapes = [
+            (FRAMES, FRAME_BYTES),
+            (STATES, STATE_BYTES),
+            (EVENTS, EVENT_BYTES),
+            (ANSWERS, ANSWER_BYTES),
+            (PICTURES, slot_bytes),
+        ]
         starts = [_PAGE]
         for shape in shapes:
             starts.append(-(-(starts[-1] + Ring.size(*shape)) // _PAGE) * _PAGE)
@@ -256,7 +273,7 @@ class SharedMemory:
             os.ftruncate(fd, starts[-1])
         self._memory = memoryview(mmap.mmap(fd, starts[-1]))
         rings = [Ring(self._memory[start:], *shape) for start, shape in zip(starts, shapes, strict=False)]
-        self.frames, self.states, self.events, self.pictures = rings
+        self.frames, self.states, self.events, self.answers, self.pictures = rings
 
     @classmethod
     def make(cls, picture_bytes: int) -> SharedMemory:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,10 +15,11 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.cameras import tracker_camera
 from hilstar.console.protocol import GridLine, SkyMap, SkyPlace, StarMark, Truth
 from hilstar.render.aids import AidLevels
-from hilstar.rotation import direction_of, to_matrix, to_radec_roll_deg
+from hilstar.rotation import direction_of, from_rotation_vector, to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.sky.catalog import label_of, load_catalog, star_names
 from hilstar.sky.stars import Stars
+from hilstar.units import ARCSEC_PER_RAD
 
 if TYPE_CHECKING:
     from hilstar.bench.frame import Bench
@@ -34,6 +35,13 @@ BEYOND = 0.1  # relative to the image's size: how far lines go on outside it
 PX_DIGITS, SKY_DIGITS = 2, 4
 
 
+class AnswerMarks(NamedTuple):
+    """A tracker's answer on the monitor, px: the field that it reports, and its centroids."""
+
+    field_px: list[list[float]]
+    centroids_px: list[list[float]]
+
+
 @dataclass(frozen=True, slots=True)
 class CameraMarks:
     """Marks that need no stars: boresight, tracker's outline, lines of RA and Dec, by the two cameras of a bench."""
@@ -46,17 +54,35 @@ class CameraMarks:
         lines: list[GridLine] = []
         if grid and q_icrs_to_cam is not None:
             lines = list(self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)))
-        # The tracker's outline on the monitor.
-        rays = self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))
-        x_px, y_px = self.monitor.project_outward(rays @ self.monitor.cam_to_image.T)
-        known = np.isfinite(x_px) & np.isfinite(y_px)
         return Truth(
             frame=frame,
             stars=stars,
             boresight_px=[round(at, PX_DIGITS) for at in self.monitor.boresight_px],
-            tracker_px=[[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()],
+            tracker_px=self._on_monitor(self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))),
             grid=lines if grid else UNSET,
         )
+
+    def answer(
+        self, residual_arcsec: list[float] | None, lit: FloatArray, shown: FloatArray, centroids: list[tuple[float, float]]
+    ) -> AnswerMarks:
+        """Where a tracker takes its field to be, and its centroids, in a picture of the attitude `shown`.
+
+        `lit` is the attitude that the answer was compared with: its stars have moved on since.
+        """
+        field_px: list[list[float]] = []
+        if residual_arcsec is not None:
+            # The reported attitude is E C: the field's rays, taken back by E, stand where the tracker says in the shown sky.
+            error = to_matrix(from_rotation_vector(np.array(residual_arcsec) / ARCSEC_PER_RAD))
+            field_px = self._on_monitor(self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES)) @ error)
+        places = np.array(centroids).reshape(-1, 2)
+        moved = to_matrix(shown) @ to_matrix(lit).T
+        return AnswerMarks(field_px, self._on_monitor(self.tracker.rays(places[:, 0], places[:, 1]) @ moved.T))
+
+    def _on_monitor(self, rays: FloatArray) -> list[list[float]]:
+        """The places (x, y) on the monitor of those rays (n, 3), cam, that have one."""
+        x_px, y_px = self.monitor.project_outward(rays @ self.monitor.cam_to_image.T)
+        known = np.isfinite(x_px) & np.isfinite(y_px)
+        return [[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()]
 
     def on_screen(self, x_px: FloatArray, y_px: FloatArray, beyond: float) -> np.ndarray[Any, Any]:
         """A mask of places (n,) on the monitor, or outside by at most `beyond` of its size."""

@@ -11,6 +11,8 @@ from typing import Annotated
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from hilstar.answers.judge import TrackerFigures
+
 SUBPROTOCOL, TOKEN_PROTOCOL = "hilstar", "hilstar.token."  # the WebSocket's subprotocols; the token follows the second
 GIVES_WAY = 4013  # close code: the page waits before it comes back, so as not to displace the next one
 HISTORY_S = 60  # length of the charts
@@ -35,6 +37,7 @@ class Hello(msgspec.Struct, kw_only=True):
     refresh_hz: float
     faults: list[str] = []
     session: bool = False
+    answers: bool = False
     history_s: int = HISTORY_S
     control: bool
 
@@ -128,10 +131,14 @@ class PageState(msgspec.Struct, frozen=True, kw_only=True):
     operator: dict[str, bool]
     faults: list[str]
     ledger: LedgerState | None
+    tracker: TrackerFigures | None = None
 
 
 class ChartPoint(msgspec.Struct, kw_only=True):
-    """What the frames since the point before add to the charts: the largest times, and how many went wrong."""
+    """What the frames since the point before add to the charts: the largest times, and how many went wrong.
+
+    `x_arcsec`, `y_arcsec` and `z_arcsec` are the residual of the newest right answer since then.
+    """
 
     t_s: float
     missed: int = 0
@@ -140,6 +147,10 @@ class ChartPoint(msgspec.Struct, kw_only=True):
     interval_ms: float | None = None
     frame_ms: float | None = None
     packets_hz: float | None = None
+    wrong: int = 0
+    x_arcsec: float | None = None
+    y_arcsec: float | None = None
+    z_arcsec: float | None = None
 
     def take(self, key: str, value: float) -> None:
         """Keep the larger of the time that is there and `value`, ms."""
@@ -174,13 +185,18 @@ class GridLine(msgspec.Struct, frozen=True):
 
 
 class Truth(msgspec.Struct, frozen=True, kw_only=True):
-    """What is where in a picture: stars, the brightest first, and the marks of the two cameras; monitor px."""
+    """What is where in a picture: stars, the brightest first, and the marks of the two cameras; monitor px.
+
+    Of the tracker's newest answer: where it takes its field to be, and the centroids that it reports.
+    """
 
     frame: int
     stars: list[StarMark]
     boresight_px: list[float] | UnsetType = UNSET
     tracker_px: list[list[float]] | UnsetType = UNSET
     grid: list[GridLine] | UnsetType = UNSET
+    reported_px: list[list[float]] | UnsetType = UNSET
+    centroids_px: list[list[float]] | UnsetType = UNSET
 
 
 class PageText(msgspec.Struct, kw_only=True, omit_defaults=True):
@@ -191,6 +207,7 @@ class PageText(msgspec.Struct, kw_only=True, omit_defaults=True):
     history: list[ChartPoint] | None = None
     point: ChartPoint | None = None
     event: EventLine | None = None
+    answer: TrackerFigures | None = None
     truth: Truth | None = None
 
     def json(self) -> str:

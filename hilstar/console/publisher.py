@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from hilstar.attitude.clock.rate_check import WRONG
@@ -26,6 +27,7 @@ from hilstar.console.messages import (
     MISSING,
     PICTURE_HEAD_BYTES,
     STALE,
+    NewAnswer,
     Order,
     OrderAnswer,
     Pace,
@@ -50,6 +52,7 @@ from hilstar.errors import HilstarError, did_you_mean, one_line, printable
 from hilstar.notices import Listener, Notice
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.run.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests, aid_levels_of
+from hilstar.run.record.ledger_records import MAX_CENTROIDS
 from hilstar.scene.sprites import brightest
 from hilstar.units import NS_PER_MS, NS_PER_S
 from hilstar.version import __version__
@@ -59,6 +62,7 @@ if TYPE_CHECKING:
     from hilstar.bench.fault_schedule import FaultSchedule
     from hilstar.calibrate.first_light.image_sources import Pattern
     from hilstar.notices import Notices
+    from hilstar.run.live_answers import LiveAnswers
     from hilstar.run.pacer import Shown
     from hilstar.run.record.ledger import Ledger, LedgerSwitch
     from hilstar.run.screen.screen import Screen
@@ -84,6 +88,16 @@ class FramePublisher:
     def follow(self, running: Running) -> None:
         """Follow a run, whose counters go on changing."""
         self.running = running
+        if running.answers is not None:
+            running.answers.heard = self._hear
+
+    def _hear(self, answers: LiveAnswers) -> None:
+        """Publish a new answer of the tracker. Called by the thread that takes answers."""
+        newest = answers.newest
+        lit = None if newest is None or newest.lit is None else tuple(newest.lit.q.tolist())
+        stars = () if newest is None else newest.answer.centroids[:MAX_CENTROIDS]
+        places = [(round(star.x_px, 2), round(star.y_px, 2)) for star in stars]
+        self._memory.answers.put(msgspec.json.encode(NewAnswer(answers.figures, lit, places)))
 
     def see(self, shown: Shown) -> None:
         """Publish a frame. Called by the frame loop."""
@@ -143,7 +157,7 @@ LEDGER_TROUBLES = {
 
 @dataclass(frozen=True, slots=True)
 class PageParts:
-    """The parts of a run; `make_ledger` begins a ledger at a path."""
+    """The parts of a run; `make_ledger` begins a ledger at a path, `answers` says that the tracker is to answer."""
 
     bench: Bench
     notices: Notices
@@ -151,6 +165,7 @@ class PageParts:
     make_ledger: Callable[[Path], Ledger]
     screen: Screen | None = None
     faults: FaultSchedule | None = None
+    answers: bool = False
 
 
 class WatchedRun:
@@ -208,6 +223,7 @@ class WatchedRun:
             ledger=self._ledger(),
             faults=[] if faults is None else faults.on(),
             rates=self._notices.lasting.get(WRONG, ""),
+            tracker=None if running.answers is None else running.answers.figures,
         )
 
     def _ledger(self) -> LedgerState | None:
@@ -417,6 +433,7 @@ def opened_page(
     bench, orders = parts.bench, OrderHandler(requests, feed, parts)
     setup = setup_for(listener, control, description, bench.file, picture_bytes)
     setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
+    setup.hello.answers = parts.answers
     setup.hello.faults = [] if parts.faults is None else parts.faults.names()
     setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
     with PageProcess(setup, memory, listener.socket, WatchedRun(feed, parts), orders.do):

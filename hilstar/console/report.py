@@ -222,6 +222,7 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
             "path": _path(run.path.rows),
             "histograms": _histograms(run),
             "stride": run.samples.stride,
+            "answers": _answers(run, summary),
             "refused": {reason: count for reason, count in summary.packets.items() if reason != "accepted"},
             "events": [_event(each, run) for each in (*run.first_events, *run.last_events)],
             "events_total": sum(run.events.values()),
@@ -299,6 +300,23 @@ def _histograms(run: RunFigures) -> list[dict[str, Any]]:
         ends = {"from_ms": float(edges[0]), "to_ms": float(edges[-1])}
         found.append({"name": name, "title": title, "counts": counts.tolist()} | ends)
     return found
+
+
+def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
+    """Residuals along the run, wrong answers, and what each fault did to the answers; None without answers."""
+    if not summary.answers:
+        return None
+    zero_s = run.first_swap_ns / NS_PER_S
+    rows, faults = run.residuals.rows, summary.answers.faults
+    edges = sorted((at_s, step) for f in faults for at_s, step in ((f.start_s, 1), (f.end_s or summary.duration_s, -1)))
+    return {
+        "t_s": _numbers(rows[:, 0] - zero_s, S_DIGITS),
+        "xyz_arcsec": [_numbers(axis, MS_DIGITS) for axis in rows[:, 1:].T],
+        "wrong_s": [round(at_ns / NS_PER_S - zero_s, S_DIGITS) for at_ns in run.answers.wrong_ns],
+        "on_s": [at_s for at_s, _ in edges],
+        "on": np.cumsum([step for _, step in edges], dtype=int).tolist(),
+        "faults": faults,
+    }
 
 
 def _event(record: EventRecord, run: RunFigures) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from hilstar.answers.judge import TrackerFigures
     from hilstar.run.pacer import Shown
     from hilstar.run.record.ledger import LedgerSwitch
     from hilstar.run.serve import Running
@@ -108,6 +109,7 @@ class RunStatus:
             _attitude_line(shown),
             frames_line,
             StatusLine("packets", told + (f" ({refused})" if refused else ""), not refused),
+            *([] if running.answers is None else [_tracker_line(running.answers.figures)]),
             *self._about(),
         ]
 
@@ -134,6 +136,18 @@ def _attitude_line(shown: Shown) -> StatusLine:
         text += f", {math.degrees(math.hypot(*rate)):.4g} deg/s"
     text += f", {attitude.age_ns / NS_PER_MS:.0f} ms old"
     return StatusLine("attitude", text + (": STALE" if shown.stale else ""), not shown.stale)
+
+
+def _tracker_line(found: TrackerFigures) -> StatusLine:
+    def three(values: list[float] | None) -> str:
+        return "-" if values is None else ", ".join(f"{value:.1f}" for value in values)
+
+    late = "-" if found.latency_ms is None else f"{found.latency_ms:.0f} ms"
+    share = "-" if found.availability is None else f"{100 * found.availability:.1f} %"
+    text = f"{three(found.residual_arcsec)} arcsec off, rms {three(found.rms_arcsec)}, {share} available, {late} late"
+    text += f", {found.mode}" if found.mode else ""
+    text += f"; {found.wrong} of {found.answers} answers wrong" if found.wrong else f"; {found.answers} answers"
+    return StatusLine("tracker", found.silent or text, not found.silent and found.verdict != "wrong")
 
 
 @contextmanager

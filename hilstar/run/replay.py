@@ -218,7 +218,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
         return shown
 
     counts = PacketCounts(received=play.packet_count)
-    outlet.follower(Running(loop, counts))
+    outlet.follower(Running(loop, counts, answers=outlet.answers))
     bench.warm_up()
     begin_ns = clock.now_ns()
     with stop_on_signal(loop.stop), loop.watch:

@@ -22,6 +22,7 @@ from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import AnyFaults
 from hilstar.run.frame_pulse import FramePulse
+from hilstar.run.live_answers import LiveAnswers
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
 from hilstar.run.operator import Aids, Operator, SwitchRequests, aid_levels_of
@@ -38,11 +39,15 @@ POLL_MS = 50
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """Counters of a run in progress, readable from any thread; `clock` tells of the sender's clock, None without a sender."""
+    """Counters of a run in progress, readable from any thread; `clock` tells of the sender's clock, None without a sender.
+
+    `answers` are the tracker's, None where the bench file names none.
+    """
 
     loop: FrameLoop
     packets: PacketCounts
     clock: Callable[[], ClockSummary] | None = None
+    answers: LiveAnswers | None = None
 
 
 Follower = Callable[[Running], None]  # called once, when a run begins
@@ -53,7 +58,7 @@ class Outlet:
     """Where frames go besides their sink (a screen, a ledger), where events are reported, and who follows the run.
 
     `pictures` are sent to a simulation that asks for its camera's pictures. `requests` are those of the operator's page.
-    `faults` are the scenario's and the stream's. `pulse` is started at each frame.
+    `faults` are the scenario's and the stream's. `pulse` is started at each frame. `answers` are compared with the frames.
     """
 
     screen: Screen | None = None
@@ -64,6 +69,7 @@ class Outlet:
     requests: SwitchRequests | None = None
     faults: AnyFaults | None = None
     pulse: FramePulse | None = None
+    answers: LiveAnswers | None = None
 
     def loop(self, bench: Bench, sink: FrameSink, moving: bool | None = None) -> FrameLoop:
         """The frame loop of a run, paced by the screen or else at the bench's own rate; its frames start the pulse."""
@@ -80,7 +86,9 @@ class Outlet:
         return loop
 
     def record(self, bench: Bench, loop: FrameLoop, shown: Shown, light_ns: int) -> None:
-        """Record a frame in the ledger, if there is one; `light_ns` is on the sender's clock."""
+        """Record a frame, in the ledger if there is one, and for answers; `light_ns` is on the sender's clock."""
+        if self.answers is not None:
+            self.answers.frame(shown, light_ns)
         if self.ledger.on:
             self.ledger.frame(frame_record(shown, light_ns, loop.tally.missed_frames, below_step(bench, shown)))
 
@@ -90,6 +98,7 @@ class Outlet:
             summary,
             faults=UNSET if self.faults is None else self.faults.summary(),
             sync=UNSET if self.pulse is None else self.pulse.summary(),
+            answers=UNSET if self.answers is None else self.answers.figures,
             events=self.notices.counts(),
             screen=loop.screen_summary(),
         )
@@ -119,7 +128,7 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
     shared = settings.clock == "shared"
     traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
     receiver = Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, wrong_rates=settings.check_rates)
-    outlet.follower(Running(loop, receiver.counts, receiver.clock_summary))
+    outlet.follower(Running(loop, receiver.counts, receiver.clock_summary, outlet.answers))
     statuses = StatusMaker(outlet.ledger)
 
     def draw_blank(moment: Moment) -> None:
@@ -175,7 +184,7 @@ class LockstepRun:
     def serve(self, link: LockstepLink) -> RunSummary:
         """Answer requests up to the limit, or until a signal; returns the summary. A refused request leaves the last frame."""
         loop, statuses, turn_ms = self._loop, StatusMaker(self._outlet.ledger), RunningStatistics()
-        self._outlet.follower(Running(loop, self.counts))
+        self._outlet.follower(Running(loop, self.counts, answers=self._outlet.answers))
         tracker = self._bench.config.tracker
         height_mm = tracker.resolution_px[1] * tracker.pixel_pitch_um * 1e-3
         field_deg = 2 * math.degrees(math.atan(height_mm / (2 * tracker.focal_length_mm)))

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from hilstar.answers.judge import TrackerFigures
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import MESSAGE_REASONS, Reason
@@ -71,6 +72,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     screen: dict[str, Any] | UnsetType = UNSET
     ledger: dict[str, str | int | None] | UnsetType = UNSET
     faults: dict[str, Any] | UnsetType = UNSET
+    answers: TrackerFigures | UnsetType = UNSET
     beat: BeatSummary | UnsetType = UNSET
     sync: SyncSummary | UnsetType = UNSET
     fields_of_view: dict[str, Any] | UnsetType = UNSET

@@ -268,7 +268,7 @@ export class Chart {
     const named = parts.length > 1;
     write(this.now, parts.length ? quantity(parts[0].value, this.unit, parts[0].one.digits) : "");
     const range = parts.map(({ one, seen }) => (Number.isFinite(seen[0]) ? `${named ? `${one.name} ` : ""}${rangeText(seen, this.unit, one.digits)}` : `${named ? `${one.name} ` : ""}no value`));
-    const lost = this.marks.filter((mark) => !mark.flag).map(({ name, t, n }) => `${t.reduce((sum, at, k) => sum + (at >= this.from && at <= this.to ? n[k] || 0 : 0), 0)} ${name}`);
+    const lost = this.marks.filter((mark) => !mark.flag).map(({ name, t, n, count }) => `${(count || t).reduce((sum, at, k) => sum + (at >= this.from && at <= this.to ? (count ? 1 : n[k] || 0) : 0), 0)} ${name}`);
     const where = at === null ? "" : `at ${timeText(at, 1)}${Math.abs(at) <= 90 ? "\u00a0s" : ""}; `;
     const words = where + [...range, ...lost].join(" \u00b7 ");
     write(this.text, words);

@@ -6,7 +6,7 @@ import { byId, clock, duration, write } from "./format.js";
 import { Health } from "./health.js";
 import { Link } from "./link.js";
 import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
-import { Rows, addEvent, writeAttitude, writeRefusals, writeRun, writeSource } from "./panels.js";
+import { Rows, addEvent, writeAttitude, writeRefusals, writeRun, writeSource, writeTracker } from "./panels.js";
 import { Picture } from "./picture.js";
 import { HISTORY_S, MESSAGE_KEYS } from "./protocol.js";
 import { Sky } from "./sky.js";
@@ -35,10 +35,12 @@ const health = new Health(link, () => redraw("picture"));
 const controls = new Controls(link);
 const attitudeRows = new Rows(byId("attitude-rows"));
 const runRows = new Rows(byId("run-rows"));
+const trackerRows = new Rows(byId("tracker-rows"));
 const charts = {
   age: new Chart(byId("chart-age"), { title: "Age of the attitude", unit: "ms", ink }),
   pacing: new Chart(byId("chart-pacing"), { title: "Pacing", unit: "ms", ink }),
   packets: new Chart(byId("chart-packets"), { title: "Packets", unit: "Hz", ink }),
+  residual: new Chart(byId("chart-residual"), { title: "Residual of the tracker", unit: "arcsec", ink }),
 };
 
 function redraw(what) {
@@ -70,6 +72,9 @@ const HEARD = {
     health.bench = said.bench;
     document.body.dataset.session = String(Boolean(said.session));
     document.body.dataset.control = String(said.control);
+    document.body.dataset.answers = String(said.answers);
+    byId("tracker").hidden = byId("chart-residual").hidden = !said.answers;
+    overlays.buttons.answer.hidden = !said.answers;
     picture.setRedClipped(overlays.on.clipped && !said.session); // a pattern's white is meant
     health.session = Boolean(said.session);
     write(byId("bench"), said.bench);
@@ -90,6 +95,7 @@ const HEARD = {
     writeSource(said, attitudeRows);
     writeRun(said, runRows);
     writeRefusals(said.counts.refused);
+    if (said.tracker) writeTracker(said.tracker, trackerRows);
     controls.hear(said);
     tellFrame(said);
     moveSky(said.attitude);
@@ -108,6 +114,9 @@ const HEARD = {
     const newest = byId("events").firstElementChild;
     if (said.kind === "pattern" && newest?.dataset.kind === "pattern") newest.remove(); // a step is worth a line, not each of its patterns
     addEvent(said);
+  },
+  answer(said) {
+    writeTracker(said, trackerRows);
   },
   truth(said) {
     if (held && said.frame !== picture.frame) return; // the truth of the picture that is held stays
@@ -192,6 +201,8 @@ function drawCharts() {
   charts.age.set([series("age", "age_ms", "one", 1)], [], span, 0);
   charts.pacing.set([series("interval", "interval_ms", "one", 2), series("drawing", "frame_ms", "two", 2)], [{ name: "missed", ink: "bad", t, n: column("missed") }], span, 0);
   charts.packets.set([series("packets", "packets_hz", "one", 1)], [{ name: "refused", ink: "bad", t, n: column("refused") }], span, 0);
+  const axes = ["x", "y", "z"].map((axis, k) => series(axis, `${axis}_arcsec`, ["one", "two", "three"][k], 1));
+  charts.residual.set(axes, [{ name: "wrong", ink: "bad", t, n: column("wrong") }], span, 0);
   for (const chart of Object.values(charts)) chart.draw();
 }
 

@@ -12,8 +12,9 @@ export const OVERLAYS = [
   ["grid", "RA/Dec grid", false, "g"],
   ["tracker", "Tracker field", true, "f"],
   ["clipped", "Clipped", true, "c"],
+  ["answer", "Answer", true, "a"],
 ];
-const INK = { truth: "#63d2a1", name: "#c9d6ee", grid: "rgba(110, 150, 225, 0.6)", tracker: "#ffcf70", boresight: "#7db4ff", clipped: "#ff6b6b" };
+const INK = { truth: "#63d2a1", name: "#c9d6ee", grid: "rgba(110, 150, 225, 0.6)", tracker: "#ffcf70", boresight: "#7db4ff", clipped: "#ff6b6b", answer: "#f08bd8" };
 const LABELS = 40; // the brightest in view; more would hide the stars
 const FAINTEST_RING_MAG = 8;
 const KEPT_TRUTHS = 12;
@@ -83,6 +84,7 @@ export class Overlays {
     this.outline = this.on.tracker && (truth.tracker_px || []).length > 2 ? truth.tracker_px.map(([x, y]) => view.toCanvas(x, y)) : [];
     if (this.on.grid) this.drawGrid(truth.grid || []);
     if (this.on.tracker) this.drawTracker();
+    if (this.on.answer) this.drawAnswer(truth);
     if (this.on.truth || this.on.clipped) this.drawRings(stars);
     if (this.on.boresight && truth.boresight_px) this.drawBoresight(truth.boresight_px);
     if (picture.hasValues) return; // names would hide the codes: they stand below the picture
@@ -143,6 +145,26 @@ export class Overlays {
     const top = inside.reduce((best, place) => (best && best[0] + best[1] <= place[0] + place[1] ? best : place), null);
     const label = "tracker\u2019s field";
     if (top && this.place(label, top[0] + 6 * unit, top[1] + 12 * unit, 11)) this.write(label, top[0] + 6 * unit, top[1] + 12 * unit, INK.tracker, 11);
+  }
+
+  // The tracker's newest answer: the field that it takes for its own, and a diamond about each centroid that it reports.
+  drawAnswer({ reported_px: field, centroids_px: places }) {
+    const { context, unit, view } = this;
+    context.strokeStyle = INK.answer;
+    context.lineWidth = 1.5 * unit;
+    if ((field || []).length > 2) {
+      this.path(field, true);
+      context.stroke();
+    }
+    for (const [x, y] of places || []) {
+      const [u, v] = view.toCanvas(x, y);
+      if (!this.inside([u, v], 20)) continue;
+      const r = Math.max(7 * unit, view.scale * 3);
+      context.beginPath();
+      for (const [a, b] of [[0, -r], [r, 0], [0, r], [-r, 0]]) context.lineTo(u + a, v + b);
+      context.closePath();
+      context.stroke();
+    }
   }
 
   // Clipped stars have a second, square ring: they are told by shape as well as by colour.

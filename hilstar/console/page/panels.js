@@ -66,6 +66,35 @@ export function writeRun({ frame, counts, pacing, ledger }, rows) {
   else rows.set("Ledger", ledger.failing ? `FAILING: ${ledger.failing}` : `${ledger.path}  ${bytes(ledger.bytes)}`, ledger.failing ? "bad" : "");
 }
 
+// The verdict on the newest answer: its words, and its colour.
+const VERDICTS = { right: ["right", "ok"], wrong: ["wrong", "bad"], invalid: ["no attitude", "warn"], unpaired: ["no sky was shown", "warn"] };
+
+export function three(values) {
+  return values ? values.map((value) => signed(value, 1)).join("  ") : NONE;
+}
+
+export function writeTracker(said, rows) {
+  const [words, shade] = said.silent ? ["silent", "bad"] : VERDICTS[said.verdict] || ["none yet", "warn"];
+  write(byId("tracker-state"), words);
+  byId("tracker-state").dataset.state = shade;
+  "xyz".split("").forEach((axis, k) => {
+    const value = byId(`residual-${axis}`);
+    write(value, said.residual_arcsec ? `${signed(said.residual_arcsec[k], 1)}\u2033` : NONE);
+    value.dataset.state = said.verdict === "wrong" ? "bad" : "";
+  });
+  rows.set("Mean, last minute", `${three(said.mean_arcsec)}\u2033`);
+  rows.set("Rms", `${three(said.rms_arcsec)}\u2033`);
+  rows.set("3 sigma", `${three(said.sigma3_arcsec)}\u2033`);
+  rows.set("Availability", said.availability === null ? NONE : `${fixed(100 * said.availability, 1)}\u00a0% at ${fixed(said.rate_hz, 1)}\u00a0Hz`);
+  rows.set("Latency", said.latency_ms === null ? NONE : `${quantity(said.latency_ms, "ms", 0)} \u00b1 ${quantity(said.latency_sigma_ms, "ms", 1)}`);
+  rows.set("Mode", said.mode || NONE);
+  rows.set("Stars", said.stars === null ? NONE : count(said.stars));
+  rows.set("Answers", `${count(said.answers)}, ${count(said.invalid)} without attitude`);
+  rows.set("Wrong", count(said.wrong), said.wrong ? "bad" : "");
+  const refused = Object.entries(said.refused).map(([reason, n]) => `${n} ${reason}`);
+  rows.set("Refused", refused.join(", ") || "none", refused.length ? "warn" : "");
+}
+
 // A bar for each reason, as long as its share of all refusals.
 export function writeRefusals(refused) {
   const list = byId("refusals");

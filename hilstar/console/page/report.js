@@ -1,7 +1,7 @@
 // A run that is over, on the same page: all of it along its time, and any moment of it.
 
 import { Chart, timeText } from "./charts.js";
-import { byId, clock, duration, make, write } from "./format.js";
+import { byId, clock, duration, fixed, make, quantity, write } from "./format.js";
 import { Histogram } from "./histogram.js";
 import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
 import { Rows, addEvent, writeAttitude, writeRefusals } from "./panels.js";
@@ -59,7 +59,7 @@ function chart(id, title, unit, note) {
 
 function curves() {
   const found = {};
-  const { spans, packets, process, motion } = run;
+  const { spans, packets, process, motion, answers } = run;
   for (const [id, , , digits, lines, marks] of CHARTS) {
     found[id] = {
       lines: lines.map(([key, name, shade]) => ({ name, ink: shade, digits, t: spans.t_s, low: spans[key][0], high: spans[key][1] })),
@@ -71,6 +71,16 @@ function curves() {
     lines: [line("accepted", "one", 1, packets.t_s, packets.accepted_hz)],
     marks: [{ name: "refused", ink: "bad", t: packets.t_s, n: packets.refused_hz.map((hz) => Math.round(hz * packets.width_s)) }],
   };
+  if (answers) {
+    const [x, y, z] = answers.xyz_arcsec;
+    found["chart-residual"] = {
+      lines: [line("x", "one", 1, answers.t_s, x), line("y", "two", 1, answers.t_s, y), line("z", "three", 1, answers.t_s, z)],
+      marks: [
+        { name: "wrong", ink: "bad", t: answers.wrong_s, n: answers.wrong_s.map(() => 1) },
+        { name: "faults", ink: "warn", lasting: true, t: answers.on_s, n: answers.on, count: answers.faults.map((fault) => fault.start_s) },
+      ],
+    };
+  }
   found["chart-memory"] = { lines: [line("resident", "one", 1, process.t_s, process.resident_mb)], marks: [] };
   found["chart-cpu"] = { lines: [line("CPU", "one", 0, process.t_s, process.cpu_percent)], marks: [] };
   for (const [id, part] of [["chart-motion", "about_mean"], ["chart-steady", "beside_steady"]]) {
@@ -86,6 +96,7 @@ function makeCharts() {
   const { motion } = run;
   const titles = [
     ...CHARTS,
+    ["chart-residual", "Residual of the tracker", "arcsec", "about the camera\u2019s x, y and z; shaded while a fault is on"],
     ["chart-motion", "Motion about the mean", motion?.about_mean.unit, "the camera\u2019s angles less their means over the run"],
     ["chart-steady", "Beside a steady turn", motion?.beside_steady.unit, "how far the camera was from where a constant rate, fitted to the whole run, would have turned it"],
     ["chart-memory", "Memory", "MB"],
@@ -93,8 +104,10 @@ function makeCharts() {
   ];
   const all = curves();
   for (const [id, title, unit, note] of titles) {
-    if (all[id]?.lines.some(({ high }) => high.some((value) => value !== null))) chart(id, title, unit, typeof note === "string" ? note : "").data = all[id];
-    else byId(id)?.remove();
+    if (all[id]?.lines.some(({ high }) => high.some((value) => value !== null))) {
+      chart(id, title, unit, typeof note === "string" ? note : "").data = all[id];
+      byId(id).hidden = false;
+    } else byId(id)?.remove();
   }
   for (const one of run.histograms) {
     const figure = byId("distributions").appendChild(make("figure", "panel chart"));
@@ -267,6 +280,30 @@ function writeFacts() {
   writeRefusals(run.refused);
 }
 
+// A row for each fault: what it did to the tracker's answers.
+function writeFaultEffects() {
+  const faults = run.answers?.faults || [];
+  byId("fault-effects").hidden = !faults.length;
+  const row = (cells, name) => {
+    const line = make("tr");
+    line.append(...cells.map((text) => make(name, "", text)));
+    return line;
+  };
+  const percent = (share) => (share === null ? "\u2013" : `${fixed(100 * share, 1)}\u00a0%`);
+  const parts = (fault, pick) => ["before", "during", "after"].map((part) => pick(fault[part])).join(" / ");
+  const cells = (fault) => [
+    fault.name,
+    `${momentText(fault.start_s)} to ${fault.end_s === null ? "the end" : momentText(fault.end_s)}`,
+    parts(fault, (span) => percent(span.availability)),
+    parts(fault, (span) => (span.rms_arcsec ? span.rms_arcsec.map((value) => fixed(value, 1)).join(" ") : "\u2013")),
+    String(fault.during.wrong + fault.after.wrong),
+    fault.first_wrong_s === null ? "none" : quantity(fault.first_wrong_s, "s", 2),
+    fault.recovered_s === null ? "not" : quantity(fault.recovered_s, "s", 2),
+  ];
+  const head = ["Fault", "On", "Availability", "Rms x y z, arcsec", "Wrong", "First wrong after", "Recovered in"];
+  byId("fault-table").replaceChildren(row(head, "th"), ...faults.map((fault) => row(cells(fault), "td")));
+}
+
 function writeEvents() {
   for (const { t_s: at, utc, kind, line } of run.events) addEvent({ utc: utc || momentText(at), kind, line }, () => moveTo(at, true), run.events.length);
   byId("range-acts").hidden = !acts().length;
@@ -286,6 +323,7 @@ function startPicture() {
   if (!pictures.length) return;
   picture.setScreen(about.resolution_px, run.white_level);
   overlays.makeButtons(byId("overlays"));
+  overlays.buttons.answer.hidden = true; // a ledger's pictures have no answer
   picture.setRedClipped(overlays.on.clipped);
   byId("scrub").max = String(pictures.length - 1);
 }
@@ -341,6 +379,7 @@ async function start() {
   writeHealth(run.verdict);
   writeFacts();
   writeEvents();
+  writeFaultEffects();
   startPicture();
   if (run.sky) sky.setSky(run.sky);
   sky.trail = run.path.q.map((q) => radecRollOf(q).slice(0, 2));

@@ -108,8 +108,11 @@ async def show(room: PicturePacker, reader: RunReader, pages: OpenPages) -> None
     last = 0
     while True:
         await asyncio.sleep(PICTURE_POLL_S)
+        answer = reader.new_answer()
+        if answer is not None:
+            pages.tell(PageText(answer=answer))
         if pages.picture_hz:
-            packed = await asyncio.to_thread(room.newest, last, reader.seen)
+            packed = await asyncio.to_thread(room.newest, last, reader.seen, reader.answer)
             if packed is not None:
                 last = packed.number
                 pages.show(packed)

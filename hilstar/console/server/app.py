@@ -25,6 +25,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
+from hilstar.answers.judge import VERDICTS, TrackerFigures
 from hilstar.console.messages import Order, OrderAnswer, RunState, Setup
 from hilstar.console.protocol import CONTROLS, SUBPROTOCOL, TOKEN_PROTOCOL, OrderBody, PageText, SkyMap
 from hilstar.console.server.connections import OpenPage, OpenPages
@@ -150,6 +151,9 @@ class RunCollector(Collector):
         for reason, count in counts.refused.items():
             refused.add_metric([reason], count)
         yield refused
+        tracker = seen.tracker
+        if tracker is not None:
+            yield from tracker_metrics(tracker)
         gauges: list[tuple[str, str, float | None, float]] = [  # in units of the last; None is left out
             ("healthy", "1 while the sky is right, as GET /health has it.", health.ok, 1),
             ("health_since_timestamp_seconds", "Since when that is so.", health.since_s, 1),
@@ -177,6 +181,36 @@ class RunCollector(Collector):
             for quantile, interval_ms in (("0.5", pacing.p50_ms), ("0.99", pacing.p99_ms)):
                 intervals.add_metric([quantile], interval_ms * 1e-3)
             yield intervals
+
+
+def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
+    """The metrics of a tracker's answers; residuals over the last minute."""
+    answers = CounterMetricFamily("hilstar_tracker_answers", "Answers of the tracker, by verdict.", labels=["verdict"])
+    for verdict in VERDICTS:
+        answers.add_metric([verdict], getattr(found, verdict))
+    yield answers
+    refused = CounterMetricFamily("hilstar_tracker_refused", "What was no answer, by reason.", labels=["reason"])
+    for reason, count in found.refused.items():
+        refused.add_metric([reason], count)
+    yield refused
+    for name, words, values in (
+        ("residual", "Of the newest answer.", found.residual_arcsec),
+        ("residual_rms", "Of the last minute's right answers.", found.rms_arcsec),
+        ("residual_sigma3", "Three standard deviations of them.", found.sigma3_arcsec),
+    ):
+        if values is not None:
+            gauge = GaugeMetricFamily(f"hilstar_tracker_{name}_arcsec", words, labels=["axis"])
+            for axis, value in zip("xyz", values, strict=True):
+                gauge.add_metric([axis], value)
+            yield gauge
+    for name, words, figure, unit in (
+        ("availability_ratio", "Right answers of the last minute over those due.", found.availability, 1),
+        ("latency_seconds", "From the exposure's middle to the answer.", found.latency_ms, 1e-3),
+        ("answer_age_seconds", "Since the newest answer.", found.age_s, 1),
+        ("silent", "1 while the tracker does not answer.", bool(found.silent), 1),
+    ):
+        if figure is not None:
+            yield GaugeMetricFamily(f"hilstar_tracker_{name}", words, value=float(figure * unit))
 
 
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"

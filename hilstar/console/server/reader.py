@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 import msgspec
 import numpy as np
 
+from hilstar.answers.judge import TrackerFigures
 from hilstar.console.messages import (
     FRAME,
     HAS_AGE,
@@ -22,6 +23,7 @@ from hilstar.console.messages import (
     PICTURE_HEAD_BYTES,
     SPRITE,
     FrameNumbers,
+    NewAnswer,
     Pace,
     PictureHead,
     RunEvent,
@@ -108,6 +110,8 @@ def _of_rest(seen: RunState, lately: RecentFrames) -> Iterator[str]:
         yield f"changed by the operator: {seen.operator_text}"
     if seen.rates:
         yield seen.rates
+    if seen.tracker is not None and seen.tracker.silent:
+        yield seen.tracker.silent
     if seen.faults:
         yield f"a fault is on: {', '.join(seen.faults)}"
     if lately.missed_share > MANY_MISSED_SHARE:
@@ -151,7 +155,10 @@ class RunReader:
         self.health = Health(memory.wrong_since_s or time.time())  # an earlier page of this run may have died
         self.points: deque[ChartPoint] = deque(maxlen=round(HISTORY_S / TICK_S))
         self.events: deque[EventLine] = deque(maxlen=KEPT_EVENTS)
-        self._frame_at = self._event_at = 0
+        self._frame_at = self._event_at = self._answer_at = 0
+        self.answer: NewAnswer | None = None
+        self._answered: list[TrackerFigures] = []  # since the last point
+        self._wrong = 0
         self._last: FrameNumbers | None = None
         self._intervals_ms: deque[tuple[int, float]] = deque()
         self._received: deque[tuple[int, RunCounts]] = deque()  # over the last second
@@ -181,12 +188,28 @@ class RunReader:
         self.events.extend(new)
         return new
 
+    def new_answer(self) -> TrackerFigures | None:
+        """The tracker's figures where it has answered since the last call."""
+        found = None
+        for number, data in self._memory.answers.after(self._answer_at):
+            self._answer_at = number
+            with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
+                self.answer = msgspec.json.decode(data, type=NewAnswer)
+                found = self.answer.figures
+                self._answered.append(found)
+        return found
+
     def _point(self, now_ns: int) -> ChartPoint:
         """What the frames since the last look add to the charts."""
         point = ChartPoint(t_s=round((now_ns - self._begun_ns) / NS_PER_S, 3))
         for number, data in self._memory.frames.after(self._frame_at):
             self._frame_at = number
             self._add(point, FrameNumbers._make(FRAME.unpack(data)))
+        for figures in self._answered:
+            point.wrong, self._wrong = point.wrong + figures.wrong - self._wrong, figures.wrong
+            if figures.verdict == "right" and figures.residual_arcsec is not None:
+                point.x_arcsec, point.y_arcsec, point.z_arcsec = figures.residual_arcsec
+        self._answered.clear()
         if self.seen is not None:
             self._received.append((now_ns, self.seen.counts))
             while len(self._received) > 1 and now_ns - self._received[0][0] > NS_PER_S:
@@ -245,6 +268,7 @@ class RunReader:
             operator=seen.operator,
             faults=seen.faults,
             ledger=seen.ledger,
+            tracker=seen.tracker,
         )
 
 
@@ -267,7 +291,7 @@ class PicturePacker:
     def __init__(self, memory: SharedMemory, scene: OverlayScene | None) -> None:
         self._memory, self._scene = memory, scene
 
-    def newest(self, after: int, seen: RunState | None) -> PackedPicture | None:
+    def newest(self, after: int, seen: RunState | None, answer: NewAnswer | None = None) -> PackedPicture | None:
         """The newest picture, None where there is none after that number."""
         found = self._memory.pictures.last() if self._memory.pictures.newest > after else None
         if found is None or found[0] <= after:
@@ -287,7 +311,12 @@ class PicturePacker:
         if self._scene is not None:
             q = np.array([head.q_w, head.q_x, head.q_y, head.q_z])
             stars = stars_of(self._scene, sprites, seen)
-            truth = self._scene.marks.truth(head.frame, stars, q if np.isfinite(q).all() else None, grid=True)
+            shown = q if np.isfinite(q).all() else None
+            truth = self._scene.marks.truth(head.frame, stars, shown, grid=True)
+            if answer is not None and answer.q_lit is not None and shown is not None:
+                residual, lit = answer.figures.residual_arcsec, np.array(answer.q_lit)
+                marks = self._scene.marks.answer(residual, lit, shown, answer.centroids)
+                truth = msgspec.structs.replace(truth, reported_px=marks.field_px, centroids_px=marks.centroids_px)
         without_grid = msgspec.structs.replace(truth, grid=msgspec.UNSET)
         return PackedPicture(number, picture, PageText(truth=without_grid).json(), PageText(truth=truth).json())
 

@@ -43,11 +43,14 @@ from hilstar.notices import Notice, Notices
 from hilstar.process.closing import Closing
 from hilstar.process.interrupts import caught, stop_on_signal
 from hilstar.run.record.ledger_records import (
+    ANSWER_TOPIC,
     COUNT_TOPIC,
     EVENT_TOPIC,
     FAULT_TOPIC,
     FRAME_TOPIC,
+    MAX_RAW_BYTES,
     PROCESS_TOPIC,
+    AnswerRecord,
     CountRecord,
     EventRecord,
     FaultRecord,
@@ -57,11 +60,11 @@ from hilstar.run.record.ledger_records import (
 )
 from hilstar.units import NS_PER_S
 
-Kind = Literal["packet", "frame", "event", "fault"]
+Kind = Literal["packet", "frame", "event", "fault", "answer"]
 MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stalls
 FRAMES_SHARE = 0.5  # frames may use this share of it; the rest is for packets
 # Approximate size of a JSON message and its objects; a packet's raw bytes are added.
-ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000}
+ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000, "answer": 4000}
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +83,7 @@ class QueueEntry:
     kind: Kind
     time_ns: int
     sequence: int
-    content: ReceivedPacket | FrameRecord | EventRecord | FaultRecord
+    content: ReceivedPacket | FrameRecord | EventRecord | FaultRecord | AnswerRecord
 
     @property
     def size_bytes(self) -> int:
@@ -204,7 +207,6 @@ NO_ROOM = "no room"  # the reason given for lost messages
 FLUSH_S = 0.2
 EACH_S = 1.0  # how often counts, the process and the disk are looked at
 MAX_CHUNK_BYTES = 1_000_000
-MAX_RAW_BYTES = 1024  # kept of a message; every packet is shorter, a simulator's own messages may be cut
 MAX_DETAIL_CHARACTERS = 200
 DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stalls at the end, without and with a signal
 MAX_REST_S = 60.0  # between two files begun because one was deleted, truncated or overwritten
@@ -319,6 +321,11 @@ class Ledger(Closing):
     def fault(self, record: FaultRecord) -> None:
         """Record the beginning or the end of a fault; a replay needs each."""
         self._queue.put(QueueEntry("fault", record.host_ns, record.number, record))
+
+    def answer(self, record: AnswerRecord) -> None:
+        """Record an answer of the tracker."""
+        if self._filter.keeps("answer", "accepted", record.host_ns):
+            self._queue.put(QueueEntry("answer", record.host_ns, 0, record))
 
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""
@@ -440,7 +447,8 @@ class Ledger(Closing):
     def _lose(self, kind: Kind | str, number: int) -> None:
         """Count messages that were lost for lack of room."""
         self._lost += number
-        self._filter.count("frame" if kind == "frame" else "packet" if kind == "packet" else "event", NO_ROOM, number)
+        own: Kind = "frame" if kind == "frame" else "packet" if kind == "packet" else "answer" if kind == "answer" else "event"
+        self._filter.count(own, NO_ROOM, number)
 
     def _look_at_disk(self) -> None:
         disk = os.fstatvfs(self._file.fd)
@@ -524,6 +532,7 @@ TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
         ("process", PROCESS_TOPIC, ProcessRecord),
         ("count", COUNT_TOPIC, CountRecord),
         ("fault", FAULT_TOPIC, FaultRecord),
+        ("answer", ANSWER_TOPIC, AnswerRecord),
     )
 }
 
@@ -570,6 +579,12 @@ class LedgerSwitch:
         ledger = self.current
         if ledger is not None:
             ledger.notice(notice)
+
+    def answer(self, record: AnswerRecord) -> None:
+        """Record an answer of the tracker."""
+        ledger = self.current
+        if ledger is not None:
+            ledger.answer(record)
 
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""

@@ -12,19 +12,23 @@ from typing import Annotated, Any
 
 import msgspec
 
+from hilstar.answers.judge import Judged
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC, RUN_METADATA, read_messages, read_metadata, read_topics
 from hilstar.attitude.wire.packet import MAX_PLACE_KM, MAX_SPEED_KM_S, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
-from hilstar.errors import InputError, cannot_read
+from hilstar.errors import InputError, cannot_read, printable
 from hilstar.reading import NOT_JSON, parse_toml
 from hilstar.run.pacer import Shown
 
 FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/process", "/event", "/not_kept", "/fault"
+ANSWER_TOPIC = "/answer"
 # What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame "skipped" too.
 PULSES = ("sent", "skipped", "lost")
+MAX_RAW_BYTES = 1024  # kept of a message; every packet is shorter, a simulator's own messages may be cut
+MAX_CENTROIDS = 200  # kept of an answer
 HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, which began at its start
 AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # a sender's clock, or the difference to the host's
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
@@ -71,8 +75,8 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     fault_since_ns: tuple[AnyNs, ...] = ()
 
 
-_KINDS: dict[Any, str] = {float: "number", str: "string", bool: "boolean"} | dict.fromkeys(
-    (int, int | None, HostNs, HostNs | None, AnyNs, AnyNs | None, Count, Marker | None), "integer"
+_KINDS: dict[Any, str] = {float: "number", float | None: "number", str: "string", bool: "boolean"} | dict.fromkeys(
+    (int, int | None, HostNs, HostNs | None, AnyNs, AnyNs | None, Count, Count | None, Marker | None), "integer"
 )
 
 
@@ -80,6 +84,8 @@ def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
     """The JSON schema of a record, of plain types only (see `attitude.logs.mcap_log.ATTITUDE_SCHEMA`)."""
     array = {"type": "array", "items": {"type": "number"}}
     fields = {f.name: {"type": _KINDS[f.type]} if f.type in _KINDS else array for f in msgspec.structs.fields(record)}
+    if "centroids" in fields:
+        fields["centroids"] = {"type": "array", "items": {"type": "array"}}
     return msgspec.json.encode({"title": title, "type": "object", "properties": fields})
 
 
@@ -120,11 +126,40 @@ class FaultRecord(msgspec.Struct, kw_only=True):
     file_sha256: str = ""
 
 
+class AnswerRecord(msgspec.Struct, kw_only=True):
+    """An answer of the tracker: its bytes (`raw`, hexadecimal), what they say, and what was lit while it looked.
+
+    Host times, ns: `host_ns` of its last byte, `middle_ns` of its exposure's middle, as known then. `t_ns` is the tracker's
+    stamp on its own clock, `light_ns` the exposure's middle on the sender's clock. `centroids` are [x_px, y_px, dn, hip].
+    `verdict` is "right", "wrong" (see `[answers] wrong_arcsec`), "invalid" (without an attitude) or "unpaired" (no one sky was
+    lit). `q_lit` is the mean attitude of the frames `first_frame` to `last_frame`, `residual_arcsec` the rotation vector from
+    it to `q`, cam.
+    """
+
+    host_ns: HostNs
+    raw: str
+    t_ns: AnyNs | None = None
+    q: tuple[float, float, float, float] | None = None
+    rate: tuple[float, float, float] | None = None
+    valid: bool = True
+    mode: str = ""
+    stars: Count | None = None
+    rms_arcsec: float | None = None
+    centroids: tuple[tuple[float, float, float | None, int | None], ...] = ()
+    verdict: str = "unpaired"
+    middle_ns: AnyNs = 0
+    light_ns: AnyNs | None = None
+    q_lit: tuple[float, float, float, float] | None = None
+    residual_arcsec: tuple[float, float, float] | None = None
+    first_frame: Count | None = None
+    last_frame: Count | None = None
+
+
 class CountRecord(msgspec.Struct, kw_only=True):
     """What was only counted, second by second (host time, ns): refused packets by reason, a flood, or pulses.
 
-    `kind` is "packet", "frame", "event" or "pulse"; `reason` that of a refusal, "accepted" of other packets, the kind of an
-    event, and of a pulse one of PULSES.
+    `kind` is "packet", "frame", "event", "answer" or "pulse"; `reason` that of a refusal, "accepted" of other packets and
+    answers, the kind of an event, and of a pulse one of PULSES.
     """
 
     host_ns: HostNs
@@ -141,7 +176,7 @@ class PacketForm(msgspec.Struct):
     receive_ns: AnyNs | None = None
 
 
-RunRecord = FrameRecord | ProcessRecord | PacketForm | CountRecord | EventRecord
+RunRecord = FrameRecord | ProcessRecord | PacketForm | CountRecord | EventRecord | FaultRecord | AnswerRecord
 
 
 def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> FrameRecord:
@@ -183,6 +218,30 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
     return record
 
 
+def answer_record(judged: Judged) -> AnswerRecord:
+    """The ledger's record of an answer of the tracker."""
+    answer, lit = judged.answer, judged.lit
+    record = AnswerRecord(
+        host_ns=answer.host_ns,
+        raw=answer.raw[:MAX_RAW_BYTES].hex(),
+        t_ns=None if answer.t_ns is None else _within_64_bits(answer.t_ns),
+        q=_numbers(answer.q_icrs_to_cam),
+        rate=_numbers(answer.rate_cam_rad_s),
+        valid=answer.valid,
+        mode=printable(answer.mode)[:MAX_REASON_CHARACTERS],
+        stars=answer.star_count,
+        rms_arcsec=answer.rms_arcsec,
+        centroids=tuple((star.x_px, star.y_px, star.dn, star.hip) for star in answer.centroids[:MAX_CENTROIDS]),
+        verdict=judged.verdict,
+        middle_ns=_within_64_bits(judged.middle_ns),
+    )
+    if lit is not None:
+        record.light_ns, record.q_lit = _within_64_bits(lit.light_ns), _numbers(lit.q)
+        record.residual_arcsec = _numbers(judged.residual)
+        record.first_frame, record.last_frame = lit.first, lit.last
+    return record
+
+
 def _numbers(values: FloatArray | None) -> Any:
     """An array as a record has it."""
     return None if values is None else tuple(values.tolist())
@@ -214,6 +273,13 @@ def fault_records(path: Path) -> Iterator[FaultRecord]:
     decoder = msgspec.json.Decoder(FaultRecord)
     for number, data in enumerate(read_messages(path, FAULT_TOPIC, tell=False), start=1):
         yield _decoded(decoder, data, f"{path}: message {number} of {FAULT_TOPIC}")
+
+
+def answer_records(path: Path) -> Iterator[AnswerRecord]:
+    """The tracker's answers in a ledger, none if the run had none. Raises InputError for damage."""
+    decoder = msgspec.json.Decoder(AnswerRecord)
+    for number, data in enumerate(read_messages(path, ANSWER_TOPIC, tell=False), start=1):
+        yield _decoded(decoder, data, f"{path}: message {number} of {ANSWER_TOPIC}")
 
 
 def _decoded(decoder: msgspec.json.Decoder[Any], data: bytes, where: str) -> Any:
@@ -254,6 +320,8 @@ def run_records(path: Path) -> Iterator[RunRecord]:
         ATTITUDE_TOPIC: msgspec.json.Decoder(PacketForm),
         COUNT_TOPIC: msgspec.json.Decoder(CountRecord),
         EVENT_TOPIC: msgspec.json.Decoder(EventRecord),
+        FAULT_TOPIC: msgspec.json.Decoder(FaultRecord),
+        ANSWER_TOPIC: msgspec.json.Decoder(AnswerRecord),
     }
     try:
         for number, (topic, data) in enumerate(read_topics(path), start=1):

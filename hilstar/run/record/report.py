@@ -10,17 +10,21 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.notices import MAX_DETAIL_CHARACTERS
+from hilstar.run.record.answer_figures import AnswerReport, AnswerTally, answer_rows
 from hilstar.run.record.ledger_records import (
     MAX_REASON_CHARACTERS,
     MAX_REASONS,
     NO_FRAMES,
     PULSES,
+    AnswerRecord,
     CountRecord,
     EventRecord,
+    FaultRecord,
     FrameRecord,
     PacketForm,
     PacketTally,
@@ -251,6 +255,8 @@ class RunFigures:
     process: ThinnedRows = field(default_factory=lambda: ThinnedRows(3, SAMPLES // 16))  # host time in s, MB, CPU time in s
     keyframes: Keyframes = field(default_factory=Keyframes)
     packet_times: TimeBins = field(default_factory=lambda: TimeBins(2))
+    answers: AnswerTally = field(default_factory=AnswerTally)
+    residuals: ThinnedRows = field(default_factory=lambda: ThinnedRows(4, SAMPLES // 4))  # host time in s, x, y, z in arcsec
     first_events: list[EventRecord] = field(default_factory=list)
     last_events: deque[EventRecord] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     first_process: ProcessRecord | None = None
@@ -288,6 +294,12 @@ class RunFigures:
                 self.events[kind] = self.events.get(kind, 0) + 1
             record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
             (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(record)
+        elif isinstance(record, FaultRecord):
+            self.answers.fault(record)
+        elif isinstance(record, AnswerRecord):
+            self.answers.answer(record)
+            if record.verdict == "right" and record.residual_arcsec is not None:
+                self.residuals.add((record.middle_ns / NS_PER_S, *record.residual_arcsec))
         else:
             self.packets.add(record)
             self._add_packets(record)
@@ -308,6 +320,7 @@ class RunFigures:
             self.first_swap_ns = frame.swap_ns
         self.last = frame
         self.frames += 1
+        self.answers.frame(frame)
         self.stale_frames += frame.stale
         self.blank_frames += frame.q is None
         self.late += frame.stale and frame.q is not None
@@ -364,11 +377,18 @@ def _turn_rad(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float,
 def figures_of(path: Path) -> RunFigures:
     """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
     figures = RunFigures(read_head(path))
+    figures.answers = AnswerTally(_begun_ns(figures.head))
     for record in run_records(path):
         figures.add(record)
     if not figures.frames:
         raise InputError(f"{path}: {NO_FRAMES}")
     return figures
+
+
+def _begun_ns(head: dict[str, str]) -> int:
+    """The host time at which a ledger was begun, 0 where its head does not say."""
+    text = head.get("monotonic_ns", "")
+    return int(text) if text.isdecimal() else 0
 
 
 class RunReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -406,6 +426,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     gl_renderer: str | None
     gl_version: str | None
     render_path: str | None
+    answers: AnswerReport | UnsetType = UNSET
 
 
 def summarise(run: RunFigures) -> RunReport:
@@ -422,6 +443,7 @@ def summarise(run: RunFigures) -> RunReport:
         pacing_jitter_ms=run.spreads["interval"].deviation,
         attitude_age_frames=None if refresh_hz is None else times["attitude_age_ms"].times(refresh_hz / 1e3),
         packets=run.packets.counts,
+        answers=run.answers.report(run.first_swap_ns) or UNSET,
     )
 
 
@@ -457,6 +479,7 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
         ("pulses", pulses),
         ("stars", f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint"),
+        *answer_rows(found.answers or None),
         ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
         ("bench file", f"SHA-256 {found.bench_sha256}"),
         ("calibration", f"{found.calibration}, SHA-256 {found.calibration_sha256}"),

@@ -1,0 +1,131 @@
+"""The tracker in the loop of a run: its answers, taken beside the frame loop, judged, recorded and told.
+
+The frame loop only leaves each frame here. One thread takes what the reader's process has decoded, fifty times a second and at
+most MAX_JUDGED_HZ answers a second; those beyond that are counted.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from hilstar.answers.answer import Answer, AnswerSource
+from hilstar.answers.judge import AnswerJudge, AnswerRules, Judged, TrackerFigures
+from hilstar.answers.pairing import LitFrame, LitFrames
+from hilstar.bench.frame import Bench
+from hilstar.errors import one_line
+from hilstar.notices import Notices
+from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.run.pacer import Shown
+from hilstar.run.record.ledger import Allowance, LedgerSwitch
+from hilstar.run.record.ledger_records import answer_record
+from hilstar.run.screen.screen import Screen
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+POLL_S = 0.02
+FIGURES_NS = NS_PER_S // 10  # between two sets of figures while nothing comes
+PROMPT_NS = NS_PER_S // 13  # and while answers come
+MAX_JUDGED_HZ = 200
+TOO_MANY = "too many"
+SILENT, WRONG = "tracker-silent", "wrong-answer"
+
+
+class LiveAnswers:
+    """A run's tracker: `figures` are the newest. Readable from any thread."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        rules: AnswerRules,
+        source: AnswerSource,
+        notices: Notices,
+        ledger: LedgerSwitch,
+        *,
+        screen: Screen | None = None,
+        clock: HostClock = HOST_CLOCK,
+    ) -> None:
+        self.figures = TrackerFigures()
+        self.newest: Judged | None = None
+        self.heard: Callable[[LiveAnswers], None] = lambda answers: None  # called with new figures of a new answer
+        self._source, self._notices, self._ledger, self._clock = source, notices, ledger, clock
+        self._light_ns = 0 if screen is None else screen.swap_to_light_ns
+        self._on_screen = screen is not None
+        period_ns = NS_PER_S / bench.config.monitor.refresh_hz
+        self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
+        self._judge = AnswerJudge(rules, self._frames)
+        self._allowance = Allowance(MAX_JUDGED_HZ, MAX_JUDGED_HZ)
+        self._too_many = 0
+        self._figures_ns = 0
+        self._untold = False
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hilstar-answers", daemon=True)
+
+    def frame(self, shown: Shown, light_ns: int) -> None:
+        """Take a frame whose light leaves at `light_ns` of the sender's clock. Called by the frame loop."""
+        attitude, on_screen = shown.attitude, shown.on_screen
+        seen = attitude is not None and not on_screen.operator and not on_screen.hidden
+        host_ns = shown.swap_ns + self._light_ns if self._on_screen else shown.draw_ns
+        q = attitude.q_icrs_to_cam if attitude is not None and seen else None
+        self._frames.add(LitFrame(shown.number, host_ns, light_ns, q, shown.drawn.rate_cam_rad_s))
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Take answers while this is open."""
+        self._thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(POLL_S):
+            try:
+                self._look()
+            except Exception as error:  # whatever it is: the run goes on, and so does this
+                self._notices.tell("answers-failed", one_line(f"an answer failed ({type(error).__name__}: {error}); going on"))
+        self._look()
+
+    def _look(self) -> None:
+        """Take what has come, and bring the figures up to date."""
+        for answer in self._source.take():
+            if self._allowance.take(answer.host_ns):
+                self._take(answer)
+                self._untold = True
+            else:
+                self._too_many += 1
+        now_ns = self._clock.now_ns()
+        if self._frames.newest is None or now_ns - self._figures_ns < (PROMPT_NS if self._untold else FIGURES_NS):
+            return
+        self._figures_ns = now_ns
+        refused = dict(self._source.refusals())
+        if self._too_many:
+            refused[TOO_MANY] = refused.get(TOO_MANY, 0) + self._too_many
+        self.figures = self._judge.figures(now_ns, refused)
+        if self.figures.silent:
+            self._notices.begin(SILENT, self.figures.silent)
+        else:
+            self._notices.end(SILENT, "tracker-answers", "the tracker answers")
+        if self._untold:
+            self._untold = False
+            self.heard(self)
+
+    def _take(self, answer: Answer) -> None:
+        judged = self.newest = self._judge.judge(answer)
+        if judged.verdict == "wrong":
+            self._notices.tell(WRONG, wrong_line(judged))
+        if self._ledger.on:
+            self._ledger.answer(answer_record(judged))
+
+
+def wrong_line(judged: Judged) -> str:
+    """What is said of a wrong answer: how far it is off, and in which frames."""
+    assert judged.residual is not None and judged.lit is not None
+    off, lit = math.hypot(*judged.residual), judged.lit
+    size = f"{off:.0f} arcsec" if off < 3600 else f"{off / 3600:.2f} deg"
+    parts = ", ".join(f"{axis} {part:.0f}" for axis, part in zip("xyz", judged.residual, strict=True))
+    late_ms = (judged.answer.host_ns - judged.middle_ns) / NS_PER_MS
+    frames = f"frames {lit.first} to {lit.last}"
+    return f"the tracker's answer is off by {size} ({parts} arcsec) in {frames}, {late_ms:.0f} ms ago"

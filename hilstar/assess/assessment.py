@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
+from hilstar.answers.judge import TO_MIDDLE, Stamp
+from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.assess.bench_effects import (
     DisplayCost,
     Slice,
@@ -30,8 +31,8 @@ from hilstar.bench.config import BenchConfig
 from hilstar.calibrate.attitude_pairs import COMMANDED, Pairs, refuse_conventions
 from hilstar.errors import HilstarError, InputError
 from hilstar.rotation import to_matrix, to_rotation_vector
-from hilstar.run.record.commanded import Commanded, CommandedRun, read_commanded
-from hilstar.run.record.ledger_records import config_of, read_head
+from hilstar.run.record.commanded import NOT_SHOWN, Commanded, CommandedRun, read_commanded
+from hilstar.run.record.ledger_records import answer_records, config_of, read_head
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 AGREE_RAD = np.radians(1.0)  # half of the answers of one sky lie this near to one rotation
@@ -42,15 +43,17 @@ SEED = 0  # the bootstrap's seed: the same files give the same intervals
 SMALL = 0.3  # share of the noise above which the display's own error gets a note
 BENT_ARCSEC = 0.1
 TOGETHER, SLOW_SHARE = 20, 0.1  # noise that lasts for so many answers gets a note from this share of the variance on
-Stamp = Literal["start", "middle", "end"]
-TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # from the stamp to the middle, in exposures
+MAX_FALLING = 0.01  # share of answers whose own time may not rise: of more, the clock was set, and arrivals count
 
 
 @dataclass(frozen=True, slots=True)
 class AssessSettings:
-    """Where in an exposure times are stamped, their latency, s, and at how many attitudes the display is tested."""
+    """Where in an exposure times are stamped, their latency, s, and at how many attitudes the display is tested.
 
-    stamp: Stamp = "middle"
+    Without a `stamp` it is the bench file's for its own answers, and the middle for a file's.
+    """
+
+    stamp: Stamp | None = None
     latency_s: float = 0.0
     display_attitudes: int = 12
 
@@ -128,17 +131,57 @@ class Assessment:
     notes: tuple[str, ...]
 
 
+class LedgerAnswers(NamedTuple):
+    """A ledger's own answers: where in an exposure their times are, and how far these are ahead of the run's, as known live."""
+
+    telemetry: Telemetry
+    stamp: Stamp
+    ahead_ns: int
+
+
+def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
+    """The answers that a run recorded, by the tracker's own times where it sends any. Raises InputError where it has none."""
+    records = list(answer_records(ledger))
+    if not any(record.valid and record.q is not None for record in records):
+        has = f"{len(records)} answers, none of them with an attitude" if records else "no answers of a tracker"
+        raise InputError(f"{ledger}: has {has}; give its telemetry too, or the ledger of a bench file with [answers]")
+    middle_ns = np.array([record.middle_ns for record in records], dtype=np.int64)
+    to_light_ns = [record.light_ns - record.middle_ns for record in records if record.light_ns is not None]
+    on_run_ns = middle_ns + (int(np.median(to_light_ns)) if to_light_ns else 0)
+    own = [record.t_ns for record in records if record.t_ns is not None]
+    t_ns = np.array(own, dtype=np.int64)
+    if len(own) < len(records) or stamp == "arrival" or not _rising(t_ns).mean() > 1 - MAX_FALLING:
+        t_ns, stamp = on_run_ns, "middle"
+    rising = _rising(t_ns)
+    kept = [record for record, later in zip(records, rising, strict=True) if later]
+    valid = np.array([record.valid and record.q is not None for record in kept], dtype=np.bool_)
+    q = np.array([NOT_SHOWN if record.q is None else record.q for record in kept], dtype=np.float64)
+    numbers = np.flatnonzero(rising) + 1
+    ahead_ns = int(np.median(t_ns - on_run_ns))
+    return LedgerAnswers(Telemetry(ledger, t_ns[rising], q, valid, numbers, of_lines=False), stamp, ahead_ns)
+
+
+def _rising(t_ns: IntArray) -> BoolArray:
+    """Which times (n,) are later than all before them."""
+    return np.append(True, t_ns[1:] > np.maximum.accumulate(t_ns)[:-1])
+
+
 def assess_files(
-    ledger: Path, telemetry: Path, settings: AssessSettings, say: Callable[[str], None] = lambda _: None
+    ledger: Path, telemetry: Path | None, settings: AssessSettings, say: Callable[[str], None] = lambda _: None
 ) -> Assessment:
-    """Assess telemetry against a ledger. Raises InputError for a fault of either."""
-    answers, run = read_telemetry(telemetry), read_ledger(ledger)
-    # The telemetry's times from the run's zero where the two overlap, else from their own first.
+    """Assess telemetry, or the ledger's own answers, against a ledger. Raises InputError for a fault of either."""
+    run = read_ledger(ledger)
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
-    overlap = answers.t_ns[0] <= zero_ns + round(end_s * NS_PER_S) and answers.t_ns[-1] >= zero_ns
-    base_ns = zero_ns if overlap else int(answers.t_ns[0])
+    if telemetry is None:
+        answers, stamp, ahead_ns = read_answers(ledger, settings.stamp or "middle")
+        base_ns, telemetry = zero_ns + ahead_ns, ledger
+    else:
+        answers, stamp = read_telemetry(telemetry), settings.stamp or "middle"
+        # The telemetry's times from the run's zero where the two overlap, else from their own first.
+        overlap = answers.t_ns[0] <= zero_ns + round(end_s * NS_PER_S) and answers.t_ns[-1] >= zero_ns
+        base_ns = zero_ns if overlap else int(answers.t_ns[0])
     tau_s, base_s = (answers.t_ns - base_ns) / NS_PER_S, (base_ns - zero_ns) / NS_PER_S
-    tau_s = tau_s + TO_MIDDLE[settings.stamp] * run.config.tracker.exposure_s - settings.latency_s
+    tau_s = tau_s + TO_MIDDLE[stamp] * run.config.tracker.exposure_s - settings.latency_s
     valid = np.flatnonzero(answers.valid)
     if len(valid) < MIN_ROWS:
         raise InputError(f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer telemetry")

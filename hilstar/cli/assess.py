@@ -17,17 +17,24 @@ MAX_LATENCY_MS = 1e7
 
 def assess(
     ledger: RunFile,
-    telemetry: Annotated[
-        Path,
-        typer.Argument(
-            metavar="TELEMETRY",
-            help="Its answers on its own clock: CSV t_s,qw,qx,qy,qz[,valid] (q_icrs_to_cam, scalar first), AEM, MCAP.",
-        ),
-    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for budget.html and its tables.")],
+    telemetry: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[TELEMETRY]",
+            help="Its answers on its own clock: CSV t_s,qw,qx,qy,qz[,valid] (q_icrs_to_cam, scalar first), AEM, MCAP;"
+            " by default the answers in the ledger.",
+            show_default=False,
+        ),
+    ] = None,
     stamp: Annotated[
-        Literal["start", "middle", "end"], typer.Option(help="Where in an exposure of tracker.exposure_s t_s stands.")
-    ] = "middle",
+        Literal["start", "middle", "end"] | None,
+        typer.Option(
+            help="Where in an exposure of tracker.exposure_s t_s stands; by default the middle, for the ledger's own answers"
+            " as its bench file says.",
+            show_default=False,
+        ),
+    ] = None,
     latency_ms: Annotated[
         float, typer.Option("--latency-ms", metavar="MS", help="How much later than that t_s is, where it is known.")
     ] = 0.0,
@@ -44,7 +51,7 @@ def assess(
     if not abs(latency_ms) < MAX_LATENCY_MS:
         raise InputError(f"--latency-ms {latency_ms:g}: write milliseconds, less than {MAX_LATENCY_MS:g} either way")
     names = ("budget.html", "budget.csv", "slices.csv", "wrong.csv", "outages.csv")
-    check_files([ledger, telemetry], [output / name for name in names])
+    check_files([ledger, *([] if telemetry is None else [telemetry])], [output / name for name in names])
     found = assess_files(ledger, telemetry, AssessSettings(stamp, latency_ms / 1e3, display_attitudes))
     make_directory(output)
     write_tables(output, found)

@@ -3,28 +3,42 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.mcap_log import RUN_METADATA, JsonTopic, McapWriter
-from hilstar.run.record.ledger_records import FRAME_TOPIC, FrameRecord, schema_of
+from hilstar.attitude.logs.mcap_log import RUN_METADATA, McapWriter
+from hilstar.run.record.ledger import TOPICS
+from hilstar.run.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 from tests.support.benches import SMALL_BENCH
 from tests.support.planted_tracker import Planted
 
 NS_PER_S = 1_000_000_000
 
 
-def write_ledger(path: Path, frames_s: FloatArray, frames_q: FloatArray | None, start_ns: int = 5 * NS_PER_S) -> Path:
-    """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the attitudes (n, 4), or none."""
+def write_ledger(
+    path: Path,
+    frames_s: FloatArray,
+    frames_q: FloatArray | None,
+    start_ns: int = 5 * NS_PER_S,
+    records: Sequence[AnswerRecord | FaultRecord] = (),
+) -> Path:
+    """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the attitudes (n, 4), or none.
+
+    The sender's clock is the host's; `records` are written among the frames by their host time.
+    """
     head = {"bench_text": SMALL_BENCH, "bench_file": str(path.parent / "bench.toml"), "bench_sha256": "of a test"}
     with path.open("wb") as file:
-        topic = JsonTopic(FRAME_TOPIC, "hilstar.Frame", schema_of(FrameRecord, "hilstar.Frame"))
-        writer = McapWriter(file.fileno(), {"frame": topic}, RUN_METADATA, head)
+        writer = McapWriter(file.fileno(), TOPICS, RUN_METADATA, head)
+        waiting = sorted(records, key=lambda each: each.host_ns, reverse=True)
         for number, t_s in enumerate(frames_s.tolist()):
             t_ns = start_ns + round(t_s * NS_PER_S)
             q = None if frames_q is None else tuple(frames_q[number].tolist())
+            while waiting and waiting[-1].host_ns <= t_ns:
+                one = waiting.pop()
+                writer.add("answer" if isinstance(one, AnswerRecord) else "fault", one.host_ns, msgspec.json.encode(one), 0)
             record = FrameRecord(frame=number, t_ns=t_ns, light_ns=t_ns, draw_ns=t_ns, swap_ns=t_ns, q=q)
             writer.add("frame", t_ns, msgspec.json.encode(record), number)
         writer.flush()

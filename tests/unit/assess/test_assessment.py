@@ -18,7 +18,8 @@ from hilstar.assess import report
 from hilstar.assess.bench_effects import display_cost, slices_of, turn_between
 from hilstar.assess.lock import lock_of
 from hilstar.run.record.commanded import Commanded
-from tests.support.commands import run_hilstar_here
+from hilstar.run.record.ledger_records import AnswerRecord
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
 from tests.support.planted_run import write_ledger, write_run, write_telemetry
 from tests.support.planted_tracker import Planted, Sizes, plant, scalar_first, scan, still
@@ -67,6 +68,32 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path
     row = table["noise", "cross"]
     assert float(row["low_95"]) < 1.0 < float(row["high_95"])
     assert (out / "slices.csv").read_text().count("rate_deg_s") == 5
+
+
+def test_a_ledgers_own_answers_give_the_budget_of_a_file_of_them(tmp_path: Path, planted: Planted) -> None:
+    ledger, telemetry = write_run(tmp_path, planted)
+    by_file = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "a", "--json", "--display-attitudes", "0")
+    own_s, epoch_ns, late_ns = planted.tau_s, 10**15, 150_000_000
+    records = []
+    for k, (tau_s, q) in enumerate(zip(own_s.tolist(), planted.reported.tolist(), strict=True)):
+        middle_ns = round((tau_s + 5) * 1e9)  # as a live run knows it, 20 ms off
+        records.append(
+            AnswerRecord(host_ns=middle_ns + late_ns, raw="00", t_ns=middle_ns + epoch_ns, q=tuple(q), verdict="right",
+                         middle_ns=middle_ns, light_ns=None if k in planted.wild else middle_ns)
+        )  # fmt: skip
+    records.insert(50, AnswerRecord(host_ns=records[50].host_ns, raw="", t_ns=records[49].t_ns, valid=False, middle_ns=0))
+    ledger = write_ledger(tmp_path / "own.mcap", planted.frames_s, planted.frames_q, records=records)
+    own = run_hilstar_here("assess", ledger, "-o", tmp_path / "b", "--json", "--display-attitudes", "0")
+    assert own.returncode == 0, own.stderr
+    found, expected = json.loads(own.stdout), json.loads(by_file.stdout)
+    for key in ("bias_arcsec", "fov_arcsec", "noise_arcsec"):
+        assert found[key] == pytest.approx(expected[key], rel=1e-3)
+    assert found["clock"]["drift_ppm"] == pytest.approx(expected["clock"]["drift_ppm"], rel=1e-3)
+    # The telemetry's clock is that of the run in the file, and its own in the ledger.
+    assert found["clock"]["offset_ms"] == pytest.approx(expected["clock"]["offset_ms"] + epoch_ns / 1e6, abs=0.01)
+    assert [each["row"] for each in found["wrong"]] == (planted.wild + 1 + (planted.wild >= 50)).tolist()
+    empty = write_ledger(tmp_path / "empty.mcap", planted.frames_s[:9], planted.frames_q[:9])
+    assert_refused(run_hilstar_here("assess", empty, "-o", tmp_path / "c"), 2, "no answers of a tracker", "give its telemetry")
 
 
 @pytest.mark.parametrize(

@@ -82,20 +82,20 @@ class LiveAnswers:
 
     def _run(self) -> None:
         while not self._stop.wait(POLL_S):
-            try:
-                self._look()
-            except Exception as error:  # whatever it is: the run goes on, and so does this
-                self._notices.tell("answers-failed", one_line(f"an answer failed ({type(error).__name__}: {error}); going on"))
+            self._look()
         self._look()
 
     def _look(self) -> None:
         """Take what has come, and bring the figures up to date."""
         for answer in self._source.take():
-            if self._allowance.take(answer.host_ns):
+            if not self._allowance.take(answer.host_ns):
+                self._too_many += 1
+                continue
+            try:
                 self._take(answer)
                 self._untold = True
-            else:
-                self._too_many += 1
+            except Exception as error:  # whatever it is: the run goes on, and so does this
+                self._notices.tell("answers-failed", one_line(f"an answer failed ({type(error).__name__}: {error}); going on"))
         now_ns = self._clock.now_ns()
         if self._frames.newest is None or now_ns - self._figures_ns < (PROMPT_NS if self._untold else FIGURES_NS):
             return

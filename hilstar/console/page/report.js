@@ -77,7 +77,7 @@ function curves() {
       lines: [line("x", "one", 1, answers.t_s, x), line("y", "two", 1, answers.t_s, y), line("z", "three", 1, answers.t_s, z)],
       marks: [
         { name: "wrong", ink: "bad", t: answers.wrong_s, n: answers.wrong_s.map(() => 1) },
-        { name: "faults", ink: "warn", lasting: true, t: answers.on_s, n: answers.on, count: answers.faults.map((fault) => fault.start_s) },
+        { name: "fault on", ink: "warn", lasting: true, t: answers.on_s, n: answers.on, count: answers.faults.map((fault) => fault.start_s) },
       ],
     };
   }

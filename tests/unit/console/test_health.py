@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
+from hilstar.answers.judge import TrackerFigures
 from hilstar.console.messages import LedgerState, RunState
 from hilstar.console.protocol import NewestFrame, ShownAttitude
 from hilstar.console.server.reader import Health, RecentFrames, reasons
@@ -43,6 +44,7 @@ def test_a_run_that_goes_well_has_no_reason():
         ({"ledger": LedgerState("run.mcap", 1, "cannot be written")}, "the ledger fails: cannot be written"),
         ({"operator_text": "blank"}, "changed by the operator: blank"),
         ({"faults": ["flash"]}, "a fault is on: flash"),
+        ({"tracker": TrackerFigures(silent="the tracker has not answered for 2.0 s")}, "has not answered for 2.0 s"),
         ({"rates": "the packets' rates are wrong"}, "the packets' rates are wrong"),
     ],
 )

@@ -124,8 +124,8 @@ def wrong_line(judged: Judged) -> str:
     """What is said of a wrong answer: how far it is off, and in which frames."""
     assert judged.residual is not None and judged.lit is not None
     off, lit = math.hypot(*judged.residual), judged.lit
-    size = f"{off:.0f} arcsec" if off < 3600 else f"{off / 3600:.2f} deg"
-    parts = ", ".join(f"{axis} {part:.0f}" for axis, part in zip("xyz", judged.residual, strict=True))
+    unit, scale, digits = ("arcsec", 1.0, 0) if off < 3600 else ("deg", 3600.0, 2)
+    parts = ", ".join(f"{axis} {part / scale:.{digits}f}" for axis, part in zip("xyz", judged.residual, strict=True))
     late_ms = (judged.answer.host_ns - judged.middle_ns) / NS_PER_MS
     frames = f"frames {lit.first} to {lit.last}"
-    return f"the tracker's answer is off by {size} ({parts} arcsec) in {frames}, {late_ms:.0f} ms ago"
+    return f"the tracker's answer is off by {off / scale:.{digits}f} {unit} ({parts}) in {frames}, {late_ms:.0f} ms ago"

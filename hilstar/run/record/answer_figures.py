@@ -37,8 +37,9 @@ class AnswerSpan(msgspec.Struct, frozen=True, kw_only=True):
 class FaultEffect(msgspec.Struct, frozen=True, kw_only=True):
     """A fault and the answers around it; times s after the run's first swap.
 
-    `first_wrong_s` is from its begin to the first wrong answer's exposure. `recovered_s` is from its end to that of the first
-    right answer; 0 where the last answer before its end was right, None where none came.
+    `first_wrong_s` is from its begin to the exposure of the first wrong answer before it was over and recovered from.
+    `recovered_s` is from its end to that of the first right answer; 0 where the last answer before its end was right, None
+    where none came.
     """
 
     name: str
@@ -137,7 +138,7 @@ class _Fault:
             if at_ns >= self.start_ns - around_ns:
                 self.parts[0].add(record)
             return
-        if record.verdict == "wrong" and self.first_wrong_ns is None:
+        if record.verdict == "wrong" and self.first_wrong_ns is None and self.recovered_ns is None:
             self.first_wrong_ns = at_ns
         if self.end_ns is None or at_ns < self.end_ns:
             self.parts[1].add(record)

@@ -27,7 +27,8 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 POLL_S = 0.02
 FIGURES_NS = NS_PER_S // 10  # between two sets of figures while nothing comes
 PROMPT_NS = NS_PER_S // 13  # and while answers come
-MAX_JUDGED_HZ = 200
+MAX_JUDGED_HZ = 100
+REST_S = 0.002  # after each, so that Python's lock is free for the frame loop
 TOO_MANY = "too many"
 SILENT, WRONG = "tracker-silent", "wrong-answer"
 
@@ -94,6 +95,7 @@ class LiveAnswers:
             try:
                 self._take(answer)
                 self._untold = True
+                self._stop.wait(REST_S)
             except Exception as error:  # whatever it is: the run goes on, and so does this
                 self._notices.tell("answers-failed", one_line(f"an answer failed ({type(error).__name__}: {error}); going on"))
         now_ns = self._clock.now_ns()

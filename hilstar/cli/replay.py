@@ -75,6 +75,7 @@ def replay(
         FrameImages(output, bench) as record,
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
+        running.optional_answers(bench, notices, kept, screen) as answers,
     ):
         running.say_of_light(bench)
         if explain:
@@ -83,11 +84,13 @@ def replay(
         status = RunStatus(RunSource(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)
         page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
         schedule = getattr(wrong, "schedule", None)  # nobody starts a fault in a run that is replayed
-        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule)
+        parts = PageParts(
+            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule, answers
+        )
         with (
             on_terminal(status),
             running.followed(listener, control, page, parts, status, record) as (sink, follower, requests),
         ):
-            outlet = Outlet(screen, kept, notices, follower=follower, requests=requests, faults=wrong, pulse=pulse)
+            outlet = Outlet(screen, kept, notices, None, follower, requests, wrong, pulse, answers)
             summary = replay_log(bench, play, sink, outlet)
     running.end_of_run(summary, screen, kept, notices, as_json)

@@ -160,6 +160,7 @@ def serve(
         running.shown_bench(file, headless, windowed, force, timed=not file.config.attitude.lockstep) as (bench, screen),
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept) as wrong,
+        running.optional_answers(bench, notices, kept, screen) as answers,
     ):
         if explain:
             running.explain_bench(bench, of_source=link.conventions.lines(Mounting(file.config.tracker.q_body_to_cam)))
@@ -176,9 +177,13 @@ def serve(
         source = file.config.attitude
         page = RunDescription("serve", source.source, link.endpoint, "asked" if source.lockstep else "clock")
         schedule = getattr(wrong, "schedule", None)
-        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule)
+        parts = PageParts(
+            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule, answers
+        )
         with on_terminal(status), running.followed(listener, control, page, parts, status) as (sink, follower, requests):
-            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse)
+            outlet = Outlet(
+                screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse, answers
+            )
             summary = serve_stream(bench, link, limit, sink, outlet)
     running.end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, notices, as_json)
     if not summary.packets.accepted:

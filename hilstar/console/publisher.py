@@ -157,7 +157,7 @@ LEDGER_TROUBLES = {
 
 @dataclass(frozen=True, slots=True)
 class PageParts:
-    """The parts of a run; `make_ledger` begins a ledger at a path, `answers` says that the tracker is to answer."""
+    """The parts of a run; `make_ledger` begins a ledger at a path, `answers` are the tracker's."""
 
     bench: Bench
     notices: Notices
@@ -165,7 +165,7 @@ class PageParts:
     make_ledger: Callable[[Path], Ledger]
     screen: Screen | None = None
     faults: FaultSchedule | None = None
-    answers: bool = False
+    answers: LiveAnswers | None = None
 
 
 class WatchedRun:
@@ -433,7 +433,7 @@ def opened_page(
     bench, orders = parts.bench, OrderHandler(requests, feed, parts)
     setup = setup_for(listener, control, description, bench.file, picture_bytes)
     setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
-    setup.hello.answers = parts.answers
+    setup.hello.answers = parts.answers is not None
     setup.hello.faults = [] if parts.faults is None else parts.faults.names()
     setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
     with PageProcess(setup, memory, listener.socket, WatchedRun(feed, parts), orders.do):

@@ -1,8 +1,8 @@
 """A simulator and a tracker in one process of their own: attitudes out over ZeroMQ, answers out over a serial line.
 
-`python -m tests.support.stub_tracker '{"port": ..., "line": "/dev/pts/1"}'`; the keys are those of `Stub`. The tracker reports what
-was commanded in the middle of each exposure, with errors that are planted here, one JSON object a line. Its `mode` is the host's
-clock just before it writes, ns. It ends when its standard input does, and then prints which of its answers were wild.
+`python -m tests.support.stub_tracker '{"port": 5560, "line": 5}'`, with the descriptor of a line; the keys are those of `Stub`. The
+tracker reports what was commanded in the middle of each exposure, with errors that are planted here, one JSON object a line. Its
+`mode` is the host's clock just before it writes, ns. It ends when its standard input does, and then prints which were wild.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Stub:
     """What is planted. `swing_deg` is the size of a slow turn to and fro, `silent_s` a part of the run without answers."""
 
     port: int
-    line: str
+    line: int
     answer_hz: float = 10.0
     latency_s: float = 0.12
     bias_arcsec: tuple[float, float, float] = (15.0, -9.0, 40.0)
@@ -67,7 +67,6 @@ def main() -> None:
     sender = zmq.Context().socket(zmq.PUB)
     sender.setsockopt(zmq.LINGER, 0)
     sender.connect(f"tcp://127.0.0.1:{stub.port}")
-    line = os.open(stub.line, os.O_WRONLY | os.O_NOCTTY)
     begun_s = time.monotonic()
     sent, answered, wild = 0, 0, []
     while not select.select([sys.stdin], [], [], 0)[0]:
@@ -79,11 +78,11 @@ def main() -> None:
         if now_s >= middle_s + stub.latency_s:
             text, is_wild = stub.answer(answered, middle_s, begun_s, rng)
             if not stub.silent_s[0] <= now_s - begun_s < stub.silent_s[1]:
-                os.write(line, text.encode())
+                os.write(stub.line, text.encode())
                 wild += [answered] if is_wild else []
             answered += 1
         if stub.babble:
-            os.write(line, rng.bytes(64))
+            os.write(stub.line, rng.bytes(64))
         time.sleep(0.001)
     print(json.dumps({"answered": answered, "wild": wild}))
 

@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import msgspec
 import numpy as np
@@ -23,6 +23,9 @@ from hilstar.answers.pairing import Lit, LitFrames, residual_arcsec
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.sender_clock import SenderClock
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
+
+if TYPE_CHECKING:
+    from hilstar.bench.config import BenchConfig
 
 Verdict = Literal["right", "wrong", "invalid", "unpaired"]
 Stamp = Literal["start", "middle", "end", "arrival"]
@@ -47,6 +50,15 @@ class AnswerRules:
     clock: Literal["own", "unix", "host"] = "own"
     wrong_arcsec: float = 3600.0
     latency_s: float | None = None
+
+    @classmethod
+    def of(cls, config: BenchConfig) -> Self:
+        """Those of a bench file; the defaults for one without `[answers]`."""
+        settings, exposure_s = config.answers, config.tracker.exposure_s
+        if settings is None:
+            return cls(exposure_s)
+        latency_s = None if settings.latency_ms is None else settings.latency_ms / 1e3
+        return cls(exposure_s, settings.stamp, settings.clock, settings.wrong_arcsec, latency_s)
 
 
 class Judged(NamedTuple):

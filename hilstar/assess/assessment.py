@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.answers.judge import TO_MIDDLE, Stamp
+from hilstar.answers.judge import TO_MIDDLE, AnswerRules, Stamp
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.assess.bench_effects import (
     DisplayCost,
@@ -173,7 +173,7 @@ def assess_files(
     run = read_ledger(ledger)
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
     if telemetry is None:
-        answers, stamp, ahead_ns = read_answers(ledger, settings.stamp or "middle")
+        answers, stamp, ahead_ns = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
         base_ns, telemetry = zero_ns + ahead_ns, ledger
     else:
         answers, stamp = read_telemetry(telemetry), settings.stamp or "middle"

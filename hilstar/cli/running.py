@@ -155,19 +155,15 @@ def optional_pulse(file: BenchFile, notices: Notices) -> Iterator[FramePulse | N
 @contextmanager
 def optional_answers(bench: Any, notices: Notices, ledger: LedgerSwitch, screen: Any) -> Iterator[LiveAnswers | None]:
     """The tracker's answers while this is open; None where the bench file names none. Raises InputError."""
-    settings = bench.config.answers
-    if settings.source is None:
+    if bench.config.answers is None:
         yield None
         return
     from hilstar.answers.judge import AnswerRules
     from hilstar.answers.reader import open_answers
     from hilstar.run.live_answers import LiveAnswers
 
-    latency_s = None if settings.latency_ms is None else settings.latency_ms / 1e3
-    exposure_s = bench.config.tracker.exposure_s
-    rules = AnswerRules(exposure_s, settings.stamp, settings.clock, settings.wrong_arcsec, latency_s)
     with open_answers(bench.config, bench.file.folder, notices) as source:
-        answers = LiveAnswers(bench, rules, source, notices, ledger, screen=screen)
+        answers = LiveAnswers(bench, AnswerRules.of(bench.config), source, notices, ledger, screen=screen)
         with answers.running():
             say(f"answers: {source.endpoint}")
             yield answers

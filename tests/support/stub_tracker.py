@@ -1,8 +1,8 @@
 """A simulator and a tracker in one process of their own: attitudes out over ZeroMQ, answers out over a serial line.
 
-`python -m tests.support.stub_tracker '{"port": 5560, "line": 5}'`, with the descriptor of a line; the keys are those of `Stub`. The
-tracker reports what was commanded in the middle of each exposure, with errors that are planted here, one JSON object a line. Its
-`mode` is the host's clock just before it writes, ns. It ends when its standard input does, and then prints which were wild.
+`python -m tests.support.stub_tracker '{"port": 5560, "line": 5}'`: the keys are those of `Stub`. The tracker reports what was
+commanded in the middle of each exposure, with errors that are planted here, one JSON object a line. Its `mode` is the host's
+clock just before it writes, ns. It ends when its standard input does, and then prints which answers were wild.
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ SENT_EACH_S = 0.02
 
 @dataclass(frozen=True)
 class Stub:
-    """What is planted. `swing_deg` is the size of a slow turn to and fro, `silent_s` a part of the run without answers."""
+    """What is planted, the simulator's port, and the descriptor of the serial line.
+
+    `swing_deg` is the size of a slow turn to and fro, `silent_s` a part of the run without answers.
+    """
 
     port: int
     line: int

@@ -18,6 +18,7 @@ MIN_STARS = 4  # identified, for an answer: three confirm a fourth
 MIN_SHARE = 0.5  # of the stars found that have to be the catalogue's
 RADII_PX = (12.0, 3.0, 1.5)  # how far a found star may be from where it is expected, at each step
 CENTROID_E_PX2, CENTROID_FLOOR_PX = 0.4, 0.02  # a centroid's variance: 0.4 px^2 an electron, and the display's own share
+REFITS, REJECTED = 4, 4.0  # stars farther off than so many times the median are left out
 FIELD_ERROR = 0.02  # share of the field of view that the database leaves open
 GAIA_RECORD = np.dtype(
     [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("mag", "<f4"), ("pm_ra", "<f4"), ("pm_dec", "<f4")]
@@ -84,9 +85,15 @@ def identify(found: FoundStars, q_expected: FloatArray, stars_near: StarsNear, p
             pairs, known = pairs[alike], known[alike]
         if len(pairs) < max(MIN_STARS, MIN_SHARE * min(len(found), len(directions)) * (step > 0)):
             return None
-        seen = found.rays[pairs]
-        q = wahba(seen, directions[known], weight[pairs])
-    off = np.linalg.norm(seen - directions[known] @ to_matrix(q).T, axis=1)
+        q = wahba(found.rays[pairs], directions[known], weight[pairs])
+    for _ in range(REFITS):  # a neighbour in a star's window pulls it away from where it is
+        off = np.linalg.norm(found.rays[pairs] - directions[known] @ to_matrix(q).T, axis=1)
+        kept = off**2 * weight[pairs] <= REJECTED**2 * np.median(off**2 * weight[pairs])
+        if kept.all() or kept.sum() < MIN_STARS:
+            break
+        pairs, known = pairs[kept], known[kept]
+        q = wahba(found.rays[pairs], directions[known], weight[pairs])
+    off = np.linalg.norm(found.rays[pairs] - directions[known] @ to_matrix(q).T, axis=1)
     return Identified(q, pairs, star[known], float(np.sqrt(np.mean(off**2) / 2)))
 
 

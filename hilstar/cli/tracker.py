@@ -6,7 +6,7 @@ import os
 import re
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from hilstar.twin.live_exposure import LiveTracker, Lost
 
 SOLVER_S = 10.0  # for a command
+NICE = 5
 MAX_RATE_HZ, USUAL_RATE_HZ = 1000.0, 10.0
 MAX_ARCSEC, MAX_S, MAX_PPM = 1e5, 1e5, 1e4
 SILENT = re.compile(r"(\d+(?:\.\d*)?)s?(?:@(\d+(?:\.\d*)?)s?)?")
@@ -98,6 +99,8 @@ def tracker(
     """The bench's virtual tracker before the running display: it watches the frames, and answers in real time."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # it stands for another machine: one core is enough
     os.environ.setdefault("LP_NUM_THREADS", "1")
+    with suppress(OSError):
+        os.nice(NICE)  # a display on this machine goes first
     import numpy as np
 
     from hilstar.attitude.wire.shown_frames import FrameWatch
@@ -135,7 +138,7 @@ def tracker(
 
         process.run(send, stop, float("inf") if duration is None else duration)
         told = process.tally.summary() | {
-            "frames": {"received": live.frames.received, "lost": live.frames.lost, "refused": frames.refused},
+            "frames": {"received": live.frames.received, "missing": live.frames.missing, "refused": frames.refused},
             "link": {"endpoint": link.endpoint, "sent": link.sent, "babbled": link.babbled},
         }
     tell(told, as_json)
@@ -149,7 +152,7 @@ def tell(told: dict[str, Any], as_json: bool) -> None:
     cpu, latency = told["cpu_ms"], told["latency_ms"]
     modes = ", ".join(f"{count} {mode}" for mode, count in told["modes"].items()) or "none"
     typer.echo(f"{'answers':20}{told['answers']}, {told['valid']} valid ({modes}), {told['passed_over']} exposures passed over")
-    typer.echo(f"{'frames':20}{told['frames']['received']} received, {told['frames']['lost']} lost")
+    typer.echo(f"{'frames':20}{told['frames']['received']} received, {told['frames']['missing']} missing")
     if cpu.p50 is not None:
         typer.echo(f"{'an answer':20}{cpu.p50:.0f} ms of one core, {latency.p50:.0f} ms after mid-exposure (median)")
     if told["own_bias_arcsec"] is not None:

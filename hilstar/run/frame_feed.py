@@ -19,7 +19,9 @@ from hilstar.attitude.wire.shown_frames import FrameHead, FrameSender, ShownFram
 from hilstar.bench.frame import Bench
 from hilstar.monitor.response import code_dtype
 from hilstar.process.closing import Closing
+from hilstar.rotation import propagate
 from hilstar.run.pacer import Shown
+from hilstar.units import NS_PER_S
 
 BUFFERS = 4
 LOOK_S = 0.1  # between looks for new watchers while there is none
@@ -35,7 +37,11 @@ class _Copied:
 
 
 class FrameFeed(Closing):
-    """Hands on each frame that `see` is given. `swap_to_light_ns` is the time from a swap to the middle row's light."""
+    """Hands on each frame that `see` is given, while somebody watches.
+
+    `swap_to_light_ns` is the time from a swap to the middle row's light. Without a screen that holds it, a frame stands for the
+    half refresh period before its moment and the one after it.
+    """
 
     def __init__(self, sender: FrameSender, bench: Bench, swap_to_light_ns: Callable[[], int] = lambda: 0) -> None:
         self.sent = self.skipped = 0
@@ -45,13 +51,14 @@ class FrameFeed(Closing):
         self._free: queue.SimpleQueue[_Copied] = queue.SimpleQueue()
         self._full: queue.SimpleQueue[_Copied | None] = queue.SimpleQueue()
         self._made = 0
-        self._watched = False
+        self.watched = False
+        self._half_period_ns = round(NS_PER_S / bench.config.monitor.refresh_hz / 2)
         self._thread = threading.Thread(target=self._send, name="hilstar-frames", daemon=True)
         self._thread.start()
 
     def see(self, shown: Shown) -> None:
         """Take a frame. Called by the frame loop."""
-        if not self._watched:
+        if not self.watched:
             return
         levels, monitor = shown.drawn.levels, self._bench.config.monitor
         try:
@@ -64,22 +71,29 @@ class FrameFeed(Closing):
             copied = _Copied(np.empty_like(levels))
         np.copyto(copied.levels, levels)
         on_screen = shown.predicted_swap_ns is not None
-        q = None if shown.attitude is None else tuple(shown.attitude.q_icrs_to_cam.tolist())
         copied.head = FrameHead(
             frame=shown.number,
-            lit_ns=shown.swap_ns + self._swap_to_light_ns() if on_screen else shown.draw_ns,
+            lit_ns=shown.swap_ns + self._swap_to_light_ns() if on_screen else shown.draw_ns - self._half_period_ns,
             width=levels.shape[1],
             height=levels.shape[0],
             bits=monitor.bits,
-            q=q,
+            q=self._attitude(shown),
             channels=1 if self._rgb is None else 3,
             bench_sha256=self._bench.file.sha256,
         )
         self._full.put(copied)
 
+    def _attitude(self, shown: Shown) -> tuple[float, float, float, float] | None:
+        """The mean attitude while the frame is lit."""
+        if shown.attitude is None:
+            return None
+        q, rate = shown.attitude.q_icrs_to_cam, shown.drawn.rate_cam_rad_s
+        w, x, y, z = (q if rate is None else propagate(q, rate, self._bench.scan.hold_s / 2)).tolist()
+        return w, x, y, z
+
     def _send(self) -> None:
         while True:
-            self._watched = self._sender.look()
+            self.watched = self._sender.look()
             try:
                 copied = self._full.get(timeout=LOOK_S)
             except queue.Empty:

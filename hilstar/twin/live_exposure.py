@@ -67,11 +67,11 @@ class Exposed:
         return sum(self.span_ns) // 2
 
 
-class LitFrames:
+class WatchedFrames:
     """The newest frames of a display, each lit until the next; `light_of` gives the light (n,) of a frame's pixels."""
 
     def __init__(self, light_of: Callable[[ShownFrame], FloatArray]) -> None:
-        self.received = self.lost = 0
+        self.received = self.missing = 0
         self._light_of = light_of
         self._frames: deque[ShownFrame] = deque()
 
@@ -81,7 +81,7 @@ class LitFrames:
         if last is not None and (frame.head.lit_ns <= last.lit_ns or frame.head.frame <= last.frame):
             self._frames.clear()
         elif last is not None:
-            self.lost += frame.head.frame - last.frame - 1
+            self.missing += frame.head.frame - last.frame - 1
         self.received += 1
         self._frames.append(frame)
         while len(self._frames) > 1 and self._frames[1].head.lit_ns < frame.head.lit_ns - KEPT_NS:
@@ -171,7 +171,7 @@ class LiveTracker(Closing):
         self._before: tuple[int, FloatArray] | None = None
         self._last: tuple[int, FloatArray] | None = None
         self.refused = 0
-        self.frames = LitFrames(self._light)
+        self.frames = WatchedFrames(self._light)
 
     def _light(self, frame: ShownFrame) -> FloatArray:
         levels = frame.codes if self._rgb is None else _levels_of(frame.codes, self._rgb)

@@ -15,7 +15,7 @@ import typer
 from hilstar.cli import options
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
-from hilstar.process.interrupts import stop_on_signal
+from hilstar.process.interrupts import is_command, stop_on_signal
 
 if TYPE_CHECKING:
     from hilstar.answers.answer import Answer
@@ -97,10 +97,8 @@ def tracker(
     as_json: options.Json = False,
 ) -> None:
     """The bench's virtual tracker before the running display: it watches the frames, and answers in real time."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # it stands for another machine: one core is enough
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    with suppress(OSError):
-        os.nice(NICE)  # a display on this machine goes first
+    if is_command():
+        stand_back()
     import numpy as np
 
     from hilstar.attitude.wire.shown_frames import FrameWatch
@@ -142,6 +140,14 @@ def tracker(
             "link": {"endpoint": link.endpoint, "sent": link.sent, "babbled": link.babbled},
         }
     tell(told, as_json)
+
+
+def stand_back() -> None:
+    """Take one core, and that after a display on this machine: the process stands for another machine."""
+    for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    with suppress(OSError):
+        os.nice(NICE)
 
 
 def tell(told: dict[str, Any], as_json: bool) -> None:

@@ -19,7 +19,7 @@ from hilstar.process.interrupts import is_command, stop_on_signal
 
 if TYPE_CHECKING:
     from hilstar.answers.answer import Answer
-    from hilstar.twin.live_exposure import LiveTracker, Lost
+    from hilstar.twin.live_exposure import LiveTracker, Solve
 
 SOLVER_S = 10.0  # for a command
 NICE = 5
@@ -192,7 +192,7 @@ def checked_rate(rate_hz: float | None, exposure_s: float) -> float:
     return rate_hz
 
 
-def solver_of(text: str | None, live: LiveTracker) -> Lost | None:
+def solver_of(text: str | None, live: LiveTracker) -> Solve | None:
     """Who finds attitudes lost in space; None: the true one is taken. Raises InputError."""
     import numpy as np
 
@@ -214,7 +214,7 @@ def solver_of(text: str | None, live: LiveTracker) -> Lost | None:
     return by_image(text or "", live)
 
 
-def by_image(text: str, live: LiveTracker) -> Lost:
+def by_image(text: str, live: LiveTracker) -> Solve:
     """A campaign's solver of images: a command, or a function. Raises InputError."""
     import numpy as np
 

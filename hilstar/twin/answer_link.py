@@ -8,8 +8,11 @@ import msgspec
 import numpy as np
 
 from hilstar.answers.answer import Answer
+from hilstar.attitude.wire import protocol
+from hilstar.attitude.wire.packet import AnswerPacket, encode
 from hilstar.process.closing import Closing
 from hilstar.run.sender import PATIENCE_S, SerialSender, open_sender
+from hilstar.twin.live_exposure import BLINDED, LOST, TOO_FEW, TRACKING
 
 FORMATS = ("packet", "json")
 MAX_BABBLE_BYTES = 300  # between two answers
@@ -31,6 +34,30 @@ def json_answer(answer: Answer) -> bytes:
     return msgspec.json.encode(said)
 
 
+MODE_FLAGS = {
+    TRACKING: protocol.ANSWER_TRACKING,
+    LOST: protocol.ANSWER_LOST_IN_SPACE,
+    TOO_FEW: protocol.ANSWER_TOO_FEW_STARS,
+    BLINDED: protocol.ANSWER_BLINDED,
+}
+
+
+def answer_packet(answer: Answer, sequence: int) -> AnswerPacket:
+    """An answer as a packet of the wire."""
+    q, rate = answer.q_icrs_to_cam, answer.rate_cam_rad_s
+    known = protocol.ANSWER_VALID * (q is not None) + protocol.ANSWER_RATE_VALID * (rate is not None)
+    q = np.array([1.0, 0.0, 0.0, 0.0]) if q is None else q
+    rate = np.zeros(3) if rate is None else rate
+    return AnswerPacket(
+        sequence,
+        MODE_FLAGS.get(answer.mode, 0) + known,
+        answer.t_ns or 0,
+        tuple(q.tolist()),
+        tuple(rate.tolist()),
+        answer.star_count or 0,
+    )
+
+
 class AnswerLink(Closing):
     """Sends answers in a format of FORMATS to a target (see `open_sender`); `babble` makes garbage before each.
 
@@ -50,7 +77,7 @@ class AnswerLink(Closing):
         if self._form == "json":
             self._put_raw(json_answer(answer) + (b"\n" if isinstance(self._end, SerialSender) else b""))
         else:
-            self._end.put(b"")
+            self._end.put(encode(answer_packet(answer, self.sent)))
         self.sent += 1
 
     def _put_raw(self, message: bytes) -> None:

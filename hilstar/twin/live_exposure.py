@@ -31,12 +31,13 @@ from hilstar.rotation import (
 from hilstar.sky.stars import split_by_rate
 from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
-from hilstar.tracker.identify import FoundStars, Identified, identify
+from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
 from hilstar.twin.optics import TwinOptics
 from hilstar.twin.simulator import TrackerBackground, detector_canvas
 from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
 
+TRACKING, LOST, TOO_FEW, BLINDED = "tracking", "lost in space", "too few stars", "blinded"
 KEPT_NS = 3 * NS_PER_S  # frames that an exposure may still be of
 SEEN_SIGMAS = 3.0  # of a pixel's noise: fainter stars are not expected in an image
 MAX_EXPECTED = 300  # brightest stars that are
@@ -128,7 +129,7 @@ def _mean(turns: list[tuple[FloatArray, float]]) -> FloatArray | None:
 class Solved:
     """An exposure's answer before anything is planted: its attitude (None: none was found), the stars that it rests on.
 
-    `mode` is "tracking", "lost" (solved lost in space, or not at all), "few" or "blind".
+    `mode` is one of the four words above; LOST is "lost in space", solved or not.
     """
 
     exposed: Exposed
@@ -137,7 +138,7 @@ class Solved:
     identified: Identified | None = None
 
 
-Lost = Callable[[FoundStars, npt.NDArray[np.uint16]], FloatArray | None]
+Solve = Callable[[FoundStars, npt.NDArray[np.uint16]], FloatArray | None]
 
 
 class LiveTracker(Closing):
@@ -147,7 +148,7 @@ class LiveTracker(Closing):
     Raises InputError as the bench does.
     """
 
-    lost_in_space: Lost | None = None
+    lost_in_space: Solve | None = None
 
     def __init__(self, file: BenchFile, rng: np.random.Generator) -> None:
         self.file, self.config, self._rng = file, file.config, rng
@@ -205,15 +206,15 @@ class LiveTracker(Closing):
         found = self._found(dn, exposed, expected)
         settings = self.config.tracker.detector
         if np.count_nonzero(dn == 2**settings.bits - 1) > BLINDED_SHARE * dn.size:
-            return self._answered(Solved(exposed, "blind", found))
+            return self._answered(Solved(exposed, BLINDED, found))
         identified = None if expected is None else identify(found, expected, self._near, self._place)
-        mode = "tracking"
+        mode = TRACKING
         if identified is None and self.lost_in_space is not None and len(found):
-            mode = "lost"
+            mode = LOST
             guess = self.lost_in_space(found, dn)
             identified = None if guess is None else identify(found, guess, self._near, self._place)
         if identified is None:
-            mode = "few" if len(found) < 4 else "lost"
+            mode = TOO_FEW if len(found) < MIN_STARS else LOST
         return self._answered(Solved(exposed, mode, found, identified))
 
     def _answered(self, solved: Solved) -> Solved:

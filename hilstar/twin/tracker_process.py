@@ -23,7 +23,7 @@ from hilstar.attitude.wire.shown_frames import FrameWatch
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
 from hilstar.running_statistics import RunningStatistics
-from hilstar.twin.live_exposure import LiveTracker, Solved
+from hilstar.twin.live_exposure import TRACKING, LiveTracker, Solved
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 
 GRACE_NS = 50 * NS_PER_MS  # three refreshes at 60 Hz
@@ -204,7 +204,7 @@ class TrackerProcess:
             raw=b"",
             t_ns=clock.of_host(middle_ns),
             q_icrs_to_cam=q,
-            rate_cam_rad_s=self._tracker.rate_cam_rad_s() if q is not None and solved.mode == "tracking" else None,
+            rate_cam_rad_s=self._tracker.rate_cam_rad_s() if q is not None and solved.mode == TRACKING else None,
             valid=q is not None,
             mode=solved.mode,
             star_count=stars,

@@ -50,7 +50,8 @@ def display(tmp_path_factory):
     command = [*HILSTAR, "replay", str(folder / "bench.toml"), str(log(folder / "log.csv", 300.0)), "--headless"]
     with Started([*command, "--frames", endpoint], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         yield folder / "bench.toml", endpoint
-        process.kill()
+        process.terminate()
+        process.wait(PATIENCE_S)
 
 
 def tracker(display, *options):
@@ -74,9 +75,9 @@ def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_a
         with tracker(display, *told, *planted) as process:
             answers = [json.loads(ear.recv(65536)) for _ in range(15)]
             found = summary(process)
-    assert answers[0]["mode"] == "lost"
+    assert answers[0]["mode"] == "lost in space"
     assert {answer["mode"] for answer in answers[2:]} == {"tracking"}
-    assert found["modes"]["lost"] == 1
+    assert found["modes"]["lost in space"] == 1
     assert np.all(np.abs(found["own_bias_arcsec"]) < OWN_ARCSEC)
     assert np.all(np.array(found["own_sigma_arcsec"]) < OWN_ARCSEC)
     rows = read_telemetry(tmp_path / "answers.csv")

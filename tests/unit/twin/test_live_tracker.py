@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from hilstar.answers.answer import Answer, ReportedStar
+from hilstar.attitude.wire import protocol
+from hilstar.attitude.wire.packet import AnswerPacket, decode, encode
 from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame
 from hilstar.rotation import conjugate, from_rotation_vector, multiply, to_rotation_vector
-from hilstar.twin.answer_link import json_answer
+from hilstar.twin.answer_link import answer_packet, json_answer
 from hilstar.twin.live_exposure import WatchedFrames, _levels_of
 from hilstar.twin.tracker_process import OwnClock, Planted, PlantedErrors
 from hilstar.units import ARCSEC_PER_RAD
@@ -95,3 +97,12 @@ def test_json_says_what_is_known_and_nothing_else():
     assert json_answer(Answer(0, b"", 5, valid=False, mode="lost", star_count=0)) == (
         b'{"t_ns":5,"valid":false,"mode":"lost","stars":0,"centroids":[]}'
     )
+
+
+def test_a_packet_has_the_flags_of_its_mode_and_of_what_is_known():
+    whole = Answer(0, b"", 5, IDENTITY, np.ones(3), True, "tracking", 9)
+    found = decode(encode(answer_packet(whole, 3)))
+    flags = protocol.ANSWER_VALID + protocol.ANSWER_RATE_VALID + protocol.ANSWER_TRACKING
+    assert found == AnswerPacket(3, flags, 5, (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 9)
+    none = decode(encode(answer_packet(Answer(0, b"", 5, valid=False, mode="too few stars", star_count=2), 4)))
+    assert (none.flags, none.stars) == (protocol.ANSWER_TOO_FEW_STARS, 2)

@@ -1,12 +1,12 @@
 """Basilisk's attitude controller before hilstar's display and tracker: a slew that closes the loop, in real time.
 
-python basilisk_loop.py BENCH.toml [SLEW_DEG [SECONDS]]
+python basilisk_loop.py [SLEW_DEG [SECONDS]]
 
 Basilisk's dynamics turn a spacecraft, whose true attitude goes to `hilstar serve`. `hilstar tracker` looks at the frames, and
 its answers (JSON over UDP) are all that Basilisk's controller (mrpFeedback) knows. The last line is a JSON object: the pointing
 error at the end, arcsec across the boresight and about it, and how many answers there were.
 
-BENCH.toml has [attitude] source = "udp". The camera's axes are the body's.
+The bench is bench.toml beside this file. The camera's axes are the body's.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import json
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +32,7 @@ from Basilisk.utilities import SimulationBaseClass, macros
 from hilstar import Sender
 from hilstar.rotation import conjugate, from_radec_roll_deg, multiply, propagate, to_rotation_vector
 
+BENCH = Path(__file__).with_name("bench.toml")
 STEP_S, CONTROL_S = 0.01, 0.1
 INERTIA_KG_M2 = (10.0, 14.0, 18.0)
 BANDWIDTH_RAD_S, DAMPING = 0.6, 0.9  # slow enough for answers that are 0.15 s old
@@ -118,8 +120,10 @@ def newest(answers: socket.socket) -> dict[str, Any] | None:
 
 
 @contextlib.contextmanager
-def display_and_tracker(bench: Path, seconds: float, answers: int) -> Iterator[None]:
-    """The two commands, until the loop is over."""
+def display_and_tracker(bench: Path, seconds: float, attitudes: int, answers: int) -> Iterator[None]:
+    """The two commands, until the loop is over; attitudes come and answers go by UDP ports."""
+    text = f'{BENCH.read_text()}\n[attitude]\nsource = "udp"\nbind = "127.0.0.1:{attitudes}"\n'
+    bench.write_text(text)
     frames = f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     shown = [*HILSTAR, "serve", str(bench), "--headless", "--duration", str(seconds + 30), "--frames", frames]
     looks = [*HILSTAR, "tracker", str(bench), "--watch", frames, "--answer", f"udp://127.0.0.1:{answers}", "--format", "json"]
@@ -130,17 +134,20 @@ def display_and_tracker(bench: Path, seconds: float, answers: int) -> Iterator[N
         yield
 
 
-def run(bench: Path, slew_deg: float = 2.0, seconds: float = 25.0) -> dict[str, Any]:
+def run(slew_deg: float = 2.0, seconds: float = 25.0) -> dict[str, Any]:
     """Slew and settle; the pointing error at the end, arcsec."""
     q_start, q_target = (from_radec_roll_deg(84.057 + turn, -1.2, turn) for turn in (0.0, slew_deg))
     plant = Plant(q_start, q_target)
     errors: list[Array] = []
     ages_s: list[float] = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as answers:
+    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as answers:
         answers.bind(("127.0.0.1", 0))
         answers.setblocking(False)
-        place = int(answers.getsockname()[1])
-        with display_and_tracker(bench, seconds, place), Sender(f"udp://{display_of(bench)}") as sender:
+        attitudes, bench = free_port(socket.SOCK_DGRAM), Path(folder) / "bench.toml"
+        with (
+            display_and_tracker(bench, seconds, attitudes, int(answers.getsockname()[1])),
+            Sender(f"udp://127.0.0.1:{attitudes}") as sender,
+        ):
             rest(sender, q_start, answers)
             begun_s = time.monotonic()
             for step in range(1, round(seconds / STEP_S) + 1):
@@ -174,13 +181,5 @@ def rest(sender: Sender, q: Array, answers: socket.socket) -> None:
         time.sleep(STEP_S)
 
 
-def display_of(bench: Path) -> str:
-    """Where serve listens, by the bench file: ADDRESS:PORT."""
-    from hilstar.bench.bench_file import read_bench_file
-
-    settings = read_bench_file(bench).config.attitude
-    return str(settings.endpoint or settings.bind).removeprefix("udp://")
-
-
 if __name__ == "__main__":
-    print(json.dumps(run(Path(sys.argv[1]), *map(float, sys.argv[2:]))))
+    print(json.dumps(run(*map(float, sys.argv[1:]))))

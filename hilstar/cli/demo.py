@@ -19,6 +19,7 @@ from hilstar.cli.running import (
     Control,
     Token,
     followed,
+    optional_answers,
     optional_frames,
     optional_ledger,
     page_listener,
@@ -27,7 +28,7 @@ from hilstar.cli.running import (
 from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.terminal import progress, report, say
 from hilstar.errors import MachineError
-from hilstar.files import check_directory
+from hilstar.files import check_directory, make_directory, temporary_folder
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
 
@@ -41,9 +42,9 @@ if TYPE_CHECKING:
 HZ = 60  # the demo bench's refresh
 USUAL_S, LOOP_S = 10.0, 60.0
 FREE_PORT = "tcp://127.0.0.1:*"
-BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, DRIFT_PPM = (20.0, -10.0, 40.0), 2.0, 0.6, 20.0  # of the tracker of --loop
+BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG, DRIFT_PPM = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01, 50.0  # of the tracker of --loop
 PLANTED = ["--bias", ",".join(map(str, BIAS_ARCSEC)), "--fov-error", str(FOV_ARCSEC), "--pixel-error", str(PIXEL_ARCSEC)]
-PLANTED += ["--wrong", "1%", "--clock-drift", str(DRIFT_PPM)]
+PLANTED += ["--wrong", str(WRONG), "--clock-drift", str(DRIFT_PPM)]
 
 
 def demo(
@@ -74,8 +75,11 @@ def demo(
     seconds = duration or (LOOP_S if loop else USUAL_S)
     samples = (scan_samples if loop else slew_samples)(seconds + 1.0, np.random.default_rng(seed))
     demo_file = resource_path("configs", "demo.toml")
-    tracker = TrackerBeside(output, demo_file, seconds, seed) if loop else None
-    with page_listener(console, control, token, console_name) as listener, progress("serving", seconds * HZ) as advance:
+    with (
+        page_listener(console, control, token, console_name) as listener,
+        tracker_beside(output, demo_file, seconds, seed) if loop else nullcontext() as tracker,
+        progress("serving", seconds * HZ) as advance,
+    ):
 
         def watching(bench: Bench, endpoint: str) -> AbstractContextManager[tuple[FrameSink, Outlet]]:
             return _watching(bench, endpoint, listener, control, lambda shown: advance(shown.number + 1), tracker)
@@ -89,7 +93,7 @@ def demo(
             write_pictures(output, result, advance)
     report(result.summary, as_json)
     if tracker is not None and caught() is None:
-        tracker.report(as_json)
+        tracker.report(result.summary.answers, as_json)
     if not as_json:
         typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
     if result.summary.stale_frames and caught() is None:
@@ -122,23 +126,34 @@ def _watching(
     status = RunStatus(RunSource(f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz))
     with (
         optional_ledger(None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT) as kept,
+        optional_answers(bench, notices, kept, None) as answers,
         optional_frames(None if tracker is None else FREE_PORT, bench, None) as frames,
         nullcontext() if tracker is None or frames is None else tracker.before(frames),
     ):
-        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices))
+        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices), answers=answers)
         page = RunDescription("demo", bench.config.attitude.source, endpoint)
         with followed(listener, control, page, parts, status, advance, frames) as (sink, follower, requests):
-            yield sink, Outlet(None, kept, notices, follower=follower, requests=requests)
+            yield sink, Outlet(None, kept, notices, follower=follower, requests=requests, answers=answers)
     refuse_lost_gpu(notices)
+
+
+@contextmanager
+def tracker_beside(folder: Path, demo_file: Path, seconds: float, seed: int) -> Iterator[TrackerBeside]:
+    """The demo's tracker, whose answers come by a socket of its own; the bench file that names it is in `folder`."""
+    make_directory(folder)
+    with temporary_folder("loop") as place:
+        endpoint, bench_file = f"ipc://{place.resolve()}/answers", folder / "loop.toml"
+        answers = f'[answers]\nsource = "zmq"\nformat = "json"\nendpoint = "{endpoint}"\n'
+        bench_file.write_text(f"{demo_file.read_text()}\n{answers}")
+        yield TrackerBeside(folder, bench_file, endpoint, seconds, seed)
 
 
 class TrackerBeside:
     """The demo's tracker, a process of its own, with its planted errors, and the budget that is found of it."""
 
-    def __init__(self, folder: Path, demo_file: Path, seconds: float, seed: int) -> None:
-        self.ledger, self.bench_file = folder / "loop.mcap", demo_file
-        self._telemetry, self._folder = folder / "telemetry.csv", folder
-        self._words = ["--duration", f"{seconds:g}", "--seed", str(seed), "--json", *PLANTED]
+    def __init__(self, folder: Path, bench_file: Path, answers: str, seconds: float, seed: int) -> None:
+        self.ledger, self.bench_file, self._page = folder / "loop.mcap", bench_file, folder / "budget.html"
+        self._words = ["--answer", answers, "--format", "json", "--duration", f"{seconds:g}", "--seed", str(seed), *PLANTED]
         self._feed: FrameFeed | None = None
         self._process: subprocess.Popen[str] | None = None
 
@@ -147,8 +162,9 @@ class TrackerBeside:
         """Run it before the frames of a feed; it ends by itself, or with this."""
         self._feed = frames
         command = [sys.executable, "-m", "hilstar", "tracker", str(self.bench_file), "--watch", frames.endpoint]
-        command += ["--answer", FREE_PORT, "--record", str(self._telemetry), *self._words]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as self._process:
+        with subprocess.Popen(
+            [*command, *self._words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        ) as self._process:
             try:
                 yield
             finally:
@@ -163,15 +179,15 @@ class TrackerBeside:
             raise MachineError(f"the demo's tracker ended before the run; it said: {said[-1]}")
         return self._feed.watched
 
-    def report(self, as_json: bool) -> None:
-        """Print the budget of the tracker's answers beside what was planted."""
+    def report(self, live: object, as_json: bool) -> None:
+        """Print the budget of the tracker's answers beside what was planted; `live` are the run's own figures."""
+        from hilstar.answers.judge import TrackerFigures
         from hilstar.assess.assessment import AssessSettings, assess_files
         from hilstar.assess.report import lines_of, write_page
         from hilstar.twin.tracker_process import ROLL
 
-        found = assess_files(self.ledger, self._telemetry, AssessSettings(display_attitudes=0))
-        page = self._folder / "budget.html"
-        write_page(page, found)
+        found = assess_files(self.ledger, None, AssessSettings(display_attitudes=0))
+        write_page(self._page, found)
         parts = found.found
         rows: list[tuple[str, float, float | None, str]] = [
             ("bias " + axis, BIAS_ARCSEC[k], float(parts.bias_arcsec[k]), "arcsec") for k, axis in enumerate("xyz")
@@ -181,6 +197,8 @@ class TrackerBeside:
             ("pixel error", PIXEL_ARCSEC, parts.pixel_arcsec),
         ):
             rows += [(f"{name} across", planted, axes.cross, "arcsec"), (f"{name} about", ROLL * planted, axes.roll, "arcsec")]
+        if isinstance(live, TrackerFigures) and live.answers:
+            rows.append(("wrong answers", 100 * WRONG, 100 * live.wrong / live.answers, "%"))
         rows.append(("clock drift", DRIFT_PPM, 1e6 * parts.clock.drift if parts.clock.drift_told else None, "ppm"))
         told = {"loop": [{"quantity": name, "planted": a, "found": b, "unit": unit} for name, a, b, unit in rows]}
         if as_json:
@@ -188,7 +206,7 @@ class TrackerBeside:
             return
         for what, text in lines_of(found):
             typer.echo(f"{what:24}{text}")
-        typer.echo(f"{'page':24}{page}")
+        typer.echo(f"{'page':24}{self._page}")
         typer.echo(f"{'':28}{'planted':>10}{'found':>10}")
         for name, planted_value, value, unit in rows:
             typer.echo(f"{name:28}{planted_value:10.2f}{'unknown' if value is None else f'{value:.2f}':>10} {unit}")

@@ -36,7 +36,7 @@ SLEW_LOG = "slew.jsonl"
 # From Orion's belt to Sirius and on to Procyon, with the roll that a real manoeuvre drags along.
 WAYPOINTS_DEG = ((84.057, -1.2, 0.0), (101.287, -16.716, 25.0), (114.825, 5.225, -10.0))
 # To and fro about the first of them, as a tracker at work: degrees, and the seconds of a turn, of RA, declination and roll.
-SCAN = ((1.5, 53.0), (1.5, 37.0), (10.0, 91.0))
+SCAN = ((2.0, 67.0), (2.0, 47.0), (10.0, 91.0))
 SETTLE_FRACTION = 0.15  # share of each leg, at rest at its end
 JITTER_ARCSEC = (1.5, 1.5, 6.0)  # 1 sigma about cam x, y, z: a good wheel-controlled satellite
 JITTER_SECONDS = 0.4  # its correlation time

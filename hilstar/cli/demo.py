@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 HZ = 60  # the demo bench's refresh
 USUAL_S, LOOP_S = 10.0, 60.0
 FREE_PORT = "tcp://127.0.0.1:*"
-BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG, DRIFT_PPM = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01, 50.0  # of the tracker of --loop
+BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01  # of the tracker of --loop
 PLANTED = ["--bias", ",".join(map(str, BIAS_ARCSEC)), "--fov-error", str(FOV_ARCSEC), "--pixel-error", str(PIXEL_ARCSEC)]
-PLANTED += ["--wrong", str(WRONG), "--clock-drift", str(DRIFT_PPM)]
+PLANTED += ["--wrong", str(WRONG)]
 
 
 def demo(
@@ -143,7 +143,7 @@ def tracker_beside(folder: Path, demo_file: Path, seconds: float, seed: int) -> 
     make_directory(folder)
     with temporary_folder("loop") as place:
         endpoint, bench_file = f"ipc://{place.resolve()}/answers", folder / "loop.toml"
-        answers = f'[answers]\nsource = "zmq"\nformat = "json"\nendpoint = "{endpoint}"\n'
+        answers = f'[answers]\nsource = "zmq"\nformat = "json"\nclock = "host"\nendpoint = "{endpoint}"\n'
         bench_file.write_text(f"{demo_file.read_text()}\n{answers}")
         yield TrackerBeside(folder, bench_file, endpoint, seconds, seed)
 
@@ -199,7 +199,6 @@ class TrackerBeside:
             rows += [(f"{name} across", planted, axes.cross, "arcsec"), (f"{name} about", ROLL * planted, axes.roll, "arcsec")]
         if isinstance(live, TrackerFigures) and live.answers:
             rows.append(("wrong answers", 100 * WRONG, 100 * live.wrong / live.answers, "%"))
-        rows.append(("clock drift", DRIFT_PPM, 1e6 * parts.clock.drift if parts.clock.drift_told else None, "ppm"))
         told = {"loop": [{"quantity": name, "planted": a, "found": b, "unit": unit} for name, a, b, unit in rows]}
         if as_json:
             say(json.dumps(told))

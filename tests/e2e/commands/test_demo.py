@@ -111,5 +111,5 @@ def test_with_a_tracker_the_loop_is_closed_and_its_budget_stands_beside_what_was
     found = {row["quantity"]: row for row in json.loads(line)["loop"]}
     for axis in "xy":
         assert abs(found[f"bias {axis}"]["found"] - found[f"bias {axis}"]["planted"]) < LOOP_BIAS_ARCSEC
-    assert {"field-of-view error across", "pixel error across", "wrong answers", "clock drift"} <= found.keys()
+    assert {"field-of-view error across", "pixel error across", "wrong answers"} <= found.keys()
     assert (tmp_path / "demo" / "budget.html").stat().st_size > 10_000

@@ -67,12 +67,12 @@ def test_planted_errors_have_their_mean_and_their_sigma_over_a_scan(rng):
     planted = Planted((20.0, -10.0, 40.0), fov_arcsec=2.0, pixel_arcsec=0.5)
     errors = PlantedErrors(planted, 5384.6, rng)
     found = []
-    for x, y in rng.uniform(-400 / 5384.6, 400 / 5384.6, (4000, 2)):  # two waves each way
+    for x, y in rng.uniform(-400 / 5384.6, 400 / 5384.6, (1500, 2)):  # two waves each way
         q = from_rotation_vector(np.array([x, y, 0.0]))
         reported, wrong = errors.reported(q)
         assert not wrong
         found.append(ARCSEC_PER_RAD * to_rotation_vector(multiply(reported, conjugate(q))))
-    sigma = np.hypot(2.0, 0.5)  # of 4000 places: 3 % of it, which is five of its own sigmas
+    sigma = np.hypot(2.0, 0.5)  # of 1500 places: a third of a sigma of their mean is 0.05
     assert np.array(found).mean(axis=0) == pytest.approx([20, -10, 40], abs=0.5)
     assert np.array(found).std(axis=0) == pytest.approx([sigma, sigma, 4 * sigma], rel=0.05)
 

@@ -28,8 +28,10 @@ from hilstar.campaign.plan import Centroiding
 from hilstar.errors import InputError, did_you_mean, one_line, shortened
 from hilstar.files import temporary_folder
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
-from hilstar.rotation import from_matrix, multiply, normalise
+from hilstar.rotation import multiply, normalise
 from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.tracker.identify import wahba
+from hilstar.twin.live_exposure import LiveTracker
 from hilstar.twin.pictures import write_dn_picture
 from hilstar.twin.simulator import Exposure, Simulator
 from hilstar.twin.verify.star_finder import crowded, nearest
@@ -47,7 +49,7 @@ class SolverFault(Exception):
     """A solver failed: it raised, ended with an error, took too long, or gave an answer that is no attitude."""
 
 
-SolvedTracker = Simulator | DisplayTracker  # whose images are solved
+SolvedTracker = Simulator | DisplayTracker | LiveTracker  # whose images are solved
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +134,10 @@ class CentroidSolver:
         errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good])
         if len(x_px) < MIN_STARS:
             return Answer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
-        # The turn from the true attitude's cam to that of the centroids: Wahba's problem by SVD (Markley 1988). Weights are the
-        # stars' light, the inverse of photon noise's variance.
         true = normalise(tracker.camera.rays(x_px, y_px))
         seen = normalise(tracker.camera.rays(x_px + dx_px, y_px + dy_px))
-        u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", flux[good] / flux[good].sum(), seen, true))
-        turn = from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
-        return Answer(multiply(turn, exposure.view.q_icrs_to_cam), "", errors)
+        # Weights are the stars' light, the inverse of photon noise's variance.
+        return Answer(multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors)
 
 
 class FunctionSolver:

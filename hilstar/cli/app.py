@@ -36,6 +36,7 @@ from hilstar.cli.serve import serve
 from hilstar.cli.service import install, uninstall
 from hilstar.cli.simulate import simulate
 from hilstar.cli.study import study
+from hilstar.cli.tracker import tracker
 from hilstar.cli.verify import verify
 from hilstar.version import __version__
 
@@ -43,7 +44,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
     "Attitude streams": (send, attitude, convert, answers, keys),
     "Check what is shown": (simulate, verify, compare, budget, catalogue, report),
-    "Test the tracker": (assess, campaign),
+    "Test the tracker": (assess, campaign, tracker),
     "Calibrate": (first_light, latency),
     "Study": (study, benchmark),
     "This machine": (doctor,),

@@ -2,34 +2,60 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hilstar.cli.options import MAX_SEED, Json
-from hilstar.cli.running import Console, ConsoleName, Control, Token, followed, optional_ledger, page_listener, refuse_lost_gpu
+from hilstar.cli.running import (
+    Console,
+    ConsoleName,
+    Control,
+    Token,
+    followed,
+    optional_answers,
+    optional_frames,
+    optional_ledger,
+    page_listener,
+    refuse_lost_gpu,
+)
 from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.terminal import progress, report, say
-from hilstar.files import check_directory
+from hilstar.errors import MachineError
+from hilstar.files import check_directory, make_directory, temporary_folder
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
 
 if TYPE_CHECKING:
     from hilstar.bench.frame import Bench
     from hilstar.console.listener import PageListener
+    from hilstar.run.frame_feed import FrameFeed
     from hilstar.run.pacer import FrameSink
     from hilstar.run.serve import Outlet
 
 HZ = 60  # the demo bench's refresh
+USUAL_S, LOOP_S = 10.0, 60.0
+FREE_PORT = "tcp://127.0.0.1:*"
+BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01  # of the tracker of --loop
+PLANTED = ["--bias", ",".join(map(str, BIAS_ARCSEC)), "--fov-error", str(FOV_ARCSEC), "--pixel-error", str(PIXEL_ARCSEC)]
+PLANTED += ["--wrong", str(WRONG)]
 
 
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Directory for the pictures.")] = Path("hilstar-demo"),
-    duration: Annotated[float, typer.Option(help="Seconds to run.", min=0.5, max=600)] = 10.0,
-    seed: Annotated[int, typer.Option(help="Seed of the slew's jitter.", min=0, max=MAX_SEED)] = 1,
+    duration: Annotated[
+        float | None, typer.Option(help="Seconds to run; by default 10, and 60 with --loop.", min=0.5, max=600)
+    ] = None,
+    loop: Annotated[
+        bool, typer.Option("--loop", help="A slow scan with a virtual tracker before the display, and its error budget.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the jitter, and of the tracker's errors.", min=0, max=MAX_SEED)] = 1,
     console: Console = None,
     control: Control = False,
     token: Token = None,
@@ -42,21 +68,32 @@ def demo(
     """
     import numpy as np
 
-    from hilstar.run.demo import run_demo, write_pictures
+    from hilstar.resources import resource_path
+    from hilstar.run.demo import Shows, run_demo, scan_samples, slew_samples, write_pictures
 
     check_directory("-o", output)
-    with page_listener(console, control, token, console_name) as listener, progress("serving", duration * HZ) as advance:
+    seconds = duration or (LOOP_S if loop else USUAL_S)
+    samples = (scan_samples if loop else slew_samples)(seconds + 1.0, np.random.default_rng(seed))
+    demo_file = resource_path("configs", "demo.toml")
+    with (
+        page_listener(console, control, token, console_name) as listener,
+        tracker_beside(output, demo_file, seconds, seed) if loop else nullcontext() as tracker,
+        progress("serving", seconds * HZ) as advance,
+    ):
 
         def watching(bench: Bench, endpoint: str) -> AbstractContextManager[tuple[FrameSink, Outlet]]:
-            return _watching(bench, endpoint, listener, control, lambda shown: advance(shown.number + 1))
+            return _watching(bench, endpoint, listener, control, lambda shown: advance(shown.number + 1), tracker)
 
-        result = run_demo(output, duration, np.random.default_rng(seed), watching)
+        shows = Shows(demo_file, samples) if tracker is None else Shows(tracker.bench_file, samples, tracker.watches)
+        result = run_demo(output, seconds, shows, watching)
     if result.kept and caught() is None:  # no pictures after Ctrl-C
         if not as_json:
             say(f"writing {len(result.kept)} pictures and their previews to {output}")
         with progress("writing pictures", 2 * len(result.kept)) as advance:
             write_pictures(output, result, advance)
     report(result.summary, as_json)
+    if tracker is not None and caught() is None:
+        tracker.report(result.summary.answers, as_json)
     if not as_json:
         typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
     if result.summary.stale_frames and caught() is None:
@@ -73,18 +110,102 @@ def demo(
 
 @contextmanager
 def _watching(
-    bench: Bench, endpoint: str, listener: PageListener | None, control: bool, advance: FrameSink
+    bench: Bench,
+    endpoint: str,
+    listener: PageListener | None,
+    control: bool,
+    advance: FrameSink,
+    tracker: TrackerBeside | None,
 ) -> Iterator[tuple[FrameSink, Outlet]]:
-    """Follow the demo with a progress bar and its page."""
+    """Follow the demo with a progress bar, its page and, if there is one, its tracker."""
     from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.record.ledger import NO_SPLIT, Ledger
     from hilstar.run.serve import Outlet
 
     notices = Notices()
     status = RunStatus(RunSource(f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz))
-    with optional_ledger(None, bench, notices, False, NO_SPLIT) as kept:
-        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices))
+    with (
+        optional_ledger(None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT) as kept,
+        optional_answers(bench, notices, kept, None) as answers,
+        optional_frames(None if tracker is None else FREE_PORT, bench, None) as frames,
+        nullcontext() if tracker is None or frames is None else tracker.before(frames),
+    ):
+        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices), answers=answers)
         page = RunDescription("demo", bench.config.attitude.source, endpoint)
-        with followed(listener, control, page, parts, status, advance) as (sink, follower, requests):
-            yield sink, Outlet(None, kept, notices, follower=follower, requests=requests)
+        with followed(listener, control, page, parts, status, advance, frames) as (sink, follower, requests):
+            yield sink, Outlet(None, kept, notices, follower=follower, requests=requests, answers=answers)
     refuse_lost_gpu(notices)
+
+
+@contextmanager
+def tracker_beside(folder: Path, demo_file: Path, seconds: float, seed: int) -> Iterator[TrackerBeside]:
+    """The demo's tracker, whose answers come by a socket of its own; the bench file that names it is in `folder`."""
+    make_directory(folder)
+    with temporary_folder("loop") as place:
+        endpoint, bench_file = f"ipc://{place.resolve()}/answers", folder / "loop.toml"
+        answers = f'[answers]\nsource = "zmq"\nformat = "json"\nclock = "host"\nendpoint = "{endpoint}"\n'
+        bench_file.write_text(f"{demo_file.read_text()}\n{answers}")
+        yield TrackerBeside(folder, bench_file, endpoint, seconds, seed)
+
+
+class TrackerBeside:
+    """The demo's tracker, a process of its own, with its planted errors, and the budget that is found of it."""
+
+    def __init__(self, folder: Path, bench_file: Path, answers: str, seconds: float, seed: int) -> None:
+        self.ledger, self.bench_file, self._page = folder / "loop.mcap", bench_file, folder / "budget.html"
+        self._words = ["--answer", answers, "--format", "json", "--duration", f"{seconds:g}", "--seed", str(seed), *PLANTED]
+        self._feed: FrameFeed | None = None
+        self._process: subprocess.Popen[str] | None = None
+
+    @contextmanager
+    def before(self, frames: FrameFeed) -> Iterator[None]:
+        """Run it before the frames of a feed; it ends by itself, or with this."""
+        self._feed = frames
+        command = [sys.executable, "-m", "hilstar", "tracker", str(self.bench_file), "--watch", frames.endpoint]
+        with subprocess.Popen(
+            [*command, *self._words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        ) as self._process:
+            try:
+                yield
+            finally:
+                self._process.terminate()
+
+    def watches(self) -> bool:
+        """Whether it watches the frames. Raises MachineError where it has ended."""
+        if self._process is None or self._feed is None:
+            return False
+        if self._process.poll() is not None:
+            said = (self._process.stderr.read().strip().splitlines() if self._process.stderr else []) or ["nothing"]
+            raise MachineError(f"the demo's tracker ended before the run; it said: {said[-1]}")
+        return self._feed.watched
+
+    def report(self, live: object, as_json: bool) -> None:
+        """Print the budget of the tracker's answers beside what was planted; `live` are the run's own figures."""
+        from hilstar.answers.judge import TrackerFigures
+        from hilstar.assess.assessment import AssessSettings, assess_files
+        from hilstar.assess.report import lines_of, write_page
+        from hilstar.twin.tracker_process import ROLL
+
+        found = assess_files(self.ledger, None, AssessSettings(display_attitudes=0))
+        write_page(self._page, found)
+        parts = found.found
+        rows: list[tuple[str, float, float | None, str]] = [
+            ("bias " + axis, BIAS_ARCSEC[k], float(parts.bias_arcsec[k]), "arcsec") for k, axis in enumerate("xyz")
+        ]
+        for name, planted, axes in (
+            ("field-of-view error", FOV_ARCSEC, parts.fov_arcsec),
+            ("pixel error", PIXEL_ARCSEC, parts.pixel_arcsec),
+        ):
+            rows += [(f"{name} across", planted, axes.cross, "arcsec"), (f"{name} about", ROLL * planted, axes.roll, "arcsec")]
+        if isinstance(live, TrackerFigures) and live.answers:
+            rows.append(("wrong answers", 100 * WRONG, 100 * live.wrong / live.answers, "%"))
+        told = {"loop": [{"quantity": name, "planted": a, "found": b, "unit": unit} for name, a, b, unit in rows]}
+        if as_json:
+            say(json.dumps(told))
+            return
+        for what, text in lines_of(found):
+            typer.echo(f"{what:24}{text}")
+        typer.echo(f"{'page':24}{self._page}")
+        typer.echo(f"{'':28}{'planted':>10}{'found':>10}")
+        for name, planted_value, value, unit in rows:
+            typer.echo(f"{name:28}{planted_value:10.2f}{'unknown' if value is None else f'{value:.2f}':>10} {unit}")

@@ -32,6 +32,7 @@ def replay(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a PNG of each frame, and frames.csv.")
     ] = None,
+    frames: Annotated[str | None, typer.Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")] = None,
     ledger: running.LedgerFile = None,
     ledger_split: running.LedgerSplit = None,
     scenario: options.ScenarioFile = None,
@@ -76,6 +77,7 @@ def replay(
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
         running.optional_answers(bench, notices, kept, screen) as answers,
+        running.optional_frames(frames, bench, screen) as watched,
     ):
         running.say_of_light(bench)
         if explain:
@@ -89,7 +91,7 @@ def replay(
         )
         with (
             on_terminal(status),
-            running.followed(listener, control, page, parts, status, record) as (sink, follower, requests),
+            running.followed(listener, control, page, parts, status, record, watched) as (sink, follower, requests),
         ):
             outlet = Outlet(screen, kept, notices, None, follower, requests, wrong, pulse, answers)
             summary = replay_log(bench, play, sink, outlet)

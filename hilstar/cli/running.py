@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from hilstar.console.listener import PageListener
     from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.faults import AnyFaults, Recording
+    from hilstar.run.frame_feed import FrameFeed
     from hilstar.run.frame_pulse import FramePulse
     from hilstar.run.live_answers import LiveAnswers
     from hilstar.run.operator import SwitchRequests
@@ -75,6 +76,7 @@ ConsoleName = Annotated[
     list[str] | None,
     typer.Option("--console-name", metavar="NAME", help="A further name of the page, as a proxy shows it; may be given often."),
 ]
+FRAMES_HELP = "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570 (hilstar tracker)"
 
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
@@ -167,6 +169,20 @@ def optional_answers(bench: Any, notices: Notices, ledger: LedgerSwitch, screen:
         with answers.running():
             say(f"answers: {source.endpoint}")
             yield answers
+
+
+@contextmanager
+def optional_frames(endpoint: str | None, bench: Any, screen: Any) -> Iterator[FrameFeed | None]:
+    """The feed of the run's frames to watchers; None without an endpoint. Raises InputError where it cannot be bound."""
+    if endpoint is None:
+        yield None
+        return
+    from hilstar.attitude.wire.shown_frames import FrameSender
+    from hilstar.run.frame_feed import FrameFeed
+
+    with FrameFeed(FrameSender(endpoint), bench, lambda: 0 if screen is None else screen.swap_to_light_ns) as feed:
+        say(f"frames: {feed.endpoint}")
+        yield feed
 
 
 def dated_ledger(path: Path | None) -> Path | None:
@@ -269,9 +285,12 @@ def followed(
     parts: PageParts,
     status: RunStatus,
     record: FrameSink | None = None,
+    frames: FrameFeed | None = None,
 ) -> Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]:
-    """Connect a run to the terminal, `record`, systemd and the page: its sink, its follower, and the page's requests."""
+    """Connect a run to the terminal, `record`, systemd, `frames` and the page: its sink, its follower, the page's requests."""
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
+    if frames is not None:
+        sinks.append(frames.see)
     with Service(status.begun, status.alive, status.line):
         if listener is None:
             yield _all_of(sinks), status.follow, None

@@ -106,7 +106,9 @@ def serve(
     bench_file: BenchFile,
     headless: Headless = False,
     duration: Annotated[float | None, typer.Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)] = None,
-    frames: Annotated[int | None, typer.Option(help="Number of frames to draw.", min=1)] = None,
+    frames: Annotated[
+        list[str] | None, typer.Option(metavar="N|ENDPOINT", help=f"Number of frames to draw. {running.FRAMES_HELP}.")
+    ] = None,
     ledger: running.LedgerFile = None,
     ledger_split: running.LedgerSplit = None,
     scenario: ScenarioFile = None,
@@ -126,10 +128,11 @@ def serve(
     from hilstar.bench.bench_file import HeadsFile, as_head, read_bench_or_heads
 
     file = read_bench_or_heads(bench_file) if head_of is None else as_head(bench_file, head_of)
+    count, watch = frames_of(frames, heads=isinstance(file, HeadsFile))
     if isinstance(file, HeadsFile):
         from hilstar.run.heads import HeadsRun
 
-        valued = {"--frames": frames, "--ledger-split": ledger_split, "--scenario": scenario}
+        valued = {"--frames": count, "--ledger-split": ledger_split, "--scenario": scenario}
         switches = {"--headless": headless, "--windowed": windowed, "--force": force, "--control": control}
         switches |= {"--overwrite": overwrite, "--explain": explain}
         words = [word for name, value in valued.items() if value is not None for word in (name, str(value))]
@@ -161,26 +164,29 @@ def serve(
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept) as wrong,
         running.optional_answers(bench, notices, kept, screen) as answers,
+        running.optional_frames(watch, bench, screen) as watched,
     ):
         if explain:
             running.explain_bench(bench, of_source=link.conventions.lines(Mounting(file.config.tracker.q_body_to_cam)))
         refresh_hz = bench.config.monitor.refresh_hz
-        limit = Limit(math.inf if duration is None else round(duration * refresh_hz), math.inf if frames is None else frames)
+        limit = Limit(math.inf if duration is None else round(duration * refresh_hz), math.inf if count is None else count)
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         say(fields.line())
         running.say_units(fields)
         running.say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
-        told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
+        source, told = file.config.attitude, RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest)
         status = RunStatus(told, kept)
-        source = file.config.attitude
         page = RunDescription("serve", source.source, link.endpoint, "asked" if source.lockstep else "clock")
         schedule = getattr(wrong, "schedule", None)
         parts = PageParts(
             bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule, answers
         )
-        with on_terminal(status), running.followed(listener, control, page, parts, status) as (sink, follower, requests):
+        with (
+            on_terminal(status),
+            running.followed(listener, control, page, parts, status, frames=watched) as (sink, follower, requests),
+        ):
             outlet = Outlet(
                 screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse, answers
             )
@@ -189,6 +195,21 @@ def serve(
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets))
         raise typer.Exit(NO_ATTITUDE)
+
+
+def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str | None]:
+    """What --frames asks for: how many frames, and where they are sent to. Raises InputError."""
+    form = "write a number of frames, or an endpoint such as tcp://127.0.0.1:5570; both may be given"
+    counts = [text for text in asked or () if "://" not in text]
+    endpoints = [text for text in asked or () if "://" in text]
+    for kind in (counts, endpoints):
+        if len(kind) > 1:
+            raise InputError(f"--frames {kind[0]} and --frames {kind[1]}: {form}")
+    if counts and not (counts[0].isdecimal() and int(counts[0]) > 0):
+        raise InputError(f"--frames {counts[0]}: {form}")
+    if endpoints and heads:
+        raise InputError(f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or leave it out")
+    return int(counts[0]) if counts else None, endpoints[0] if endpoints else None
 
 
 def _source(file: ReadFile, fed_by: str | None, notices: Notices) -> AnyLink:

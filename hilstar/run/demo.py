@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Self
 
 import numpy as np
 
+from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.log_file import write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
@@ -22,7 +24,6 @@ from hilstar.bench.frame_files import write_codes_png, write_preview_png
 from hilstar.errors import MachineError
 from hilstar.files import make_directory
 from hilstar.monitor.response import Codes
-from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
 from hilstar.run.loop import Limit
 from hilstar.run.pacer import FrameSink, Shown
@@ -34,6 +35,8 @@ SEND_HZ = 100.0
 SLEW_LOG = "slew.jsonl"
 # From Orion's belt to Sirius and on to Procyon, with the roll that a real manoeuvre drags along.
 WAYPOINTS_DEG = ((84.057, -1.2, 0.0), (101.287, -16.716, 25.0), (114.825, 5.225, -10.0))
+# To and fro about the first of them, as a tracker at work: degrees, and the seconds of a turn, of RA, declination and roll.
+SCAN = ((2.0, 67.0), (2.0, 47.0), (10.0, 91.0))
 SETTLE_FRACTION = 0.15  # share of each leg, at rest at its end
 JITTER_ARCSEC = (1.5, 1.5, 6.0)  # 1 sigma about cam x, y, z: a good wheel-controlled satellite
 JITTER_SECONDS = 0.4  # its correlation time
@@ -53,6 +56,29 @@ class Demo:
 
 def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
     """A rest-to-rest slew through WAYPOINTS_DEG at SEND_HZ, quintic in angle, with jitter, then REST_S at rest."""
+    points = [from_radec_roll_deg(*waypoint) for waypoint in WAYPOINTS_DEG]
+
+    def slew(t_s: float) -> FloatArray:
+        progress = min(t_s / duration_s, 1.0) * (len(points) - 1)
+        leg = min(int(progress), len(points) - 2)
+        s = min((progress - leg) / (1 - SETTLE_FRACTION), 1.0)
+        return slerp(points[leg], points[leg + 1], s**3 * (10 - 15 * s + 6 * s * s))
+
+    return _jittered(slew, duration_s, rng)
+
+
+def scan_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
+    """A slow scan about the first of WAYPOINTS_DEG, 0.3 deg/s and less across the boresight, with jitter."""
+
+    def scan(t_s: float) -> FloatArray:
+        turns = [size_deg * math.sin(2 * math.pi * t_s / period_s) for size_deg, period_s in SCAN]
+        return from_radec_roll_deg(*(middle + turn for middle, turn in zip(WAYPOINTS_DEG[0], turns, strict=True)))
+
+    return _jittered(scan, duration_s, rng)
+
+
+def _jittered(path: Callable[[float], FloatArray], duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
+    """Attitudes along a path at SEND_HZ, with jitter and rates, until REST_S after a duration."""
     count = round((duration_s + REST_S) * SEND_HZ) + 1
     times_s = np.arange(count) / SEND_HZ
     # Jitter about cam axes: first-order Gauss-Markov noise.
@@ -60,14 +86,8 @@ def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
     jitter = rng.normal(size=(count, 3)) * np.array(JITTER_ARCSEC) / ARCSEC_PER_RAD
     for k in range(1, count):
         jitter[k] = keep * jitter[k - 1] + np.sqrt(1 - keep**2) * jitter[k]
-    points = [from_radec_roll_deg(*waypoint) for waypoint in WAYPOINTS_DEG]
-    attitudes, samples = [], []
-    for k, t in enumerate(times_s):
-        progress = min(t / duration_s, 1.0) * (len(points) - 1)
-        leg = min(int(progress), len(points) - 2)
-        s = min((progress - leg) / (1 - SETTLE_FRACTION), 1.0)
-        path = slerp(points[leg], points[leg + 1], s**3 * (10 - 15 * s + 6 * s * s))
-        attitudes.append(propagate(path, jitter[k], -1.0))
+    attitudes = [propagate(path(t), jitter[k], -1.0) for k, t in enumerate(times_s.tolist())]
+    samples = []
     for k, q in enumerate(attitudes):
         before, after = attitudes[max(k - 1, 0)], attitudes[min(k + 1, count - 1)]
         rate = rate_between_rad_s(before, after, (min(k + 1, count - 1) - max(k - 1, 0)) / SEND_HZ)
@@ -78,17 +98,26 @@ def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
 Watching = Callable[[Bench, str], AbstractContextManager[tuple[FrameSink, Outlet]]]
 
 
-def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watching: Watching) -> Demo:
-    """Stream a slew from a process of its own through a loopback socket, and serve it.
+@dataclass(frozen=True, slots=True)
+class Shows:
+    """What a demo shows: its bench file, the attitudes that are sent, and whether all who watch are there before they are."""
+
+    bench_file: Path
+    samples: list[AttitudeSample]
+    ready: Callable[[], bool] = lambda: True
+
+
+def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watching) -> Demo:
+    """Stream attitudes from a process of their own through a loopback socket, and serve them.
 
     The sender begins once the loop has drawn its first frame, and the run once an attitude has come. `watching` opens the sink
     of all frames and the run's outlet, for a bench and its endpoint. Raises InputError or MachineError.
     """
     make_directory(directory)
     log_path = directory / SLEW_LOG
-    write_log(log_path, slew_samples(duration_s + 1.0, rng))
+    write_log(log_path, shows.samples)
     with (
-        load(resource_path("configs", "demo.toml")) as bench,
+        load(shows.bench_file) as bench,
         ZmqApart(ZmqReceiver(bench.config.attitude.address, bind=True)) as link,
         _DemoSender(["send", str(log_path), "--to", link.endpoint, "--connect", "--wait", f"{LISTENER_WITHIN_S:g}"]) as sender,
         watching(bench, link.endpoint) as (watch, outlet),
@@ -98,9 +127,9 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
         kept: dict[int, Codes] = {}
 
         def sink(shown: Shown) -> None:
-            if shown.missing:
+            if shown.missing and shows.ready():
                 sender.tend()
-            elif wanted and shown.number >= min(wanted):
+            elif not shown.missing and wanted and shown.number >= min(wanted):
                 wanted.remove(min(wanted))
                 kept[shown.number] = bench.code_values(shown.drawn.levels).copy()
             watch(shown)

@@ -44,6 +44,11 @@ class Limit:
     frames: float = math.inf
     from_first_attitude: bool = False
 
+    @property
+    def shortest(self) -> float:
+        """The smaller of the two."""
+        return min(self.slots, self.frames)
+
 
 @dataclass(frozen=True, slots=True)
 class Held:

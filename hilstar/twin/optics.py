@@ -76,12 +76,16 @@ class TwinOptics(Closing):
     def image_e_per_s(self, light_e_per_s: FloatArray) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of each monitor pixel (H, W), float64."""
         rows, columns = np.nonzero(light_e_per_s)
+        return self.lit_image_e_per_s(rows, columns, light_e_per_s[rows, columns])
+
+    def lit_image_e_per_s(self, rows: IntArray, columns: IntArray, light_e_per_s: FloatArray) -> FloatArray:
+        """The same from monitor pixels (n,) that are lit."""
         width, height = self.geometry.tracker.resolution_px
         total = np.zeros((height, width))
         at_once = max(1, POINTS_AT_ONCE // SUB**2)
         for begin in range(0, len(rows), at_once):
             part = slice(begin, begin + at_once)
-            total += self._points(columns[part], rows[part], light_e_per_s[rows[part], columns[part]])
+            total += self._points(columns[part], rows[part], light_e_per_s[part])
         return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total  # a measured PSF may be negative somewhere
 
     def _points(self, columns: IntArray, rows: IntArray, light_e_per_s: FloatArray) -> FloatArray:

@@ -1,0 +1,140 @@
+"""The frames that a display shows, sent to whoever watches: over ZeroMQ, each a message of three parts.
+
+1. A JSON object: `frame` (its number), `lit_ns` (when the middle row lights, `time.monotonic_ns()` of this machine), `q`
+   (q_icrs_to_cam, null for a blank frame), `width`, `height`, `bits`, `channels` (1, or 3 where the primaries are driven
+   apart), `bench_sha256`.
+2. The lit pixels, uint32, little-endian: row * width + column, rising. All others have code 0.
+3. Their codes: uint8, or uint16 little-endian above 8 bits; `channels` of each.
+
+A frame of stars has some thousand lit pixels of two million, so its message has 20 to 100 kB and needs no shared memory.
+A frame is lit until the next one is. The sender keeps few frames for a watcher: one that is slow loses frames, and its gap in
+`frame` says so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import zmq
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.keys import NO_KEYS
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
+from hilstar.errors import one_line
+
+KEPT_FRAMES = 8  # at the sender for each watcher, an eighth of a second at 60 Hz
+WAITING_FRAMES = 64  # at the watcher, which reads between two answers
+MAX_FRAME_BYTES = 1 << 27  # every pixel of 4K, three channels of 16 bits
+MAX_SIDE_PX = 32_768
+
+
+class FrameHead(msgspec.Struct, frozen=True):
+    """The first part of a frame's message (see the module)."""
+
+    frame: int
+    lit_ns: int
+    width: int
+    height: int
+    bits: int
+    q: tuple[float, float, float, float] | None = None
+    channels: int = 1
+    bench_sha256: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ShownFrame:
+    """A frame as it was shown: `lit` (n,) are the flat indices of its pixels over code 0, `codes` (n,) or (n, 3) theirs."""
+
+    head: FrameHead
+    lit: npt.NDArray[np.uint32]
+    codes: npt.NDArray[np.unsignedinteger[Any]]
+
+    @property
+    def q_icrs_to_cam(self) -> FloatArray | None:
+        """Its attitude (4,), unit; None where it is blank."""
+        return None if self.head.q is None else np.array(self.head.q)
+
+
+_heads = msgspec.json.Decoder(FrameHead)
+
+
+def frame_parts(frame: ShownFrame) -> list[bytes]:
+    """The parts of a frame's message."""
+    kind = "<u1" if frame.head.bits <= 8 else "<u2"
+    return [msgspec.json.encode(frame.head), frame.lit.astype("<u4").tobytes(), frame.codes.astype(kind).tobytes()]
+
+
+def read_frame(parts: list[bytes]) -> ShownFrame | str:
+    """The frame of a message, or why it is none."""
+    try:
+        return _checked(*parts)
+    except (TypeError, ValueError, RecursionError, msgspec.MsgspecError) as error:
+        return one_line(str(error))
+
+
+def _checked(first: bytes, indices: bytes, values: bytes) -> ShownFrame:
+    """The frame of three parts. Raises ValueError or msgspec's errors for what is none."""
+    head = _heads.decode(first)
+    sizes = 0 < head.width <= MAX_SIDE_PX and 0 < head.height <= MAX_SIDE_PX
+    if not (sizes and 1 <= head.bits <= 16 and head.channels in {1, 3}):
+        raise ValueError(f"{head.width} x {head.height} pixels of {head.channels} x {head.bits} bits")
+    if head.q is not None and not abs(float(np.linalg.norm(head.q)) - 1) <= NORM_TOLERANCE:
+        raise ValueError("its quaternion is not unit")
+    lit = np.frombuffer(indices, dtype="<u4")
+    if len(lit) and not (lit[-1] < head.width * head.height and (lit[1:] > lit[:-1]).all()):
+        raise ValueError("its indices do not rise within the image")
+    codes = np.frombuffer(values, dtype="<u1" if head.bits <= 8 else "<u2")
+    return ShownFrame(head, lit, codes.reshape(len(lit), 3) if head.channels == 3 else codes.reshape(len(lit)))
+
+
+class FrameSender(ZmqSender):
+    """Sends frames to watchers; never waits for one."""
+
+    LINGER_MS, STOPPED_LINGER_MS = 0, 0
+    watched = False
+
+    def _configure(self, made: zmq.Socket[bytes]) -> None:
+        super()._configure(made)
+        made.setsockopt(zmq.SNDHWM, KEPT_FRAMES)
+
+    def look(self) -> bool:
+        """Read who subscribes and who leaves; True while somebody watches."""
+        self._tend()
+        while (message := self._take()) is not None:
+            self.watched = message[:1] == b"\x01"
+        return self.watched
+
+    def put_frame(self, frame: ShownFrame) -> None:
+        """Send one frame."""
+        with contextlib.suppress(zmq.Again):
+            self._ready().send_multipart(frame_parts(frame), zmq.NOBLOCK, copy=False)
+
+
+class FrameWatch(ZmqReceiver):
+    """The watcher's end: connects to where the frames are sent from. `refused` counts messages that are no frames."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.refused = 0
+        self.why_refused = ""
+        super().__init__(endpoint, keys=NO_KEYS, max_part_bytes=MAX_FRAME_BYTES)
+
+    def _configure(self, made: zmq.Socket[bytes]) -> None:
+        super()._configure(made)
+        made.setsockopt(zmq.RCVHWM, WAITING_FRAMES)
+
+    def frames(self, timeout_ms: int) -> list[ShownFrame]:
+        """The frames that came, oldest first; waits at most `timeout_ms` for the first."""
+        found = []
+        for message in self.taken(timeout_ms):
+            frame = read_frame(list(message.parts))
+            if isinstance(frame, ShownFrame):
+                found.append(frame)
+            else:
+                self.refused, self.why_refused = self.refused + 1, frame
+        return found

@@ -1,0 +1,138 @@
+"""From found stars to an attitude: which star is which, by where they are expected or lost in space, and Wahba's problem."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.errors import InputError
+from hilstar.rotation import from_matrix, normalise, to_matrix
+
+MIN_STARS = 4  # identified, for an answer: three confirm a fourth
+MIN_SHARE = 0.5  # of the stars found that have to be the catalogue's
+RADII_PX = (12.0, 3.0, 1.5)  # how far a found star may be from where it is expected, at each step
+CENTROID_E_PX2, CENTROID_FLOOR_PX = 0.4, 0.02  # a centroid's variance: 0.4 px^2 an electron, and the display's own share
+REFITS, REJECTED = 4, 4.0  # stars farther off than so many times the median are left out
+FIELD_ERROR = 0.02  # share of the field of view that the database leaves open
+GAIA_RECORD = np.dtype(
+    [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("mag", "<f4"), ("pm_ra", "<f4"), ("pm_dec", "<f4")]
+)  # of its catalogue's file: degrees, and motions of mas/yr
+
+
+def wahba(seen: FloatArray, known: FloatArray, weight: FloatArray) -> FloatArray:
+    """The rotation (4,), unit quaternion, that best turns directions `known` (n, 3) into `seen` (n, 3); weights (n,).
+
+    Wahba's problem by SVD (Markley 1988).
+    """
+    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", weight / weight.sum(), seen, known))
+    return from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundStars:
+    """Stars found in an image, brightest first: places (n,), px, signal (n,), e-, and directions (n, 3), cam, unit."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    flux_e: FloatArray
+    rays: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """An attitude q_icrs_to_cam and what it rests on: pairs (k,) of found stars and catalogue stars, and their rms, arcsec."""
+
+    q_icrs_to_cam: FloatArray
+    found: IntArray
+    star: IntArray
+    rms_rad: float
+
+
+# Catalogue stars near an attitude: their numbers (m,), brightest first, and directions (m, 3), ICRS.
+StarsNear = Callable[[FloatArray], tuple[IntArray, FloatArray]]
+Place = Callable[[FloatArray], tuple[FloatArray, FloatArray]]  # pixels of directions (m, 3), cam
+
+
+def identify(found: FoundStars, q_expected: FloatArray, stars_near: StarsNear, place: Place) -> Identified | None:
+    """The attitude near an expected one, by stars where they are expected; None where too few are there."""
+    if len(found) < MIN_STARS:
+        return None
+    seen_px = KDTree(np.stack([found.x_px, found.y_px], axis=1))
+    star, directions = stars_near(q_expected)
+    weight = 1 / (CENTROID_E_PX2 / np.maximum(found.flux_e, 1.0) + CENTROID_FLOOR_PX**2)
+    q = q_expected
+    for step, radius_px in enumerate(RADII_PX):
+        expected = np.stack(place(directions @ to_matrix(q).T), axis=1)
+        inside = np.flatnonzero(np.isfinite(expected).all(axis=1))
+        distance, found_at = seen_px.query(expected[inside], distance_upper_bound=radius_px)
+        nearest = np.asarray(found_at)
+        # Of several catalogue stars near one find the brightest has it.
+        near = inside[np.isfinite(distance)]
+        pairs, first = np.unique(nearest[np.isfinite(distance)], return_index=True)
+        known = near[first]
+        if step == 0 and len(pairs) >= MIN_STARS:  # they all moved alike: those that did not are others
+            moved = np.stack([found.x_px[pairs], found.y_px[pairs]], axis=1) - expected[known]
+            alike = np.linalg.norm(moved - np.median(moved, axis=0), axis=1) < RADII_PX[1]
+            pairs, known = pairs[alike], known[alike]
+        if len(pairs) < max(MIN_STARS, MIN_SHARE * min(len(found), len(directions)) * (step > 0)):
+            return None
+        q = wahba(found.rays[pairs], directions[known], weight[pairs])
+    for _ in range(REFITS):  # a neighbour in a star's window pulls it away from where it is
+        off = np.linalg.norm(found.rays[pairs] - directions[known] @ to_matrix(q).T, axis=1)
+        kept = off**2 * weight[pairs] <= REJECTED**2 * np.median(off**2 * weight[pairs])
+        if kept.all() or kept.sum() < MIN_STARS:
+            break
+        pairs, known = pairs[kept], known[kept]
+        q = wahba(found.rays[pairs], directions[known], weight[pairs])
+    off = np.linalg.norm(found.rays[pairs] - directions[known] @ to_matrix(q).T, axis=1)
+    return Identified(q, pairs, star[known], float(np.sqrt(np.mean(off**2) / 2)))
+
+
+class LostInSpace:
+    """Attitudes from stars alone, by `tetra3rs` (the extra hilstar[solve]) and a database of the given catalogue.
+
+    `directions` (n, 3), ICRS unit vectors, and magnitudes (n,) are the stars that the tracker can see; the database is made of
+    them in a second. Raises InputError where the extra is missing.
+    """
+
+    def __init__(self, directions: FloatArray, v_mag: FloatArray, focal_length_px: float, size_px: tuple[int, int]) -> None:
+        try:
+            import tetra3rs
+        except ImportError as error:
+            raise InputError(
+                '--solver tetra3: needs the extra hilstar[solve]; run pip install "hilstar[solve]", or write --solver truth'
+            ) from error
+        self._result = tetra3rs.SolveResult
+        width, height = size_px
+        self._camera = tetra3rs.CameraModel(focal_length_px=focal_length_px, image_width=width, image_height=height)
+        field_deg = float(np.degrees(2 * np.arctan(width / 2 / focal_length_px)))
+        order = np.argsort(v_mag, kind="stable")
+        rows = np.zeros(len(order), dtype=GAIA_RECORD)
+        x, y, z = directions[order].T
+        rows["id"], rows["mag"] = order + 1, v_mag[order]
+        rows["ra"], rows["dec"] = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arcsin(np.clip(z, -1, 1)))
+        with tempfile.TemporaryDirectory(prefix="hilstar-") as folder:
+            path = Path(folder) / "stars.bin"
+            path.write_bytes(b"GDR3" + np.array([1], "<u4").tobytes() + np.array([len(rows)], "<u8").tobytes() + rows.tobytes())
+            self._database = tetra3rs.SolverDatabase.generate_from_gaia(
+                str(path),
+                max_fov_deg=field_deg * (1 + FIELD_ERROR),
+                min_fov_deg=field_deg * (1 - FIELD_ERROR),
+                star_max_magnitude=float(v_mag.max()),
+                epoch_proper_motion_year=None,  # the stars are where they are
+            )
+
+    def solve(self, slopes: FloatArray, flux_e: FloatArray) -> FloatArray | None:
+        """q_icrs_to_cam of stars at slopes (n, 2) from the boresight (x / z and y / z in cam), brightest first; or None."""
+        places = np.column_stack([slopes * self._camera.focal_length_px, flux_e])
+        solved = self._database.solve_from_centroids(places, camera_model=self._camera)
+        return normalise(np.asarray(solved.quaternion)) if isinstance(solved, self._result) else None

@@ -1,0 +1,109 @@
+"""Found stars become an attitude: near an expected one, and lost in space by tetra3rs, against the truth."""
+
+from __future__ import annotations
+
+import builtins
+
+import numpy as np
+import pytest
+
+from hilstar.errors import InputError
+from hilstar.rotation import angle_between_rad, from_rotation_vector, multiply, normalise, to_matrix
+from hilstar.sky.catalog import load_catalog
+from hilstar.sky.stars import unit_vectors_icrs
+from hilstar.tracker.identify import FoundStars, LostInSpace, identify, wahba
+
+FOCAL_PX, SIDE_PX = 5384.6, 1024
+ARCSEC = np.pi / 180 / 3600
+NOISE_PX = 0.05
+# About the boresight n stars r px from it say s / (r sqrt(n)); five sigma of 20 stars at 300 px.
+LIMIT_RAD = 5 * NOISE_PX / 300 / np.sqrt(20)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    catalog = load_catalog().brighter_than(6.5)
+    order = np.argsort(catalog.v_mag, kind="stable")
+    return unit_vectors_icrs(catalog, 2026.0)[order], catalog.v_mag[order]
+
+
+@pytest.fixture(scope="module")
+def lost_in_space(sky):
+    return LostInSpace(*sky, FOCAL_PX, (SIDE_PX, SIDE_PX))
+
+
+class Sky:
+    """Stars that a camera of 10.9 degrees sees at an attitude, with noise, false ones and one that a neighbour pulled away."""
+
+    def __init__(self, sky, q, rng, false=5):
+        self.vectors, v_mag = sky
+        x, y = self.place(self.vectors @ to_matrix(q).T)
+        seen = np.flatnonzero((np.abs(x - 511.5) < 512) & (np.abs(y - 511.5) < 512))
+        x, y = (each[seen] + rng.normal(0, NOISE_PX, len(seen)) for each in (x, y))
+        x[3] += 1.0
+        x, y = (np.append(each, rng.uniform(0, SIDE_PX, false)) for each in (x, y))
+        flux = np.append(3e6 * 10 ** (-0.4 * v_mag[seen]), np.full(false, 2e4))
+        order = np.argsort(-flux)
+        rays = np.stack([x - 511.5, y - 511.5, np.full(len(x), FOCAL_PX)], axis=1)
+        self.found = FoundStars(x[order], y[order], flux[order], normalise(rays[order]))
+
+    def place(self, rays):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.where(rays[:, 2] > 0.5, FOCAL_PX / rays[:, 2], np.nan)
+        return rays[:, 0] * scale + 511.5, rays[:, 1] * scale + 511.5
+
+    def near(self, q):
+        near = np.flatnonzero(self.vectors @ to_matrix(q)[2] > np.cos(np.radians(7.7)))
+        return near, self.vectors[near]
+
+
+def test_lost_in_space_and_then_by_all_stars_is_the_true_attitude_wherever_the_camera_looks(sky, lost_in_space, rng):
+    for q in normalise(rng.normal(size=(25, 4))):
+        seen = Sky(sky, q, rng)
+        rays = seen.found.rays
+        guess = lost_in_space.solve(rays[:, :2] / rays[:, 2:], seen.found.flux_e)
+        assert guess is not None
+        known = identify(seen.found, guess, seen.near, seen.place)
+        assert known is not None
+        assert angle_between_rad(known.q_icrs_to_cam, q) < LIMIT_RAD
+
+
+def test_noise_alone_is_no_attitude(sky, lost_in_space, rng):
+    x, y = rng.uniform(0, SIDE_PX, (2, 30))
+    rays = normalise(np.stack([x - 511.5, y - 511.5, np.full(30, FOCAL_PX)], axis=1))
+    assert lost_in_space.solve(rays[:, :2] / rays[:, 2:], np.ones(30)) is None
+    seen = Sky(sky, normalise(rng.normal(size=4)), rng)
+    assert identify(FoundStars(x, y, np.ones(30), rays), normalise(rng.normal(size=4)), seen.near, seen.place) is None
+
+
+@pytest.mark.parametrize("off_px", [0.5, 9.0])
+def test_an_expected_attitude_may_be_off_by_the_first_radius(sky, rng, off_px):
+    q = normalise(rng.normal(size=4))
+    expected = multiply(from_rotation_vector(np.array([0.6, 0.8, 0.0]) * off_px / FOCAL_PX), q)
+    seen = Sky(sky, q, rng)
+    known = identify(seen.found, expected, seen.near, seen.place)
+    assert known is not None
+    assert angle_between_rad(known.q_icrs_to_cam, q) < LIMIT_RAD
+    assert known.rms_rad < 2 * NOISE_PX / FOCAL_PX  # the star that was pulled away is none of them
+
+
+def test_wahba_finds_the_rotation_of_weighted_directions(rng):
+    q = normalise(rng.normal(size=4))
+    known = normalise(rng.normal(size=(6, 3)))
+    seen = known @ to_matrix(q).T
+    seen[0] = [1.0, 0.0, 0.0]
+    weight = np.array([0.0, 1.0, 2.0, 1.0, 1.0, 3.0])
+    assert angle_between_rad(wahba(seen, known, weight), q) < 1e-12
+
+
+def test_without_the_extra_it_says_how_to_get_it(sky, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *arguments):
+        if name == "tetra3rs":
+            raise ImportError(name)
+        return real(name, *arguments)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match=r"pip install \"hilstar\[solve\]\", or write --solver truth"):
+        LostInSpace(*sky, FOCAL_PX, (SIDE_PX, SIDE_PX))

@@ -1,7 +1,8 @@
 """Tables of README and docs/ from the CSV files beside this script: `python results/tables.py` writes them between their marks.
 
-bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by `hilstar study NAME -o`,
-quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on which machine.
+bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by
+`hilstar study NAME -o`, quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on
+which machine; bench_h100.csv on an NVIDIA H100.
 """
 
 from __future__ import annotations

@@ -23,11 +23,11 @@ def benchmark(
     sizes: Annotated[str | None, typer.Option(metavar="WxH,WxH,...", help="Image sizes.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random stars beyond the catalogue.", min=0, max=MAX_SEED)] = 1,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for bench.csv and bench.png.")
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for bench.csv, tracker.csv and bench.png.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Time a whole frame and its stages, beside NumPy, numba, GalSim and photutils on the same stars."""
+    """Time a whole frame and its stages, and the virtual tracker, beside NumPy, numba, GalSim, photutils and sep."""
     import msgspec
     import numpy as np
 

@@ -39,6 +39,7 @@ from hilstar.scene.psf import SQRT2, GaussianPsf
 from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, pack_sprites
 from hilstar.sky.stars import Stars, cell_grid
 from hilstar.study.settings import FULL_HD, Table, Value, bench_text
+from hilstar.study.speed import tracker
 from hilstar.study.speed.report import (
     REFERENCE_PX,
     Agreement,
@@ -405,10 +406,11 @@ class BenchmarkPlan:
     rounds: int = 100
     budget_s: float = 10.0
     starts: int = 3
+    exposures: int = 20
     file: BenchFile | None = None
 
 
-QUICK = BenchmarkPlan(sizes=(REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0)
+QUICK = BenchmarkPlan(sizes=(REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0, exposures=1)
 
 
 def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], object]) -> Result:
@@ -431,6 +433,9 @@ def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], 
                         cell.measure(methods, plan.rounds, plan.budget_s)
                     advance(place * len(plan.counts) + k + 1)
             result.startup += [fresh_start(file.path, q_icrs_to_cam, size) for _ in range(plan.starts)]
+    if plan.exposures:
+        result.tracker, without = tracker.tracker_rows(plan.exposures, plan.budget_s)
+        result.skipped += without
     size = REFERENCE_PX if REFERENCE_PX in plan.sizes else plan.sizes[0]
     here = [start for start in result.startup if start.size == size]
     for name in ("import_ms", "first_frame_ms", "memory_mb"):

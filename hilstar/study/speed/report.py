@@ -134,6 +134,7 @@ class Result:
     machine: Machine
     gl_renderer: str = ""
     rows: list[MethodTiming] = field(default_factory=list)
+    tracker: list[MethodTiming] = field(default_factory=list)
     scenes: list[SceneOrigin] = field(default_factory=list)
     agreement: list[Agreement] = field(default_factory=list)
     startup: list[ProcessStart] = field(default_factory=list)
@@ -162,9 +163,22 @@ def lines(result: Result) -> Iterator[str]:
         python = {row.stars: row.ms.median for row in result.python_ms if row.size == size}
         yield f"{'  Python outside GL':{NAME}}" + "".join(f"{_ms(python.get(count)):>{COLUMN}}" for count in counts)
     yield ""
+    yield from _tracker_lines(result.tracker)
     yield from _notes(result)
     if is_busy(result.others_cores):
         yield busy_line(result.others_cores)
+
+
+def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
+    """The virtual tracker's works, by whom, their medians, and each peer's ratio to hilstar."""
+    own = {row.kind: row.ms.median for row in rows if row.method == "hilstar"}
+    if rows:
+        yield f"the virtual tracker, {_words(rows[0].size)}, {rows[0].stars} stars, ms (median)"
+    for row in rows:
+        beside = "" if row.method == "hilstar" else f"   {row.ms.median / own[row.kind]:.2f} of hilstar's"
+        yield f"  {row.kind.replace('_', ' '):12}{row.method:11}{row.ms.median:8.1f}{beside}"
+    if rows:
+        yield ""
 
 
 def _notes(result: Result) -> Iterator[str]:
@@ -190,10 +204,11 @@ def _notes(result: Result) -> Iterator[str]:
 
 
 def write(result: Result, folder: Path) -> None:
-    """Write bench.csv and its chart into `folder`. Raises InputError where they cannot be written."""
+    """Write bench.csv, tracker.csv and the chart into `folder`. Raises InputError where they cannot be written."""
     columns = ("width", "height", "stars", "method", "kind", "median_ms", "min_ms", "max_ms")
-    table = [(r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max) for r in result.rows]
-    write_csv(folder / "bench.csv", columns, table)
+    for name, rows in (("bench.csv", result.rows), ("tracker.csv", result.tracker)):
+        table = [(r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max) for r in rows]
+        write_csv(folder / name, columns, table)
     _draw(folder / "bench", result)
 
 

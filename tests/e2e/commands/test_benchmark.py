@@ -96,6 +96,15 @@ def test_the_files_say_the_same(measured):
         assert picture.width > 500
 
 
+def test_the_virtual_tracker_is_timed_beside_its_peers(measured):
+    result, folder = measured
+    kinds = {(row["method"], row["kind"]) for row in result["tracker"]}
+    assert {("hilstar", kind) for kind in ("exposure", "find_stars", "case", "verify")} | {("numpy", "exposure")} <= kinds
+    with (folder / "tracker.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["median_ms"]) for row in rows] == [row["ms"]["median"] for row in result["tracker"]]
+
+
 def test_a_bench_file_is_measured_at_its_own_size(small_bench_file):
     result = run_hilstar_here("benchmark", small_bench_file, "--quick", "--stars", "50")
     assert result.returncode == 0, result.stderr

@@ -149,3 +149,17 @@ def test_many_answers_a_second_cost_the_same_each():
         judge.judge(Answer(NS_PER_S + k * 1_000_000, b"", NS_PER_S, q))
     figures = judge.figures(6 * NS_PER_S, {})
     assert figures.right == 5000 and figures.rate_hz == pytest.approx(1000)
+
+
+def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
+    frames = LitFrames(PERIOD_NS)
+    judge, verdicts, k = AnswerJudge(AnswerRules(EXPOSURE_S), frames), [], 0
+    for i in range(200):
+        middle_ns = NS_PER_S + i * NS_PER_S // 10
+        while k * PERIOD_NS < middle_ns + NS_PER_S // 5:
+            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
+            k += 1
+        set_ns = 10**18 if 60 <= i < 120 else 0  # forward by thirty years, and back
+        verdicts.append(judge.judge(Answer(middle_ns + NS_PER_S // 6, b"", middle_ns + set_ns, START)).verdict)
+    assert verdicts.count("right") >= 197 and "wrong" not in verdicts
+    assert set(verdicts[:120] + verdicts[124:]) == {"right"}

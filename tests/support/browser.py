@@ -32,9 +32,9 @@ FLAGS = (
     "--disable-dev-shm-usage",
     "--hide-scrollbars",
 )
-# Beside what may be scrolled: the row of overlays, the bench file, tables of events.
+# Beside what may be scrolled: the row of overlays, wide tables, the bench file, tables of events.
 OVERFLOWING = """
-const may = (element) => element.closest("#overlays, pre, canvas, .skip, dialog");
+const may = (element) => element.closest("#overlays, .wide-table, pre, canvas, .skip, dialog");
 const wide = (element) => !element.childElementCount && element.clientWidth && element.scrollWidth > element.clientWidth + 1;
 return [...document.querySelectorAll("body *")]
   .filter((element) => element.checkVisibility() && !may(element))

@@ -253,6 +253,7 @@ class AnswerTally:
             return None
         cycle_s = self._interval_s.percentile(50)
         due = 0 if not cycle_s else round((self._last_ns - self._first_ns) / NS_PER_S / cycle_s) + 1 - counts["unpaired"]
+        end_ns = self._last_ns + round((cycle_s or 0.0) * NS_PER_S)  # the last answer stands for the time to the next
         return AnswerReport(
             answers=answers,
             right=counts["right"],
@@ -265,7 +266,7 @@ class AnswerTally:
             rms_arcsec=self.whole.rms(),
             sigma3_arcsec=self.whole.sigma3(),
             latency_ms=self._latency_ms.percentiles(),
-            faults=[fault.effect(zero_ns, self._first_ns, self._last_ns, cycle_s) for fault in self.faults],
+            faults=[fault.effect(zero_ns, self._first_ns, end_ns, cycle_s) for fault in self.faults],
         )
 
 

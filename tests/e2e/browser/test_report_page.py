@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import hilstar
 from hilstar.notices import Notice
 from hilstar.rotation import from_rotation_vector, multiply
 from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.ledger_records import FrameRecord
+from hilstar.run.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 from tests.support.benches import ORION_Q, SMALL_BENCH
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.commands import run_hilstar_here
@@ -21,6 +22,7 @@ from tests.support.run_page import levels_of, run_data_of
 
 pytestmark = [pytest.mark.e2e, pytest.mark.gpu]
 FRAMES, PERIOD_NS = 600, 16_666_667
+FAULTY = range(120, 240)
 TURN_RAD = 2e-4  # a frame
 
 
@@ -30,7 +32,19 @@ def record(k: int) -> FrameRecord:
     age_ns = 400_000_000 if 300 <= k < 330 else 8_000_000 + 10_000 * (k % 50)
     times = {"t_ns": at_ns, "light_ns": at_ns, "draw_ns": at_ns - 4_000_000, "swap_ns": at_ns, "age_ns": age_ns}
     missed = {"missed_before": 2 if k == 450 else 0, "missed": 2 if k >= 450 else 0}
+    missed |= {"faults": (1,), "fault_since_ns": (10**12,)} if k in FAULTY else {}
     return FrameRecord(frame=k, q=q, stale=age_ns > 250_000_000, stars_drawn=200, **times, **missed)
+
+
+def answer(k: int) -> AnswerRecord:
+    """The tracker's answer with frame k: lost in the fault, and wrong once."""
+    at_ns = 10**12 + k * PERIOD_NS
+    found = AnswerRecord(host_ns=at_ns + 10**8, raw="", middle_ns=at_ns, verdict="right", residual_arcsec=(2.0, -3.0, 9.0))
+    if k in FAULTY:
+        found.verdict, found.residual_arcsec, found.valid = "invalid", None, False
+    elif k == 420:
+        found.verdict, found.residual_arcsec = "wrong", (9e4, 0.0, 0.0)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +53,14 @@ def report_file(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     (folder / "bench.toml").write_text(SMALL_BENCH)
     with hilstar.load(folder / "bench.toml") as bench, Ledger(folder / "run.mcap", bench) as ledger:
+        ghost = json.dumps({"kind": "false-star", "name": "ghost", "radec_deg": [84.0, -1.0], "v_mag": 2.0})
+        ledger.fault(
+            FaultRecord(host_ns=1, event="start", number=1, name="ghost", kind="false-star", who="", t_ns=0, table=ghost)
+        )
         for k in range(FRAMES):
             ledger.frame(record(k))
+            if k % 6 == 0:
+                ledger.answer(answer(k))
         ledger.packet(10**12 + 10**9, b"?", None, None)
         ledger.notice(Notice(10**12 + 5 * 10**9, "stale", "the attitude is stale"))
         ledger.notice(Notice(10**12 + 7 * 10**9, "mark", "<img src=x onerror=alert(1)>"))
@@ -69,6 +89,14 @@ def test_it_says_what_was_wrong_and_shows_the_whole_run(report):
     age = chart_aria(report, "age")
     assert "8.0 to 400.0" in age and "30 stale frames" in age
     assert "2 missed" in chart_aria(report, "pacing")
+
+
+def test_the_trackers_residual_is_charted_with_its_faults_shaded_and_their_effect_said(report):
+    words = chart_aria(report, "residual")
+    assert "x 2.0 to 2.0" in words and "z 9.0 to 9.0" in words and "1 wrong" in words and "1 fault on" in words
+    cells = [cell.text for cell in report.find_elements("css selector", "#fault-table td")]
+    assert cells[0] == "ghost" and cells[2] == "100.0 % / 0.0 % / 98.3 %" and cells[5] == "none"
+    assert "100 ms" not in report.text("#fault-table") and "tracker's answers" in report.text("#summary").lower()
 
 
 def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(report):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hilstar.answers import judge as judge_module
 from hilstar.answers.answer import Answer
 from hilstar.answers.judge import AnswerJudge, AnswerRules
 from hilstar.answers.pairing import LitFrame, LitFrames, residual_arcsec
-from hilstar.rotation import from_rotation_vector, from_rotation_vectors, multiply, propagate
+from hilstar.rotation import from_rotation_vector, multiply, propagate
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 PERIOD_NS = NS_PER_S // 60
@@ -141,11 +142,30 @@ def test_a_silent_tracker_is_told_before_its_first_answer():
     assert judge.figures(4 * NS_PER_S, {}).silent == "the tracker has not answered yet"
 
 
-def test_many_answers_a_second_cost_the_same_each():
-    frames = lit_until(2.0)
+def test_of_more_answers_than_it_keeps_the_newest_count(monkeypatch):
+    monkeypatch.setattr(judge_module, "MAX_IN_WINDOW", 100)
+    frames = LitFrames(PERIOD_NS)
+    for k in range(120):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
     judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
-    q = multiply(from_rotation_vectors(np.zeros((1, 3)))[0], attitude(1.0))
-    for k in range(5000):
-        judge.judge(Answer(NS_PER_S + k * 1_000_000, b"", NS_PER_S, q))
-    figures = judge.figures(6 * NS_PER_S, {})
-    assert figures.right == 5000 and figures.rate_hz == pytest.approx(1000)
+    for k in range(250):
+        error_rad = (1.0 if k < 150 else 2.0) / ARCSEC_PER_RAD
+        turned = multiply(from_rotation_vector(np.array([error_rad, 0.0, 0.0])), START)
+        judge.judge(Answer(NS_PER_S + k * 1_000_000, b"", NS_PER_S, turned))
+    figures = judge.figures(2 * NS_PER_S, {})
+    assert figures.right == 250 and figures.rate_hz == pytest.approx(1000)
+    assert figures.mean_arcsec == pytest.approx([2.0, 0.0, 0.0], abs=1e-3)
+
+
+def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
+    frames = LitFrames(PERIOD_NS)
+    judge, verdicts, k = AnswerJudge(AnswerRules(EXPOSURE_S), frames), [], 0
+    for i in range(200):
+        middle_ns = NS_PER_S + i * NS_PER_S // 10
+        while k * PERIOD_NS < middle_ns + NS_PER_S // 5:
+            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
+            k += 1
+        set_ns = 10**18 if 60 <= i < 120 else 0  # forward by thirty years, and back
+        verdicts.append(judge.judge(Answer(middle_ns + NS_PER_S // 6, b"", middle_ns + set_ns, START)).verdict)
+    assert verdicts.count("right") >= 197 and "wrong" not in verdicts
+    assert set(verdicts[:120] + verdicts[124:]) == {"right"}

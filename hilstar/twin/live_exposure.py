@@ -38,14 +38,14 @@ from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
 
 TRACKING, LOST, TOO_FEW, BLINDED = "tracking", "lost in space", "too few stars", "blinded"
-KEPT_NS = 3 * NS_PER_S  # frames that an exposure may still be of
+KEPT_NS = 10 * NS_PER_S  # frames that an exposure may still be of
 SEEN_SIGMAS = 3.0  # of a pixel's noise: fainter stars are not expected in an image
 MAX_EXPECTED = 300  # brightest stars that are
 MAX_REPORTED = 30  # stars
 BLINDED_SHARE = 0.05  # of the detector's pixels at the last code
 STREAK_PX = 0.5  # from this streak on, the window is as wide as it, and no S-curve is removed
 MAX_WINDOW_PX = 6.0
-STALE_S = 1.0  # an attitude older than this predicts no other
+STALE_S, TURN_S = 5.0, 1.0  # an attitude older than this predicts no other; two further apart than that tell no rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +234,7 @@ class LiveTracker(Closing):
     def rate_cam_rad_s(self) -> FloatArray:
         """The turn between the last two attitudes (3,), cam; 0 where there are none of the last second."""
         before, last = self._before, self._last
-        if before is None or last is None or last[0] - before[0] > STALE_S * NS_PER_S:
+        if before is None or last is None or last[0] - before[0] > TURN_S * NS_PER_S:
             return np.zeros(3)
         return rate_between_rad_s(before[1], last[1], (last[0] - before[0]) / NS_PER_S)
 

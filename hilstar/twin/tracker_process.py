@@ -23,7 +23,7 @@ from hilstar.attitude.wire.shown_frames import FrameWatch
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
 from hilstar.running_statistics import RunningStatistics
-from hilstar.twin.live_exposure import TRACKING, LiveTracker, Solved
+from hilstar.twin.live_exposure import LOST, TRACKING, LiveTracker, Solved
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 
 GRACE_NS = 50 * NS_PER_MS  # three refreshes at 60 Hz
@@ -163,7 +163,8 @@ class TrackerProcess:
             self._put(send)
             number += 1
             behind = (self._host.now_ns() - end_ns) // self._period_ns - 1
-            if behind > 0:
+            acquired = solved.mode == LOST and solved.identified is not None
+            if behind > 0 and not acquired:  # the exposure after it tells the rate, however long the solver took
                 self.tally.passed_over += behind
                 number += behind
         while self._waiting and not stop.is_set():

@@ -8,6 +8,7 @@ import pty
 import select
 import socket
 import subprocess
+import sys
 import tty
 
 import numpy as np
@@ -17,7 +18,7 @@ import zmq
 from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.attitude.wire.shown_frames import FrameHead, FrameSender, ShownFrame
 from hilstar.rotation import conjugate, from_radec_roll_deg, multiply, propagate, to_rotation_vector
-from tests.support.benches import TWIN, bench_text
+from tests.support.benches import ROOT, TWIN, bench_text
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.forks import Started
 from tests.support.senders import free_port
@@ -107,6 +108,16 @@ def test_planted_silence_garbage_latency_and_wrong_answers_over_a_serial_line(di
     whole = [part for part in heard.split(b"\n") if part.rpartition(b'{"t_ns"')[1]]
     assert len(whole) == found["answers"]
     assert len(heard) > sum(map(len, whole))
+
+
+def test_an_outside_command_finds_the_attitude_and_prediction_follows_it(display):
+    """The example's solver gets a FITS file, and is asked once."""
+    solver = f"{sys.executable} {ROOT / 'examples' / 'star_solver.py'} {{image}} {25e3 / 13}"
+    with tracker(display, "--answer", f"udp://127.0.0.1:{free_port()}", "--duration", 4, "--solver", solver) as process:
+        found = summary(process)
+    assert found["modes"]["lost in space"] == 1
+    assert found["modes"]["tracking"] >= 3
+    assert np.all(np.abs(found["own_bias_arcsec"]) < OWN_ARCSEC)
 
 
 def test_a_watcher_that_never_reads_loses_frames_and_holds_up_none():

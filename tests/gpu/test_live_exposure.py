@@ -1,0 +1,63 @@
+"""The tracker before a running display sees what the campaign's tracker before the same display does, electron for electron."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame, frame_parts, read_frame
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.bench.build import open_bench
+from hilstar.campaign.display_tracker import DisplayTracker
+from hilstar.frame.view import View
+from hilstar.rotation import normalise
+from hilstar.run.frame_feed import lit_pixels
+from hilstar.twin.live_exposure import LiveTracker
+from tests.support.benches import ORION_Q, TWIN, bench_text
+
+ORION = normalise(np.array(ORION_Q))
+FRAMES = 6
+PERIOD_NS = 16_666_667
+SAME = 1e-6  # of the brightest pixel: both add the same float32 shares, in another order
+
+
+def frame_of(bench, number: int) -> ShownFrame:
+    """A frame of the bench at Orion's belt, as a watcher gets it."""
+    levels = bench.draw(ORION, number).levels
+    lit, rgb = lit_pixels(levels), bench.calibration.response.rgb
+    found = levels.ravel()[lit]
+    codes = found if rgb is None else rgb[found]
+    height, width = levels.shape
+    head = FrameHead(number, number * PERIOD_NS, width, height, bench.config.monitor.bits, ORION_Q, 1 if rgb is None else 3)
+    frame = read_frame(frame_parts(ShownFrame(head, lit.astype(np.uint32), codes)))
+    assert isinstance(frame, ShownFrame), frame
+    return frame
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"monitor": {"bits": 8}, "render": {"quantisation": "round", "bit_stealing": True}, "verify": {"true_mirror": "x"}},
+        {"render": {"quantisation": "dither"}, "monitor": {"bits": 8, "calibration": "lcd-example"}},
+    ],
+)
+def test_both_trackers_see_the_same_electrons(tmp_path: Path, rng, monkeypatch, changes):
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN, changes))
+    file = read_bench_file(tmp_path / "bench.toml")
+    view = View.exposure(ORION, np.zeros(3), file.config.tracker.exposure_s, None)
+    campaigns = DisplayTracker(file)
+    wanted = campaigns.expose(view, None).mean_e
+    campaigns.close()
+    with open_bench(file) as bench, LiveTracker(file, rng) as live:
+        for number in range(FRAMES + 1):
+            live.take(frame_of(bench, number))
+        exposed = live.frames.exposed(0, FRAMES * PERIOD_NS)
+        assert exposed is not None
+        seen = []
+        monkeypatch.setattr(live._detector, "expose", lambda light_e, *_: seen.append(light_e))
+        live.expose(exposed)
+    assert np.abs(seen[0] - wanted).max() < SAME * wanted.max()
+    assert wanted.max() > 1000

@@ -16,7 +16,7 @@ from hilstar.cli.assess import assess
 from hilstar.cli.attitude import attitude
 from hilstar.cli.benchmark import benchmark
 from hilstar.cli.budget import budget
-from hilstar.cli.calibrate import alignment, dots, geometric, photometric, plan, scale
+from hilstar.cli.calibrate import alignment, dots, geometric, photometric, plan, psf, scale
 from hilstar.cli.campaign import campaign
 from hilstar.cli.catalogue import catalogue
 from hilstar.cli.compare import compare
@@ -139,7 +139,7 @@ def of_this_machine() -> None:
 for panel, commands in COMMANDS.items():
     for command in commands:
         app.command(command.__name__.replace("_", "-"), rich_help_panel=panel)(command)
-for command in (dots, geometric, alignment, plan, photometric, scale):
+for command in (dots, geometric, psf, alignment, plan, photometric, scale):
     calibrate.command()(command)
 app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")
 sensor.command("import")(import_)

@@ -13,7 +13,7 @@ from hilstar.cli.options import MAX_SEED, BenchFile, Json, Overwrite, check_file
 from hilstar.cli.running import Windowed
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
-from hilstar.files import CSV, PNG, TOML, check_directory, check_ending, make_directory
+from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 RESOLUTION_FORM = "--resolution W,H in pixels, such as 1920,1080"
@@ -86,6 +86,36 @@ def geometric(
     found = calibrate_files(file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal)
     written = write_calibrated(output, found, plot)
     _report(output, as_json, lambda: summary_of(found, written), lambda: lines_of(found))
+
+
+def psf(
+    bench_file: BenchFile,
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGES...", help="The tracker's images of the dots.")],
+    plan: Annotated[Path, typer.Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")],
+    dark: Annotated[Path | None, typer.Option(metavar="FILE", help="A dark frame, taken from each image.")] = None,
+    oversampling: Annotated[int, typer.Option(help="Samples a tracker pixel along each axis.", min=2, max=16)] = 4,
+    plot: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The PSFs over the field.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Find the effective PSF of tracker and collimator over the field by the dots of `calibrate geometric`."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.calibrate.effective_psf import draw_effective, effective_psf, lines_of, summary_of
+    from hilstar.optics.psf_file import write_glass
+
+    check_ending("-o", output, FITS)
+    check_ending("--plot", plot, PNG)
+    file = read_bench_file(bench_file)
+    check_files([*images, dark, plan / "plan.csv"], [output, plot], file)
+    found = effective_psf(file, images, plan / "plan.csv", dark, oversampling)
+    write_glass(output, found.glass)
+    if plot is not None:
+        draw_effective(plot, found)
+    if as_json:
+        print_json(summary_of(found) | {"written": [str(each) for each in (output, plot) if each is not None]})
+        return
+    typer.echo("\n".join(lines_of(found)))
+    typer.echo(f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}")
 
 
 def _report(output: Path, as_json: bool, figures: Callable[[], dict[str, Any]], lines: Callable[[], list[str]]) -> None:

@@ -32,7 +32,9 @@ PHASE_TOLERANCE = 1e-4  # the same of the functions of a star's place in its pix
 MAX_DEGREE = 3  # splines over wavelength and focus, polynomials over a scattered field
 MAX_GRID_DEGREE = 4
 ON_EDGE_PX = 1e-6
+SMALLEST = 1e-15
 SPRITES_AT_ONCE_PX = 2_000_000
+STARS_AT_ONCE = 128  # whose sums over the basis stay in a processor's cache: all at once takes three times as long
 
 
 Kernel = Literal["linear", "thin_plate_spline", "quintic"]
@@ -226,20 +228,20 @@ class GlassPsf(SampledPsf):
         at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
         count, height, width = self.optics.basis.shape
         down, across = (
-            _pixels_of(size, self.per_px, at_px.ravel(), self.pixel_integrated).astype(np.float32) for size in (height, width)
+            _normal_floats(_pixels_of(size, self.per_px, at_px.ravel(), self.pixel_integrated)) for size in (height, width)
         )
         used = np.sqrt((self.optics.weights**2).mean(axis=(0, 1))).astype(np.float32)
         table = np.empty((count, (steps + 1) ** 2, side * side), dtype=np.float32)
-        for image, scale, own in zip(self.optics.basis.astype(np.float32), used, table, strict=True):
+        for image, scale, own in zip(_normal_floats(self.optics.basis), used, table, strict=True):
             pixels = (down @ (scale * image) @ across.T).reshape(steps + 1, side, steps + 1, side)
             own[:] = pixels.transpose(0, 2, 1, 3).reshape(own.shape)
         stamps, coefficients = _few(table.reshape(-1, side * side), side)
-        coefficients = coefficients.reshape(*table.shape[:2], -1) / np.maximum(used, 1e-30)[:, None, None]
+        coefficients = coefficients.reshape(*table.shape[:2], -1)
         flat = np.ascontiguousarray(coefficients.transpose(1, 0, 2)).reshape((steps + 1) ** 2, -1)
         values, vectors = np.linalg.eigh((flat @ flat.T).astype(np.float64))
         needed = int(np.argmax(values.sum() - np.cumsum(values[::-1]) <= PHASE_TOLERANCE**2 * values.sum())) + 1
         phases = vectors[:, ::-1][:, :needed].astype(np.float32)
-        parts = (phases.T @ flat).reshape(needed, count, -1).transpose(1, 0, 2)
+        parts = (phases.T @ flat).reshape(needed, count, -1).transpose(1, 0, 2) / np.maximum(used, 1e-30)[:, None, None]
         phases = phases.reshape(steps + 1, steps + 1, needed)
         return _Stamps(stamps, phases, np.ascontiguousarray(parts), stamps.sum(axis=1))
 
@@ -299,14 +301,19 @@ class GlassPsf(SampledPsf):
 
         Their light has `shares` (n, L) at each wavelength, or (L,) all of it.
         """
-        weights = self._mixed(x_px, y_px, shares)
-        both = (weights[:, :, None] * self._phased(x_px, y_px)[:, None, :]).reshape(len(x_px), -1)
-        parts = both @ self._stamps.parts.reshape(both.shape[1], -1)
+        weights, phased = self._mixed(x_px, y_px, shares), self._phased(x_px, y_px)
+        count, functions, stamps = self._stamps.parts.shape
+        of_basis = self._stamps.parts.reshape(count, -1)
+        parts = np.empty((len(x_px), stamps), dtype=np.float32)
+        for begin in range(0, len(x_px), STARS_AT_ONCE):
+            part = slice(begin, begin + STARS_AT_ONCE)
+            mixed = (weights[part] @ of_basis).reshape(-1, functions, stamps)
+            parts[part] = np.matmul(phased[part, None, :], mixed)[:, 0]
         # Interpolated phases and reduced stamps keep all light but some 1e-5 of it; this restores the rest.
         light, whole = weights @ self._sums, parts @ self._stamps.sums
         scale = electrons_per_s * light / np.where(whole > 0, whole, np.inf)
-        stamps = (parts * scale.astype(np.float32)[:, None]) @ self._stamps.stamps
-        return np.asarray(stamps.reshape(-1, self.footprint_px, self.footprint_px))
+        squares = (parts * scale.astype(np.float32)[:, None]) @ self._stamps.stamps
+        return np.asarray(squares.reshape(-1, self.footprint_px, self.footprint_px))
 
     def image(self, sprites: Sprites, shares: FloatArray, resolution_px: tuple[int, int]) -> Float32Array:
         """The light of sprites (n,) in all pixels (height, width), electrons per second; `shares` as in `of_stars`."""
@@ -345,7 +352,7 @@ def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPs
     basis = glass.basis.astype(np.float64)
     optics = Focused(basis, weights, illumination, inside)
     if lateral_px.any() or len(glass.focuses_um) > 1:
-        optics = _rebased(optics, lateral_px * glass.per_px)
+        optics = _rebased(optics, lateral_px * glass.per_px, 1 if glass.pixel_integrated else glass.per_px)
     field = Field(glass.places_px)
     return GlassPsf(
         _middle(optics, field, mean_shares),
@@ -364,8 +371,11 @@ def _middle(optics: Focused, field: Field, shares: FloatArray) -> FloatArray:
     return np.asarray(np.tensordot(np.einsum("f,l,flk->k", middle, shares, optics.weights), optics.basis, axes=1))
 
 
-def _rebased(optics: Focused, lateral: FloatArray) -> Focused:
-    """PSFs moved by `lateral` (F, L, 2) samples, right and down, on a basis of their own: one focus needs fewer components."""
+def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
+    """PSFs moved by `lateral` (F, L, 2) samples, right and down, on a basis of their own: one focus needs fewer components.
+
+    Pixels have `width` samples, 1 where they are integrated.
+    """
     from scipy.ndimage import shift
 
     room = math.ceil(float(np.abs(lateral).max()))
@@ -375,7 +385,7 @@ def _rebased(optics: Focused, lateral: FloatArray) -> Focused:
     moved = [shift(image, move[::-1], order=5) if move.any() else image for image, move in zip(unmoved, moves, strict=True)]
     images = np.stack(moved)
     images /= images.sum(axis=(1, 2), keepdims=True)
-    basis, weights, _ = principal(images.reshape(len(images), -1), images.shape[1:], TOLERANCE)
+    basis, weights, _ = principal(images.reshape(len(images), -1), images.shape[1:], TOLERANCE, width)
     weights /= (weights @ basis.sum(axis=1, dtype=np.float64))[:, None]
     return replace(
         optics,
@@ -396,6 +406,11 @@ def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> F
     light = spline.antiderivative()
     low, high = (light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5))
     return np.asarray((high - low) * per_px)
+
+
+def _normal_floats(values: FloatArray) -> Float32Array:
+    """Values in single precision, the smallest set to zero: products of subnormal numbers are slow."""
+    return np.where(np.abs(values) < SMALLEST, 0, values).astype(np.float32)
 
 
 def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:

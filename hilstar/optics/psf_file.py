@@ -41,6 +41,7 @@ AXES = ("x_px", "y_px", "wavelength_nm", "focus_um")
 FACTS = ("relative_illumination", "outside_share", "lateral_x_px", "lateral_y_px")
 TOLERANCE = 1e-3  # share of a PSF's light that its basis may put elsewhere
 MAX_FILE_BYTES, MAX_IMAGES = 500_000_000, 20_000
+PHASES = 4  # places along a pixel's side at which what pixels get is compared
 FEW_IMAGES = 7  # no basis has fewer components
 MAX_OFF = 0.25  # share of a stamp's side; a PSF whose centroid lies farther from the middle is not centred on its chief ray
 MAX_NEGATIVE = 0.1  # share of a PSF's light, summed over pixels
@@ -109,7 +110,7 @@ def glass_of(
     history: Sequence[str] = (),
 ) -> Glass:
     """The glass of a stack, whose images need not be normalised. Raises InputError for one that is not of PSFs."""
-    images, count = stack.images, len(stack.images)
+    images, count, per_px = stack.images, len(stack.images), stack.per_px
     if images.ndim != 3 or not all(side % 2 for side in images.shape[1:]):
         found = " x ".join(map(str, images.shape[::-1]))
         raise InputError(f"a stack of {found} has no middle samples; write images (n, height, width) of odd sides")
@@ -123,7 +124,10 @@ def glass_of(
                 f"image {number} has samples that are not finite, or no light; write finite ones with a positive sum"
             )
     images = images / images.sum(axis=(1, 2), keepdims=True)
-    basis, weights, residual = principal(images.reshape(count, -1), images.shape[1:], tolerance)
+    if per_px < 1:
+        raise InputError(f"PSFs of {per_px} samples a pixel; write 1 or more")
+    width = 1 if stack.pixel_integrated else per_px
+    basis, weights, residual = principal(images.reshape(count, -1), images.shape[1:], tolerance, width)
     sums = basis.sum(axis=1, dtype=np.float64)
     weights /= (weights @ sums)[:, None]
     axes, place = _product(stack.at)
@@ -158,11 +162,14 @@ def moment_carriers(shape: tuple[int, int], sigma: float) -> tuple[FloatArray, F
     return np.linalg.pinv(terms.T @ weighed) @ weighed.T, terms
 
 
-def principal(images: FloatArray, shape: tuple[int, int], tolerance: float) -> tuple[Float32Array, FloatArray, float]:
-    """Basis (K, m), weights (n, K) and the residual of images (n, m) that sum to 1.
+def principal(
+    images: FloatArray, shape: tuple[int, int], tolerance: float, width: int
+) -> tuple[Float32Array, FloatArray, float]:
+    """Basis (K, m), weights (n, K) and the residual of images (n, m) that sum to 1, for pixels of `width` samples.
 
     Flux, centroids and second moments are kept exactly; of the rest there are as few principal components as leave at most
-    `tolerance`: half the sum of a residual's absolute values, which is the share of light that lies elsewhere.
+    `tolerance`: half the sum of a residual's absolute values, which is the share of light that lies elsewhere. Both are of
+    what pixels get (`_by_pixels`): detail finer than a pixel moves no electron.
     """
     if len(images) <= FEW_IMAGES:
         return images.astype(np.float32), np.eye(len(images)), 0.0
@@ -170,19 +177,38 @@ def principal(images: FloatArray, shape: tuple[int, int], tolerance: float) -> t
     carriers, terms = moment_carriers(shape, float(1 / np.sqrt(4 * np.pi * (mean @ mean))))
     moments = images @ terms
     rest = images - moments @ carriers
-    values, vectors = np.linalg.eigh(rest @ rest.T)
-    basis, weights = list(carriers), list(moments.T)
-    residual = 0.5 * float(np.abs(rest).sum(axis=1).max())
-    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
-        if residual <= tolerance or value <= 1e-14 * values[-1]:
+    in_pixels = _by_pixels(rest.reshape(-1, *shape), width)
+    values, vectors = np.linalg.eigh(in_pixels @ in_pixels.T)
+    residual, count = 1.0, 0
+    for count in range(len(images) + 1):
+        residual = _elsewhere(in_pixels)
+        if residual <= tolerance or count == len(images) or values[-1 - count] <= 1e-14 * values[-1]:
             break
-        own = (vector @ rest) / np.sqrt(value)
-        weight = rest @ own
-        rest -= np.outer(weight, own)
-        basis.append(own)
-        weights.append(weight)
-        residual = 0.5 * float(np.abs(rest).sum(axis=1).max())
-    return np.array(basis, dtype=np.float32), np.array(weights).T, residual
+        vector = vectors[:, -1 - count]
+        in_pixels -= np.outer(vector, vector @ in_pixels)
+    own = vectors[:, ::-1][:, :count]
+    basis = own.T @ rest
+    size = np.maximum(np.linalg.norm(basis, axis=1), 1e-300)
+    return np.concatenate([carriers, basis / size[:, None]]).astype(np.float32), np.hstack([moments, own * size]), residual
+
+
+def _by_pixels(images: FloatArray, width: int) -> FloatArray:
+    """What pixels of `width` samples get of images (n, height, width), at about PHASES places in a pixel along each axis.
+
+    The result (n, m) is divided by the number of these places: of one image its absolute values sum to its mean light.
+    """
+    apart = max(1, round(width / PHASES))
+    found = images
+    for axis in (1, 2):
+        summed = np.cumsum(np.pad(found, [(width, width - 1) if k == axis else (0, 0) for k in range(3)]), axis=axis)
+        last = np.arange(width, summed.shape[axis], apart)
+        found = summed.take(last, axis) - summed.take(last - width, axis)
+    return np.asarray(found.reshape(len(images), -1) * (apart / width) ** 2)
+
+
+def _elsewhere(residuals: FloatArray) -> float:
+    """The largest share of light that lies elsewhere, of residuals (n, m) by `_by_pixels`."""
+    return 0.5 * float(np.abs(residuals).sum(axis=1).max())
 
 
 def _product(at: FloatArray) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[IntArray, ...]]:

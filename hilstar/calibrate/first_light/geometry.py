@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
+from hilstar.calibrate.effective_psf import dots_of_image, draw_effective, fit_effective
 from hilstar.calibrate.first_light.context import DarkSubtracted, StepContext
 from hilstar.calibrate.first_light.image_sources import Pattern, black
 from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, with_changes
@@ -22,7 +23,7 @@ from hilstar.calibrate.geometric.calibration import (
     parameters_of,
     write_calibrated,
 )
-from hilstar.calibrate.geometric.dots import DotPlan, dot_image, plan_dots, write_plan
+from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, dot_image, plan_dots, write_plan
 from hilstar.charts import DARK, INK, ORANGE, TEXT_PT, chart
 from hilstar.errors import InputError
 from hilstar.files import make_directory
@@ -189,6 +190,7 @@ class Sharpness:
     sigma_px: FloatArray
     each_psf_sigma_px: FloatArray
     psf_sigma_px: float
+    dot_side_px: float
 
 
 def sharpness(image: FloatArray, dot_side_px: float) -> Sharpness:
@@ -206,7 +208,7 @@ def sharpness(image: FloatArray, dot_side_px: float) -> Sharpness:
     sigma_px = _sigmas(np.pad(image - level, RADIUS_PX), x_px, y_px)
     expected = [_model_sigma(float(psf), dot_side_px) for psf in MODEL_SIGMAS_PX]
     each = np.interp(sigma_px, np.maximum.accumulate(expected), MODEL_SIGMAS_PX)
-    return Sharpness(x_px, y_px, sigma_px, each, float(np.median(each)))
+    return Sharpness(x_px, y_px, sigma_px, each, float(np.median(each)), dot_side_px)
 
 
 def _model_sigma(psf_sigma_px: float, dot_side_px: float) -> float:
@@ -246,7 +248,7 @@ PLAN_SEED = 0
 FRAMES = 20
 MIN_LIT, MAX_LIT = 12, 60  # dots in a frame
 TRACKER_PX_A_DOT = 40.0  # tracker px between neighbouring dots of a frame
-DOT_PX = 3  # side of a dot, monitor px
+OVERSAMPLING = 4  # of the effective PSF
 BLURRED = 1.3  # times the bench file's sigma
 BLURRED_BY_PX = 0.1
 
@@ -312,18 +314,29 @@ def focus(context: StepContext) -> StepOutcome:
         axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
         axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
         axes.invert_yaxis()
-    figures = {
+    figures: dict[str, Figure] = {
         "psf_sigma_px": sigma,
         "dot_sigma_px": float(np.median(found.sigma_px)),
         "dots": len(found.x_px),
         "dot_code": code,
     }
-    files = (looked.path, picture)
+    files: tuple[Path, ...] = looked.path, picture
+    pictures: tuple[Path, ...] = (picture,)
     line = f"PSF sigma {sigma:.3f} px, the bench file says {wanted:g}; dots at code {code}"
+    try:
+        effective = fit_effective(dots_of_image(looked.image, found.x_px, found.y_px, found.dot_side_px), OVERSAMPLING)
+    except InputError:  # too few dots stand alone: the width alone is known
+        pass
+    else:
+        drawn = context.session / "psf.png"
+        draw_effective(drawn, effective)
+        files, pictures = (*files, drawn), (picture, drawn)
+        figures["effective_psf_rms"] = effective.chosen.rms
+        line += f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the field"
     if sigma > BLURRED * wanted + BLURRED_BY_PX:
         cure = "turn the focus until this figure is smallest (--again focus), or write [tracker] psf_sigma_px as it is"
-        return StepOutcome("failed", f"{line}: {cure}", figures, files, (picture,))
-    return StepOutcome("done", line, figures, files, (picture,))
+        return StepOutcome("failed", f"{line}: {cure}", figures, files, pictures)
+    return StepOutcome("done", line, figures, files, pictures)
 
 
 class SharpDots(NamedTuple):

@@ -11,10 +11,11 @@ import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.calibrate.first_light.context import HOT_FILL, StepContext
-from hilstar.calibrate.first_light.geometry import DOT_PX, sharp_dots
+from hilstar.calibrate.first_light.geometry import sharp_dots
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.calibrate.first_light.photometry import calibration_of, calibration_source
 from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, Verdict
+from hilstar.calibrate.geometric.dots import DOT_PX
 from hilstar.charts import chart
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import load_calibration, weights_of_grid, with_uniformity

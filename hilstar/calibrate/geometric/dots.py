@@ -23,6 +23,7 @@ LIT_SHARE = 0.4  # share of the frames that a dot is lit in
 MIN_LIT, MAX_LIT = 3, 10  # frames that a dot is lit in
 MIN_FRAMES = 8
 MAX_PLAN_BYTES = 20_000_000
+DOT_PX = 3  # side of a dot, monitor px
 EDGE_PX = 6  # from a dot's centre to the edge of the screen
 TRIES = 400  # random codes for each dot, at each distance
 PLAN_COLUMNS = ("frame", "dot", "x_px", "y_px")
@@ -96,11 +97,11 @@ def _places(resolution_px: tuple[int, int], count: int) -> tuple[FloatArray, Flo
 
 
 def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: int) -> npt.NDArray[np.uint16]:
-    """Code values (h, w) of a frame: each lit dot is a square of 3 x 3 px of `white` about its place."""
+    """Code values (h, w) of a frame: each lit dot is a square of DOT_PX of `white` about its place."""
     width, height = resolution_px
     image = np.zeros((height, width), dtype=np.uint16)
     for x, y in zip(plan.x_px[plan.lit[:, frame]].astype(int), plan.y_px[plan.lit[:, frame]].astype(int), strict=True):
-        image[y - 1 : y + 2, x - 1 : x + 2] = white
+        image[y - DOT_PX // 2 :, x - DOT_PX // 2 :][:DOT_PX, :DOT_PX] = white
     return image
 
 

@@ -84,23 +84,29 @@ def measure_images(paths: Sequence[Path], dark: Path | None, resolution_px: tupl
 
     Raises InputError for an image that cannot be read, has another size than the tracker's, or is saturated.
     """
-    numbered: dict[tuple[int, int], Path] = {}
+    paths_of = numbered(paths)
+    under = None if dark is None else read_image(dark, resolution_px)
+    places = [_centroids(path, resolution_px, under) for path in paths_of.values()]
+    count = [len(x) for x, _ in places]
+    if not sum(count):
+        raise InputError(f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer")
+    frame_of, pose_of = (np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True))
+    x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
+    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)))
+
+
+def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
+    """Images by frame and pose, as `measure_images` takes them from their names. Raises InputError."""
+    found: dict[tuple[int, int], Path] = {}
     for path in paths:  # all names before the first image, which takes a second
         number, pose_number = NUMBER.search(path.stem), POSE.search(str(path.parent.name))
         if number is None or int(number[1]) > 10**6:
             raise InputError(f"{path}: its name has no frame number; {IMAGE_ADVICE}")
         frame, pose = int(number[1]), int(pose_number[1]) if pose_number else 0
-        if (frame, pose) in numbered:
-            raise InputError(f"{path}: is frame {frame} of pose {pose}, and so is {numbered[frame, pose]}; {IMAGE_ADVICE}")
-        numbered[frame, pose] = path
-    under = None if dark is None else read_image(dark, resolution_px)
-    places = [_centroids(path, resolution_px, under) for path in numbered.values()]
-    count = [len(x) for x, _ in places]
-    if not sum(count):
-        raise InputError(f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer")
-    frame_of, pose_of = (np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*numbered, strict=True))
-    x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
-    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)))
+        if (frame, pose) in found:
+            raise InputError(f"{path}: is frame {frame} of pose {pose}, and so is {found[frame, pose]}; {IMAGE_ADVICE}")
+        found[frame, pose] = path
+    return found
 
 
 def _centroids(path: Path, resolution_px: tuple[int, int], under: FloatArray | None) -> tuple[FloatArray, FloatArray]:

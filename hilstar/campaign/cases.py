@@ -56,9 +56,10 @@ BEFORE = (
     *(*Q, "ra_deg", "dec_deg", "roll_deg"),
 )
 AFTER = (
-    *("frames", "stars_in_view", "limit_v_mag", "solved", "wrong", *(f"solved_{name}" for name in Q)),
+    *("frames", "stars_in_view", "limit_v_mag", "solved", "wrong", "first_attitude_s", *(f"solved_{name}" for name in Q)),
     *(f"{what}_{axis}_arcsec" for what in ("error", "scatter") for axis in AXES),
 )
+RECOVERY = ("fault_end_s", "recovery_s")  # of a plan that varies scenario
 CENTROIDS = (
     *("stars", "found", "matched", "false", "measured"),
     *("centroid_dx_px", "centroid_dy_px", "centroid_sigma_x_px", "centroid_sigma_y_px"),
@@ -140,6 +141,15 @@ class CaseMaker:
         begin_ns = 0 if self._log is None else self._log.span_ns[0]
         return faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - begin_ns)
 
+    def fault_end_s(self, case: Case, length_s: float) -> float | None:
+        """When the last fault of the case's scenario ends, after the case's begin; None outside its `length_s`."""
+        scenario = self._scenarios.get(str(case.values.get(SCENARIO, "")))
+        if scenario is None:
+            return None
+        begin_ns = 0 if self._log is None else self._log.span_ns[0]
+        end_s = scenario.end_s - ((case.first.t_ns or 0) - begin_ns) / NS_PER_S
+        return end_s if 0 < end_s <= length_s else None
+
     def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> View:
         rate_rad_s = np.radians([float(values.get(f"rate_deg_s.{axis}", 0.0)) for axis in "xyz"])
         across = math.radians(float(values.get("rate_deg_s.across", 0.0)))
@@ -213,7 +223,8 @@ def columns(parameters: list[Parameter], with_centroids: bool) -> dict[str, Kind
     """The columns of a campaign's rows, in their order."""
     varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
     found: dict[str, Kind] = {}
-    for name in (*BEFORE, *varied, *AFTER, *(CENTROIDS if with_centroids else ())):
+    recovery = RECOVERY if f"vary.{SCENARIO}" in varied else ()
+    for name in (*BEFORE, *varied, *AFTER, *recovery, *(CENTROIDS if with_centroids else ())):
         found[name] = varied.get(name) or ("text" if name in TEXTS else "int64" if name in WHOLE else "float64")
     return found
 
@@ -255,6 +266,9 @@ class CaseTally:
 
     with_centroids: bool
     wrong_above_arcsec: float
+    fault_end_s: float | None = None
+    first_attitude_s: float | None = None
+    recovery_s: float | None = None
     frames: int = 0
     stars_in_view: int = 0
     errors_arcsec: list[FloatArray] = field(default_factory=list)
@@ -270,8 +284,8 @@ class CaseTally:
         self.stars_in_view += len(exposure.truth)
         self._digest.update(exposure.dn.tobytes())
 
-    def hear(self, exposure: Exposure, answer: Answer) -> None:
-        """Count the answer to an exposure."""
+    def hear(self, exposure: Exposure, answer: Answer, end_s: float) -> None:
+        """Count the answer to an exposure that ends so long after the case's begin."""
         if answer.star_errors is not None:
             self.star_errors.append(answer.star_errors)
         if answer.q_icrs_to_cam is None:
@@ -284,11 +298,21 @@ class CaseTally:
             self.wrong += 1
         else:
             self.errors_arcsec.append(error)
+            self.first_attitude_s = end_s if self.first_attitude_s is None else self.first_attitude_s
+            if (
+                self.fault_end_s is not None
+                and self.recovery_s is None
+                and end_s - exposure.view.exposure_s / 2 >= self.fault_end_s
+            ):
+                self.recovery_s = end_s - self.fault_end_s
 
     def into(self, row: Row) -> Row:
         """The case's row with its results. Errors are those of answers that are not wrong."""
         row = row | {"why": self.why, "image_sha256": self._digest.hexdigest(), "frames": self.frames}
         row |= {"stars_in_view": self.stars_in_view, "solved": self.wrong + len(self.errors_arcsec), "wrong": self.wrong}
+        row["first_attitude_s"] = self.first_attitude_s
+        if "recovery_s" in row:
+            row |= {"fault_end_s": self.fault_end_s, "recovery_s": self.recovery_s}
         if self.first_q is not None:
             row |= dict(zip((f"solved_{name}" for name in Q), self.first_q.tolist(), strict=True))
         if self.errors_arcsec:

@@ -11,7 +11,7 @@ import msgspec
 
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.campaign.cases import CaseMaker, columns, failed, first_row
-from hilstar.campaign.plan import Design, Plan, grid_levels, parse_plan
+from hilstar.campaign.plan import Design, Plan, checked_conditions, grid_levels, parse_plan
 from hilstar.campaign.pool import MAX_DEATHS, Backlog, Pool, Task
 from hilstar.campaign.session import Identity, Job, Session, files_sha256
 from hilstar.campaign.store import About, Directory, Row, require_parquet, schema_of, write_table
@@ -54,6 +54,8 @@ class Campaign:
         finally:
             session.close()
         self.columns = columns(self.maker.parameters, "stars" in session.columns)
+        for require in self.plan.require:
+            checked_conditions(require.condition, self.columns)
         levels = grid_levels(self.plan)
         self.cases = self.plan.cases or math.prod(levels)
         self.design = Design(self.plan.sampling, self.plan.seed, self.cases, self.maker.attitude_dimensions, levels)
@@ -61,6 +63,7 @@ class Campaign:
     def about(self) -> About:
         """Everything that the rows depend on."""
         plan = msgspec.json.decode(msgspec.json.encode(self.plan, enc_hook=str))
+        del plan["require"]  # judged afterwards: another limit is no other campaign
         identity = msgspec.to_builtins(self.identity)
         return About(plan, self.file.sha256, self.job.files_sha256, self.job.solver, self.job.images, identity)
 

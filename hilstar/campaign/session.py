@@ -153,10 +153,13 @@ class Session:
             return failed(row, one_line(f"{type(error).__name__}: {error}"))
 
     def _exposed(self, case: Case, tracker: Imaging, row: Row) -> Row:
-        tally = CaseTally("stars" in self.columns, self.plan.wrong_above_arcsec)
+        exposure_s = tracker.config.tracker.exposure_s
+        length_s = (self.plan.frames - 1) * self.plan.step_s + exposure_s
+        fault_end_s = self.maker.fault_end_s(case, length_s)
+        tally = CaseTally("stars" in self.columns, self.plan.wrong_above_arcsec, fault_end_s)
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         for frame in range(self.plan.frames):
-            view = self.maker.view(case, frame, tracker.config.tracker.exposure_s)
+            view = self.maker.view(case, frame, exposure_s)
             # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and attitude.
             rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
             if isinstance(tracker, Simulator):
@@ -172,7 +175,7 @@ class Session:
                 write_exposure_fits(path, tracker, exposure, noise)
             tally.see(exposure)
             try:
-                tally.hear(exposure, self._solver.solve(exposure, tracker))
+                tally.hear(exposure, self._solver.solve(exposure, tracker), frame * self.plan.step_s + exposure_s)
             except SolverFault as error:
                 return failed(tally.into(row), one_line(str(error)))
         return tally.into(row)

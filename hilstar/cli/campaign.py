@@ -58,6 +58,9 @@ def campaign(
         str | None,
         typer.Option(metavar="SIZE", help="For this process and its workers together, such as 4GB: as many run as fit."),
     ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit with code 1 where one of the plan's [[require]] is not met.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Run a plan's cases over every core, or a cluster, into one Parquet table, a row a case."""
@@ -83,12 +86,23 @@ def campaign(
         from hilstar.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
 
         summary = write_results(directory.table, this.maker.file, this.plan.seed)
+        lines, not_met = lines_of(summary), False
+        if this.plan.require:
+            from hilstar.campaign.requirements import NOT_MET
+            from hilstar.campaign.requirements_page import summary_of, write_requirements
+
+            verdicts = write_requirements(this.plan, this.path, directory.table, this.maker.file)
+            not_met = any(each.verdict == NOT_MET for each in verdicts)
+            summary["requirements"] = [summary_of(each) for each in verdicts]
+            lines += [each.words for each in verdicts]
     finally:
         directory.close()
     if as_json:
         print_json(summary)
-        return
-    typer.echo("\n".join(lines_of(summary)))
+    else:
+        typer.echo("\n".join(lines))
+    if strict and not_met:
+        raise typer.Exit(1)
 
 
 def run_cases(

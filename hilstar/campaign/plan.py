@@ -40,6 +40,10 @@ MAX_CASES = 1_000_000_000
 MAX_FRAMES = 10_000
 MAX_VALUES = 10_000
 MAX_SEED = 2**63 - 1
+DEFAULT_ANSWERS, DEFAULT_TIMEOUT_S = 5, 10.0
+MAX_BENCH_CASES = 1_000_000
+BENCH_KEYS = ("answers", "settle_s", "timeout_s", "blank_s", "silent_s", "check_every")  # of through = "bench" alone
+TRACKER_KEYS = ("frames", "step_s", "noise", "centroids")  # of the others
 
 Sampling = Literal["grid", "latin-hypercube", "sobol"]
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
@@ -141,15 +145,31 @@ class Plan(Table, frozen=True):
     seed: Annotated[int, Meta(ge=0, le=MAX_SEED)] = 0
     cases: Annotated[int, Meta(ge=1, le=MAX_CASES)] | None = None
     sampling: Sampling = "sobol"
-    through: Literal["tracker", "display"] = "tracker"
+    through: Literal["tracker", "display", "bench"] = "tracker"
     frames: Annotated[int, Meta(ge=1, le=MAX_FRAMES)] = 1
     step_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 0.2
     noise: Literal["full", "none"] = "full"
     wrong_above_arcsec: Annotated[float, Meta(ge=0, le=648000)] = 1800.0
+    answers: Annotated[int, Meta(ge=1, le=MAX_FRAMES)] | None = None
+    settle_s: Annotated[float, Meta(ge=0, le=86400)] | None = None
+    timeout_s: Annotated[float, Meta(ge=0.01, le=86400)] | None = None
+    blank_s: Annotated[float, Meta(ge=0, le=86400)] = 0.0
+    silent_s: Annotated[float, Meta(ge=0, le=86400)] = 10.0
+    check_every: Annotated[int, Meta(ge=0, le=MAX_CASES)] = 0
     attitudes: Attitudes = msgspec.field(default_factory=Attitudes)
     centroids: Centroiding = msgspec.field(default_factory=Centroiding)
     vary: Annotated[list[Varied], Meta(max_length=64)] = msgspec.field(default_factory=list)
     require: Annotated[list[Require], Meta(max_length=256)] = msgspec.field(default_factory=list)
+
+    @property
+    def asked(self) -> int:
+        """How many answers a case on the bench gathers."""
+        return DEFAULT_ANSWERS if self.answers is None else self.answers
+
+    @property
+    def limit_s(self) -> float:
+        """How long a case on the bench lasts at most."""
+        return DEFAULT_TIMEOUT_S if self.timeout_s is None else self.timeout_s
 
 
 KIND = Kind(Plan, "docs/campaign.md", TYPE_WORDS)
@@ -171,6 +191,10 @@ def parse_plan(path: Path, text: str) -> Plan:
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
     try:
+        for key in TRACKER_KEYS if plan.through == "bench" else BENCH_KEYS:
+            if key in tables:
+                other = 'through = "tracker" or "display"' if plan.through == "bench" else 'through = "bench"'
+                raise InputError(f"{key}: is for {other}; write that, or leave {key} out")
         _check_attitudes(plan.attitudes)
         keys = [varied.key for varied in plan.vary]
         for varied in plan.vary:

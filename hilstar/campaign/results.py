@@ -135,6 +135,9 @@ def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tu
 def attitudes_of(cases: Columns) -> tuple[FloatArray, FloatArray]:
     """Commanded attitudes (n, 4), and reported ones, NaN where there is none: the case's mean error on the commanded one."""
     commanded, reported = (cases.vectors(form, "wxyz") for form in ("q{}", "solved_q{}"))
+    if "lit_qw" in cases.numbers:  # on the bench a case in motion is where it was lit when the tracker looked
+        lit = cases.vectors("lit_q{}", "wxyz")
+        commanded = np.where(np.isfinite(lit), lit, commanded)
     error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
     known = np.isfinite(error).all(axis=1)
     reported[known] = multiply(from_rotation_vectors(error[known]), commanded[known])

@@ -12,6 +12,7 @@ One process and one frame loop, which never waits for the tracker. Laws:
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -36,6 +37,7 @@ from hilstar.campaign.cases import AXES, Case, CaseMaker, Q, first_row, spread_r
 from hilstar.campaign.plan import SCENARIO, Design, Plan
 from hilstar.campaign.store import Directory, Journal, Row
 from hilstar.charts import write_csv
+from hilstar.errors import MachineError
 from hilstar.files import write_whole
 from hilstar.frame.fault_kinds import Now as FaultNow
 from hilstar.frame.view import View
@@ -161,7 +163,7 @@ class BenchRun:
         self._now_path, runs = directory.path / NOW, directory.path / RUNS
         begun = runs.read_text().splitlines()[1:] if runs.exists() else []
         self._run = len(begun) + 1
-        starts = [*(line.split(",") for line in begun), [self._run, f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"]]
+        starts: list[list[Any]] = [*(line.split(",") for line in begun), [self._run, f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"]]
         write_csv(runs, ("run", "begun_utc"), starts)
         self._base = self._next = 0  # frame numbers go on from one renderer to the next
         self._frames: LitFrames | None = None
@@ -227,6 +229,8 @@ class BenchRun:
         with stop_on_signal(loop.stop), loop.watch:
             bench.warm_up()
             loop.paced(Limit(), draw_slot)
+        if screen is not None and screen.window.gone is not None:
+            raise MachineError(f"the run ended early: {screen.window.gone}")
         return over
 
     def _faults(self, bench: Bench, turns: list[tuple[int, int]]) -> FaultyFrames | None:
@@ -356,18 +360,24 @@ class BenchRun:
         return row | spread_row(now.errors)
 
 
-def write_checks(path: Path, rows: list[Row], cases: int) -> dict[str, Any] | None:
-    """Write checks.csv; the bench's drift over the campaign by a straight line through the check cases; None for fewer than two.
+def write_checks(path: Path, rows: list[Row], cases: int) -> None:
+    """Write the check cases' rows as checks.csv."""
+    told = [(row["case"] - cases, row["begun_utc"], row["run"], row["received"]) for row in rows]
+    write_csv(path, CHECK_COLUMNS, [[*told[k], *(row[name] for name in CHECK_COLUMNS[4:])] for k, row in enumerate(rows)])
+
+
+def drift_of(path: Path) -> dict[str, Any] | None:
+    """The bench's drift over a campaign, by straight lines through the check cases of checks.csv; None for fewer than two.
 
     `arcsec` (about x, y, z, cam) and `mag` are last minus first along that line, with their standard errors (None: two checks).
     """
-    told = [[row["case"] - cases, *(row[name] for name in CHECK_COLUMNS[1:3]), row["received"]] for row in rows]
-    write_csv(path, CHECK_COLUMNS, [[*told[k], *(row[name] for name in CHECK_COLUMNS[4:])] for k, row in enumerate(rows)])
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
     at_s = np.array([datetime.fromisoformat(row["begun_utc"]).timestamp() for row in rows])
-    found = {name: _line(at_s, [row[name] for row in rows]) for name in CHECK_COLUMNS[4:]}
-    if found["error_x_arcsec"] is None:
+    found = {name: _line(at_s, [float(row[name]) if row[name] else None for row in rows]) for name in CHECK_COLUMNS[4:]}
+    each = [line for axis in AXES if (line := found[f"error_{axis}_arcsec"]) is not None]
+    if len(each) < len(AXES):
         return None
-    each = [found[f"error_{axis}_arcsec"] or (math.nan, None) for axis in AXES]
     mag = found["signal_mag"] or (None, None)
     arcsec = {"arcsec": [change for change, _ in each], "sigma_arcsec": [sigma for _, sigma in each]}
     return {"checks": len(rows), **arcsec, "mag": mag[0], "sigma_mag": mag[1]}

@@ -75,6 +75,11 @@ def difference(found: Identity, wanted: Identity) -> str | None:
     return None
 
 
+def identity_of(gl_renderer: str) -> Identity:
+    """The identity of this process with a renderer."""
+    return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer)
+
+
 class Job(msgspec.Struct, frozen=True):
     """The message that starts a worker: the plan and the bench as they were read, the solver, and the place of images."""
 
@@ -127,8 +132,7 @@ class Session:
 
     def identity(self) -> Identity:
         """This worker's identity."""
-        renderer = self._at(self.maker.file).gl_renderer
-        return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, renderer)
+        return identity_of(self._at(self.maker.file).gl_renderer)
 
     def run(self, begin: int, points: FloatArray) -> Answered:
         """The rows of the cases from `begin` on at their points (n, dimensions)."""

@@ -6,22 +6,25 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from hilstar.cli.options import Json, parse_memory
+from hilstar.cli import running
+from hilstar.cli.options import Headless, Json, parse_memory
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory
 
 if TYPE_CHECKING:
+    from hilstar.bench.bench_file import BenchFile
     from hilstar.campaign.cluster import Scheduler
     from hilstar.campaign.run import Campaign
     from hilstar.campaign.store import Directory
 
+CENTROIDS = "centroids"  # the solver without another one
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
 
 
@@ -51,13 +54,16 @@ def campaign(
             metavar="SOLVER",
             help='What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image} that prints a quaternion.',
         ),
-    ] = "centroids",
+    ] = CENTROIDS,
     solver_timeout: Annotated[float, typer.Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)] = 10.0,
     images: Annotated[Literal["fits"] | None, typer.Option(help="Keep the images, with their truth.")] = None,
     memory: Annotated[
         str | None,
         typer.Option(metavar="SIZE", help="For this process and its workers together, such as 4GB: as many run as fit."),
     ] = None,
+    headless: Headless = False,
+    windowed: running.Windowed = False,
+    force: running.Force = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit with code 1 where one of the plan's [[require]] is not met.")
     ] = False,
@@ -71,6 +77,8 @@ def campaign(
     check_directory("-o", output)
     if scheduler is not None and (workers is not None or memory is not None):
         raise InputError("campaign --scheduler: the cluster's workers are its own; leave out --workers and --memory")
+    pooled = {"--workers": workers is not None, "--scheduler": scheduler is not None, "--memory": memory is not None}
+    pooled |= {"--images": images is not None, "--solver": solver != CENTROIDS}
     cluster = None if scheduler is None else Scheduler(scheduler, tls_ca_file, tls_cert, tls_key)
     if cluster is not None:
         cluster.check()
@@ -78,15 +86,23 @@ def campaign(
         raise InputError("campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it")
     memory_bytes = None if memory is None else parse_memory(memory)
     this = Campaign(plan, output, solver, solver_timeout, images is not None)
+    _check_options(this.on_bench, {"--headless": headless, "--windowed": windowed, "--force": force}, pooled)
     directory = Directory(output)
     try:
         directory.claim(this.about())
-        if not directory.table.exists():
+        if not directory.table.exists() and this.on_bench:
+            show_cases(this, directory, headless, windowed, force)
+        elif not directory.table.exists():
             run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
         from hilstar.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
 
         summary = write_results(directory.table, this.maker.file, this.plan.seed)
         lines, not_met = lines_of(summary), False
+        if this.on_bench:
+            from hilstar.campaign.bench_results import bench_lines, bench_summary
+
+            summary |= bench_summary(directory.table)
+            lines += bench_lines(summary)
         if this.plan.require:
             from hilstar.campaign.requirements import NOT_MET
             from hilstar.campaign.requirements_page import summary_of, write_requirements
@@ -103,6 +119,35 @@ def campaign(
         typer.echo("\n".join(lines))
     if strict and not_met:
         raise typer.Exit(1)
+
+
+def _check_options(on_bench: bool, of_bench: dict[str, bool], pooled: dict[str, bool]) -> None:
+    """Refuse (InputError) options that mean nothing for the campaign's `through`."""
+    for name, given in (pooled if on_bench else of_bench).items():
+        if given:
+            through = "tracker or display" if on_bench else "bench"
+            raise InputError(f"campaign {name}: is for through = {through}; leave it out")
+
+
+def show_cases(this: Campaign, directory: Directory, headless: bool, windowed: bool, force: bool) -> None:
+    """Show the missing cases to the real tracker."""
+    from hilstar.notices import Notices
+
+    count = 0
+    notices = Notices()
+    with telling(this.cases) as advance:
+
+        def on_done(done: int) -> None:
+            nonlocal count
+            count = min(done, this.cases)
+            advance(count)
+
+        def display(file: BenchFile) -> AbstractContextManager[tuple[Any, Any]]:
+            return running.shown_bench(file, headless, windowed, force, timed=True)
+
+        if not this.show(directory, display, notices, on_done):
+            say(f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there")
+            raise KeyboardInterrupt
 
 
 def run_cases(

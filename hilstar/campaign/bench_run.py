@@ -177,7 +177,7 @@ class BenchRun:
         self._now: Tally | None = None
         self._dark_until_ns = 0
         self._file_sha256 = ""
-        self._light_ns = 0
+        self._light_ns = self._last_row_ns = 0  # from a swap to the light of the middle row, and from there to the last one
 
     def run(self, display: Display) -> bool:
         """Show the missing cases, each renderer's on a display of its own; False where a signal ended the run first."""
@@ -204,6 +204,7 @@ class BenchRun:
             self._judge = AnswerJudge(self._rules, self._frames)
         self._base = self._next
         self._light_ns, self._file_sha256 = 0 if screen is None else screen.swap_to_light_ns, bench.file.sha256
+        self._last_row_ns = 0 if screen is None else round(bench.scan.scanout_s / 2 * NS_PER_S)
         pacer = Pacer(period_ns) if screen is None else DisplayPacer(screen, self._notices)
         faults = self._faults(bench, turns)
         loop = FrameLoop(bench, self._lit, pacer, None, self._notices, faults)
@@ -327,10 +328,11 @@ class BenchRun:
 
     def _is_of(self, now: Tally, judged: Judged, answer: Answer) -> bool:
         """Whether an answer is of the case on the display; one of the case before that comes late is counted."""
-        begun_ns = now.begun_ns or 0
+        half_ns = round(self._rules.exposure_s * NS_PER_S / 2)
+        if judged.middle_ns - half_ns < (now.begun_ns or 0) + self._last_row_ns:
+            return False
         if judged.lit is None or judged.residual is None or answer.q_icrs_to_cam is None:
-            half_ns = round(self._rules.exposure_s * NS_PER_S / 2)
-            return judged.verdict == "invalid" and judged.middle_ns - half_ns >= begun_ns
+            return judged.verdict == "invalid"
         if judged.lit.first < now.first_frame:
             return False
         if now.first_attitude_s is None and self._before_q is not None:

@@ -13,6 +13,7 @@ import socket
 import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from hilstar.rotation import from_rotation_vector, multiply, propagate, to_matri
 from hilstar.units import ARCSEC_PER_RAD
 
 FOCAL_PX = 2000.0
-WAVE_PX = 200.0  # of the field-of-view error
+WAVE_PX = 100.0  # of the field-of-view error
 FIRST_DIRECTION = np.array([0.163, 0.926, 0.342])  # RA 80, Dec 20: its phase is the pixel error's
 
 
@@ -47,8 +48,7 @@ class Planted:
 def seen(planted: Planted, middle_ns: int) -> tuple[int, np.ndarray] | None:
     """The case and the attitude that were lit over the whole exposure; None where none was."""
     try:
-        with open(planted.now) as file:
-            told = json.load(file)
+        told = json.loads(Path(planted.now).read_text())
     except (OSError, ValueError):
         return None
     if told["light_ns"] > middle_ns - planted.exposure_s / 2 * 1e9:
@@ -57,13 +57,16 @@ def seen(planted: Planted, middle_ns: int) -> tuple[int, np.ndarray] | None:
     return told["case"], propagate(q, rate, (middle_ns - told["light_ns"]) / 1e9)
 
 
+def wave(q: np.ndarray, length_px: float) -> np.ndarray:
+    """A wave (..., 2) of rms 1 over many lengths, in x and y, of where attitudes (..., 4) put FIRST_DIRECTION."""
+    star = to_matrix(q) @ FIRST_DIRECTION
+    return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * FOCAL_PX * star[..., :2] / star[..., 2:] / length_px))
+
+
 def error_arcsec(planted: Planted, q: np.ndarray, at_s: float, rng: np.random.Generator) -> np.ndarray:
     """The planted error at an attitude, so long after the start."""
-    axes = to_matrix(q)
-    star = axes @ FIRST_DIRECTION
     error = np.array(planted.bias_arcsec) + np.array(planted.noise_arcsec) * rng.standard_normal(3)
-    error[:2] += planted.fov_arcsec * np.sqrt(2) * np.sin(2 * np.pi * FOCAL_PX * axes[2, :2] / WAVE_PX)
-    error[:2] += planted.pixel_arcsec * np.sqrt(2) * np.sin(2 * np.pi * FOCAL_PX * star[:2] / star[2])
+    error[:2] += planted.fov_arcsec * wave(q, WAVE_PX) + planted.pixel_arcsec * wave(q, 1.0)
     error[0] += planted.drift_arcsec_s * at_s
     return error
 

@@ -273,11 +273,12 @@ class BenchRun:
         self._next = number + 1
         self._frames.add(LitFrame(number, host_ns, host_ns, q, shown.drawn.rate_cam_rad_s))
         self._shown_q = q if q is not None else self._shown_q
-        if now is not None and now.begun_ns is None and q is not None:
+        if now is not None and now.begun_ns is None and not on_screen.operator and not on_screen.hidden:
             now.begun_ns, now.first_frame = host_ns, number
             now.begun_utc = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
-            rate = now.case.first.turn.rate_cam_rad_s
-            told = {"case": now.case.number, "order": now.place, "q_icrs_to_cam": q.tolist(), "rate_cam_rad_s": rate.tolist()}
+            first = now.case.first
+            told = {"case": now.case.number, "order": now.place, "q_icrs_to_cam": first.q_icrs_to_cam.tolist()}
+            told |= {"rate_cam_rad_s": first.turn.rate_cam_rad_s.tolist()}
             write_whole(self._now_path, msgspec.json.encode(told | {"light_ns": host_ns, "begun_utc": now.begun_utc}))
 
     def _listen(self, now_ns: int) -> None:
@@ -357,8 +358,8 @@ class BenchRun:
         if now.signals:
             row["signal_mag"] = float(np.mean(now.signals))
         if not row["solved"]:
-            silent = "no answer came" if not now.received else f"{now.received} answers came, none with an attitude"
-            row |= {"status": NO_ANSWER, "why": f"{silent} within {self._plan.limit_s:g} s"}
+            silent = (self._heard_ns or 0) < (now.begun_ns or 0)
+            row |= {"status": NO_ANSWER, "why": "the tracker was silent" if silent else "the tracker had no attitude"}
         return row | spread_row(now.errors)
 
 

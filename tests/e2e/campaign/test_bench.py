@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import pytest
 from tests.support.benches import ROOT, bench_text
 from tests.support.campaign_tracker import FOCAL_PX, WAVE_PX, Planted, wave
 from tests.support.campaigns import plan_text, read_columns
-from tests.support.commands import HILSTAR, run_hilstar_here
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.waiting import PATIENCE_S, wait_for
 
 pytestmark = pytest.mark.e2e
@@ -140,3 +141,84 @@ def test_a_campaign_that_is_killed_on_either_side_has_the_same_cases_attitudes_a
     assert [run for _, run, _ in by_order] == sorted(killed["run"]) and [at for *_, at in by_order] == sorted(
         killed["begun_utc"]
     )
+
+
+def test_a_case_without_answers_is_a_result_and_a_first_attitude_has_its_time(tmp_path: Path) -> None:
+    planted = replace(
+        write_bench(tmp_path, cases=6, answers=3, timeout_s=0.5, silent_s=0.0, blank_s=0.05), blind=(2, 4), wild=0.0
+    )
+    with answering(planted):
+        result = run_hilstar_here(*COMMAND, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = read_columns(tmp_path / "out" / "cases.parquet")
+    assert rows["status"] == ["done", "done", "no-answer", "done", "no-answer", "done"]
+    assert json.loads(result.stdout)["no_answer"] == 2 and rows["why"][2] == "the tracker had no attitude"
+    assert rows["received"][2] == 0 and rows["first_attitude_s"][2] is None and rows["frames"] == [3] * 6
+    assert all(0 < rows["first_attitude_s"][case] < 0.5 for case in (0, 1, 3, 5))
+    assert all(rows["scatter_z_arcsec"][case] > 0 for case in (0, 1, 3, 5))
+    assert rows["solved"] == [3, 3, 0, 3, 0, 3]
+
+
+def test_without_a_tracker_every_case_is_a_result(tmp_path: Path) -> None:
+    write_bench(tmp_path, cases=3, timeout_s=0.1, silent_s=0.3)
+    result = run_hilstar_here(*COMMAND, cwd=tmp_path)
+    assert result.returncode == 0 and "the tracker is silent" in result.stderr
+    assert read_columns(tmp_path / "out" / "cases.parquet")["status"] == ["no-answer"] * 3
+
+
+def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_they_were(tmp_path: Path) -> None:
+    quantised = {"key": "render.quantisation", "values": ["round", "temporal"]}
+    rate = {"key": "rate_deg_s.across", "minimum": 0.5, "maximum": 2.0}
+    attitudes = FIELD | {"radius_deg": 0.5}
+    planted = write_bench(tmp_path, quantised, rate, cases=12, answers=3, settle_s=0.05, attitudes=attitudes)
+    planted = replace(planted, fov_arcsec=0.0, pixel_arcsec=0.0, noise_arcsec=(0.5, 0.5, 0.5), wild=0.0)
+    with answering(planted):
+        result = run_hilstar_here(*COMMAND, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = read_columns(tmp_path / "out" / "cases.parquet")
+    by_order = [value for _, value in sorted(zip(rows["order"], rows["vary.render.quantisation"], strict=True))]
+    assert sum(a != b for a, b in pairwise(by_order)) == 1
+    error = np.stack([rows[f"error_{axis}_arcsec"] for axis in "xyz"], axis=1) - planted.bias_arcsec
+    # At 2 deg/s a millisecond is 7 arcsec; a whole case has gone on by a thousand.
+    assert np.abs(error[:, :2]).max() < 30
+
+
+def test_a_case_with_faults_has_its_time_to_recover(tmp_path: Path) -> None:
+    (tmp_path / "faults.toml").write_text('[[fault]]\nkind = "blank"\nname = "dark"\nat_s = 0.0\nfor_s = 0.3\n')
+    scenario = {"key": "scenario", "values": ["faults.toml", ""]}
+    planted = replace(write_bench(tmp_path, scenario, cases=6, sampling="grid", answers=2), wild=0.0)
+    with answering(planted):
+        result = run_hilstar_here(*COMMAND, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = read_columns(tmp_path / "out" / "cases.parquet")
+    for named, end_s, recovery_s, first_s in zip(
+        *(rows[name] for name in ("vary.scenario", "fault_end_s", "recovery_s", "first_attitude_s")), strict=True
+    ):
+        assert end_s == (pytest.approx(0.3) if named else None)
+        assert (0 <= recovery_s < 0.3 and first_s > 0.3) if named else recovery_s is None
+
+
+@pytest.mark.parametrize(
+    ("vary", "keys", "words"),
+    [
+        ({"key": "tracker.focal_length_mm", "values": [25, 26]}, {}, "cannot be changed on a real bench"),
+        ({"key": "misalignment_arcsec.x", "values": [0, 10]}, {}, "cannot be changed on a real bench"),
+        ({"key": "noise_seed", "values": [1, 2]}, {}, "cannot be changed on a real bench"),
+        (None, {"frames": 3}, "frames: is for through"),
+        (None, {"through": "tracker"}, "answers: is for through"),
+    ],
+)
+def test_what_a_bench_cannot_do_is_refused_before_the_first_case(
+    tmp_path: Path, vary: dict[str, Any] | None, keys: dict[str, Any], words: str
+) -> None:
+    write_bench(tmp_path, *([] if vary is None else [vary]), cases=4, **keys)
+    assert_refused(run_hilstar_here(*COMMAND, cwd=tmp_path), 2, words)
+    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("journal/*"))
+
+
+def test_options_of_the_other_kind_and_a_bench_without_answers_are_refused(tmp_path: Path) -> None:
+    write_bench(tmp_path, cases=4)
+    assert_refused(run_hilstar_here(*COMMAND, "--workers", "2", cwd=tmp_path), 2, "--workers: is for through = tracker")
+    text = (tmp_path / "bench.toml").read_text()
+    (tmp_path / "bench.toml").write_text(text[: text.index("[answers]")])
+    assert_refused(run_hilstar_here(*COMMAND, cwd=tmp_path), 2, "needs the tracker's answers", "[answers]")

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -30,6 +30,8 @@ from hilstar.answers.judge import AnswerJudge, AnswerRules, Judged
 from hilstar.answers.pairing import LitFrame, LitFrames, residual_arcsec
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude
+from hilstar.attitude.receiver import PacketCounts
+from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
 from hilstar.bench.scenario import Timetable
@@ -44,8 +46,9 @@ from hilstar.frame.view import View
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.loop import FaultyFrames, FrameLoop, Limit
-from hilstar.run.pacer import Moment, Pacer, Shown
+from hilstar.run.pacer import FrameSink, Moment, Pacer, Shown, ignore
 from hilstar.run.screen.screen import DisplayPacer, Screen
+from hilstar.run.serve import Follower, Running
 from hilstar.units import NS_PER_S
 
 ORDER_STREAM = 4  # stream of a plan's seed for the order of its cases
@@ -54,7 +57,18 @@ MAX_SILENCE_S = 1.0  # at the end of a case: a tracker that said nothing for lon
 NO_ANSWER = "no-answer"
 RUNS, NOW, CHECKS = "runs.csv", "now.json", "checks.csv"
 CHECK_COLUMNS = ("check", "begun_utc", "run", "answers", *(f"error_{axis}_arcsec" for axis in AXES), "signal_mag")
-Display = Callable[[Any], AbstractContextManager[tuple[Bench, Screen | None]]]
+
+
+class OpenDisplay(NamedTuple):
+    """An open bench with its screen (None: headless), a sink for its frames, and who follows the run."""
+
+    bench: Bench
+    screen: Screen | None = None
+    sink: FrameSink = ignore
+    follower: Follower = lambda running: None
+
+
+Display = Callable[[BenchFile], AbstractContextManager[OpenDisplay]]
 
 
 class Order:
@@ -186,8 +200,8 @@ class BenchRun:
         for _, group in groupby((turn for turn in self._order.turns() if turn[1] in missing), lambda turn: turn[0]):
             turns = [(number, place) for _, number, place in group]
             first = next((number for number, _ in turns if number < self._order.cases), 0)
-            with display(self._maker.bench(self._order.case(first))) as (bench, screen):
-                if not self.show(turns, bench, screen):
+            with display(self._maker.bench(self._order.case(first))) as opened:
+                if not self.show(turns, opened):
                     return False
         self._now_path.unlink(missing_ok=True)
         return True
@@ -196,8 +210,9 @@ class BenchRun:
         self._done += self.journal.append([row])
         self._on_done(self._done)
 
-    def show(self, turns: list[tuple[int, int]], bench: Bench, screen: Screen | None) -> bool:
+    def show(self, turns: list[tuple[int, int]], opened: OpenDisplay) -> bool:
         """Show cases (number, place) that have one renderer; whether all of them are over, and no signal ended the run."""
+        bench, screen = opened.bench, opened.screen
         period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         if self._frames is None:
             self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
@@ -207,7 +222,13 @@ class BenchRun:
         self._last_row_ns = 0 if screen is None else round(bench.scan.scanout_s / 2 * NS_PER_S)
         pacer = Pacer(period_ns) if screen is None else DisplayPacer(screen, self._notices)
         faults = self._faults(bench, turns)
-        loop = FrameLoop(bench, self._lit, pacer, None, self._notices, faults)
+
+        def sink(shown: Shown) -> None:
+            self._lit(shown)
+            opened.sink(shown)
+
+        loop = FrameLoop(bench, sink, pacer, None, self._notices, faults)
+        opened.follower(Running(loop, PacketCounts()))
         self._turns, over = list(reversed(turns)), False
 
         def draw_slot(moment: Moment) -> Shown | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -121,10 +122,7 @@ class Campaign:
         from hilstar.campaign.bench_run import CHECKS, BenchRun, Order, write_checks
 
         config = self.file.config
-        assert config.answers is not None
-        latency_s = None if config.answers.latency_ms is None else config.answers.latency_ms / 1e3
-        exposure_s, wrong_arcsec = config.tracker.exposure_s, self.plan.wrong_above_arcsec
-        rules = AnswerRules(exposure_s, config.answers.stamp, config.answers.clock, wrong_arcsec, latency_s)
+        rules = replace(AnswerRules.of(config), wrong_arcsec=self.plan.wrong_above_arcsec)
         order = Order(self.plan, self.cases, self.maker, self.design)
         with open_answers(config, self.file.folder, notices) as source:
             source.await_ready()

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -64,8 +66,15 @@ def campaign(
     headless: Headless = False,
     windowed: running.Windowed = False,
     force: running.Force = False,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}."),
+    ] = None,
+    console: running.Console = None,
+    token: running.Token = None,
+    console_name: running.ConsoleName = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Exit with code 1 where one of the plan's [[require]] is not met.")
+        bool, typer.Option("--strict", help="Exit with code 1 where one of the plan's requirements is not met.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -86,12 +95,14 @@ def campaign(
         raise InputError("campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it")
     memory_bytes = None if memory is None else parse_memory(memory)
     this = Campaign(plan, output, solver, solver_timeout, images is not None)
-    _check_options(this.on_bench, {"--headless": headless, "--windowed": windowed, "--force": force}, pooled)
+    of_bench = {"--headless": headless, "--windowed": windowed, "--force": force}
+    of_bench |= {"--frames": frames is not None, "--console": console is not None}
+    _check_options(this.on_bench, of_bench, pooled)
     directory = Directory(output)
     try:
         directory.claim(this.about())
         if not directory.table.exists() and this.on_bench:
-            show_cases(this, directory, headless, windowed, force)
+            show_cases(this, directory, Showing(headless, windowed, force, frames, console, token, console_name))
         elif not directory.table.exists():
             run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
         from hilstar.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
@@ -129,21 +140,58 @@ def _check_options(on_bench: bool, of_bench: dict[str, bool], pooled: dict[str, 
             raise InputError(f"campaign {name}: is for through = {through}; leave it out")
 
 
-def show_cases(this: Campaign, directory: Directory, headless: bool, windowed: bool, force: bool) -> None:
-    """Show the missing cases to the real tracker."""
-    from hilstar.notices import Notices
+@dataclass(frozen=True, slots=True)
+class Showing:
+    """How the cases are shown to a real tracker: the options of `serve`."""
 
-    count = 0
-    notices = Notices()
-    with telling(this.cases) as advance:
+    headless: bool
+    windowed: bool
+    force: bool
+    frames: str | None
+    console: str | None
+    token: str | None
+    console_name: list[str] | None
+
+
+def show_cases(this: Campaign, directory: Directory, asked: Showing) -> None:
+    """Show the missing cases to the real tracker, with progress on the terminal and on the page."""
+    from hilstar.campaign.bench_run import OpenDisplay
+    from hilstar.console.publisher import PageParts, RunDescription
+    from hilstar.console.run_status import RunSource, RunStatus
+    from hilstar.notices import Notices
+    from hilstar.run.record.ledger import Ledger, LedgerSwitch
+
+    count, begun = 0, 0
+    notices, started_s, said_s = Notices(), time.monotonic(), time.monotonic()
+    where = str(this.path)
+
+    with (
+        telling(this.cases) as advance,
+        running.page_listener(asked.console, False, asked.token, asked.console_name) as listener,
+    ):
 
         def on_done(done: int) -> None:
-            nonlocal count
+            nonlocal count, begun, said_s
+            begun, now_s = begun if count else done, time.monotonic()
             count = min(done, this.cases)
             advance(count)
+            if listener is not None and now_s - said_s >= LINE_S and count > begun:
+                said_s = now_s
+                left_s = (this.cases - count) * (now_s - started_s) / (count - begun)
+                notices.tell("campaign", f"{count} of {this.cases} cases, {left_s:.0f} s left")
 
-        def display(file: BenchFile) -> AbstractContextManager[tuple[Any, Any]]:
-            return running.shown_bench(file, headless, windowed, force, timed=True)
+        @contextmanager
+        def display(file: BenchFile) -> Iterator[OpenDisplay]:
+            with (
+                running.shown_bench(file, asked.headless, asked.windowed, asked.force, timed=True) as (bench, screen),
+                running.optional_frames(asked.frames, bench, screen) as feed,
+            ):
+                ledger = LedgerSwitch()
+                told = RunSource(where, bench.renderer.gl_renderer, bench.config.monitor.refresh_hz, math.inf)
+                parts = PageParts(bench, notices, ledger, lambda path: Ledger(path, bench, notices), screen)
+                page, status = RunDescription("campaign", "campaign", where), RunStatus(told, ledger)
+                with running.followed(listener, False, page, parts, status, frames=feed) as (sink, follower, _):
+                    yield OpenDisplay(bench, screen, sink, follower)
 
         if not this.show(directory, display, notices, on_done):
             say(f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there")

@@ -168,19 +168,20 @@ def test_without_a_tracker_every_case_is_a_result(tmp_path: Path) -> None:
 
 def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_they_were(tmp_path: Path) -> None:
     quantised = {"key": "render.quantisation", "values": ["round", "temporal"]}
-    rate = {"key": "rate_deg_s.across", "minimum": 0.5, "maximum": 2.0}
+    rate = {"key": "rate_deg_s.across", "minimum": 0.1, "maximum": 0.2}
     attitudes = FIELD | {"radius_deg": 0.5}
-    planted = write_bench(tmp_path, quantised, rate, cases=12, answers=3, settle_s=0.05, attitudes=attitudes)
+    planted = write_bench(tmp_path, quantised, rate, cases=8, answers=3, settle_s=0.5, attitudes=attitudes)
     planted = replace(planted, fov_arcsec=0.0, pixel_arcsec=0.0, noise_arcsec=(0.5, 0.5, 0.5), wild=0.0)
     with answering(planted):
-        result = run_hilstar_here(*COMMAND, cwd=tmp_path)
+        result = run_hilstar_here(*COMMAND, "--console", "127.0.0.1:0", "--frames", "tcp://127.0.0.1:0", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
+    assert "the operator's page is at http://127.0.0.1:" in result.stderr and "frames: tcp://127.0.0.1:" in result.stderr
     rows = read_columns(tmp_path / "out" / "cases.parquet")
     by_order = [value for _, value in sorted(zip(rows["order"], rows["vary.render.quantisation"], strict=True))]
     assert sum(a != b for a, b in pairwise(by_order)) == 1
     error = np.stack([rows[f"error_{axis}_arcsec"] for axis in "xyz"], axis=1) - planted.bias_arcsec
-    # At 2 deg/s a millisecond is 7 arcsec; a whole case has gone on by a thousand.
-    assert np.abs(error[:, :2]).max() < 30
+    # A frame that is late by its 10 ms is off by 7 arcsec, and after half a second a case has gone on by 180 and more.
+    assert np.median(np.abs(error[:, :2])) < 10 and np.abs(error[:, :2]).max() < 90
 
 
 def test_a_case_with_faults_has_its_time_to_recover(tmp_path: Path) -> None:

@@ -281,7 +281,11 @@ class BenchRun:
         if now is None:
             return None
         elapsed_ns = 0 if now.begun_ns is None else max(light_ns - now.begun_ns, 0)
-        return now.case.first if now.case.number >= self._order.cases else self._maker.after(now.case, elapsed_ns)
+        return (
+            now.case.first
+            if now.case.number >= self._order.cases
+            else self._maker.after(now.case, elapsed_ns, self._rules.exposure_s)
+        )
 
     def _lit(self, shown: Shown) -> None:
         """Take a frame that was shown."""
@@ -299,7 +303,8 @@ class BenchRun:
             now.begun_utc = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
             first = now.case.first
             told = {"case": now.case.number, "order": now.place, "q_icrs_to_cam": first.q_icrs_to_cam.tolist()}
-            told |= {"rate_cam_rad_s": first.turn.rate_cam_rad_s.tolist()}
+            rate = first.turn.rate_cam_rad_s if attitude is None else attitude.rate_cam_rad_s
+            told |= {"rate_cam_rad_s": None if rate is None else rate.tolist()}
             write_whole(self._now_path, msgspec.json.encode(told | {"light_ns": host_ns, "begun_utc": now.begun_utc}))
 
     def _listen(self, now_ns: int) -> None:

@@ -154,7 +154,7 @@ class Plan(Table, frozen=True):
     settle_s: Annotated[float, Meta(ge=0, le=86400)] | None = None
     timeout_s: Annotated[float, Meta(ge=0.01, le=86400)] | None = None
     blank_s: Annotated[float, Meta(ge=0, le=86400)] = 0.0
-    silent_s: Annotated[float, Meta(ge=0, le=86400)] = 10.0
+    silent_s: Annotated[float, Meta(ge=0, le=86400)] = 20.0
     check_every: Annotated[int, Meta(ge=0, le=MAX_CASES)] = 0
     attitudes: Attitudes = msgspec.field(default_factory=Attitudes)
     centroids: Centroiding = msgspec.field(default_factory=Centroiding)

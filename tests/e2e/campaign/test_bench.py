@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hilstar.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT, bench_text
 from tests.support.campaign_tracker import FOCAL_PX, WAVE_PX, Planted, wave
 from tests.support.campaigns import plan_text, read_columns
@@ -182,6 +183,20 @@ def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_th
     error = np.stack([rows[f"error_{axis}_arcsec"] for axis in "xyz"], axis=1) - planted.bias_arcsec
     # A frame that is late by its 10 ms is off by 7 arcsec, and after half a second a case has gone on by 180 and more.
     assert np.median(np.abs(error[:, :2])) < 10 and np.abs(error[:, :2]).max() < 90
+
+
+def test_a_case_goes_along_a_log(tmp_path: Path) -> None:
+    turning = [from_radec_roll_deg(80 + 0.01 * k, 20.0, 0.0).tolist() for k in range(300)]  # 0.1 deg/s, 340 arcsec/s across
+    lines = ["t_s,qw,qx,qy,qz", *(",".join(map(repr, [k / 10, *q])) for k, q in enumerate(turning))]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    attitudes = {"kind": "log", "log": "log.csv"}
+    planted = replace(write_bench(tmp_path, cases=5, answers=3, settle_s=0.2, attitudes=attitudes), wild=0.0)
+    with answering(replace(planted, fov_arcsec=0.0, pixel_arcsec=0.0)):
+        result = run_hilstar_here(*COMMAND, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = read_columns(tmp_path / "out" / "cases.parquet")
+    error = np.stack([rows[f"error_{axis}_arcsec"] for axis in "xy"], axis=1) - planted.bias_arcsec[:2]
+    assert np.median(np.abs(error)) < 15  # 0.2 s after its begin a case that stood still would be off by 70
 
 
 def test_a_case_with_faults_has_its_time_to_recover(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.bench.bench_file import BenchFile, dated
-from hilstar.bench.scenario import read_scenario
+from hilstar.bench.scenario import Scenario, read_scenario
 from hilstar.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
 from hilstar.campaign.solvers import Answer, CentroidErrors
 from hilstar.campaign.store import Row
@@ -42,23 +42,31 @@ from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
 AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
 SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
+ON_BENCH = ("sky", "render", "spacecraft", "rate_deg_s", "time_s", "scenario")  # what varies on a real bench
 Kind = Literal["int64", "float64", "bool", "text"]
 
 DONE, FAILED = "done", "failed"
 AXES = ("x", "y", "z")
 
 Q = ("qw", "qx", "qy", "qz")
-TEXTS = {"status", "why", "bench_sha256", "image_sha256", "image"}
+TEXTS = {"status", "why", "bench_sha256", "image_sha256", "image", "begun_utc"}
 WHOLE = {"case", "noise_seed", "t_ns", "frames", "stars_in_view", "solved", "wrong"}
-WHOLE |= {"stars", "found", "matched", "false", "measured"}
+WHOLE |= {"stars", "found", "matched", "false", "measured", "order", "run", "received", "late"}
 BEFORE = (
     *("case", "status", "why", "noise_seed", "bench_sha256", "image_sha256", "image", "t_ns"),
     *(*Q, "ra_deg", "dec_deg", "roll_deg"),
 )
 AFTER = (
-    *("frames", "stars_in_view", "limit_v_mag", "solved", "wrong", *(f"solved_{name}" for name in Q)),
+    *("frames", "stars_in_view", "limit_v_mag", "solved", "wrong", "first_attitude_s", *(f"solved_{name}" for name in Q)),
     *(f"{what}_{axis}_arcsec" for what in ("error", "scatter") for axis in AXES),
 )
+BENCH_BEFORE = ("case", "status", "why", "order", "run", "begun_utc", "bench_sha256", *BEFORE[BEFORE.index("t_ns") :])
+BENCH_AFTER = (
+    *("frames", "received", "late", "solved", "wrong", "wrong_deg", "first_attitude_s", "stars", "signal_mag"),
+    *(f"{what}_{name}" for what in ("solved", "lit") for name in Q),
+    *AFTER[AFTER.index("error_x_arcsec") :],
+)
+RECOVERY = ("fault_end_s", "recovery_s")  # of a plan that varies scenario
 CENTROIDS = (
     *("stars", "found", "matched", "false", "measured"),
     *("centroid_dx_px", "centroid_dy_px", "centroid_sigma_x_px", "centroid_sigma_y_px"),
@@ -121,8 +129,11 @@ class CaseMaker:
 
     def view(self, case: Case, frame: int, exposure_s: float) -> View:
         """The view of one of the case's exposures, `step_s` apart: at the case's rate, or along the log."""
+        return self.after(case, round(frame * self.plan.step_s * NS_PER_S), exposure_s)
+
+    def after(self, case: Case, step_ns: int, exposure_s: float = 0.0) -> View:
+        """The view so long after the case's begin."""
         first = case.first
-        step_ns = round(frame * self.plan.step_s * NS_PER_S)
         if self._log is not None and first.t_ns is not None:
             t_ns = min(first.t_ns + step_ns, self._log.span_ns[1])
             along = view_at(self._log.timeline, self._log.span_ns, t_ns, exposure_s)
@@ -134,11 +145,25 @@ class CaseMaker:
 
     def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
         """The faults of the case's scenario in an exposure, at the case's time or the log's since its beginning."""
-        scenario = self._scenarios.get(str(case.values.get(SCENARIO, "")))
+        scenario = self.scenario(case)
+        return None if scenario is None else faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - self.begin_ns)
+
+    @property
+    def begin_ns(self) -> int:
+        """The time of a case's view from which its scenario counts: 0, or the log's begin."""
+        return 0 if self._log is None else self._log.span_ns[0]
+
+    def scenario(self, case: Case) -> Scenario | None:
+        """The case's scenario."""
+        return self._scenarios.get(str(case.values.get(SCENARIO, "")))
+
+    def fault_end_s(self, case: Case, length_s: float) -> float | None:
+        """When the last fault of the case's scenario ends, after the case's begin; None outside its `length_s`."""
+        scenario = self.scenario(case)
         if scenario is None:
             return None
-        begin_ns = 0 if self._log is None else self._log.span_ns[0]
-        return faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - begin_ns)
+        end_s = scenario.end_s - ((case.first.t_ns or 0) - self.begin_ns) / NS_PER_S
+        return end_s if 0 < end_s <= length_s else None
 
     def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> View:
         rate_rad_s = np.radians([float(values.get(f"rate_deg_s.{axis}", 0.0)) for axis in "xyz"])
@@ -191,6 +216,11 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
     """Refuse (InputError) parameters that would change nothing."""
     for parameter in varied:
         table = parameter.key.split(".")[0]
+        if plan.through == "bench" and table not in ON_BENCH:
+            raise InputError(
+                f'[[vary]] key = "{parameter.key}": cannot be changed on a real bench; write a key of [sky], [render] or'
+                " [spacecraft], rate_deg_s.*, time_s or scenario, or leave it out"
+            )
         if plan.through == "tracker" and table in {"monitor", "collimator", "render", "verify", "misalignment_arcsec"}:
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": changes nothing for through = "tracker", which sees no display; write'
@@ -209,12 +239,26 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             )
 
 
+def bench_columns(parameters: list[Parameter]) -> dict[str, Kind]:
+    """The columns of the rows of a campaign on the bench, in their order."""
+    names = columns(parameters, False)
+    varied = [name for name in names if name.startswith("vary.")]
+    kinds = {name: columns_kind(name) for name in (*BENCH_BEFORE, *varied, *BENCH_AFTER)} | {"stars": "float64"}
+    return kinds | {name: names[name] for name in (*varied, *RECOVERY) if name in names}
+
+
+def columns_kind(name: str) -> Kind:
+    """The kind of a column that is not varied."""
+    return "text" if name in TEXTS else "int64" if name in WHOLE else "float64"
+
+
 def columns(parameters: list[Parameter], with_centroids: bool) -> dict[str, Kind]:
     """The columns of a campaign's rows, in their order."""
     varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
     found: dict[str, Kind] = {}
-    for name in (*BEFORE, *varied, *AFTER, *(CENTROIDS if with_centroids else ())):
-        found[name] = varied.get(name) or ("text" if name in TEXTS else "int64" if name in WHOLE else "float64")
+    recovery = RECOVERY if f"vary.{SCENARIO}" in varied else ()
+    for name in (*BEFORE, *varied, *AFTER, *recovery, *(CENTROIDS if with_centroids else ())):
+        found[name] = varied.get(name) or columns_kind(name)
     return found
 
 
@@ -249,12 +293,27 @@ def failed(row: Row, why: str) -> Row:
     return row | {"status": FAILED, "why": why}
 
 
+def spread_row(errors_arcsec: list[FloatArray]) -> Row:
+    """The mean of a case's errors (3,), and their standard deviation where there are several."""
+    row: Row = {}
+    if errors_arcsec:
+        errors = np.array(errors_arcsec)
+        row |= {f"error_{axis}_arcsec": float(value) for axis, value in zip(AXES, errors.mean(axis=0), strict=True)}
+        if len(errors) > 1:
+            scatter = errors.std(axis=0, ddof=1)
+            row |= {f"scatter_{axis}_arcsec": float(value) for axis, value in zip(AXES, scatter, strict=True)}
+    return row
+
+
 @dataclass(slots=True)
 class CaseTally:
     """The exposures and answers of a case so far."""
 
     with_centroids: bool
     wrong_above_arcsec: float
+    fault_end_s: float | None = None
+    first_attitude_s: float | None = None
+    recovery_s: float | None = None
     frames: int = 0
     stars_in_view: int = 0
     errors_arcsec: list[FloatArray] = field(default_factory=list)
@@ -270,8 +329,8 @@ class CaseTally:
         self.stars_in_view += len(exposure.truth)
         self._digest.update(exposure.dn.tobytes())
 
-    def hear(self, exposure: Exposure, answer: Answer) -> None:
-        """Count the answer to an exposure."""
+    def hear(self, exposure: Exposure, answer: Answer, end_s: float) -> None:
+        """Count the answer to an exposure that ends so long after the case's begin."""
         if answer.star_errors is not None:
             self.star_errors.append(answer.star_errors)
         if answer.q_icrs_to_cam is None:
@@ -284,19 +343,24 @@ class CaseTally:
             self.wrong += 1
         else:
             self.errors_arcsec.append(error)
+            self.first_attitude_s = end_s if self.first_attitude_s is None else self.first_attitude_s
+            if (
+                self.fault_end_s is not None
+                and self.recovery_s is None
+                and end_s - exposure.view.exposure_s / 2 >= self.fault_end_s
+            ):
+                self.recovery_s = end_s - self.fault_end_s
 
     def into(self, row: Row) -> Row:
         """The case's row with its results. Errors are those of answers that are not wrong."""
         row = row | {"why": self.why, "image_sha256": self._digest.hexdigest(), "frames": self.frames}
         row |= {"stars_in_view": self.stars_in_view, "solved": self.wrong + len(self.errors_arcsec), "wrong": self.wrong}
+        row["first_attitude_s"] = self.first_attitude_s
+        if "recovery_s" in row:
+            row |= {"fault_end_s": self.fault_end_s, "recovery_s": self.recovery_s}
         if self.first_q is not None:
             row |= dict(zip((f"solved_{name}" for name in Q), self.first_q.tolist(), strict=True))
-        if self.errors_arcsec:
-            errors = np.array(self.errors_arcsec)
-            row |= {f"error_{axis}_arcsec": float(value) for axis, value in zip(AXES, errors.mean(axis=0), strict=True)}
-            if len(errors) > 1:
-                scatter = errors.std(axis=0, ddof=1)
-                row |= {f"scatter_{axis}_arcsec": float(value) for axis, value in zip(AXES, scatter, strict=True)}
+        row |= spread_row(self.errors_arcsec)
         return row | self._centroids() if self.with_centroids and self.star_errors else row
 
     def _centroids(self) -> Row:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -39,6 +40,10 @@ MAX_CASES = 1_000_000_000
 MAX_FRAMES = 10_000
 MAX_VALUES = 10_000
 MAX_SEED = 2**63 - 1
+DEFAULT_ANSWERS, DEFAULT_TIMEOUT_S = 5, 10.0
+MAX_BENCH_CASES = 1_000_000
+BENCH_KEYS = ("answers", "settle_s", "timeout_s", "blank_s", "silent_s", "check_every")  # of through = "bench" alone
+TRACKER_KEYS = ("frames", "step_s", "noise", "centroids")  # of the others
 
 Sampling = Literal["grid", "latin-hypercube", "sobol"]
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
@@ -54,6 +59,15 @@ OWN_KEYS = (
 )
 MAX_OWN = {"rate_deg_s": 360.0, "misalignment_arcsec": 36_000.0, "time_s": 9e9, "noise_seed": 2.0**63 - 1}
 WHOLE = ("noise_seed",)
+# What [[require]] limits (ECSS-E-ST-60-20C), and its unit; those of an axis, arcsec, come first.
+Quantity = Literal[
+    "bias", "fov-error", "pixel-error", "noise", "nea", "availability", "wrong-rate", "time-to-first-attitude", "recovery"
+]
+AXIS_QUANTITIES = ("bias", "fov-error", "pixel-error", "noise", "nea")
+TIME_QUANTITIES = ("time-to-first-attitude", "recovery")
+QUANTITY_UNITS = dict.fromkeys(AXIS_QUANTITIES, "arcsec") | dict.fromkeys(TIME_QUANTITIES, "s")
+QUANTITY_UNITS |= {"availability": "", "wrong-rate": ""}
+CONDITION = re.compile(r"\s*([A-Za-z0-9_.]+)\s*(<=|>=|==|!=|<|>)\s*(?:\"([^\"]*)\"|([-+0-9.eE]+))\s*")
 SCENARIO = "scenario"  # the path of a file of faults; empty for none
 ATTITUDE_STREAM = 1  # stream of a case's seed for the attitudes of a grid
 SOBOL_BITS = 30
@@ -91,6 +105,39 @@ class Centroiding(Table, frozen=True):
     remove_s_curve: bool = False
 
 
+class Require(Table, frozen=True):
+    """[[require]]: a limit of one figure, to be shown at `confidence`; `share` asks for the quantile of that share of cases."""
+
+    quantity: Quantity
+    maximum: Number | None = None
+    minimum: Number | None = None
+    confidence: Annotated[float, Meta(ge=0.5, le=0.99999)] = 0.95
+    share: Annotated[float, Meta(ge=0.01, le=0.99999)] | None = None
+    axis: Literal["x", "y", "z", "cross", "roll"] | None = None
+    condition: Annotated[str, Meta(max_length=400)] = ""
+
+    @property
+    def limit(self) -> float:
+        """The limit, of either kind."""
+        limit = self.maximum if self.minimum is None else self.minimum
+        return 0.0 if limit is None else limit
+
+    @property
+    def of_axis(self) -> bool:
+        """Whether its quantity has an axis."""
+        return self.quantity in AXIS_QUANTITIES
+
+    @property
+    def words(self) -> str:
+        """The requirement in words: quantity, axis, limit, share and condition."""
+        axis = f" {self.axis or 'cross'}" if self.of_axis else ""
+        share = f" in {100 * self.share:g} % of cases" if self.share else ""
+        where = f" where {self.condition}" if self.condition else ""
+        side = "at most" if self.minimum is None else "at least"
+        unit = QUANTITY_UNITS[self.quantity]
+        return f"{self.quantity}{axis} {side} {self.limit:g}{f' {unit}' if unit else ''}{share}{where}"
+
+
 class Plan(Table, frozen=True):
     """A whole plan."""
 
@@ -98,14 +145,31 @@ class Plan(Table, frozen=True):
     seed: Annotated[int, Meta(ge=0, le=MAX_SEED)] = 0
     cases: Annotated[int, Meta(ge=1, le=MAX_CASES)] | None = None
     sampling: Sampling = "sobol"
-    through: Literal["tracker", "display"] = "tracker"
+    through: Literal["tracker", "display", "bench"] = "tracker"
     frames: Annotated[int, Meta(ge=1, le=MAX_FRAMES)] = 1
     step_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 0.2
     noise: Literal["full", "none"] = "full"
     wrong_above_arcsec: Annotated[float, Meta(ge=0, le=648000)] = 1800.0
+    answers: Annotated[int, Meta(ge=1, le=MAX_FRAMES)] | None = None
+    settle_s: Annotated[float, Meta(ge=0, le=86400)] | None = None
+    timeout_s: Annotated[float, Meta(ge=0.01, le=86400)] | None = None
+    blank_s: Annotated[float, Meta(ge=0, le=86400)] = 0.0
+    silent_s: Annotated[float, Meta(ge=0, le=86400)] = 20.0
+    check_every: Annotated[int, Meta(ge=0, le=MAX_CASES)] = 0
     attitudes: Attitudes = msgspec.field(default_factory=Attitudes)
     centroids: Centroiding = msgspec.field(default_factory=Centroiding)
     vary: Annotated[list[Varied], Meta(max_length=64)] = msgspec.field(default_factory=list)
+    require: Annotated[list[Require], Meta(max_length=256)] = msgspec.field(default_factory=list)
+
+    @property
+    def asked(self) -> int:
+        """How many answers a case on the bench gathers."""
+        return DEFAULT_ANSWERS if self.answers is None else self.answers
+
+    @property
+    def limit_s(self) -> float:
+        """How long a case on the bench lasts at most."""
+        return DEFAULT_TIMEOUT_S if self.timeout_s is None else self.timeout_s
 
 
 KIND = Kind(Plan, "docs/campaign.md", TYPE_WORDS)
@@ -127,12 +191,18 @@ def parse_plan(path: Path, text: str) -> Plan:
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
     try:
+        for key in TRACKER_KEYS if plan.through == "bench" else BENCH_KEYS:
+            if key in tables:
+                other = 'through = "tracker" or "display"' if plan.through == "bench" else 'through = "bench"'
+                raise InputError(f"{key}: is for {other}; write that, or leave {key} out")
         _check_attitudes(plan.attitudes)
         keys = [varied.key for varied in plan.vary]
         for varied in plan.vary:
             if keys.count(varied.key) > 1:
                 raise InputError(f'[[vary]] key = "{varied.key}" stands there twice; leave one of them out')
             _check_range(varied, plan.sampling)
+        for number, require in enumerate(plan.require, start=1):
+            _check_require(f"[[require]] number {number}", require)
         if plan.cases is None and plan.sampling != "grid":
             raise InputError(f'sampling = "{plan.sampling}" needs the number of cases; add cases = 1000')
     except InputError as error:
@@ -179,6 +249,65 @@ def _check_range(varied: Varied, sampling: Sampling) -> None:
         raise InputError(f'{where}: sampling = "grid" needs values, or steps beside minimum and maximum; add steps = 5')
     if sampling != "grid" and varied.steps is not None:
         raise InputError(f'{where}: steps is for sampling = "grid"; leave it out')
+
+
+def _check_require(where: str, require: Require) -> None:
+    quantity = require.quantity
+    where = f"{where} ({quantity})"
+    if (require.maximum is None) == (require.minimum is None):
+        raise InputError(f"{where}: write either maximum or minimum, a number")
+    if require.axis is not None and not require.of_axis:
+        raise InputError(f"{where}: has no axis; leave axis out")
+    if require.share is not None and quantity in ("bias", "availability", "wrong-rate"):
+        raise InputError(f"{where}: is one figure of all cases, without a share of them; leave share out")
+    if quantity in ("availability", "wrong-rate") and not 0 <= require.limit <= 1:
+        raise InputError(f"{where}: the limit {require.limit:g}; write a share from 0 to 1")
+    try:
+        conditions_of(require.condition)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+class Condition(NamedTuple):
+    """A condition on a column: the key, the comparison, and a number or a text."""
+
+    key: str
+    comparison: str
+    value: float | str
+
+
+def conditions_of(text: str) -> list[Condition]:
+    """The conditions of `condition = "KEY <= 0.5 and KEY > 0.1"`, none for an empty text. Raises InputError."""
+    found = []
+    for part in text.split(" and ") if text.strip() else []:
+        match = CONDITION.fullmatch(part)
+        key, comparison, word, number = match.groups() if match else ("", "", None, "")
+        try:
+            value = word if word is not None else float(number)
+        except ValueError:
+            match = None
+        if match is None or (word is not None and comparison not in ("==", "!=")):
+            raise InputError(
+                f'condition = "{shortened(text)}"; write such as "rate_deg_s.across <= 0.5": a key, one of <= < >= > == !=,'
+                ' a number, and " and " between several'
+            )
+        found.append(Condition(key, comparison, value))
+    return found
+
+
+def checked_conditions(text: str, columns: Mapping[str, str]) -> list[Condition]:
+    """The conditions on columns (name -> kind) of a campaign's table, by their names there. Raises InputError."""
+    found = []
+    for key, comparison, value in conditions_of(text):
+        name = f"vary.{key}" if f"vary.{key}" in columns else key
+        if name not in columns or isinstance(value, str) != (columns[name] == "text"):
+            varied = ", ".join(each.removeprefix("vary.") for each in columns if each.startswith("vary.")) or "none"
+            raise InputError(
+                f'[[require]] condition = "{shortened(text)}": {shortened(key)} is no key that the plan varies ({varied}),'
+                f" and no column of {'texts' if isinstance(value, str) else 'numbers'}; write one of those"
+            )
+        found.append(Condition(name, comparison, value))
+    return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,6 +64,14 @@ class Columns:
         """The names of the varied columns."""
         return [name for name in (*self.numbers, *self.texts) if name.startswith(VARY)]
 
+    def some(self, chosen: npt.NDArray[np.bool_]) -> Columns:
+        """The chosen (n,) cases alone."""
+        numbers = {name: column[chosen] for name, column in self.numbers.items()}
+        texts = {
+            name: [text for text, is_one in zip(column, chosen, strict=True) if is_one] for name, column in self.texts.items()
+        }
+        return Columns(self.cases, numbers, texts)
+
     def vectors(self, form: str, names: str) -> FloatArray:
         """Columns (n, k) side by side: `form` with each of `names` in it."""
         return np.stack([self.numbers[form.format(name)] for name in names], axis=1)
@@ -102,11 +110,7 @@ def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tu
     asked, solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("frames", "solved", "wrong"))
     tracker = file.config.tracker
     scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
-    # The solver's attitudes, NaN where there is none: a case's mean error applied to its commanded attitude.
-    commanded, reported = (cases.vectors(form, "wxyz") for form in ("q{}", "solved_q{}"))
-    error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
-    known = np.isfinite(error).all(axis=1)
-    reported[known] = multiply(from_rotation_vectors(error[known]), commanded[known])
+    commanded, reported = attitudes_of(cases)
     step = -(-len(commanded) // MAX_FITTED_CASES)
     parts: Decomposed | None = None
     try:
@@ -126,6 +130,18 @@ def case_budget(cases: Columns, file: BenchFile, rng: np.random.Generator) -> tu
         "limit_arcsec": noise_limit(file, commanded),
         "notes": notes,
     }, parts
+
+
+def attitudes_of(cases: Columns) -> tuple[FloatArray, FloatArray]:
+    """Commanded attitudes (n, 4), and reported ones, NaN where there is none: the case's mean error on the commanded one."""
+    commanded, reported = (cases.vectors(form, "wxyz") for form in ("q{}", "solved_q{}"))
+    if "lit_qw" in cases.numbers:  # on the bench a case in motion is where it was lit when the tracker looked
+        lit = cases.vectors("lit_q{}", "wxyz")
+        commanded = np.where(np.isfinite(lit), lit, commanded)
+    error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
+    known = np.isfinite(error).all(axis=1)
+    reported[known] = multiply(from_rotation_vectors(error[known]), commanded[known])
+    return commanded, reported
 
 
 def budget_rows(budget: dict[str, Any], parts: Decomposed | None) -> Iterator[FigureRow]:

@@ -75,6 +75,11 @@ def difference(found: Identity, wanted: Identity) -> str | None:
     return None
 
 
+def identity_of(gl_renderer: str) -> Identity:
+    """The identity of this process with a renderer."""
+    return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer)
+
+
 class Job(msgspec.Struct, frozen=True):
     """The message that starts a worker: the plan and the bench as they were read, the solver, and the place of images."""
 
@@ -127,8 +132,7 @@ class Session:
 
     def identity(self) -> Identity:
         """This worker's identity."""
-        renderer = self._at(self.maker.file).gl_renderer
-        return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, renderer)
+        return identity_of(self._at(self.maker.file).gl_renderer)
 
     def run(self, begin: int, points: FloatArray) -> Answered:
         """The rows of the cases from `begin` on at their points (n, dimensions)."""
@@ -153,10 +157,13 @@ class Session:
             return failed(row, one_line(f"{type(error).__name__}: {error}"))
 
     def _exposed(self, case: Case, tracker: Imaging, row: Row) -> Row:
-        tally = CaseTally("stars" in self.columns, self.plan.wrong_above_arcsec)
+        exposure_s = tracker.config.tracker.exposure_s
+        length_s = (self.plan.frames - 1) * self.plan.step_s + exposure_s
+        fault_end_s = self.maker.fault_end_s(case, length_s)
+        tally = CaseTally("stars" in self.columns, self.plan.wrong_above_arcsec, fault_end_s)
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         for frame in range(self.plan.frames):
-            view = self.maker.view(case, frame, tracker.config.tracker.exposure_s)
+            view = self.maker.view(case, frame, exposure_s)
             # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and attitude.
             rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
             if isinstance(tracker, Simulator):
@@ -172,7 +179,7 @@ class Session:
                 write_exposure_fits(path, tracker, exposure, noise)
             tally.see(exposure)
             try:
-                tally.hear(exposure, self._solver.solve(exposure, tracker))
+                tally.hear(exposure, self._solver.solve(exposure, tracker), frame * self.plan.step_s + exposure_s)
             except SolverFault as error:
                 return failed(tally.into(row), one_line(str(error)))
         return tally.into(row)

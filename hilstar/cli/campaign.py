@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hilstar.cli.options import Json, parse_memory
+from hilstar.cli import running
+from hilstar.cli.options import Headless, Json, parse_memory
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory
 
 if TYPE_CHECKING:
+    from hilstar.bench.bench_file import BenchFile
     from hilstar.campaign.cluster import Scheduler
     from hilstar.campaign.run import Campaign
     from hilstar.campaign.store import Directory
 
+CENTROIDS = "centroids"  # the solver without another one
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
 
 
@@ -51,13 +56,26 @@ def campaign(
             metavar="SOLVER",
             help='What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image} that prints a quaternion.',
         ),
-    ] = "centroids",
+    ] = CENTROIDS,
     solver_timeout: Annotated[float, typer.Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)] = 10.0,
     images: Annotated[Literal["fits"] | None, typer.Option(help="Keep the images, with their truth.")] = None,
     memory: Annotated[
         str | None,
         typer.Option(metavar="SIZE", help="For this process and its workers together, such as 4GB: as many run as fit."),
     ] = None,
+    headless: Headless = False,
+    windowed: running.Windowed = False,
+    force: running.Force = False,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}."),
+    ] = None,
+    console: running.Console = None,
+    token: running.Token = None,
+    console_name: running.ConsoleName = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit with code 1 where one of the plan's requirements is not met.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Run a plan's cases over every core, or a cluster, into one Parquet table, a row a case."""
@@ -68,6 +86,8 @@ def campaign(
     check_directory("-o", output)
     if scheduler is not None and (workers is not None or memory is not None):
         raise InputError("campaign --scheduler: the cluster's workers are its own; leave out --workers and --memory")
+    pooled = {"--workers": workers is not None, "--scheduler": scheduler is not None, "--memory": memory is not None}
+    pooled |= {"--images": images is not None, "--solver": solver != CENTROIDS}
     cluster = None if scheduler is None else Scheduler(scheduler, tls_ca_file, tls_cert, tls_key)
     if cluster is not None:
         cluster.check()
@@ -75,20 +95,107 @@ def campaign(
         raise InputError("campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it")
     memory_bytes = None if memory is None else parse_memory(memory)
     this = Campaign(plan, output, solver, solver_timeout, images is not None)
+    of_bench = {"--headless": headless, "--windowed": windowed, "--force": force}
+    of_bench |= {"--frames": frames is not None, "--console": console is not None}
+    _check_options(this.on_bench, of_bench, pooled)
     directory = Directory(output)
     try:
         directory.claim(this.about())
-        if not directory.table.exists():
+        if not directory.table.exists() and this.on_bench:
+            show_cases(this, directory, Showing(headless, windowed, force, frames, console, token, console_name))
+        elif not directory.table.exists():
             run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
         from hilstar.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
 
         summary = write_results(directory.table, this.maker.file, this.plan.seed)
+        lines, not_met = lines_of(summary), False
+        if this.on_bench:
+            from hilstar.campaign.bench_results import bench_lines, bench_summary
+
+            summary |= bench_summary(directory.table)
+            lines += bench_lines(summary)
+        if this.plan.require:
+            from hilstar.campaign.requirements import NOT_MET
+            from hilstar.campaign.requirements_page import summary_of, write_requirements
+
+            verdicts = write_requirements(this.plan, this.path, directory.table, this.maker.file)
+            not_met = any(each.verdict == NOT_MET for each in verdicts)
+            summary["requirements"] = [summary_of(each) for each in verdicts]
+            lines += [each.words for each in verdicts]
     finally:
         directory.close()
     if as_json:
         print_json(summary)
-        return
-    typer.echo("\n".join(lines_of(summary)))
+    else:
+        typer.echo("\n".join(lines))
+    if strict and not_met:
+        raise typer.Exit(1)
+
+
+def _check_options(on_bench: bool, of_bench: dict[str, bool], pooled: dict[str, bool]) -> None:
+    """Refuse (InputError) options that mean nothing for the campaign's `through`."""
+    for name, given in (pooled if on_bench else of_bench).items():
+        if given:
+            through = "tracker or display" if on_bench else "bench"
+            raise InputError(f"campaign {name}: is for through = {through}; leave it out")
+
+
+@dataclass(frozen=True, slots=True)
+class Showing:
+    """How the cases are shown to a real tracker: the options of `serve`."""
+
+    headless: bool
+    windowed: bool
+    force: bool
+    frames: str | None
+    console: str | None
+    token: str | None
+    console_name: list[str] | None
+
+
+def show_cases(this: Campaign, directory: Directory, asked: Showing) -> None:
+    """Show the missing cases to the real tracker, with progress on the terminal and on the page."""
+    from hilstar.campaign.bench_run import OpenDisplay
+    from hilstar.console.publisher import PageParts, RunDescription
+    from hilstar.console.run_status import RunSource, RunStatus
+    from hilstar.notices import Notices
+    from hilstar.run.record.ledger import Ledger, LedgerSwitch
+
+    count, begun = 0, 0
+    notices, started_s, said_s = Notices(), time.monotonic(), time.monotonic()
+    where = str(this.path)
+
+    with (
+        telling(this.cases) as advance,
+        running.page_listener(asked.console, False, asked.token, asked.console_name) as listener,
+    ):
+
+        def on_done(done: int) -> None:
+            nonlocal count, begun, said_s
+            begun, now_s = begun if count else done, time.monotonic()
+            count = min(done, this.cases)
+            advance(count)
+            if listener is not None and now_s - said_s >= LINE_S and count > begun:
+                said_s = now_s
+                left_s = (this.cases - count) * (now_s - started_s) / (count - begun)
+                notices.tell("campaign", f"{count} of {this.cases} cases, {left_s:.0f} s left")
+
+        @contextmanager
+        def display(file: BenchFile) -> Iterator[OpenDisplay]:
+            with (
+                running.shown_bench(file, asked.headless, asked.windowed, asked.force, timed=True) as (bench, screen),
+                running.optional_frames(asked.frames, bench, screen) as feed,
+            ):
+                ledger = LedgerSwitch()
+                told = RunSource(where, bench.renderer.gl_renderer, bench.config.monitor.refresh_hz, math.inf)
+                parts = PageParts(bench, notices, ledger, lambda path: Ledger(path, bench, notices), screen)
+                page, status = RunDescription("campaign", "campaign", where), RunStatus(told, ledger)
+                with running.followed(listener, False, page, parts, status, frames=feed) as (sink, follower, _):
+                    yield OpenDisplay(bench, screen, sink, follower)
+
+        if not this.show(directory, display, notices, on_done):
+            say(f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there")
+            raise KeyboardInterrupt
 
 
 def run_cases(

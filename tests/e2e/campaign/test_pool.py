@@ -110,3 +110,42 @@ def test_another_plan_and_a_budget_that_is_too_small_are_refused(folder: Path) -
     other = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=folder)
     assert_refused(other, 2, "seed was 7 and is 8")
     assert rows_so_far(folder) == before == 1
+
+
+REQUIRE = """
+[[require]]
+quantity = "noise"
+maximum = {0}
+condition = "rate_deg_s.across <= 0.5"
+[[require]]
+quantity = "availability"
+minimum = 0.999
+confidence = 0.9
+"""
+ALL_COLUMNS = "quantity,axis,condition,limit,bound,confidence,cases,verdict"
+
+
+def test_requirements_are_judged_and_judged_again_without_running_a_case(tmp_path: Path) -> None:
+    plan = write_campaign(tmp_path, cases=64)
+    text = plan.read_text()
+    command = ("campaign", "plan.toml", "-o", "out", "--workers", "1", "--strict")
+    plan.write_text(text + REQUIRE.format(1000.0))
+    result = run_hilstar_here(*command, "--json", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    noise, availability = json.loads(result.stdout)["requirements"]
+    assert noise["verdict"] == "met" and noise["axis"] == "cross" and 30 <= noise["cases"] < 64
+    assert availability["verdict"] == "not shown" and availability["more_cases"] > 1000
+    header, *rows = (tmp_path / "out" / "requirements.csv").read_text().splitlines()
+    assert header == ALL_COLUMNS and len(rows) == 2
+    assert rows[0].startswith("noise,cross,rate_deg_s.across <= 0.5,1000.0,") and rows[0].endswith(",met")
+    assert rows[1].startswith("availability,,,0.999,") and rows[1].endswith(",0.9,64,not shown")
+    page = (tmp_path / "out" / "requirements.html").read_text()
+    assert all(words in page for words in ("Signature", "not shown", "data:image/svg+xml;base64,"))
+    assert "http" not in page.replace("http://www.w3.org", "")
+    table = (tmp_path / "out" / "cases.parquet").read_bytes()
+    plan.write_text(text + REQUIRE.format(0.001))  # another limit is no other campaign
+    again = run_hilstar_here(*command, cwd=tmp_path)
+    assert again.returncode == 1 and "noise cross at most 0.001 arcsec where rate_deg_s.across <= 0.5: not met" in again.stdout
+    assert (tmp_path / "out" / "cases.parquet").read_bytes() == table
+    plan.write_text(text + REQUIRE.format(1.0).replace("rate_deg_s", "speed"))
+    assert_refused(run_hilstar_here(*command, cwd=tmp_path), 2, "speed.across is no key that the plan varies")

@@ -1,0 +1,100 @@
+"""A tracker before a campaign on the bench, in a process of its own: it sees what `now.json` says is lit, and answers over UDP.
+
+`python -m tests.support.campaign_tracker '{"now": "out/now.json", "port": 5000}'`; the keys are those of `Planted`. An exposure
+that was not lit by one attitude alone has no answer that is valid. It prints the wild answers' times when its input ends.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.rotation import from_rotation_vector, multiply, propagate, to_matrix
+from hilstar.units import ARCSEC_PER_RAD
+
+FOCAL_PX = 2000.0
+WAVE_PX = 100.0  # of the field-of-view error
+FIRST_DIRECTION = np.array([0.163, 0.926, 0.342])  # RA 80, Dec 20: its phase is the pixel error's
+
+
+@dataclass(frozen=True)
+class Planted:
+    """What is planted: one sigma an axis, arcsec, across the boresight (`noise_arcsec` about x, y, z), and shares."""
+
+    now: str
+    port: int
+    answer_hz: float = 100.0
+    exposure_s: float = 0.004
+    latency_s: float = 0.002
+    bias_arcsec: tuple[float, float, float] = (15.0, -9.0, 40.0)
+    fov_arcsec: float = 6.0
+    pixel_arcsec: float = 4.0
+    noise_arcsec: tuple[float, float, float] = (2.0, 2.0, 12.0)
+    wild: float = 0.01
+    drift_arcsec_s: float = 0.0
+    dim_mag_s: float = 0.0
+    blind: tuple[int, ...] = ()  # cases in which it never has an attitude
+    seed: int = 1
+
+
+def seen(planted: Planted, middle_ns: int) -> tuple[int, np.ndarray] | None:
+    """The case and the attitude that were lit over the whole exposure; None where none was."""
+    try:
+        told = json.loads(Path(planted.now).read_text())
+    except (OSError, ValueError):
+        return None
+    if told["light_ns"] > middle_ns - planted.exposure_s / 2 * 1e9:
+        return None
+    q, rate = np.array(told["q_icrs_to_cam"]), np.array(told["rate_cam_rad_s"])
+    return told["case"], propagate(q, rate, (middle_ns - told["light_ns"]) / 1e9)
+
+
+def wave(q: np.ndarray, length_px: float) -> np.ndarray:
+    """A wave (..., 2) of rms 1 over many lengths, in x and y, of where attitudes (..., 4) put FIRST_DIRECTION."""
+    star = to_matrix(q) @ FIRST_DIRECTION
+    return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * FOCAL_PX * star[..., :2] / star[..., 2:] / length_px))
+
+
+def error_arcsec(planted: Planted, q: np.ndarray, at_s: float, rng: np.random.Generator) -> np.ndarray:
+    """The planted error at an attitude, so long after the start."""
+    error = np.array(planted.bias_arcsec) + np.array(planted.noise_arcsec) * rng.standard_normal(3)
+    error[:2] += planted.fov_arcsec * wave(q, WAVE_PX) + planted.pixel_arcsec * wave(q, 1.0)
+    error[0] += planted.drift_arcsec_s * at_s
+    return error
+
+
+def main() -> None:
+    """Answer until standard input ends."""
+    planted = Planted(**json.loads(sys.argv[1]))
+    rng = np.random.default_rng((planted.seed, os.getpid()))
+    line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    begun_ns, k, wild = time.monotonic_ns(), 0, []
+    while not select.select([sys.stdin], [], [], 0)[0]:
+        middle_ns = begun_ns + round(k / planted.answer_hz * 1e9)
+        k += 1
+        time.sleep(max(0.0, (middle_ns - time.monotonic_ns()) / 1e9 + planted.exposure_s / 2 + planted.latency_s))
+        found, at_s = seen(planted, middle_ns), (middle_ns - begun_ns) / 1e9
+        told: dict[str, object] = {"t_ns": middle_ns, "q": [1.0, 0.0, 0.0, 0.0], "valid": False}
+        if found is not None and found[0] not in planted.blind:
+            turn = from_rotation_vector(error_arcsec(planted, found[1], at_s, rng) / ARCSEC_PER_RAD)
+            if rng.random() < planted.wild:
+                turn = from_rotation_vector(rng.uniform(0.3, 1.5) * np.array([0.6, -0.8, 0.0]))
+                wild.append(found[0])
+            dn = 1000.0 * 10 ** (-0.4 * planted.dim_mag_s * at_s)
+            told |= {"q": multiply(turn, found[1]).tolist(), "valid": True, "stars": 7}
+            told["centroids"] = [[100.0 + 50 * star, 200.0, dn * (1 + star)] for star in range(7)]
+        line.sendto(json.dumps(told).encode(), ("127.0.0.1", planted.port))
+        k = max(k, int((time.monotonic_ns() - begun_ns) / 1e9 * planted.answer_hz))
+    print(json.dumps(wild))
+
+
+if __name__ == "__main__":
+    main()

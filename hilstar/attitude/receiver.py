@@ -8,8 +8,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
-from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter, SharedClockFilter
+from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter, KnownClockFilter
 from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
 from hilstar.attitude.clock.senders import Repeats, Senders
@@ -18,7 +19,7 @@ from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
 from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Packet, Reason, Refusal, Status, TimeReply, TimeRequest
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK
+from hilstar.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -30,17 +31,24 @@ POLL_MS = 20
 # Messages found when the frames begin were there before; those that arrive this soon after may have queued on the way.
 QUEUED_NS = NS_PER_S // 10
 QUEUE_NEVER_EMPTY_NS = NS_PER_S
+KNOWN_AGAIN_NS = NS_PER_S // 5  # how soon a step of this machine's clock of Unix time is followed
+SAME_CLOCK = UnixOffset(0, 0)
+UNDISCIPLINED = "clock-undisciplined"
+UNDISCIPLINED_LINE = (
+    '[attitude] clock = "unix", but nothing keeps this machine\'s clock: the kernel states an error of 16 s; start chronyd, '
+    'ntpd or phc2sys, or write clock = "estimated"'
+)
 MIN_BACK_OFF_NS = NS_PER_S // 20
 MAX_BACK_OFF_NS = NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """What goes back to the sender on a two-way link, and whether its clock is this machine's own."""
+    """What goes back to the sender on a two-way link, and what its clock is: estimated, this machine's own, or Unix time."""
 
     status_hz: float = 0.0
     time_requests: bool = False
-    shared_clock: bool = False
+    clock: Literal["estimated", "shared", "unix"] = "estimated"
 
 
 QUIET = Traffic()
@@ -149,12 +157,20 @@ class Receiver:
         *,
         wrong_rates: WrongRates = "use-quaternions",
         now_ns: Callable[[], int] = HOST_CLOCK.now_ns,
+        unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset,
     ) -> None:
         self.counts = PacketCounts()
         self._now_ns = now_ns
         self._notices = Notices() if notices is None else notices
-        self.clock = SenderClock(shared=traffic.shared_clock)
-        self.jumps = SharedClockFilter(self._notices) if traffic.shared_clock else JumpFilter(self.clock)
+        self._unix_offset = unix_offset if traffic.clock == "unix" else None
+        self._known_ns = 0
+        if traffic.clock == "estimated":
+            self.clock = SenderClock()
+            self.jumps: JumpFilter | KnownClockFilter = JumpFilter(self.clock)
+        else:
+            known = SAME_CLOCK if self._unix_offset is None else self._unix_offset()
+            self.clock = SenderClock(known, traffic.clock)
+            self.jumps = KnownClockFilter(self._notices, self.clock)
         self.latency_ms = RunningStatistics()
         self._link = link
         self._timeline = timeline
@@ -238,6 +254,10 @@ class Receiver:
         """Take what the link brings within POLL_MS. The thread calls this in a loop."""
         waits = self._link.wait_for_message(0)
         now_ns = self._now_ns()
+        if self._unix_offset is not None and now_ns - self._known_ns >= KNOWN_AGAIN_NS:
+            self._known_ns, known = now_ns, self._unix_offset()
+            self.clock.know(known)
+            self._doubt(known)
         if not waits:
             self._empty_ns = now_ns
         begun_ns = self._begun_ns
@@ -255,6 +275,13 @@ class Receiver:
         self._settle(self.jumps.expire(now_ns))
         if self._link.two_way:
             self._back.talk(now_ns, ask=self._learn_from_ns is not None)
+
+    def _doubt(self, known: UnixOffset) -> None:
+        """Say while nothing keeps this machine's clock of Unix time."""
+        if known.error_ns < UNDISCIPLINED_NS:
+            self._notices.end(UNDISCIPLINED, "clock-disciplined", "this machine's clock of Unix time is kept again")
+        else:
+            self._notices.begin(UNDISCIPLINED, UNDISCIPLINED_LINE)
 
     def _take(self, arrival: Arrival[Event], waited_ns: int) -> None:
         match arrival.event:

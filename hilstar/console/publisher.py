@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from hilstar.attitude.clock.rate_check import WRONG
+from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 from hilstar.bench.frame import Bench
 from hilstar.console.listener import PageListener
 from hilstar.console.messages import (
@@ -259,7 +260,7 @@ def _clock(running: Running) -> ShownClock | None:
         offset_ms=clock.offset_ms,
         sigma_ms=clock.uncertainty_ms,
         drift_ppm=clock.drift_ppm,
-        synchronised=clock.mode in {"exchange", "shared"},
+        synchronised=clock.mode in KNOWN_MODES,
         mode=clock.mode,
     )
 

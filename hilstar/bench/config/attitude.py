@@ -127,10 +127,12 @@ class AttitudeSettings(Table, frozen=True):
         ),
     ] = True
     clock: Annotated[
-        Literal["estimated", "shared"],
+        Literal["estimated", "shared", "unix"],
         Meta(
             description='`"estimated"`: the offset of the sender\'s clock is estimated. `"shared"`: the sender runs on this '
-            "machine and `t_ns` is its CLOCK_MONOTONIC; nothing is estimated, and latency is absolute."
+            "machine and `t_ns` is its CLOCK_MONOTONIC; nothing is estimated, and latency is absolute. "
+            '`"unix"`: `t_ns` is Unix time of a machine that PTP or NTP disciplines, as this one; the offset is that of this '
+            "machine's own clock, with the error that its kernel states."
         ),
     ] = "estimated"
     stale_after_ms: Annotated[
@@ -206,8 +208,8 @@ def _check_simulation(settings: AttitudeSettings, name: str) -> None:
     for key in ("curve_secret_key", "curve_server_key", "allowed_clients"):
         if getattr(settings, key) is not None:
             raise InputError(f'{key}: {name} knows no keys; remove it, and write endpoint = "tcp://127.0.0.1:PORT"')
-    if settings.clock == "shared":
-        raise InputError(f'clock = "shared": {name} sends the time of its simulation; write clock = "estimated"')
+    if settings.clock != "estimated":
+        raise InputError(f'clock = "{settings.clock}": {name} sends the time of its simulation; write clock = "estimated"')
 
 
 def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:

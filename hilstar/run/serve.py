@@ -125,7 +125,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
 def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
     settings, clock = bench.config.attitude, loop.pacer.clock
     timeline = Timeline(policy_of(settings))
-    kept = settings.clock
+    kept = "shared" if settings.source == "scpi" else settings.clock
     traffic = Traffic(settings.status_hz, settings.time_requests and kept == "estimated", kept)
     receiver = Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, wrong_rates=settings.check_rates)
     outlet.follower(Running(loop, receiver.counts, receiver.clock_summary, outlet.answers))

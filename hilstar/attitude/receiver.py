@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -16,7 +17,18 @@ from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderCl
 from hilstar.attitude.clock.senders import Repeats, Senders
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
-from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Packet, Reason, Refusal, Status, TimeReply, TimeRequest
+from hilstar.attitude.wire.packet import (
+    REASONS,
+    AnswerPacket,
+    AttitudeSample,
+    Event,
+    Packet,
+    Reason,
+    Refusal,
+    Status,
+    TimeReply,
+    TimeRequest,
+)
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
@@ -28,6 +40,7 @@ QUICK_ASK_NS = NS_PER_S // 10
 ASK_NS = NS_PER_S // 2
 TOLD_ONCE = HEALTH_MISSED | HEALTH_REFUSED
 POLL_MS = 20
+MAX_PASSED_ON = 10
 # Messages found when the frames begin were there before; those that arrive this soon after may have queued on the way.
 QUEUED_NS = NS_PER_S // 10
 QUEUE_NEVER_EMPTY_NS = NS_PER_S
@@ -57,7 +70,7 @@ QUIET = Traffic()
 class BackChannel:
     """Sends what is due over `link`, to the sender of the newest attitude shown where it has several.
 
-    The receiver's thread calls it, but for `post`.
+    The receiver's thread calls it, but for `post` and `pass_on`.
     """
 
     def __init__(self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = HOST_CLOCK.now_ns) -> None:
@@ -66,6 +79,7 @@ class BackChannel:
         self._traffic = traffic
         self._posting = threading.Lock()
         self._status: Status | None = None
+        self._answers: deque[AnswerPacket] = deque(maxlen=MAX_PASSED_ON)
         self._next_status_ns = 0
         self._asked: dict[int, TimeRequest] = {}
         self._asks = 0
@@ -79,6 +93,10 @@ class BackChannel:
                 status = replace(status, health=status.health | self._status.health & TOLD_ONCE)
             self._status = status
 
+    def pass_on(self, answer: AnswerPacket) -> None:
+        """Take an answer of the tracker; it leaves at once. The oldest of more than MAX_PASSED_ON is dropped."""
+        self._answers.append(answer)
+
     def talk(self, now_ns: int, *, ask: bool) -> None:
         """Send what is due; time requests only where `ask`."""
         if ask and self._traffic.time_requests and now_ns >= self._next_ask_ns:
@@ -89,6 +107,8 @@ class BackChannel:
             self._quick_asks -= 1
             self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS)
             self._send(request)
+        while self._answers:
+            self._send(self._answers.popleft())
         if self._traffic.status_hz and self._status is not None and now_ns >= self._next_status_ns:
             with self._posting:
                 status, self._status = self._status, None
@@ -222,6 +242,10 @@ class Receiver:
     def post(self, status: Status) -> None:
         """Hand in the newest status; it leaves when it is due."""
         self._back.post(status)
+
+    def pass_on(self, answer: AnswerPacket) -> None:
+        """Hand in an answer of the tracker, for the sender."""
+        self._back.pass_on(answer)
 
     def sender_ns(self, continuous_ns: int) -> int:
         """A time of the timeline on the sender's own clock."""

@@ -98,7 +98,9 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
         for name in ANSWERED:
             words = "attitude of the tracker's newest valid answer, q_icrs_to_cam; zeros before one"
             self.register_variable(Real(name, causality=Fmi2Causality.output, description=words))
-        self.register_variable(Real("answered_t_s", causality=Fmi2Causality.output, description="s: that answer's own stamp"))
+        self.register_variable(
+            Real("answered_t_s", causality=Fmi2Causality.output, description="s: when that answer's exposure had its middle")
+        )
 
     def to_xml(self, *options: object) -> Element:
         """The model's description; outputs are also its initial unknowns (FMI 2.0, 2.2.8), which PythonFMU leaves out."""

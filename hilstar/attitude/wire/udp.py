@@ -3,7 +3,7 @@
 Laws:
 1. A datagram from an address that is not allowed is counted and never answered; the kernel drops a flood of them, by a socket
    filter (classic BPF; Linux, Documentation/networking/filter.rst), before it costs buffer space or a read.
-2. To an address go at most as many bytes of time requests and replies as came from it; statuses besides, at their own rate.
+2. To an address go at most as many bytes of time requests, replies and answers as came from it; statuses besides, at a rate.
 3. A flood costs the reading of MAX_TAKEN datagrams every PAUSE_S, and the decoding of what `FloodGate` admits.
 
 The kernel stamps the arrival (SO_TIMESTAMPNS), however late a datagram is read; `KernelStamps` does the same for TCP.

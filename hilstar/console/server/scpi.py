@@ -365,8 +365,8 @@ class Connection:
 
     def residual(self) -> str:
         """`TRAC:RES?`: of the tracker's newest answer, arcsec about x, y, z."""
-        figures = getattr(self.seen, "tracker", None)
-        return _numbers(getattr(figures, "residual_arcsec", None), 3)
+        figures = self.seen.tracker
+        return _numbers(None if figures is None else figures.residual_arcsec, 3)
 
 
 def _numbers(values: tuple[float, ...] | list[float] | None, places: int) -> str:

@@ -6,19 +6,32 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
-from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter, SharedClockFilter
+from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter, KnownClockFilter
 from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
 from hilstar.attitude.clock.senders import Repeats, Senders
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
-from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Packet, Reason, Refusal, Status, TimeReply, TimeRequest
+from hilstar.attitude.wire.packet import (
+    REASONS,
+    AnswerPacket,
+    AttitudeSample,
+    Event,
+    Packet,
+    Reason,
+    Refusal,
+    Status,
+    TimeReply,
+    TimeRequest,
+)
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK
+from hilstar.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -27,20 +40,28 @@ QUICK_ASK_NS = NS_PER_S // 10
 ASK_NS = NS_PER_S // 2
 TOLD_ONCE = HEALTH_MISSED | HEALTH_REFUSED
 POLL_MS = 20
+MAX_PASSED_ON = 10
 # Messages found when the frames begin were there before; those that arrive this soon after may have queued on the way.
 QUEUED_NS = NS_PER_S // 10
 QUEUE_NEVER_EMPTY_NS = NS_PER_S
+KNOWN_AGAIN_NS = NS_PER_S // 5  # how soon a step of this machine's clock of Unix time is followed
+SAME_CLOCK = UnixOffset(0, 0)
+UNDISCIPLINED = "clock-undisciplined"
+UNDISCIPLINED_LINE = (
+    '[attitude] clock = "unix", but nothing keeps this machine\'s clock: the kernel states an error of 16 s; start chronyd, '
+    'ntpd or phc2sys, or write clock = "estimated"'
+)
 MIN_BACK_OFF_NS = NS_PER_S // 20
 MAX_BACK_OFF_NS = NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """What goes back to the sender on a two-way link, and whether its clock is this machine's own."""
+    """What goes back to the sender on a two-way link, and what its clock is: estimated, this machine's own, or Unix time."""
 
     status_hz: float = 0.0
     time_requests: bool = False
-    shared_clock: bool = False
+    clock: Literal["estimated", "shared", "unix"] = "estimated"
 
 
 QUIET = Traffic()
@@ -49,7 +70,7 @@ QUIET = Traffic()
 class BackChannel:
     """Sends what is due over `link`, to the sender of the newest attitude shown where it has several.
 
-    The receiver's thread calls it, but for `post`.
+    The receiver's thread calls it, but for `post` and `pass_on`.
     """
 
     def __init__(self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = HOST_CLOCK.now_ns) -> None:
@@ -58,6 +79,7 @@ class BackChannel:
         self._traffic = traffic
         self._posting = threading.Lock()
         self._status: Status | None = None
+        self._answers: deque[AnswerPacket] = deque(maxlen=MAX_PASSED_ON)
         self._next_status_ns = 0
         self._asked: dict[int, TimeRequest] = {}
         self._asks = 0
@@ -71,6 +93,10 @@ class BackChannel:
                 status = replace(status, health=status.health | self._status.health & TOLD_ONCE)
             self._status = status
 
+    def pass_on(self, answer: AnswerPacket) -> None:
+        """Take an answer of the tracker; it leaves at once. The oldest of more than MAX_PASSED_ON is dropped."""
+        self._answers.append(answer)
+
     def talk(self, now_ns: int, *, ask: bool) -> None:
         """Send what is due; time requests only where `ask`."""
         if ask and self._traffic.time_requests and now_ns >= self._next_ask_ns:
@@ -81,6 +107,8 @@ class BackChannel:
             self._quick_asks -= 1
             self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS)
             self._send(request)
+        while self._answers:
+            self._send(self._answers.popleft())
         if self._traffic.status_hz and self._status is not None and now_ns >= self._next_status_ns:
             with self._posting:
                 status, self._status = self._status, None
@@ -149,12 +177,20 @@ class Receiver:
         *,
         wrong_rates: WrongRates = "use-quaternions",
         now_ns: Callable[[], int] = HOST_CLOCK.now_ns,
+        unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset,
     ) -> None:
         self.counts = PacketCounts()
         self._now_ns = now_ns
         self._notices = Notices() if notices is None else notices
-        self.clock = SenderClock(shared=traffic.shared_clock)
-        self.jumps = SharedClockFilter(self._notices) if traffic.shared_clock else JumpFilter(self.clock)
+        self._unix_offset = unix_offset if traffic.clock == "unix" else None
+        self._known_ns = 0
+        if traffic.clock == "estimated":
+            self.clock = SenderClock()
+            self.jumps: JumpFilter | KnownClockFilter = JumpFilter(self.clock)
+        else:
+            known = SAME_CLOCK if self._unix_offset is None else self._unix_offset()
+            self.clock = SenderClock(known, traffic.clock)
+            self.jumps = KnownClockFilter(self._notices, self.clock)
         self.latency_ms = RunningStatistics()
         self._link = link
         self._timeline = timeline
@@ -207,6 +243,10 @@ class Receiver:
         """Hand in the newest status; it leaves when it is due."""
         self._back.post(status)
 
+    def pass_on(self, answer: AnswerPacket) -> None:
+        """Hand in an answer of the tracker, for the sender."""
+        self._back.pass_on(answer)
+
     def sender_ns(self, continuous_ns: int) -> int:
         """A time of the timeline on the sender's own clock."""
         return continuous_ns - self.jumps.correction_ns
@@ -238,6 +278,10 @@ class Receiver:
         """Take what the link brings within POLL_MS. The thread calls this in a loop."""
         waits = self._link.wait_for_message(0)
         now_ns = self._now_ns()
+        if self._unix_offset is not None and now_ns - self._known_ns >= KNOWN_AGAIN_NS:
+            self._known_ns, known = now_ns, self._unix_offset()
+            self.clock.know(known)
+            self._doubt(known)
         if not waits:
             self._empty_ns = now_ns
         begun_ns = self._begun_ns
@@ -255,6 +299,13 @@ class Receiver:
         self._settle(self.jumps.expire(now_ns))
         if self._link.two_way:
             self._back.talk(now_ns, ask=self._learn_from_ns is not None)
+
+    def _doubt(self, known: UnixOffset) -> None:
+        """Say while nothing keeps this machine's clock of Unix time."""
+        if known.error_ns < UNDISCIPLINED_NS:
+            self._notices.end(UNDISCIPLINED, "clock-disciplined", "this machine's clock of Unix time is kept again")
+        else:
+            self._notices.begin(UNDISCIPLINED, UNDISCIPLINED_LINE)
 
     def _take(self, arrival: Arrival[Event], waited_ns: int) -> None:
         match arrival.event:

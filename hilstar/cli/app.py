@@ -24,6 +24,7 @@ from hilstar.cli.convert import convert
 from hilstar.cli.demo import demo
 from hilstar.cli.doctor import doctor
 from hilstar.cli.first_light import first_light
+from hilstar.cli.fmu import fmu
 from hilstar.cli.frame import frame
 from hilstar.cli.keys import keys
 from hilstar.cli.latency import latency
@@ -42,7 +43,7 @@ from hilstar.version import __version__
 
 COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
-    "Attitude streams": (send, attitude, convert, answers, keys),
+    "Attitude streams": (send, attitude, convert, answers, fmu, keys),
     "Check what is shown": (simulate, verify, compare, budget, catalogue, report),
     "Test the tracker": (assess, campaign, tracker),
     "Calibrate": (first_light, latency),

@@ -91,10 +91,11 @@ READING_FORM = "write --reading HIP,DN: a star's Hipparcos number, and the sum o
 MIN_SPLIT_BYTES, MIN_SPLIT_S = 1e6, 10.0
 MAX_SIZE_PX = 32768
 MAX_AT_S = 1e10
-ADDRESS = re.compile(r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]")  # after --console
+# What may follow --console and --scpi.
+ADDRESS = re.compile(r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]")
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
 USUAL_SHARE = "5%"
-USUAL_ADDRESS = "127.0.0.1:8765"
+USUAL_ADDRESSES = {"--console": "127.0.0.1:8765", "--scpi": "127.0.0.1:5025"}
 
 
 def check_files(
@@ -127,8 +128,8 @@ def with_values(words: list[str]) -> list[str]:
         complete.append(word)
         if word in SHARE_OPTIONS and not re.match(r"[\d.]+%?$", following):
             complete.append(USUAL_SHARE)
-        if word == "--console" and not ADDRESS.fullmatch(following):
-            complete.append(USUAL_ADDRESS)
+        if word in USUAL_ADDRESSES and not ADDRESS.fullmatch(following):
+            complete.append(USUAL_ADDRESSES[word])
     return complete
 
 

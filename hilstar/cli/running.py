@@ -62,6 +62,15 @@ Console = Annotated[
         show_default=False,
     ),
 ]
+Scpi = Annotated[
+    str | None,
+    typer.Option(
+        "--scpi",
+        metavar="[HOST:PORT]",
+        help="Answer a test stand's SCPI there, by default on 127.0.0.1:5025; port 0 is any free one.",
+        show_default=False,
+    ),
+]
 Control = Annotated[bool, typer.Option("--control", help="Let the page act: without it, it only shows.")]
 Token = Annotated[
     str | None,
@@ -278,6 +287,25 @@ def page_listener(
 
 
 @contextmanager
+def scpi_listener(
+    file: BenchFile, scpi: str | None, page: PageListener | None, token: str | None
+) -> Iterator[PageListener | None]:
+    """SCPI's listening socket, with the page's token if that has one; None without --scpi. Raises InputError."""
+    from hilstar.console.listener import PageListener, parse_address
+
+    if scpi is None:
+        if file.config.attitude.source == "scpi":
+            raise InputError(f'{file.path}: [attitude] source = "scpi" needs SCPI; add --scpi, or name another source')
+        yield None
+        return
+    token = token if page is None else page.token or None
+    with PageListener(parse_address(scpi, "--scpi"), token, option="--scpi") as listener:
+        secret = f', SYST:AUTH "{listener.token}" first' if listener.made else ", SYST:AUTH first" if listener.token else ""
+        say(f"SCPI is at {listener.host}:{listener.port}{secret}")
+        yield listener
+
+
+@contextmanager
 def followed(
     listener: PageListener | None,
     control: bool,
@@ -286,18 +314,20 @@ def followed(
     status: RunStatus,
     record: FrameSink | None = None,
     frames: FrameFeed | None = None,
+    scpi: PageListener | None = None,
 ) -> Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]:
-    """Connect a run to the terminal, `record`, systemd, `frames` and the page: its sink, its follower, the page's requests."""
+    """Connect a run to the terminal, `record`, systemd, `frames`, page and SCPI: its sink, its follower, their requests."""
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
     if frames is not None:
         sinks.append(frames.see)
     with Service(status.begun, status.alive, status.line):
-        if listener is None:
+        if listener is None and scpi is None:
             yield _all_of(sinks), status.follow, None
             return
+        from hilstar.console.page_process import Listeners
         from hilstar.console.publisher import opened_page
 
-        with opened_page(listener, control, description, parts) as (feed, requests):
+        with opened_page(Listeners(listener, scpi), control, description, parts) as (feed, requests):
 
             def follow(running: Running) -> None:
                 status.follow(running)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from hilstar.attitude.wire.zmq_links import ZmqReceiver
     from hilstar.bench.bench_file import BenchFile as ReadFile
     from hilstar.bench.frame import Bench
+    from hilstar.console.publisher import RunDescription
     from hilstar.run.heads import HeadsRun
     from hilstar.run.open_link import AnyLink
 
@@ -119,6 +120,7 @@ def serve(
     control: running.Control = False,
     token: running.Token = None,
     console_name: running.ConsoleName = None,
+    scpi: running.Scpi = None,
     explain: Explain = False,
     as_json: Json = False,
     head_of: HeadOf = None,
@@ -132,6 +134,8 @@ def serve(
     if isinstance(file, HeadsFile):
         from hilstar.run.heads import HeadsRun
 
+        if scpi is not None:
+            raise InputError(f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench file of a head")
         valued = {"--frames": count, "--ledger-split": ledger_split, "--scenario": scenario}
         switches = {"--headless": headless, "--windowed": windowed, "--force": force, "--control": control}
         switches |= {"--overwrite": overwrite, "--explain": explain}
@@ -142,7 +146,7 @@ def serve(
         return
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.cameras import fields_of_view
-    from hilstar.console.publisher import PageParts, RunDescription
+    from hilstar.console.publisher import PageParts
     from hilstar.run.loop import Limit
     from hilstar.run.record.ledger import Ledger
     from hilstar.run.serve import Outlet
@@ -157,6 +161,7 @@ def serve(
     notices = Notices()
     with (
         running.page_listener(console, control, token, console_name) as listener,
+        running.scpi_listener(file, scpi, listener, token) as instrument,
         _source(file, fed_by, notices) as link,
         running.optional_pulse(file, notices) as pulse,
         # In lockstep the simulation waits for each frame: no frame is late, and a run's codes are those of any other machine.
@@ -176,21 +181,23 @@ def serve(
         running.say_units(fields)
         running.say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
-        source, told = file.config.attitude, RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest)
+        told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest)
         status = RunStatus(told, kept)
-        page = RunDescription("serve", source.source, link.endpoint, "asked" if source.lockstep else "clock")
-        schedule = getattr(wrong, "schedule", None)
         parts = PageParts(
-            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule, answers
+            bench,
+            notices,
+            kept,
+            lambda path: Ledger(path, bench, notices, split=split),
+            screen,
+            getattr(wrong, "schedule", None),
+            answers,
         )
         with (
             on_terminal(status),
-            running.followed(listener, control, page, parts, status, frames=watched) as (sink, follower, requests),
+            running.followed(listener, control, _described(file, link), parts, status, frames=watched, scpi=instrument) as fed,
         ):
-            outlet = Outlet(
-                screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse, answers
-            )
-            summary = serve_stream(bench, link, limit, sink, outlet)
+            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), *fed[1:], wrong, pulse, answers)
+            summary = serve_stream(bench, link, limit, fed[0], outlet)
     running.end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, notices, as_json)
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets))
@@ -210,6 +217,15 @@ def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str 
     if endpoints and heads:
         raise InputError(f"--frames {endpoints[0]}: one endpoint for several heads; serve one head's file, or leave it out")
     return int(counts[0]) if counts else None, endpoints[0] if endpoints else None
+
+
+def _described(file: ReadFile, link: AnyLink) -> RunDescription:
+    """The run as its page says it; where SCPI steers, with the port of the link to which it sends."""
+    from hilstar.console.publisher import RunDescription
+
+    source = file.config.attitude
+    steer_port = int(link.endpoint.rpartition(":")[2]) if source.source == "scpi" else 0
+    return RunDescription("serve", source.source, link.endpoint, "asked" if source.lockstep else "clock", steer_port)
 
 
 def _source(file: ReadFile, fed_by: str | None, notices: Notices) -> AnyLink:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from hilstar.errors import InputError, shortened
 from hilstar.process.closing import Closing
 
-HOST, PORT = "127.0.0.1", 8765
+HOST, PORT, SCPI_PORT = "127.0.0.1", 8765, 5025
 MAX_PORT = 2**16 - 1
+PORTS = {"--console": PORT, "--scpi": SCPI_PORT}
 FORM = "write HOST:PORT, such as 127.0.0.1:8765, or 0.0.0.0:8765 to be reached from elsewhere"
 BACKLOG = 512
 TOKEN_BYTES = 32
@@ -38,9 +39,9 @@ class ListenAddress:
         return False
 
 
-def parse_address(text: str) -> ListenAddress:
-    """ "HOST:PORT", "HOST", ":PORT" or "PORT". Raises InputError."""
-    wrong = InputError(f"--console {shortened(text)}: {FORM}")
+def parse_address(text: str, option: str = "--console") -> ListenAddress:
+    """ "HOST:PORT", "HOST", ":PORT" or "PORT" of --console or --scpi. Raises InputError."""
+    wrong = InputError(f"{option} {shortened(text)}: {_form(option)}")
     if text.isdecimal() and text.isascii():
         host, port = HOST, text
     elif text.startswith("["):
@@ -60,17 +61,23 @@ def parse_address(text: str) -> ListenAddress:
             ipaddress.ip_address(host)
         except ValueError:
             raise wrong from None
-    return ListenAddress(host, int(port) if port else PORT)
+    return ListenAddress(host, int(port) if port else PORTS[option])
+
+
+def _form(option: str) -> str:
+    return FORM.replace(str(PORT), str(PORTS[option]))
 
 
 class PageListener(Closing):
     """The page's listening socket, its names and its token. Raises InputError where the address cannot be used.
 
     Where the page can be reached from other machines and no token is given, one is made (`made`). `names` has further names
-    of the page, under which a proxy shows it.
+    of the page, under which a proxy shows it. SCPI listens by the same rules.
     """
 
-    def __init__(self, address: ListenAddress, token: str | None = None, names: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, address: ListenAddress, token: str | None = None, names: tuple[str, ...] = (), option: str = "--console"
+    ) -> None:
         if token is not None and TOKEN.fullmatch(token) is None:
             raise InputError("--token: write 16 to 200 letters, digits or . _ ~ -, as `openssl rand -hex 32` makes them")
         for name in names:
@@ -81,7 +88,7 @@ class PageListener(Closing):
         self.token = secrets.token_urlsafe(TOKEN_BYTES) if self.made else token or ""
         self.any_address = not address.is_loopback
         self.host = address.host
-        self.socket = _listen(address)
+        self.socket = _listen(address, option)
         self.port: int = self.socket.getsockname()[1]
 
     @property
@@ -115,12 +122,12 @@ def _bracketed(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _listen(address: ListenAddress) -> socket.socket:
+def _listen(address: ListenAddress, option: str) -> socket.socket:
     where = f"{_bracketed(address.host)}:{address.port}"
     try:
         found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError) as error:
-        raise InputError(f"--console {where}: no such host ({getattr(error, 'strerror', error)}); {FORM}") from error
+        raise InputError(f"{option} {where}: no such host ({getattr(error, 'strerror', error)}); {_form(option)}") from error
     family, kind, protocol, _, place = found[0]
     listener = socket.socket(family, kind, protocol)
     try:
@@ -130,6 +137,6 @@ def _listen(address: ListenAddress) -> socket.socket:
     except OSError as error:
         listener.close()
         reason = str(error.strerror or error)
-        raise InputError(f"--console {where}: cannot listen there ({reason}); choose another port, or 0 for any") from error
+        raise InputError(f"{option} {where}: cannot listen there ({reason}); choose another port, or 0 for any") from error
     listener.setblocking(False)
     return listener

@@ -136,6 +136,15 @@ class OrderAnswer(msgspec.Struct, kw_only=True):
 Pace = Literal["clock", "asked", "session"]
 
 
+class ScpiSetup(msgspec.Struct, frozen=True):
+    """SCPI's token ("" for none), the run's source of attitudes, and the UDP port where SCPI steers the sky (0: it may not)."""
+
+    token: str
+    source: str
+    steer_port: int = 0
+    max_rate_deg_s: float = 0.0
+
+
 class Setup(msgspec.Struct, kw_only=True):
     """What the page's process is given at its start; `hello` is the first message to every page.
 
@@ -153,6 +162,7 @@ class Setup(msgspec.Struct, kw_only=True):
     picture_bytes: int
     pace: Pace
     scene: bytes = b""  # a pickled `overlay.OverlayScene`
+    scpi: ScpiSetup | None = None
 
 
 _HEAD = struct.Struct("<Q")

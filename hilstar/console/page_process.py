@@ -1,4 +1,4 @@
-"""Keeps the page's process alive beside a run: starts and restarts it, publishes the run's state, and takes its orders.
+"""Keeps the process of the page and of SCPI alive beside a run: starts it again, publishes the run's state, takes its orders.
 
 One thread does this ten times a second; the frame loop takes no part in it.
 """
@@ -17,10 +17,11 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import msgspec
 
+from hilstar.console.listener import PageListener
 from hilstar.console.messages import Order, OrderAnswer, RunEvent, RunState, Setup, SharedMemory
 from hilstar.errors import one_line
 from hilstar.notices import Listener, Notice
@@ -33,6 +34,13 @@ MAX_ORDERS = 8  # at once
 MAX_ORDER_BYTES = 8_000
 OF_THE_RUN = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "HILSTAR_TOKEN"}
 PAGE = (sys.executable, "-P", "-m", "hilstar.console.server")
+
+
+class Listeners(NamedTuple):
+    """Where the page is served, and where SCPI is; None where it is not."""
+
+    page: PageListener | None
+    scpi: PageListener | None = None
 
 
 Do = Callable[[Order], OrderAnswer]  # on a thread of its own
@@ -63,8 +71,9 @@ class _Page:
 class PageProcess:
     """The page of a run while this is open."""
 
-    def __init__(self, setup: Setup, memory: SharedMemory, listener: socket.socket, watched: PageSubject, do: Do) -> None:
-        self._memory, self._listener, self._watched, self._do = memory, listener, watched, do
+    def __init__(self, setup: Setup, memory: SharedMemory, listeners: Listeners, watched: PageSubject, do: Do) -> None:
+        self._memory, self._watched, self._do = memory, watched, do
+        self._listener_fds = [-1 if each is None else each.socket.fileno() for each in listeners]
         self._setup_fd = os.memfd_create("hilstar-console-setup")
         with os.fdopen(os.dup(self._setup_fd), "wb") as file:
             file.write(msgspec.msgpack.encode(setup))
@@ -133,11 +142,11 @@ class PageProcess:
     def _start_page(self, now_s: float) -> None:
         channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         environment = {name: value for name, value in os.environ.items() if name not in OF_THE_RUN}
-        given = (self._setup_fd, self._memory.fd, its_end.fileno(), self._listener.fileno())
+        given = (self._setup_fd, self._memory.fd, its_end.fileno(), *self._listener_fds)
         try:
             process = subprocess.Popen(
                 [*PAGE, *map(str, given)],
-                pass_fds=given,
+                pass_fds=[fd for fd in given if fd >= 0],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 env=environment | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)},

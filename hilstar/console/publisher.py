@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from hilstar.attitude.clock.rate_check import WRONG
+from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 from hilstar.bench.frame import Bench
 from hilstar.console.listener import PageListener
 from hilstar.console.messages import (
@@ -33,11 +34,12 @@ from hilstar.console.messages import (
     Pace,
     PictureHead,
     RunState,
+    ScpiSetup,
     Setup,
     SharedMemory,
 )
 from hilstar.console.overlay import OverlayScene, overlay_of
-from hilstar.console.page_process import PageProcess
+from hilstar.console.page_process import Listeners, PageProcess
 from hilstar.console.protocol import (
     SWITCHES,
     AttitudeSource,
@@ -259,7 +261,7 @@ def _clock(running: Running) -> ShownClock | None:
         offset_ms=clock.offset_ms,
         sigma_ms=clock.uncertainty_ms,
         drift_ppm=clock.drift_ppm,
-        synchronised=clock.mode in {"exchange", "shared"},
+        synchronised=clock.mode in KNOWN_MODES,
         mode=clock.mode,
     )
 
@@ -367,17 +369,18 @@ class OrderHandler:
 
 @dataclass(frozen=True, slots=True)
 class RunDescription:
-    """What the page says of a run: the command, the source of attitudes, and the pace of frames."""
+    """What the page says of a run: command, source of attitudes, pace of frames; and the UDP port by which SCPI steers it."""
 
     command: str
     kind: str
     endpoint: str
     pace: Pace = "clock"
+    steer_port: int = 0
 
 
-def setup_for(listener: PageListener, control: bool, description: RunDescription, file: BenchFile, picture_bytes: int) -> Setup:
-    """The setup of a page for a bench file; a run adds to `hello`."""
-    monitor = file.config.monitor
+def setup_for(listeners: Listeners, control: bool, description: RunDescription, file: BenchFile, picture_bytes: int) -> Setup:
+    """The setup of a page and of SCPI for a bench file; a run adds to `hello`."""
+    monitor, page, scpi = file.config.monitor, listeners.page, listeners.scpi
     hello = Hello(
         version=__version__,
         command=f"hilstar {description.command}",
@@ -392,13 +395,16 @@ def setup_for(listener: PageListener, control: bool, description: RunDescription
     return Setup(
         hello=hello,
         source=AttitudeSource(description.kind, printable(description.endpoint)),
-        hosts=listener.hosts,
-        names=[name.lower() for name in listener.names],
-        any_address=listener.any_address,
-        port=listener.port,
-        token=listener.token,
+        hosts=[] if page is None else page.hosts,
+        names=[] if page is None else [name.lower() for name in page.names],
+        any_address=page is not None and page.any_address,
+        port=0 if page is None else page.port,
+        token="" if page is None else page.token,
         picture_bytes=picture_bytes,
         pace=description.pace,
+        scpi=None
+        if scpi is None
+        else ScpiSetup(scpi.token, description.kind, description.steer_port, file.config.attitude.max_rate_deg_s),
     )
 
 
@@ -423,20 +429,21 @@ def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
 
 @contextmanager
 def opened_page(
-    listener: PageListener, control: bool, description: RunDescription, parts: PageParts
+    listeners: Listeners, control: bool, description: RunDescription, parts: PageParts
 ) -> Iterator[tuple[FramePublisher, SwitchRequests]]:
-    """The page of a run while this is open: the publisher of its frames, and the queue of its requests."""
+    """The page and the SCPI of a run while this is open: the publisher of its frames, and the queue of its requests."""
     width, height = parts.bench.config.monitor.resolution_px
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
     memory = SharedMemory.make(picture_bytes)
     feed, requests = FramePublisher(memory), SwitchRequests()
     bench, orders = parts.bench, OrderHandler(requests, feed, parts)
-    setup = setup_for(listener, control, description, bench.file, picture_bytes)
+    setup = setup_for(listeners, control, description, bench.file, picture_bytes)
     setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
     setup.hello.answers = parts.answers is not None
     setup.hello.faults = [] if parts.faults is None else parts.faults.names()
-    setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
-    with PageProcess(setup, memory, listener.socket, WatchedRun(feed, parts), orders.do):
+    if listeners.page is not None:
+        setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
+    with PageProcess(setup, memory, listeners, WatchedRun(feed, parts), orders.do):
         yield feed, requests
 
 
@@ -506,7 +513,8 @@ def session_page(listener: PageListener, control: bool, file: BenchFile) -> Iter
     picture_bytes = width * height * CODE_BYTES
     memory = SharedMemory.make(picture_bytes)
     feed = SessionPublisher(memory)
-    setup = setup_for(listener, control, RunDescription("first-light", "session", "", "session"), file, picture_bytes)
+    listeners = Listeners(listener)
+    setup = setup_for(listeners, control, RunDescription("first-light", "session", "", "session"), file, picture_bytes)
     setup.hello.session = True
-    with PageProcess(setup, memory, listener.socket, feed, feed.do):
+    with PageProcess(setup, memory, listeners, feed, feed.do):
         yield feed

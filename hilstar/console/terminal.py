@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import msgspec
 import typer
 
+from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 from hilstar.errors import one_line
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def report(summary: RunSummary, as_json: bool) -> None:
         "packets": f"{packets.received} received, {packets.refused} refused{turned_away}",
     }
     if summary.clock:
-        absolute = "" if summary.clock.mode in {"exchange", "shared"} else " above the minimum"
+        absolute = "" if summary.clock.mode in KNOWN_MODES else " above the minimum"
         if summary.receive_latency_ms:
             lines["receive latency"] = f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"
         lines["sender's clock"] = clock_line(summary.clock)
@@ -113,6 +114,8 @@ def clock_line(clock: ClockSummary) -> str:
         return "no attitude has arrived"
     if clock.mode == "shared":
         return "shared with the sender"
+    if clock.mode == "unix":
+        return f"Unix time, kept to {clock.uncertainty_ms or 0.0:.3f} ms by this machine's kernel, and the sender's own error"
     if clock.uncertainty_ms is None:
         return f"{CLOCK_WORDS[clock.mode]}: heard too briefly to state an uncertainty"
     known = f"drift {clock.drift_ppm:.1f} ppm, uncertainty {clock.uncertainty_ms:.3f} ms"

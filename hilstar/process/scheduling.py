@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 FIFO_PRIORITY = 10
 # How long another thread may keep Python's lock from the frame loop; 5 ms by default, a third of a frame.
@@ -44,7 +45,29 @@ MAX_WAIT_S = 3600.0  # the platform's own limit is some centuries; a longer wait
 COARSE_NS = 700_000
 NS_PER_S = 1_000_000_000
 
+CLOCK_TRIES, NEAR_NS = 3, 20_000
+UNDISCIPLINED_NS = 16 * NS_PER_S  # NTP_PHASE_LIMIT of linux/timex.h: what the kernel states where nothing disciplines its clock
+
 Clock = Callable[[], float]
+
+
+class Timex(ctypes.Structure):
+    """The first fields of adjtimex(2)'s structure, and room for the others; times in us."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("others", ctypes.c_byte * 256),
+    )
+
+
+class UnixOffset(NamedTuple):
+    """CLOCK_MONOTONIC minus CLOCK_REALTIME, ns, and the largest error of CLOCK_REALTIME that the kernel states, ns."""
+
+    offset_ns: int
+    error_ns: int
 
 
 class HostClock:
@@ -61,6 +84,24 @@ class HostClock:
     def realtime_ns(self) -> int:
         """The time that the machine's calendar shows, ns since 1970; somebody may set it."""
         return time.time_ns()
+
+    def monotonic_minus_realtime_ns(self) -> int:
+        """The offset between the two clocks of this machine, both read within a few microseconds where that succeeds."""
+        best_ns, offset_ns = None, 0
+        for _ in range(CLOCK_TRIES):
+            before_ns, realtime_ns, after_ns = self.now_ns(), self.realtime_ns(), self.now_ns()
+            took_ns = after_ns - before_ns
+            if best_ns is None or took_ns < best_ns:
+                best_ns, offset_ns = took_ns, (before_ns + after_ns) // 2 - realtime_ns
+            if took_ns < NEAR_NS:
+                break
+        return offset_ns
+
+    def unix_offset(self) -> UnixOffset:
+        """The offset to Unix time, and how wrong that may be: what NTP or PTP told the kernel (adjtimex, `maxerror`)."""
+        told = Timex()  # modes = 0: nothing is set
+        answered = ctypes.CDLL(None).adjtimex(ctypes.byref(told)) >= 0
+        return UnixOffset(self.monotonic_minus_realtime_ns(), told.maxerror * 1000 if answered else UNDISCIPLINED_NS)
 
     def sleep(self, seconds: float) -> None:
         """Do nothing for a while; nothing for 0 or less."""

@@ -247,7 +247,7 @@ def _head(asked: HeadsRun, k: int, endpoint: str, folder: Path, say: Say) -> Hea
 
 def _hand_on(link: StreamLink, feed: Feed, processes: list[HeadProcess], stop: threading.Event) -> None:
     """Give what arrives to the heads, and tend them, until all have ended or a signal comes."""
-    back = BackChannel(link, Traffic(0, time_requests=False, shared_clock=False))
+    back = BackChannel(link, Traffic())
     tended_ns = 0
     while not stop.is_set():
         for arrival in link.receive(POLL_MS):

@@ -50,6 +50,7 @@ class LiveAnswers:
         self.figures = TrackerFigures()
         self.newest: Judged | None = None
         self.heard: Callable[[LiveAnswers], None] = lambda answers: None  # called with new figures of a new answer
+        self.passed_on: Callable[[Answer, int], None] = lambda answer, middle_ns: None  # called with each, as it is judged
         self._source, self._notices, self._ledger, self._clock = source, notices, ledger, clock
         self._light_ns = 0 if screen is None else screen.swap_to_light_ns
         self._on_screen = screen is not None
@@ -116,6 +117,7 @@ class LiveAnswers:
 
     def _take(self, answer: Answer) -> None:
         judged = self.newest = self._judge.judge(answer)
+        self.passed_on(answer, judged.middle_ns)
         if judged.verdict == "wrong":
             self._notices.tell(WRONG, wrong_line(judged))
         if self._ledger.on:

@@ -41,7 +41,7 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None,
     settings = config.attitude
     if settings.source == "serial":
         return (SerialApart if apart else SerialLink)(str(settings.port), settings.baud, notices)
-    if settings.source == "udp":
+    if settings.source in {"udp", "scpi"}:
         return UdpLink(*udp_road(settings), notices)
     if settings.source == "vizard":
         return _open_vizard(config, notices, apart=apart)

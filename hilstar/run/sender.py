@@ -13,6 +13,7 @@ from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival, LinkCounts
 from hilstar.attitude.wire.packet import (
     DELIMITER,
+    AnswerPacket,
     Event,
     Packet,
     Refusal,
@@ -51,9 +52,10 @@ def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, cl
 
 
 class TwoWay(Closing):
-    """An end that also listens: a thread answers time requests by the clock, and keeps the newest status."""
+    """An end that also listens: a thread answers time requests by the clock, keeps the newest status and answer."""
 
     status: Status | None = None
+    answer: AnswerPacket | None = None
     statuses = requests = 0  # that came; every request is answered
 
     def _listen_to(self, receive: Callable[[int], list[Arrival[Event]]], send: Callable[[Packet], None], clock: Clock) -> None:
@@ -73,6 +75,8 @@ class TwoWay(Closing):
                         self._answered.set()
                     case Status() as status:
                         self.status, self.statuses = status, self.statuses + 1
+                    case AnswerPacket() as answer:
+                        self.answer = answer
 
     def _stop_listening(self) -> None:
         self._stop.set()
@@ -181,6 +185,11 @@ class Sender(Closing):
     def status(self) -> Status | None:
         """The newest status of hilstar; None before the first, and over ZeroMQ, which has no way back."""
         return self._end.status
+
+    @property
+    def answer(self) -> AnswerPacket | None:
+        """The tracker's newest valid answer, `t_ns` on this end's clock; None as `status` is, and without `[answers]`."""
+        return self._end.answer
 
     def wait(self, timeout_s: float = 30.0) -> bool:
         """True once hilstar listens: a subscriber (ZeroMQ), an answer (UDP), or at once where the road cannot tell (serial)."""

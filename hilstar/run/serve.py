@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
+from hilstar.answers.answer import Answer
 from hilstar.attitude.clock.rate_check import RateCheck
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, Traffic
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.links import LockstepLink, Pictures, StreamLink, TrackerCamera
-from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, Status, rate_refusal
+from hilstar.attitude.wire.packet import AnswerPacket, AttitudeSample, Event, Refusal, Status, rate_refusal
 from hilstar.attitude.wire.source import Mounting
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
@@ -125,11 +128,13 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
 def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
     settings, clock = bench.config.attitude, loop.pacer.clock
     timeline = Timeline(policy_of(settings))
-    shared = settings.clock == "shared"
-    traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
+    kept = "shared" if settings.source == "scpi" else settings.clock
+    traffic = Traffic(settings.status_hz, settings.time_requests and kept == "estimated", kept)
     receiver = Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, wrong_rates=settings.check_rates)
     outlet.follower(Running(loop, receiver.counts, receiver.clock_summary, outlet.answers))
     statuses = StatusMaker(outlet.ledger)
+    if outlet.answers is not None and link.two_way:
+        outlet.answers.passed_on = partial(_pass_on, receiver, itertools.count(1))
 
     def draw_blank(moment: Moment) -> None:
         receiver.tend()
@@ -165,6 +170,17 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
         clock=receiver.clock_summary(),
         reconnects=link.reconnects,
     )
+
+
+def _pass_on(receiver: Receiver, numbers: Iterator[int], answer: Answer, middle_ns: int) -> None:
+    """Pass a valid answer of the tracker on to the sender, stamped on the sender's clock, once that is known."""
+    offset_ms = receiver.clock_summary().offset_ms
+    if answer.q_icrs_to_cam is None or not answer.valid or offset_ms is None:
+        return
+    t_ns, rate = middle_ns - round(offset_ms * NS_PER_MS), answer.rate_cam_rad_s
+    flags = protocol.ANSWER_VALID | (0 if rate is None else protocol.ANSWER_RATE_VALID)
+    q, rates = tuple(answer.q_icrs_to_cam.tolist()), (0.0, 0.0, 0.0) if rate is None else tuple(rate.tolist())
+    receiver.pass_on(AnswerPacket(next(numbers), flags, t_ns, q, rates, answer.star_count or 0))
 
 
 class LockstepRun:

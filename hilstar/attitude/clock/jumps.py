@@ -8,7 +8,7 @@ Laws:
 3. A message that waited unread may be late by as long as it waited, and teaches nothing.
 4. Until the clock is settled, a message that arrives early shows that those before it were late.
 
-A sender on this machine that stamps with hilstar's own clock needs none of this (`SharedClockFilter`).
+A sender that stamps with hilstar's own clock, or with Unix time, needs none of this (`KnownClockFilter`).
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ MIN_FUTURE_NS = 5 * NS_PER_MS
 PERSISTENT_NS = NS_PER_S  # a queue may be older for a moment
 MIN_OFF = 3
 UNSHARED = "clock-not-shared"
+CLOCK_NAMES = {"shared": "CLOCK_MONOTONIC", "unix": "CLOCK_REALTIME (Unix time)"}
 
 
 class _TimeSteps:
@@ -264,22 +265,23 @@ def _too_early(each: _Doubtful) -> SampleArrival:
     return replace(each.arrival, refusal=Refusal("time", detail))
 
 
-class SharedClockFilter:
-    """Takes the place of a `JumpFilter`: refuses times far ahead, and says once where the clock is not the host's."""
+class KnownClockFilter:
+    """Takes the place of a `JumpFilter`: refuses times far ahead, and says once where the clock is another one."""
 
     correction_ns = 0
     jumps = 0
     slowness = 0.0
 
-    def __init__(self, notices: Notices) -> None:
-        self._notices = notices
+    def __init__(self, notices: Notices, clock: SenderClock) -> None:
+        self._notices, self._clock = notices, clock
         self._off_since_ns: int | None = None
         self._off = 0
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
-        """The sample itself, refused where its time is more than MAX_OFF_NS ahead of this machine's."""
+        """The sample itself, refused where its time is more than MAX_OFF_NS ahead of the clock's."""
         t_ns, host_ns = arrival.event.t_ns, arrival.host_ns
-        late_ns = host_ns - t_ns
+        mode = self._clock.mode
+        late_ns = round(self._clock.latency_ns(t_ns, host_ns) or 0.0)
         if -MIN_FUTURE_NS <= late_ns <= MAX_OFF_NS:
             self._off_since_ns, self._off = None, 0
             return [arrival]
@@ -289,7 +291,7 @@ class SharedClockFilter:
             where = f"{late_ns / NS_PER_S:.3f} s behind" if late_ns > 0 else f"{-late_ns / NS_PER_S:.3f} s ahead of"
             self._notices.begin(
                 UNSHARED,
-                f'[attitude] clock = "shared", but t_ns is {where} CLOCK_MONOTONIC of this machine:'
+                f'[attitude] clock = "{mode}", but t_ns is {where} {CLOCK_NAMES[mode]} of this machine:'
                 ' stamp with that clock, or write clock = "estimated"',
             )
         if late_ns >= -MAX_OFF_NS:

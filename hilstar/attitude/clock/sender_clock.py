@@ -6,6 +6,8 @@ An offset is host time minus sender time, ns, as a line over host time. Three mo
   Skelly and Towsley 1999). It is too large by the minimum transport delay, which a one-way stream cannot measure. A message
   that waited unread gives only an upper bound, which counts until one arrives that did not wait.
 - "shared": the sender stamps with this machine's own clock; nothing is estimated.
+- "unix": the sender stamps with Unix time, which NTP or PTP keeps on both machines; the offset is that of this machine's own
+  clock of Unix time, its uncertainty what the kernel states of that. The error of the sender's clock comes on top.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.process.scheduling import UnixOffset
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 WINDOW_NS = 30 * NS_PER_S
@@ -40,7 +43,8 @@ SETTLING_NS = 2 * NS_PER_S
 # that it contains the truth there; the delay of a longer link is not.
 LOCAL_DELAY_NS = 100_000
 
-ClockMode = Literal["none", "one-way", "exchange", "shared"]
+ClockMode = Literal["none", "one-way", "exchange", "shared", "unix"]
+KNOWN_MODES = frozenset[ClockMode]({"exchange", "shared", "unix"})  # their latencies are absolute
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,34 +267,43 @@ class ClockSummary:
 
 
 class SenderClock:
-    """The sender's time at any host time. One thread may observe while another asks. A `shared` one is the host's own."""
+    """The sender's time at any host time. One thread may observe while another asks.
 
-    def __init__(self, *, shared: bool = False) -> None:
+    `known` is the offset of a clock that is not estimated: of the host's own one ("shared"), or of Unix time.
+    """
+
+    def __init__(self, known: UnixOffset | None = None, mode: ClockMode = "none") -> None:
         self._one_way = OneWayFilter()
         self._exchanges = _ExchangeFilter()
-        self._shared = shared
-        self._base_ns: int | None = 0 if shared else None  # the first offset: the rest fits a float64 to below 1 ns
-        self._line = _OffsetLine(0, 0.0, uncertainty_ns=0.0) if shared else None  # one attribute: read whole by other threads
-        self._mode: ClockMode = "shared" if shared else "none"
+        self._known = known is not None
+        self._base_ns: int | None = None  # the first offset: the rest fits a float64 to below 1 ns
+        self._line: _OffsetLine | None = None  # one attribute: read whole by other threads
+        self._mode: ClockMode = mode
+        if known is not None:
+            self.know(known)
         self._first_ns: int | None = None
         self._used: tuple[int, float] | None = None  # host time and offset of the last frame
 
+    def know(self, known: UnixOffset) -> None:
+        """Take the offset of a clock that is not estimated: a step of it is one of the next frame."""
+        self._line = _OffsetLine(0, known.offset_ns - self._base(known.offset_ns), uncertainty_ns=known.error_ns)
+
     def observe(self, t_ns: int, host_ns: int) -> None:
         """Take one message: its time on the sender's clock and its arrival."""
-        if not self._shared:
+        if not self._known:
             self._first_ns = host_ns if self._first_ns is None else self._first_ns
             self._one_way.observe(host_ns, host_ns - t_ns - self._base(host_ns - t_ns))
             self._choose(host_ns)
 
     def guess(self, t_ns: int, host_ns: int) -> None:
         """Take one message that waited unread: better than nothing, until one arrives that did not."""
-        if not self._shared:
+        if not self._known:
             self._one_way.guess(host_ns, host_ns - t_ns - self._base(host_ns - t_ns))
             self._choose(host_ns)
 
     def exchange(self, exchange: Exchange) -> None:
         """Take one exchange; an impossible one is ignored."""
-        if not exchange.possible or self._shared:
+        if not exchange.possible or self._known:
             return
         self._first_ns = exchange.t4_ns if self._first_ns is None else self._first_ns
         self._exchanges.observe(exchange, self._base(exchange.t1_ns - exchange.t2_ns))
@@ -339,6 +352,11 @@ class SenderClock:
         """A message's delay above the line of the arrivals alone; 0 before any message."""
         line, base_ns = self._one_way.line, self._base_ns
         return 0.0 if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
+
+    @property
+    def mode(self) -> ClockMode:
+        """Where the offset comes from."""
+        return self._mode
 
     @property
     def unheard(self) -> bool:

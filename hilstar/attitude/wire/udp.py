@@ -3,7 +3,7 @@
 Laws:
 1. A datagram from an address that is not allowed is counted and never answered; the kernel drops a flood of them, by a socket
    filter (classic BPF; Linux, Documentation/networking/filter.rst), before it costs buffer space or a read.
-2. To an address go at most as many bytes of time requests and replies as came from it; statuses besides, at their own rate.
+2. To an address go at most as many bytes of time requests, replies and answers as came from it; statuses besides, at a rate.
 3. A flood costs the reading of MAX_TAKEN datagrams every PAUSE_S, and the decoding of what `FloodGate` admits.
 
 The kernel stamps the arrival (SO_TIMESTAMPNS), however late a datagram is read; `KernelStamps` does the same for TCP.
@@ -41,8 +41,6 @@ MAX_INSTRUCTIONS = 4096
 SO_TIMESTAMPNS = 35  # Linux's number (asm-generic/socket.h); the stamp is a timespec of CLOCK_REALTIME
 TIMESPEC = struct.Struct("@ll")
 ANCILLARY_BYTES = socket.CMSG_SPACE(TIMESPEC.size)
-CLOCK_TRIES = 3
-NEAR_NS = 20_000
 MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1  # the rest of a longer one is cut off, and `packet.decode` refuses what is left
 WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows; a small datagram takes some 800 bytes of it
 SO_MEMINFO = 55  # Linux's number, which Python does not name (asm-generic/socket.h)
@@ -93,27 +91,15 @@ class KernelStamps:
         """When something came, from what `recvmsg` told at `now_ns`.
 
         A realtime clock that was set meanwhile moves it by no more than it waited.
-        `offset_ns` is `monotonic_minus_realtime_ns()`, where it was asked for already.
+        `offset_ns` is the clock's `monotonic_minus_realtime_ns()`, where it was asked for already.
         """
         for _, kind, stamp in ancillary:
             if kind == SO_TIMESTAMPNS and len(stamp) == TIMESPEC.size:
                 seconds, ns = TIMESPEC.unpack(stamp)
-                offset_ns = self.monotonic_minus_realtime_ns() if offset_ns is None else offset_ns
+                offset_ns = self._clock.monotonic_minus_realtime_ns() if offset_ns is None else offset_ns
                 stamped_ns: int = seconds * NS_PER_S + ns + offset_ns
                 return min(max(stamped_ns, self.empty_ns), now_ns)
         return now_ns
-
-    def monotonic_minus_realtime_ns(self) -> int:
-        """The offset between the two clocks of this machine, both read within a few microseconds where that succeeds."""
-        best_ns, offset_ns = None, 0
-        for _ in range(CLOCK_TRIES):
-            before_ns, realtime_ns, after_ns = self._clock.now_ns(), self._clock.realtime_ns(), self._clock.now_ns()
-            took_ns = after_ns - before_ns
-            if best_ns is None or took_ns < best_ns:
-                best_ns, offset_ns = took_ns, (before_ns + after_ns) // 2 - realtime_ns
-            if took_ns < NEAR_NS:
-                break
-        return offset_ns
 
 
 class Datagrams:
@@ -169,7 +155,7 @@ class Datagrams:
 
     def take(self, count: int) -> list[RawMessage]:
         """The datagrams that wait, oldest first, `count` at most."""
-        offset_ns = self._stamps.monotonic_minus_realtime_ns()
+        offset_ns = self._clock.monotonic_minus_realtime_ns()
         taken: list[RawMessage] = []
         for _ in range(count):
             asked_ns = self._clock.now_ns()

@@ -16,6 +16,7 @@ from hilstar.attitude.wire.apart import OpenStream, ReaderProcess
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import (
+    AnswerPacket,
     AttitudeSample,
     Event,
     Refusal,
@@ -185,6 +186,7 @@ class ZmqSender(ZmqSocket):
 
     LINGER_MS, STOPPED_LINGER_MS = 2000, 200  # for a slow subscriber, without and with a signal
     status: Status | None = None  # no way back
+    answer: AnswerPacket | None = None
 
     def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, clock: HostClock = HOST_CLOCK) -> None:
         self._tended_until = clock.within(0.0)

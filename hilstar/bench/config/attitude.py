@@ -33,11 +33,12 @@ class AttitudeSettings(Table, frozen=True):
     """
 
     source: Annotated[
-        Literal["zmq", "serial", "udp", "vizard", "42"],
+        Literal["zmq", "serial", "udp", "vizard", "42", "scpi"],
         Meta(
             description='`"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet '
             'or JSON in each datagram. `"vizard"`: Basilisk\'s Vizard stream, and `"42"`: the text '
-            "stream of NASA's 42; their attitude is the body's (`[tracker] q_body_to_cam`)."
+            "stream of NASA's 42; their attitude is the body's (`[tracker] q_body_to_cam`). "
+            '`"scpi"`: `SKY:ATT` and `SKY:RATE` of a test stand (`hilstar serve --scpi`), with no other key of a source.'
         ),
     ] = "zmq"
     endpoint: Annotated[
@@ -127,10 +128,12 @@ class AttitudeSettings(Table, frozen=True):
         ),
     ] = True
     clock: Annotated[
-        Literal["estimated", "shared"],
+        Literal["estimated", "shared", "unix"],
         Meta(
             description='`"estimated"`: the offset of the sender\'s clock is estimated. `"shared"`: the sender runs on this '
-            "machine and `t_ns` is its CLOCK_MONOTONIC; nothing is estimated, and latency is absolute."
+            "machine and `t_ns` is its CLOCK_MONOTONIC; nothing is estimated, and latency is absolute. "
+            '`"unix"`: `t_ns` is Unix time of a machine that PTP or NTP disciplines, as this one; the offset is that of this '
+            "machine's own clock, with the error that its kernel states."
         ),
     ] = "estimated"
     stale_after_ms: Annotated[
@@ -196,7 +199,7 @@ def check_road(settings: AttitudeSettings) -> None:
         raise InputError(f'spacecraft is for source = "vizard" or "42"; remove it (source = "{source}")')
     if source in {"vizard", "42"}:
         _check_simulation(settings, "Basilisk" if source == "vizard" else "42")
-    if source == "udp":
+    if source in {"udp", "scpi"}:
         udp_road(settings)
     if source == "42":
         nasa42_road(settings)
@@ -206,12 +209,22 @@ def _check_simulation(settings: AttitudeSettings, name: str) -> None:
     for key in ("curve_secret_key", "curve_server_key", "allowed_clients"):
         if getattr(settings, key) is not None:
             raise InputError(f'{key}: {name} knows no keys; remove it, and write endpoint = "tcp://127.0.0.1:PORT"')
-    if settings.clock == "shared":
-        raise InputError(f'clock = "shared": {name} sends the time of its simulation; write clock = "estimated"')
+    if settings.clock != "estimated":
+        raise InputError(f'clock = "{settings.clock}": {name} sends the time of its simulation; write clock = "estimated"')
 
 
 def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
-    """Where UDP is bound, and who may send. Raises InputError, also where an open address has no list of senders."""
+    """Where UDP is bound, and who may send. Raises InputError, also where an open address has no list of senders.
+
+    For SCPI it is a free port on loopback, to which the process that speaks SCPI sends packets as any sender would.
+    """
+    if settings.source == "scpi":
+        for key in ("endpoint", "bind", "port"):
+            if getattr(settings, key) not in {None, ""}:
+                raise InputError(f'{key}: source = "scpi" has none; remove it, and give the address in --scpi HOST:PORT')
+        if settings.clock != "estimated":
+            raise InputError(f'clock = "{settings.clock}": SCPI\'s attitudes are stamped by this machine; remove it')
+        return bound_place("127.0.0.1:0", "", None), AllowedSenders(())
     place, allowed = bound_place(settings.bind, settings.port, settings.endpoint), AllowedSenders(settings.allow)
     if not allowed and not place.loopback:
         raise InputError(f"{place} is open to other machines, and allow does not say which may send; {ALLOW_FORM}")

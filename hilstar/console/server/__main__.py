@@ -1,4 +1,5 @@
-"""The page's process. `console.page_process` starts it with four file descriptors: setup, shared memory, channel, listener.
+"""The page's process. `console.page_process` starts it with five file descriptors: setup, shared memory, channel, and the
+listeners of the page and of SCPI, of which one may be missing (-1).
 
 It ends with the run, when the other end of the channel is closed for whatever reason.
 """
@@ -16,7 +17,8 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
+from typing import Any
 
 import msgspec
 import uvicorn
@@ -27,6 +29,7 @@ from hilstar.console.protocol import PageText
 from hilstar.console.server.app import ORDERED_S, Page
 from hilstar.console.server.connections import PING_S, PONG_S, BoundedHttp, OpenPages, ReadingWebSocket
 from hilstar.console.server.reader import TICK_S, PicturePacker, RunReader
+from hilstar.console.server.scpi import ScpiServer
 from hilstar.errors import one_line
 from hilstar.units import NS_PER_S
 
@@ -118,7 +121,7 @@ async def show(room: PicturePacker, reader: RunReader, pages: OpenPages) -> None
                 pages.show(packed)
 
 
-async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, listener: socket.socket) -> None:
+async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, page_fd: int, scpi_fd: int) -> None:
     """Serve until the run has ended."""
     scene: OverlayScene | None = pickle.loads(setup.scene) if setup.scene else None
     reader, pages = RunReader(memory, setup), OpenPages()
@@ -140,11 +143,12 @@ async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, listene
         ws_max_size=MAX_MESSAGE_BYTES,
         ws_per_message_deflate=False,
     )
-    server = Server(config)
-    tasks = [
-        asyncio.create_task(work)
-        for work in (server.serve([listener]), tick(reader, memory, pages), show(PicturePacker(memory, scene), reader, pages))
-    ]
+    works: list[Coroutine[Any, Any, None]] = [tick(reader, memory, pages)]
+    if page_fd >= 0:
+        works += [Server(config).serve([socket.socket(fileno=page_fd)]), show(PicturePacker(memory, scene), reader, pages)]
+    if setup.scpi is not None:
+        works.append(ScpiServer(setup.scpi, reader, memory, channel.give).serve(socket.socket(fileno=scpi_fd)))
+    tasks = [asyncio.create_task(work) for work in works]
     ended = asyncio.create_task(channel.listen())
     done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
     if ended not in done:
@@ -154,7 +158,7 @@ async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, listene
 
 def main() -> None:
     """Set the process up, and serve."""
-    setup_fd, board_fd, wire_fd, listener_fd = map(int, sys.argv[1:])
+    setup_fd, board_fd, wire_fd, page_fd, scpi_fd = map(int, sys.argv[1:])
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # even where this process hangs
     for number in (signal.SIGINT, signal.SIGHUP):  # a terminal sends them to all; the run ends this process
         signal.signal(number, signal.SIG_IGN)
@@ -163,10 +167,9 @@ def main() -> None:
     logging.disable(logging.CRITICAL)  # the run says what there is to say
     setup = msgspec.msgpack.decode(os.pread(setup_fd, os.fstat(setup_fd).st_size, 0), type=Setup)
     memory = SharedMemory(board_fd, setup.picture_bytes)
-    listener = socket.socket(fileno=listener_fd)
     code = 0
     try:
-        asyncio.run(run(setup, memory, OrderChannel(socket.socket(fileno=wire_fd)), listener))
+        asyncio.run(run(setup, memory, OrderChannel(socket.socket(fileno=wire_fd)), page_fd, scpi_fd))
     except Exception as error:  # whatever it is: the run starts the page again
         print(one_line(f"hilstar: the operator's page failed ({type(error).__name__}: {error})"), file=sys.stderr, flush=True)
         code = 1

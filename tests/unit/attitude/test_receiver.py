@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import takewhile
 
 import numpy as np
@@ -16,6 +17,7 @@ from hilstar.attitude.receiver import QUEUED_NS, Receiver, Traffic
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
 from hilstar.notices import Notice, Notices
+from hilstar.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.units import NS_PER_MS, NS_PER_S
 from tests.support.waiting import PATIENCE_S
@@ -105,7 +107,9 @@ def seconds(begin_s: float, end_s: float, period_ns: int = PERIOD_NS) -> range:
 class Run:
     """A whole script through a receiver; `ages_ms` and `shown` are of the attitude shown just after each message."""
 
-    def __init__(self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, **script) -> None:
+    def __init__(
+        self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, unix_offset=HOST_CLOCK.unix_offset, **script
+    ) -> None:
         clock = Clock()
         self.host0_ns = clock.now_ns + LEAD_NS
         arrivals = sorted(make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns))
@@ -117,7 +121,8 @@ class Run:
         self.ages_ms: list[float] = []
         self.shown: list[np.ndarray] = []
         self.link = Script(arrivals, clock, self._look, **script)
-        self.receiver = Receiver(self.link, self.timeline, traffic or Traffic(), notices=self.notices, now_ns=clock)
+        kept = {"now_ns": clock, "unix_offset": unix_offset}
+        self.receiver = Receiver(self.link, self.timeline, traffic or Traffic(), notices=self.notices, **kept)
         self.receiver.learn()
         if self.link.fails:
             self._run_on_its_thread(clock)
@@ -463,7 +468,7 @@ def test_the_summary_s_offset_is_that_of_the_clock_after_its_jumps(jump_s):
     assert told.uncertainty_ms < 0.2
 
 
-SHARED = Traffic(shared_clock=True)
+SHARED = Traffic(clock="shared")
 
 
 def test_a_shared_clock_is_taken_as_it_is():
@@ -480,6 +485,57 @@ def test_a_clock_that_is_not_shared_is_said_once(offset_s, refused):
     run = Run(lambda t0: Sender(offset_ns=round(offset_s * NS_PER_S)).packets(t0, seconds(0, 4)), SHARED)
     assert run.events == {"clock-not-shared": 1}
     assert run.counts.refused_by["time"] == (800 if refused else 0)
+
+
+class SteppingUnixTime:
+    """This machine's clock of Unix time: `error_ns` as its kernel states it, and a step after so many readings."""
+
+    def __init__(self, error_ns: int, step_ns: int = 0, steps_after: int = 10**9) -> None:
+        self.error_ns, self.step_ns, self.left = error_ns, step_ns, steps_after
+
+    def __call__(self) -> UnixOffset:
+        self.left -= 1
+        return UnixOffset(-UNIX_NOW_NS - (self.step_ns if self.left < 0 else 0), self.error_ns)
+
+
+UNIX_NOW_NS = 1_795_000_000_123_456_789  # beyond what a float64 holds to 1 ns
+UNIX = Traffic(clock="unix")
+
+
+@pytest.mark.parametrize(("error_ns", "events"), [(250_000, {}), (16 * NS_PER_S, {"clock-undisciplined": 1})])
+def test_unix_time_has_the_offset_of_this_machine_s_clock_and_the_error_that_its_kernel_states(error_ns, events):
+    packets = partial(Sender(offset_ns=UNIX_NOW_NS).packets, times=seconds(0, 1), delay_ns=3_000_000)
+    run = Run(packets, UNIX, unix_offset=SteppingUnixTime(error_ns))
+    told = run.receiver.clock_summary()
+    assert (told.mode, told.uncertainty_ms, told.jumps, told.drift_ppm) == ("unix", error_ns / 1e6, 0, 0.0)
+    assert told.offset_ms == -UNIX_NOW_NS / 1e6
+    assert run.receiver.latency_ms.summary()["p50"] == pytest.approx(3.0, rel=0.05)
+    assert np.allclose(run.ages_ms, 3.0)
+    assert run.events == events
+
+
+def test_a_step_of_unix_time_is_followed_without_a_jump():
+    def make(t0: int) -> list[Arrival]:
+        stepped = Sender(first=600, offset_ns=UNIX_NOW_NS + NS_PER_S // 2).packets(t0, seconds(1, 3))
+        return Sender(offset_ns=UNIX_NOW_NS).packets(t0, seconds(0, 1)) + stepped
+
+    run = Run(make, UNIX, unix_offset=SteppingUnixTime(1000, NS_PER_S // 2, steps_after=5))
+    assert run.receiver.clock_summary().jumps == 0 and run.counts.refused_by["time"] == 0
+    assert np.abs(run.ages_ms[-100:]).max() < 1.0
+
+
+def test_what_is_no_unix_time_is_said_once():
+    """TAI, as PTP has it on the wire, is 37 s ahead."""
+    ahead = Sender(offset_ns=UNIX_NOW_NS + 37 * NS_PER_S)
+    run = Run(lambda t0: ahead.packets(t0, seconds(0, 3)), UNIX, unix_offset=SteppingUnixTime(1000))
+    assert run.events == {"clock-not-shared": 1}
+    assert run.counts.refused_by["time"] == 600
+
+
+def test_the_kernel_states_how_well_it_keeps_unix_time():
+    offset = HOST_CLOCK.unix_offset()
+    assert 0 <= offset.error_ns <= UNDISCIPLINED_NS
+    assert abs(time.time_ns() + offset.offset_ns - time.monotonic_ns()) < NS_PER_MS * 100
 
 
 def test_what_was_queued_before_the_frames_teaches_nothing():

@@ -1,0 +1,77 @@
+"""hilstar fmu: a co-simulation FMU (FMI 2.0) that drives a bench over UDP, by PythonFMU."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilstar import run
+from hilstar.cli.options import BenchFile, check_files
+from hilstar.console.terminal import say
+from hilstar.errors import InputError, MachineError
+from hilstar.files import check_ending, temporary_folder, written
+
+FMU = (".fmu",)
+MODEL = "star_display"  # the module in the FMU
+EXTRA = "pythonfmu cannot be imported; install it: pip install 'hilstar[fmi]'"
+
+
+def fmu(
+    bench_file: BenchFile,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")],
+) -> None:
+    """Make an FMU of a bench: a simulation tool's block with attitude in; frame, health and answered attitude out."""
+    from hilstar.bench.bench_file import read_bench_file
+
+    check_ending("-o", output, FMU)
+    file = read_bench_file(bench_file)
+    check_files([], [output], file)
+    address = _address(file.path, file.config.attitude)
+    with temporary_folder("fmu") as folder:
+        written(output, lambda out: out.write(build(folder, address).read_bytes()))
+    say(f"{output}: sends to {address}; start hilstar serve {bench_file} there")
+    typer.echo(str(output))
+
+
+def _address(path: Path, settings: object) -> str:
+    """Where the FMU is to send, HOST:PORT. Raises InputError for a bench that no FMU can drive."""
+    from hilstar.bench.config.attitude import AttitudeSettings, udp_road
+
+    assert isinstance(settings, AttitudeSettings)
+    if settings.source != "udp":
+        raise InputError(f'{path}: [attitude] source = "{settings.source}"; an FMU sends over UDP: write source = "udp"')
+    place, _ = udp_road(settings)
+    if not place.port:
+        raise InputError(f"{path}: [attitude] port 0 is another one at each start; write the port to which the FMU sends")
+    if not settings.status_hz:
+        raise InputError(f"{path}: [attitude] status_hz = 0, by which an FMU hears nothing; write 10 or more")
+    host = "[::1]" if place.host.version == 6 else "127.0.0.1"
+    named = f"[{place.host}]" if place.host.version == 6 else str(place.host)
+    return f"{host if place.host.is_unspecified else named}:{place.port}"
+
+
+def build(folder: Path, address: str) -> Path:
+    """Make the FMU in an empty folder. Raises MachineError without PythonFMU."""
+    try:
+        from pythonfmu.builder import FmuBuilder
+    except ImportError as error:
+        raise MachineError(EXTRA) from error
+    script = folder / f"{MODEL}.py"
+    shutil.copyfile(Path(run.__file__).with_name("fmu_model.py"), script)
+    bench = folder / "bench.json"
+    bench.write_text(json.dumps({"address": address}))
+    path = list(sys.path)
+    try:  # PythonFMU imports the script by its name
+        sys.path.insert(0, str(folder))
+        sys.modules.pop(MODEL, None)
+        importlib.invalidate_caches()
+        return Path(FmuBuilder.build_FMU(script, folder / f"{MODEL}.fmu", project_files=[bench]))
+    finally:
+        sys.path[:] = path
+        sys.modules.pop(MODEL, None)

@@ -1,0 +1,353 @@
+"""SCPI-1999 and IEEE 488.2 as a bench speaks them: a line in, program units out, and an instrument's status; no I/O.
+
+Laws:
+1. Every line gives units up to its end or its first syntax error (a standard number of the -100s). Nothing else raises.
+2. A keyword has two forms, short and long, in any case. Nodes in brackets may be left out. A header after `;` goes on from the
+   node before the last keyword of the header before; `:` goes back to the root, and a common command (`*`) moves nothing.
+3. Memory is bounded: a line by MAX_LINE_BYTES, the queue of errors by MAX_ERRORS, whose last then says that it is full.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+MAX_LINE_BYTES = 4096
+MAX_ERRORS = 20
+MAX_MNEMONIC = 12
+MAX_DIGITS = 255
+MAX_DETAIL = 200  # SCPI-1999 vol. 2, 21.8: 255 characters with the description
+NOT_A_NUMBER = "9.91E37"  # SCPI-1999 vol. 1, 7.2.1.5
+
+DESCRIPTIONS = {
+    0: "No error",
+    -101: "Invalid character",
+    -102: "Syntax error",
+    -103: "Invalid separator",
+    -104: "Data type error",
+    -108: "Parameter not allowed",
+    -109: "Missing parameter",
+    -110: "Command header error",
+    -112: "Program mnemonic too long",
+    -113: "Undefined header",
+    -121: "Invalid character in number",
+    -123: "Exponent too large",
+    -124: "Too many digits",
+    -128: "Numeric data not allowed",
+    -131: "Invalid suffix",
+    -138: "Suffix not allowed",
+    -141: "Invalid character data",
+    -148: "Character data not allowed",
+    -151: "Invalid string data",
+    -158: "String data not allowed",
+    -168: "Block data not allowed",
+    -178: "Expression data not allowed",
+    -203: "Command protected",
+    -221: "Settings conflict",
+    -222: "Data out of range",
+    -224: "Illegal parameter value",
+    -250: "Mass storage error",
+    -310: "System error",
+    -350: "Queue overflow",
+    -363: "Input buffer overrun",
+    -365: "Time out error",
+}
+# Bits of the standard event register (IEEE 488.2, 11.5.1), by the hundreds of an error's number.
+OPERATION_COMPLETE = 1
+EVENT_BITS = {1: 32, 2: 16, 3: 8, 4: 4}
+# Bits of the status byte (IEEE 488.2, 11.2; SCPI-1999 vol. 1, 5.2).
+ERRORS_WAIT, QUESTIONABLE, MESSAGE_WAITS, STANDARD_EVENT, MASTER, OPERATION = 4, 8, 16, 32, 64, 128
+
+Kind = Literal["number", "word", "string"]
+KINDS: dict[Kind, int] = {"number": -128, "word": -148, "string": -158}  # the error where that kind does not belong
+
+
+class ScpiError(Exception):
+    """An error by its standard number, with what is wrong here."""
+
+    def __init__(self, number: int, detail: str = "") -> None:
+        super().__init__(number, detail)
+        self.number = number
+        self.detail = detail
+
+    @property
+    def text(self) -> str:
+        """As `SYST:ERR?` answers it."""
+        clean = "".join(c if " " <= c <= "~" and c != '"' else "'" if c == '"' else "?" for c in self.detail)[:MAX_DETAIL]
+        return f'{self.number},"{DESCRIPTIONS[self.number]}{";" if clean else ""}{clean}"'
+
+
+class Parameter(NamedTuple):
+    """One parameter: a number with its suffix (upper case, "" for none), a word (upper case) or a string."""
+
+    kind: Kind
+    text: str
+    suffix: str = ""
+
+
+class Unit(NamedTuple):
+    """A command or query (`SKY:ATTitude?`) by its pattern, and its parameters."""
+
+    pattern: str
+    parameters: tuple[Parameter, ...]
+
+
+NODE = re.compile(r"(\[)?:?([A-Za-z*]+)\]?")
+HEADER = re.compile(r"(\*[A-Za-z][A-Za-z0-9_]*|:?[A-Za-z][A-Za-z0-9_]*(?::[A-Za-z][A-Za-z0-9_]*)*)(\?)?(?:[ \t]+|$)")
+NUMBER = re.compile(r"([+-]?)(\d+\.?\d*|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?[ \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?")
+INTEGER = re.compile(r"#(?:[Hh]([0-9A-Fa-f]+)|[Qq]([0-7]+)|[Bb]([01]+))")
+WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+class Headers:
+    """The headers that a device knows, from patterns such as `SYSTem:ERRor[:NEXT]?` and `*CLS`."""
+
+    def __init__(self, patterns: Iterable[str]) -> None:
+        self._patterns = {form: pattern for pattern in patterns for form in _forms(pattern)}
+
+    def units(self, line: str) -> Iterator[Unit]:
+        """The program units of a line, without its end. Raises ScpiError at the first that is wrong."""
+        path: tuple[str, ...] = ()
+        for text in _split(line, ";"):
+            text = text.strip(" \t")
+            if not text:
+                continue
+            if any(not " " <= c <= "~" and c != "\t" for c in text):
+                raise ScpiError(-101, "only printable ASCII is understood")
+            match = HEADER.match(text)
+            if match is None:
+                raise ScpiError(*_of_header(text))
+            name, query = match[1].upper(), match[2] or ""
+            if any(len(each) > MAX_MNEMONIC for each in name.lstrip("*:").split(":")):
+                raise ScpiError(-112, f"{name[:40]}; a keyword has at most {MAX_MNEMONIC} letters")
+            if name.startswith("*"):
+                known = self._patterns.get(name + query)
+            else:
+                nodes = (() if name.startswith(":") else path) + tuple(name.lstrip(":").split(":"))
+                name = ":".join(nodes)
+                known, path = self._patterns.get(name + query), nodes[:-1]
+            if known is None:
+                raise ScpiError(-113, name[:80] + query)
+            rest = text[match.end() :]
+            yield Unit(known, tuple(map(_parameter, _split(rest, ","))) if rest else ())
+
+
+def _forms(pattern: str) -> Iterator[str]:
+    """Every spelling of a pattern, upper case."""
+    if pattern.startswith("*"):
+        yield pattern
+        return
+    nodes = []
+    for optional, name in NODE.findall(pattern.removesuffix("?")):
+        forms = {name.upper(), "".join(c for c in name if c.isupper())}
+        nodes.append(forms | {""} if optional else forms)
+    for chosen in itertools.product(*nodes):
+        yield ":".join(filter(None, chosen)) + "?" * pattern.endswith("?")
+
+
+def _split(text: str, at: str) -> Iterator[str]:
+    """The parts of a text between separators that stand in no string. Raises ScpiError (-151) where a string has no end."""
+    quote, begin = "", 0
+    for k, c in enumerate(text):
+        if quote:
+            quote = "" if c == quote else quote
+        elif c in "\"'":
+            quote = c
+        elif c == at:
+            yield text[begin:k]
+            begin = k + 1
+    if quote:
+        raise ScpiError(-151, f"a string has no closing {quote.replace(chr(34), 'quotation mark')}")
+    yield text[begin:]
+
+
+def _of_header(text: str) -> tuple[int, str]:
+    if text[0] in "*:" or text[0].isalpha():
+        return (-103 if re.match(r"[*:]?[A-Za-z][A-Za-z0-9_:]*\??[^A-Za-z0-9_:? \t]", text) else -110), text[:40]
+    return -102, text[:40]
+
+
+def _parameter(text: str) -> Parameter:
+    text = text.strip(" \t")
+    if not text:
+        raise ScpiError(-109, "nothing stands between two commas")
+    if text[0] in "\"'":
+        return Parameter("string", _string(text))
+    if text[0] == "#":
+        return _by_base(text)
+    if text[0] == "(":
+        raise ScpiError(-178, text[:40])
+    if WORD.fullmatch(text):
+        return Parameter("word", text.upper())
+    return _decimal(text)
+
+
+def _by_base(text: str) -> Parameter:
+    """A whole number to base 16, 8 or 2 (IEEE 488.2, 7.7.4)."""
+    match = INTEGER.fullmatch(text)
+    if match is None:
+        raise ScpiError(-168, text[:40])
+    digits, base = next((each, base) for each, base in zip(match.groups(), (16, 8, 2), strict=True) if each)
+    if len(digits) > MAX_DIGITS:
+        raise ScpiError(-124)
+    return Parameter("number", str(int(digits, base)))
+
+
+def _decimal(text: str) -> Parameter:
+    match = NUMBER.fullmatch(text)
+    if match is None:
+        begins = NUMBER.match(text)
+        if begins is None:
+            raise ScpiError(-121 if text[0] in "+-." else -141, text[:40])
+        raise ScpiError(-103 if text[begins.end() - 1] in " \t" else -121, text[:40])
+    sign, mantissa, exponent, suffix = match.groups(default="")
+    if len(mantissa) > MAX_DIGITS:
+        raise ScpiError(-124)
+    if len(exponent) > len("+32000") or abs(int(exponent or 0)) > 32000:
+        raise ScpiError(-123)
+    return Parameter("number", f"{sign}{mantissa}e{exponent or 0}", suffix.upper())
+
+
+def _string(text: str) -> str:
+    quote = text[0]
+    inner = text[1:-1]
+    if len(text) < 2 or text[-1] != quote or quote in inner.replace(2 * quote, ""):
+        raise ScpiError(-151, text[:40])
+    return inner.replace(2 * quote, quote)
+
+
+def count(unit: Unit, at_least: int, at_most: int | None = None) -> tuple[Parameter, ...]:
+    """The parameters of a unit, as many as it takes. Raises ScpiError."""
+    at_most = at_least if at_most is None else at_most
+    if len(unit.parameters) < at_least:
+        raise ScpiError(-109, f"{unit.pattern} takes {at_least}")
+    if len(unit.parameters) > at_most:
+        raise ScpiError(-108, f"{unit.pattern} takes {at_most or 'none'}")
+    return unit.parameters
+
+
+def number(parameter: Parameter, suffix: str = "") -> float:
+    """A finite number; `suffix` is the only unit that it may be given in. Raises ScpiError."""
+    if parameter.kind != "number":
+        raise ScpiError(KINDS[parameter.kind], "write a number")
+    if parameter.suffix not in {"", suffix}:
+        raise ScpiError(-131 if suffix else -138, f"{parameter.suffix}{f'; write {suffix}, or nothing' if suffix else ''}")
+    value = float(parameter.text)
+    if not math.isfinite(value):
+        raise ScpiError(-222, "too large")
+    return value
+
+
+def integer(parameter: Parameter, maximum: int) -> int:
+    """A number from 0 to `maximum`, rounded. Raises ScpiError."""
+    value = round(number(parameter))
+    if not 0 <= value <= maximum:
+        raise ScpiError(-222, f"write 0 to {maximum}")
+    return value
+
+
+def boolean(parameter: Parameter) -> bool:
+    """ON, OFF, or a number, of which only 0 is off. Raises ScpiError."""
+    if parameter.kind == "word":
+        if parameter.text not in {"ON", "OFF"}:
+            raise ScpiError(-224, f"{parameter.text[:40]}; write ON or OFF")
+        return parameter.text == "ON"
+    return round(number(parameter)) != 0
+
+
+@dataclass(slots=True)
+class Register:
+    """A SCPI status register: its condition now, what has become true since it was read, and what is summed up."""
+
+    condition: int = 0
+    event: int = 0
+    enable: int = 0
+
+    def see(self, condition: int) -> None:
+        """The condition as it is now; bits that turn on are kept as events."""
+        self.event |= condition & ~self.condition
+        self.condition = condition
+
+    def read(self) -> int:
+        """The events since it was read last, which reading clears."""
+        event, self.event = self.event, 0
+        return event
+
+
+@dataclass(slots=True)
+class InstrumentStatus:
+    """What IEEE 488.2 and SCPI keep for a connection: the queue of errors, the registers, what `*OPC` waits for."""
+
+    errors: deque[str] = field(default_factory=deque)
+    event: int = 0
+    event_enable: int = 0
+    service_enable: int = 0
+    operation: Register = field(default_factory=Register)
+    questionable: Register = field(default_factory=Register)
+    completes: bool = False  # whether `*OPC` waits
+
+    def add(self, error: ScpiError) -> None:
+        """Queue an error, and set its bit of the standard event register."""
+        self.event |= EVENT_BITS[-error.number // 100]
+        if len(self.errors) < MAX_ERRORS:
+            self.errors.append(error.text)
+        else:
+            self.errors[-1] = ScpiError(-350).text
+            self.event |= EVENT_BITS[3]
+
+    def next_error(self) -> str:
+        """The oldest error, which leaves the queue."""
+        return self.errors.popleft() if self.errors else ScpiError(0).text
+
+    def read_event(self) -> int:
+        """The standard event register, which reading clears."""
+        event, self.event = self.event, 0
+        return event
+
+    def clear(self) -> None:
+        """`*CLS`: events and errors are gone, enables stay."""
+        self.errors.clear()
+        self.event = self.operation.event = self.questionable.event = 0
+        self.completes = False
+
+    def preset(self) -> None:
+        """`STAT:PRES`: neither register is summed up."""
+        self.operation.enable = self.questionable.enable = 0
+
+    def byte(self, message_waits: bool) -> int:
+        """The status byte, as `*STB?` has it."""
+        found = ERRORS_WAIT * bool(self.errors) | MESSAGE_WAITS * message_waits
+        found |= STANDARD_EVENT * bool(self.event & self.event_enable)
+        found |= QUESTIONABLE * bool(self.questionable.event & self.questionable.enable)
+        found |= OPERATION * bool(self.operation.event & self.operation.enable)
+        return found | MASTER * bool(found & self.service_enable & ~MASTER)
+
+
+class LineBuffer:
+    """Bytes to lines, however they are cut: a line ends with LF, before which a CR counts as a space."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self._too_long = False
+
+    def feed(self, data: bytes) -> Iterator[str | None]:
+        """The lines that are whole now; None for one that was longer than MAX_LINE_BYTES."""
+        *whole, rest = data.split(b"\n")
+        for part in whole:
+            self._add(part)
+            yield None if self._too_long else self._bytes.decode("latin-1").rstrip("\r")
+            self._bytes.clear()
+            self._too_long = False
+        self._add(rest)
+
+    def _add(self, part: bytes) -> None:
+        self._too_long |= len(self._bytes) + len(part) > MAX_LINE_BYTES
+        if self._too_long:
+            self._bytes.clear()
+        else:
+            self._bytes += part

@@ -120,7 +120,7 @@ class Simulator(Closing):
         self.camera = tracker_camera(tracker, self.file.folder)
         self.canvas = detector_canvas(self.file, self.camera)
         psf = self.canvas.psf
-        self._glass = StarGlass(self.file, psf) if isinstance(psf, GlassPsf) else None
+        self.glass = StarGlass(self.file, psf) if isinstance(psf, GlassPsf) else None
         self._background = TrackerBackground(self.config, self.file.folder, self.camera, refuse=self._refuse)
         self.background_e = self._background.steady_e
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
@@ -182,9 +182,9 @@ class Simulator(Closing):
             light = faults.sprites()
         if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
             mean_e = np.minimum(mean_e, BODY_MAX_E)
-        if self._glass is not None:  # a measured PSF may be negative somewhere
+        if self.glass is not None:  # a measured PSF may be negative somewhere
             np.maximum(mean_e, 0.0, out=mean_e)
-        dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self._glass)
+        dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self.glass)
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
         truth = np.concatenate([truth, _exposed(faults.added_truth())])
@@ -198,10 +198,10 @@ class Simulator(Closing):
 
     def _exposed_e(self, sprites: Sprites, stars: Stars, seconds: float) -> FloatArray:
         """Electrons of each pixel (h, w) by sprites of `stars` in some time."""
-        if self._glass is None:
+        if self.glass is None:
             self.renderer.draw(sprites)
             return np.multiply(self.renderer.linear(), seconds, dtype=np.float64)
-        image = self._glass.psf.image(sprites, self._glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
+        image = self.glass.psf.image(sprites, self.glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
         if sprites.extended:
             self.renderer.draw(without_stars(sprites))
             image += self.renderer.linear()

@@ -9,7 +9,7 @@ import csv
 from pathlib import Path
 
 from hilstar.charts import read_records
-from hilstar.study import codes, timing
+from hilstar.study import codes, stripes, timing
 from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import ROUNDING_MAG
@@ -45,5 +45,6 @@ def tradeoff_step(name: str) -> Trials:
 
 if __name__ == "__main__":
     timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome))
+    stripes.draw(DOCS / "stripes.svg", read_records(HERE / "stripes.csv", stripes.StripePoint))
     codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.OverFrames))
     tradeoff.draw(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)

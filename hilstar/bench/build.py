@@ -101,7 +101,7 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
         sky_share=math.prod(camera.resolution_px) / math.prod(camera.scales_px_rad()) / (4 * math.pi),  # about
         refresh_hz=file.config.monitor.refresh_hz,
         seen=seen_by(file, camera),
-        centroider=file.config.verify.centroider,
+        centroider=file.config.verify.judge,
         exposure_frames=file.config.exposure_frames,
         cost=partial(level_cost, context=context),
     )

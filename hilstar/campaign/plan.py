@@ -21,6 +21,7 @@ from msgspec import Meta
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, changed_file
+from hilstar.bench.config import GAUSSIAN
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, Table, explained
@@ -95,11 +96,21 @@ class Varied(Table, frozen=True):
     scale: Literal["linear", "log"] = "linear"
 
 
+TRACKER_PSF = "tracker"
+
+
 class Centroiding(Table, frozen=True):
-    """[centroids]: how `--solver centroids` finds stars."""
+    """[centroids]: how `--solver centroids` finds stars, and which PSF `centroider = "psf"` is told.
+
+    `psf` is the tracker's own, the Gaussian nearest to it, or that of a file at `psf_focus_um`.
+    """
 
     threshold_sigma: Annotated[float, Meta(ge=0, le=1e6)] = 5.0
     minimum_pixels: Annotated[int, Meta(ge=1, le=1000)] = 1
+    centroider: Literal["window", "psf"] = "window"
+    psf: Annotated[str, Meta(min_length=1)] = TRACKER_PSF
+    psf_focus_um: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
+    psf_spectrum: Literal["star", "mean"] = "star"
     window: Literal["gaussian", "plain"] = "gaussian"
     window_sigma_px: Annotated[float, Meta(ge=0.1, le=100)] | None = None
     remove_s_curve: bool = False
@@ -196,6 +207,7 @@ def parse_plan(path: Path, text: str) -> Plan:
                 other = 'through = "tracker" or "display"' if plan.through == "bench" else 'through = "bench"'
                 raise InputError(f"{key}: is for {other}; write that, or leave {key} out")
         _check_attitudes(plan.attitudes)
+        _check_told(plan.centroids)
         keys = [varied.key for varied in plan.vary]
         for varied in plan.vary:
             if keys.count(varied.key) > 1:
@@ -229,6 +241,16 @@ def _check_attitudes(attitudes: Attitudes) -> None:
         )
     if attitudes.kind != "log" and attitudes.log is not None:
         raise InputError(f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or leave it out')
+
+
+def _check_told(centroids: Centroiding) -> None:
+    told = centroids.psf, centroids.psf_focus_um, centroids.psf_spectrum
+    if centroids.centroider == "window" and told != (TRACKER_PSF, 0.0, "star"):
+        raise InputError(
+            '[centroids] psf, psf_focus_um and psf_spectrum are for centroider = "psf"; write that, or leave them out'
+        )
+    if centroids.psf_focus_um and centroids.psf in (TRACKER_PSF, GAUSSIAN):
+        raise InputError(f'[centroids] psf_focus_um is for the file of psf, and psf is "{centroids.psf}"; leave it out')
 
 
 def _check_range(varied: Varied, sampling: Sampling) -> None:

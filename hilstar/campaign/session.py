@@ -20,9 +20,10 @@ import scipy
 import hilstar
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, bench_file_of
+from hilstar.bench.config import GAUSSIAN
 from hilstar.campaign.cases import Case, CaseMaker, CaseTally, Kind, columns, failed, first_row
 from hilstar.campaign.display_tracker import DisplayTracker
-from hilstar.campaign.plan import SCENARIO, Plan, parse_plan
+from hilstar.campaign.plan import SCENARIO, TRACKER_PSF, Plan, parse_plan
 from hilstar.campaign.solvers import CENTROIDS, SolverFault, choose_solver
 from hilstar.campaign.store import Row
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
@@ -126,7 +127,9 @@ class Session:
             )
         self.maker = CaseMaker(self.plan, self.file, Path(job.plan_path).parent)
         self.columns: dict[str, Kind] = columns(self.maker.parameters, job.solver == CENTROIDS)
-        self._solver = choose_solver(job.solver, self.plan.centroids, Path(job.solver_folder), job.timeout_s)
+        self._solver = choose_solver(
+            job.solver, self.plan.centroids, Path(job.solver_folder), job.timeout_s, Path(job.plan_path).parent
+        )
         self._tracker: Imaging | None = None
         self._at(self.maker.file)
 
@@ -209,7 +212,8 @@ def files_sha256(plan: Plan, folder: Path) -> str:
     """The digest of the files that a plan names beside its bench: its log, and its scenarios. Raises InputError."""
     digest = hashlib.sha256()
     varied = [str(name) for each in plan.vary if each.key == SCENARIO for name in each.values or () if name]
-    for name in [*([plan.attitudes.log] if plan.attitudes.log else []), *varied]:
+    told = [] if plan.centroids.psf in (TRACKER_PSF, GAUSSIAN) else [plan.centroids.psf]
+    for name in [*([plan.attitudes.log] if plan.attitudes.log else []), *varied, *told]:
         with open_regular(folder / name, "give the path of a file") as file:
             while chunk := file.read(CHUNK_BYTES):
                 digest.update(chunk)

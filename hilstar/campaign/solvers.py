@@ -20,17 +20,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.cameras import tracker_psf
+from hilstar.bench.config import GAUSSIAN
+from hilstar.bench.config.hardware import TrackerOptics
 from hilstar.campaign.display_tracker import DisplayTracker
-from hilstar.campaign.plan import Centroiding
+from hilstar.campaign.plan import TRACKER_PSF, Centroiding
 from hilstar.errors import InputError, did_you_mean, one_line, shortened
 from hilstar.files import temporary_folder
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.rotation import multiply, normalise
-from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.scene.psf import GaussianPsf, Psf
+from hilstar.tracker.centroiders import Places, psf_places
+from hilstar.tracker.centroids import CentroidSettings, estimate_background, find_stars
 from hilstar.tracker.identify import wahba
+from hilstar.twin.glass import StarGlass, told_psf
 from hilstar.twin.live_exposure import LiveTracker
 from hilstar.twin.pictures import write_dn_picture
 from hilstar.twin.simulator import Exposure, Simulator
@@ -101,10 +110,14 @@ def checked_attitude(numbers: object, who: str) -> FloatArray:
 
 
 class CentroidSolver:
-    """Finds stars, and matches each star of the truth, brightest first, with the nearest find within 3 px."""
+    """Finds stars, and matches each star of the truth, brightest first, with the nearest find within 3 px.
 
-    def __init__(self, settings: Centroiding) -> None:
-        self._wanted = settings
+    `folder` is that of the PSF's file, where `settings` name one.
+    """
+
+    def __init__(self, settings: Centroiding, folder: Path = Path()) -> None:
+        self._wanted, self._folder = settings, folder
+        self._told: tuple[str, Psf, StarGlass | None] | None = None
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
         """Centroid errors, and the attitude by the matched stars."""
@@ -130,6 +143,9 @@ class CentroidSolver:
             good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, psf)
         x_px, y_px, matched = truth["x_px"][good], truth["y_px"][good], int(is_matched.sum())
         dx_px, dy_px = found.x_px[index[good]] - x_px, found.y_px[index[good]] - y_px
+        if wanted.centroider == "psf":
+            places = self._fitted(exposure, tracker, truth[good], (found.x_px[index[good]], found.y_px[index[good]]))
+            dx_px, dy_px = places[0] - x_px, places[1] - y_px
         counts = len(truth), len(found), matched, len(found) - matched
         errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good])
         if len(x_px) < MIN_STARS:
@@ -138,6 +154,37 @@ class CentroidSolver:
         seen = normalise(tracker.camera.rays(x_px + dx_px, y_px + dy_px))
         # Weights are the stars' light, the inverse of photon noise's variance.
         return Answer(multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors)
+
+    def _fitted(self, exposure: Exposure, tracker: SolvedTracker, truth: npt.NDArray[np.void], first: Places) -> Places:
+        """Places (n,) of stars by the PSF that is told, from where a window found them; their spectra are known."""
+        psf, glass = self._told_by(tracker)
+        pixels = np.rint(first[1]).astype(np.intp), np.rint(first[0]).astype(np.intp)
+        reach = psf.footprint_px // 2 + 1
+        padded = np.pad(exposure.dn - estimate_background(exposure.dn).level, 2 * reach)
+        near = np.arange(reach, 3 * reach + 1)
+        stamps = padded[(pixels[0][:, None] + near)[:, :, None], (pixels[1][:, None] + near)[:, None, :]]
+        shares = None
+        if glass is not None and self._wanted.psf_spectrum == "star":
+            order = np.argsort(tracker.stars.hip)
+            at = np.searchsorted(tracker.stars.hip, truth["hip"], sorter=order)
+            which = order[np.minimum(at, len(order) - 1)]
+            shares = glass.shares(tracker.stars, np.where(truth["hip"] > 0, which, -1))
+        told = told_psf(psf, pixels, len(near), shares)
+        x_px, y_px = psf_places(stamps, told, (first[0] - pixels[1], first[1] - pixels[0]))
+        return pixels[1] + x_px, pixels[0] + y_px
+
+    def _told_by(self, tracker: SolvedTracker) -> tuple[Psf, StarGlass | None]:
+        wanted, psf = self._wanted, tracker.canvas.psf
+        if wanted.psf == TRACKER_PSF:
+            return psf, tracker.glass if isinstance(tracker, Simulator) else None
+        if wanted.psf == GAUSSIAN:
+            return GaussianPsf(psf.width_px), None
+        if self._told is None or self._told[0] != tracker.file.sha256:
+            optics = TrackerOptics(psf=str(self._folder / wanted.psf), focus_um=wanted.psf_focus_um)
+            told = tracker_psf(msgspec.structs.replace(tracker.config.tracker, optics=optics), tracker.file.folder)
+            glass = StarGlass(tracker.file, told) if isinstance(told, GlassPsf) and isinstance(tracker, Simulator) else None
+            self._told = tracker.file.sha256, told, glass
+        return self._told[1:]
 
 
 class FunctionSolver:
@@ -290,10 +337,13 @@ def printed_attitude(text: str) -> object | None:
     return None
 
 
-def choose_solver(text: str, settings: Centroiding, folder: Path, timeout_s: float) -> Solver:
-    """The solver that `text` names, with relative names in `folder`. Raises InputError for an unknown one."""
+def choose_solver(text: str, settings: Centroiding, folder: Path, timeout_s: float, plan_folder: Path = Path()) -> Solver:
+    """The solver that `text` names, with relative names in `folder`, those of the plan in `plan_folder`.
+
+    Raises InputError for an unknown one.
+    """
     if text == CENTROIDS:
-        return CentroidSolver(settings)
+        return CentroidSolver(settings, plan_folder)
     if text.startswith("python:"):
         return FunctionSolver(text, folder, timeout_s)
     return CommandSolver(text, folder, timeout_s)

@@ -13,8 +13,9 @@ import numpy as np
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.frame.view import Canvas, View
 from hilstar.rotation import propagate, to_matrix
+from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, Shear, disc_lights
-from hilstar.scene.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, slowed
+from hilstar.scene.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, slowed
 from hilstar.scene.sprites import Sprites
 from hilstar.sky.bodies.disc import AIR_TOP, Disc, gauss_legendre
 from hilstar.sky.stars import Stars
@@ -110,7 +111,7 @@ class BodyLayer:
         """Discs that may be on the image at some time of a view, and that no other hides, nearest first."""
         reach_rad, wide_rad = self._reach_rad, POINT_PX / self._px_per_rad
         if view.turns:
-            reach_rad += view.turn.speed_rad_s * (view.scan.hold_s / 2 if view.exposed else view.scan.longest_s)
+            reach_rad += view.turn.speed_rad_s * (view.scan.whole_s / 2 if view.exposed else view.scan.longest_s)
         axis = view.icrs_to_image(self.canvas.camera)[2]
         found = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
         kept = []
@@ -134,7 +135,7 @@ class BodyLayer:
         place, weight = gauss_legendre(count)
         maps = view.motion.icrs_to_image(place / 2 * exposure_s, camera)
         poses = tuple(Pose(one, float(share / 2)) for one, share in zip(maps, weight, strict=True))
-        return DiscView(camera, self.canvas.psf, poses)
+        return DiscView(camera, self.canvas.psf, poses, _shear(view.scan, view.turn.rate_cam_rad_s, camera))
 
     def _turning(self, view: View, max_poses: int) -> DiscView:
         """The camera while a screen's rows light up one after the other, each held for a time."""
@@ -148,10 +149,7 @@ class BodyLayer:
         times = zip(((place + 1) / 2 * scan.hold_s).tolist(), (weight / 2).tolist(), strict=True)
         attitudes = ((propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, seconds), share) for seconds, share in times)
         poses = tuple(Pose(camera.cam_to_image @ to_matrix(q), share) for q, share in attitudes)
-        late_s = tuple(down * scan.scanout_s / size for down, size in zip(scan.down, camera.resolution_px, strict=True))
-        middle = tuple((size - 1) / 2 for size in camera.resolution_px)
-        shear = Shear(camera.cam_to_image @ turn.rate_cam_rad_s, (late_s[0], late_s[1]), (middle[0], middle[1]))
-        return DiscView(camera, self.canvas.psf, poses, shear if scan.scanout_s else None)
+        return DiscView(camera, self.canvas.psf, poses, _shear(scan, turn.rate_cam_rad_s, camera))
 
     def _lights(self, discs: list[Disc], posed: DiscView) -> list[list[ExtendedLight]]:
         """The light of each of some discs, which are nearest first, in the order in which they are drawn."""
@@ -183,6 +181,15 @@ class BodyLayer:
         on_image = camera.contains_px(*camera.project(places @ light.icrs_to_image.T))
         of_face = float(light.disc.radiance(places[on_image]).max(initial=0.0))
         return max(float(light.disc.radiance(seen @ light.icrs_to_image).max()), of_face)
+
+
+def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | None:
+    """What the turn of a camera does to an image whose rows are lit one after the other."""
+    if not scan.scanout_s:
+        return None
+    late_s = tuple(down * scan.scanout_s / size for down, size in zip(scan.down, camera.resolution_px, strict=True))
+    middle = tuple((size - 1) / 2 for size in camera.resolution_px)
+    return Shear(camera.cam_to_image @ rate_cam_rad_s, (late_s[0], late_s[1]), (middle[0], middle[1]))
 
 
 def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:

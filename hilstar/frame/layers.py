@@ -94,7 +94,7 @@ class StarLayer:
         """The light before, with a sprite or a chain of sprites for each star on the image."""
         canvas, camera = self.canvas, self.canvas.camera
         if self.paths and view.exposed and view.rate_cam_rad_s is not None:
-            made = smeared_sprites(stars, view.motion, camera, canvas.psf)
+            made = smeared_sprites(stars, view.motion, camera, canvas.psf, view.scan)
         elif self.paths and view.turns and not view.exposed:
             made = swept_sprites(stars, view.turn, view.scan, camera, canvas.psf)
             made = replace(made, rate_cam_rad_s=view.rate_cam_rad_s)

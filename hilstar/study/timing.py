@@ -30,6 +30,7 @@ from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
+from hilstar.study import stripes
 from hilstar.study.predictors import Movement, attitude_at
 from hilstar.study.settings import FULL_HD, GLASS, Isolation, Table, centroid_px, lone_windows, star_error, study_bench
 from hilstar.study.sweep import medians_ms
@@ -340,7 +341,7 @@ def measure(quick: bool = False) -> list[TimingOutcome]:
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Measure, and write `timing` and `beat`, each as csv and png; the findings, a line each. Raises InputError."""
+    """Measure, and write `timing`, `beat` and `stripes`, each as csv and png; the findings, a line each. Raises InputError."""
     outcomes = measure(quick)
     write_records(directory / "timing.csv", outcomes)
     finding = draw(directory / "timing", outcomes)
@@ -350,7 +351,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         for o in outcomes
         if o.rate_deg_s == QUICK_RATES_DEG_S[0]
     ]
-    return [finding, *lines, *beat_findings(measure_beat(quick), directory)]
+    return [finding, *lines, *beat_findings(measure_beat(quick), directory), *stripes.findings(directory)]
 
 
 def draw(path: Path, outcomes: list[TimingOutcome]) -> str:

@@ -2,8 +2,8 @@
 
 `moment`: the plain first moment. `window`: the mean under a Gaussian that follows the star and is as wide, a pixel at least
 (SExtractor's XWIN_IMAGE); `wide`: under one half as wide again. `fit`: least squares of a Gaussian integrated over pixels.
-`box3`, `box5`: the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a fiftieth of the brightest. What a display does to a
-star's light, each sees differently.
+`psf`: least squares of any PSF that it is told. `box3`, `box5`: the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a
+fiftieth of the brightest. What a display does to a star's light, each sees differently.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 
-Centroider = Literal["moment", "window", "wide", "fit", "box3", "box5"]
-FAMILY: tuple[Centroider, ...] = get_args(Centroider)
+Kind = Literal["moment", "window", "wide", "fit", "box3", "box5"]
+Centroider = Literal[Kind, "psf"]  # which is `fit` where a star is a Gaussian
+FAMILY: tuple[Kind, ...] = get_args(Kind)
 WIDE = 1.5  # in units of the star's sigma
 MIN_WINDOW_PX = 1.0  # a narrower one sees the one pixel that it stands on
 FIT_STEPS, WINDOW_STEPS = 8, 20
@@ -28,11 +29,14 @@ SETTLED_PX = 1e-6
 MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
 BOX_SHARE = 0.02
 MIN_LIGHT = 1e-30
+SLOPE_PX = 0.02  # to either side of a place, for a told PSF's slope
 
 
 Pixels = tuple[IntArray, IntArray]  # rows and columns (n,)
 Sigma = tuple[float, float]
 Places = tuple[FloatArray, FloatArray]
+# Shares (n, side, side) of stars at x and y (n,), px from the middles of their squares.
+ToldPsf = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def star_places(stamps: FloatArray, kind: Centroider, sigma_px: Sigma, pixels: Pixels | None = None) -> Places:
@@ -43,9 +47,34 @@ def star_places(stamps: FloatArray, kind: Centroider, sigma_px: Sigma, pixels: P
     """
     lit = np.flatnonzero(stamps.sum(axis=(1, 2)) > MIN_LIGHT)
     x, y = np.zeros(len(stamps)), np.zeros(len(stamps))
+    kind = "fit" if kind == "psf" else kind
     if len(lit):
         rows, columns = brightest(stamps) if pixels is None else pixels
         x[lit], y[lit] = _KINDS[kind](stamps[lit], sigma_px, (rows[lit], columns[lit]))
+    return x, y
+
+
+def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
+    """Each star's x and y (n,), px from the middle of its square (n, side, side), by least squares of a PSF from `first` on.
+
+    The place is that of the PSF's middle, the chief ray: with coma the star's light lies beside it.
+    """
+    half = stamps.shape[1] // 2
+    x, y = (np.clip(place, -half, half) for place in first)
+    for _ in range(FIT_STEPS):
+        shares = told(x, y)
+        slopes = [
+            (told(x + dx, y + dy) - told(x - dx, y - dy)) / (2 * SLOPE_PX) for dx, dy in ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
+        ]
+        parts = np.stack([shares, *slopes], axis=1).reshape(len(stamps), 3, -1)
+        normal, seen = parts @ parts.transpose(0, 2, 1), (parts @ stamps.reshape(len(stamps), -1, 1))
+        normal += np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
+        found = np.linalg.solve(normal, seen)[..., 0]  # flux, and flux times each step
+        flux = np.where(found[:, 0] > MIN_LIGHT, found[:, 0], np.inf)  # where there is no light, no step
+        dx, dy = (np.clip(found[:, k] / flux, -MAX_STEP_PX, MAX_STEP_PX) for k in (1, 2))
+        x, y = (np.clip(place, -half, half) for place in (x + dx, y + dy))
+        if not len(dx) or max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
+            break
     return x, y
 
 
@@ -145,7 +174,7 @@ def _box_about(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels, half: int) -
     return _box(stamps, half, pixels)
 
 
-_KINDS: dict[Centroider, Callable[[FloatArray, Sigma, Pixels], Places]] = {
+_KINDS: dict[Kind, Callable[[FloatArray, Sigma, Pixels], Places]] = {
     "moment": _moment,
     "window": _window,
     "wide": partial(_window, wide=WIDE),

@@ -4,7 +4,7 @@ Cosmic rays and false stars are new in every frame.
 
 The physical order, which is the order of `Detector.expose`:
 
-    light (+ false stars) -> PRNU gain -> + dark -> Poisson -> + cosmic rays -> full well (and blooming)
+    light (+ frame-transfer smear, false stars) -> PRNU gain -> + dark -> Poisson -> + cosmic rays -> full well (and blooming)
     -> column pattern -> read noise -> ADC
 
 Laws:
@@ -216,6 +216,9 @@ class Detector:
             raise InputError(f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}")
         if not 0 <= exposure_s <= MAX_E:
             raise InputError(f"exposure {exposure_s} s; write 0 or more seconds")
+        shift_s = self.settings.row_shift_us * 1e-6
+        if shift_s and exposure_s:  # clearing and readout together shift each charge through the light of all rows once
+            light_e = light_e + light_e.sum(axis=0, dtype=np.float64) * (shift_s / exposure_s)
         return light_e
 
     def _check_light(self, light_e: npt.NDArray[Any]) -> None:

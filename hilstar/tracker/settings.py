@@ -88,6 +88,23 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             extra={"form": "[[hz, e], ...]", "default": "none"},
         ),
     ] = ()
+    shutter: Annotated[
+        Literal["global", "rolling", "frame-transfer"],
+        Meta(
+            description='`"global"`: all pixels at once. `"rolling"`: each row begins `row_time_us` after the one before. '
+            '`"frame-transfer"`: no shutter while rows are shifted under the mask, so light smears along the columns '
+            "([real glass](optics.md#the-shutter))."
+        ),
+    ] = "global"
+    row_time_us: Annotated[
+        Amount, Meta(description="Of `rolling`: from the beginning of a row's exposure to the next row's.")
+    ] = 0.0
+    row_direction: Annotated[
+        Literal["down", "up"], Meta(description='Of `rolling`: `"down"`, the top row first, or `"up"`, the bottom row first.')
+    ] = "down"
+    row_shift_us: Annotated[
+        Amount, Meta(description="Of `frame-transfer`: the time in which charge is shifted by one row.")
+    ] = 0.0
     sense_capacitance_ff: Annotated[
         Amount,
         Meta(description="Capacitance whose reset adds kTC noise; 0: none, as with correlated double sampling."),
@@ -190,6 +207,7 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
                     f'{name} = {getattr(self, name):g}; dark_law "{self.dark_law}" holds from {low_k:g} to {high_k:g} K: '
                     'write such a temperature, or dark_law = "arrhenius"'
                 )
+        _check_shutter(self)
         for name in ("column_noise_e", "column_dark_e_per_s"):
             if self.fixed_pattern == "ccd" and getattr(self, name) > 0:
                 raise InputError(
@@ -270,6 +288,13 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
 
 _KINDS = get_type_hints(DetectorSettings, include_extras=True)
+
+
+def _check_shutter(detector: DetectorSettings) -> None:
+    for name, shutter in (("row_time_us", "rolling"), ("row_shift_us", "frame-transfer")):
+        if (getattr(detector, name) > 0) != (detector.shutter == shutter):
+            way = "above 0" if detector.shutter == shutter else f'= 0, or shutter = "{shutter}"'
+            raise InputError(f'{name} = {getattr(detector, name):g} with shutter = "{detector.shutter}"; write {name} {way}')
 
 
 def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:

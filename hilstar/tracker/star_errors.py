@@ -152,7 +152,8 @@ def stamp_errors(
     whole, boxed = (
         [seen(images, *how) for images in (wanted, shown)] for how in ((sampled_px, half), (pixel_px, BOX_SIDE // 2))
     )
-    middle, off_px = np.full(count, half), {}
+    middle = np.full(count, half)
+    off_px: dict[Centroider, FloatArray] = {}
     for kind in FAMILY:
         views, width_px, pixels = (
             (boxed, pixel_px, brightest(boxed[0])) if kind in BOXES else (whole, sampled_px, (middle, middle))

@@ -94,7 +94,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
 
     None takes the bench's own. Raises InputError for a bench without stars.
     """
-    by = centroider or bench.config.verify.centroider or USUAL
+    by = centroider or bench.config.verify.judge or USUAL
     found = _errors(bench)
     render, white = bench.config.render, bench.flux_at_white_e_per_s
     # A star of rate r has V = zero_mag + magnitude(r).

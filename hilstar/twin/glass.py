@@ -16,12 +16,39 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import StarRates, bench_optics, channel_rates, star_kinds
 from hilstar.errors import InputError
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
+from hilstar.scene.psf import Psf
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import Stars
+from hilstar.tracker.centroiders import Pixels, ToldPsf
 
 BAND_NM = 25.0  # twice as fine moves no star's shares by more than 1e-3 (tests/unit/twin/test_glass.py)
 KNOT_NM = 5.0
+
+
+def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None = None) -> ToldPsf:
+    """What `psf_places` fits: a PSF in squares of `side_px` about `pixels`, rows and columns (n,), each at its place.
+
+    `shares` (n, L) are the stars' spectra as a glass has them, by default those of light without a spectrum.
+    """
+    rows, columns = pixels
+    near = np.arange(side_px) - side_px // 2
+
+    def of(x: FloatArray, y: FloatArray) -> FloatArray:
+        if not isinstance(psf, GlassPsf):
+            offsets = near - x[:, None], near - y[:, None]
+            return np.stack([psf.shares(across[None, :], down[:, None]) for across, down in zip(*offsets, strict=True)])
+        places, own = (columns + x, rows + y), psf.footprint_px
+        light = psf.of_stars(*places, psf.mean_shares if shares is None else shares, np.ones(len(x)))
+        light = np.pad(light, ((0, 0), (1, 1), (1, 1)))
+        # The glass's square is about the pixel nearest to the star, this one about its own.
+        to = [
+            np.clip(middle[:, None] + near - np.floor(place + 0.5).astype(np.intp)[:, None] + own // 2 + 1, 0, own + 1)
+            for place, middle in zip(places, (columns, rows), strict=True)
+        ]
+        return np.asarray(light[np.arange(len(x))[:, None, None], to[1][:, :, None], to[0][:, None, :]], dtype=np.float64)
+
+    return of
 
 
 class StarGlass:

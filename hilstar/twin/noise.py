@@ -281,7 +281,7 @@ def noise_budget(
         threshold_sigma=finder.threshold_sigma,
         minimum_pixels=finder.minimum_pixels,
         background_e_per_px=middle_e,
-        centroider=config.verify.centroider or USUAL,
+        centroider=config.verify.judge or USUAL,
         fields=len(sights),
         rows=_rows({"v_mag": v_mag[shown]}, noise[shown], reached),
         stars=listed,

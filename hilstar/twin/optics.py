@@ -44,13 +44,14 @@ class BenchGeometry:
 
     def to_tracker(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Tracker pixels of monitor pixels, (n,) each; NaN behind the tracker."""
-        return self.tracker.project(self.monitor.rays(*self._shown_at(x_px, y_px)) @ self.tracker.cam_to_image.T)
+        return self.tracker.project(self.monitor.rays(*self.shown_at(x_px, y_px)) @ self.tracker.cam_to_image.T)
 
     def to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Monitor pixels that tracker pixels see, (n,) each, without the mirror; NaN behind the monitor."""
         return self.monitor.project(self.tracker.rays(x_px, y_px) @ self.monitor.cam_to_image.T)
 
-    def _shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where the mirror shows pixels (n,) of the image, and which pixels it shows there."""
         width, height = self.monitor.resolution_px
         middle_x, middle_y = (width - 1) / 2, (height - 1) / 2
         match self.mirror:

@@ -37,8 +37,9 @@ from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera, linear_shares
-from hilstar.scene.exposure_motion import MIDDLE_S
-from hilstar.scene.frame_motion import Scan
+from hilstar.scene.exposure_motion import MIDDLE_S, own_row_s
+from hilstar.scene.frame_motion import EVERY, Scan
+from hilstar.scene.paths import Paths
 from hilstar.scene.sprites import Sprites, join_sprites, without_stars
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
@@ -46,6 +47,7 @@ from hilstar.sky.zodiacal import ZodiacalLight, sunward, tabled_light
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import MAX_E, DetectorSettings
 from hilstar.twin.glass import StarGlass
+from hilstar.twin.shutter import rolled
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 if TYPE_CHECKING:
@@ -118,7 +120,7 @@ class Simulator(Closing):
         self.camera = tracker_camera(tracker, self.file.folder)
         self.canvas = detector_canvas(self.file, self.camera)
         psf = self.canvas.psf
-        self._glass = StarGlass(self.file, psf) if isinstance(psf, GlassPsf) else None
+        self.glass = StarGlass(self.file, psf) if isinstance(psf, GlassPsf) else None
         self._background = TrackerBackground(self.config, self.file.folder, self.camera, refuse=self._refuse)
         self.background_e = self._background.steady_e
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
@@ -164,7 +166,7 @@ class Simulator(Closing):
 
     def expose(self, view: View, rng: np.random.Generator | None, faults: FaultyExposure | None = None) -> Exposure:
         """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
-        exposure_s, canvas = self.config.tracker.exposure_s, self.canvas
+        exposure_s, canvas, view = self.config.tracker.exposure_s, self.canvas, rolled(view, self.config.tracker)
         stars = seen_in(view, self.stars, self.moving)
         layers = self._layers
         if faults is None:
@@ -173,16 +175,16 @@ class Simulator(Closing):
             mean_e += self._background.of_view_e(view)
         else:
             mean_e, open_s = faults.light_e(
-                lambda part, layer: light_of(canvas, (*layers, layer), stars, part),
+                lambda part, layer: light_of(canvas, (*layers, layer), stars, rolled(part, self.config.tracker)),
                 lambda light, seconds: self._exposed_e(light, stars, seconds),
             )
             mean_e += self._background.of_view_e(faults.pieces[len(faults.pieces) // 2].view) * (open_s / exposure_s)
             light = faults.sprites()
         if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
             mean_e = np.minimum(mean_e, BODY_MAX_E)
-        if self._glass is not None:  # a measured PSF may be negative somewhere
+        if self.glass is not None:  # a measured PSF may be negative somewhere
             np.maximum(mean_e, 0.0, out=mean_e)
-        dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self._glass)
+        dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self.glass)
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
         truth = np.concatenate([truth, _exposed(faults.added_truth())])
@@ -196,10 +198,10 @@ class Simulator(Closing):
 
     def _exposed_e(self, sprites: Sprites, stars: Stars, seconds: float) -> FloatArray:
         """Electrons of each pixel (h, w) by sprites of `stars` in some time."""
-        if self._glass is None:
+        if self.glass is None:
             self.renderer.draw(sprites)
             return np.multiply(self.renderer.linear(), seconds, dtype=np.float64)
-        image = self._glass.psf.image(sprites, self._glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
+        image = self.glass.psf.image(sprites, self.glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
         if sprites.extended:
             self.renderer.draw(without_stars(sprites))
             image += self.renderer.linear()
@@ -350,11 +352,16 @@ def exposure_truth(
 ) -> npt.NDArray[np.void]:
     """The truth of an exposure (see `Exposure`): a row for each of `stars` that has a sprite in its light, and for discs.
 
-    With a `glass` centroids and illumination are those of each star's light through it.
+    Behind a rolling shutter each is in the middle of its own row's exposure. With a `glass` centroids and illumination are
+    those of each star's light through it.
     """
     star = np.append(np.unique(light.star), disc_stars(stars, light.discs))
     icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, canvas.camera)[0]
-    x_px, y_px = canvas.camera.project(stars.directions(star) @ icrs_to_image.T)
+    seen = stars.directions(star) @ icrs_to_image.T
+    x_px, y_px = canvas.camera.project(seen)
+    if view.scan.scanout_s and view.turns:
+        paths = Paths(seen, canvas.camera.cam_to_image @ view.turn.rate_cam_rad_s, canvas.camera)
+        x_px, y_px = paths.places_px(EVERY, own_row_s(paths, EVERY, np.zeros(len(star)), view.scan)[0])
     truth = _exposed(truth_table(stars, star, x_px, y_px))
     height, width = mean_e.shape
     inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)

@@ -94,10 +94,19 @@ def test_rows_share_an_exposure_among_the_frames_that_they_show():
 
 def test_the_study_writes_a_chart_and_a_table(study):
     folder, findings, _ = study
-    assert len(findings) == 1 + len(WAYS) + 1 + len(QUICK_CASES)
+    assert len(findings) == 1 + len(WAYS) + 1 + len(QUICK_CASES) + 1
     pixels = np.array(Image.open(folder / "timing.png").convert("L"))
     assert pixels.shape[0] > 500 and (pixels < 200).mean() > 0.005
     assert len((folder / "timing.csv").read_text().splitlines()) == 1 + len(WAYS)
+
+
+def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(study):
+    rows = [{name: float(value) for name, value in row.items()} for row in table(study[0] / "stripes.csv")]
+    assert_drawn(study[0] / "stripes.png")
+    assert max(abs(row["light"] - row["foretold"]) for row in rows) < 1e-6
+    deep = [row["light"] for row in rows if row["refreshes"] == 2.4 and row["lit_ms"] == 4]
+    assert max(deep) > 1.2 and min(deep) < 0.9
+    assert all(abs(row["light"] - 1) < 1e-6 for row in rows if row["refreshes"] == 2 or row["lit_ms"] > 16)
 
 
 def test_a_tracker_sees_the_beat_that_is_foretold(study):

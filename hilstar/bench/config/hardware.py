@@ -394,10 +394,11 @@ class Verify(Table, frozen=True):
         ),
     ] = "none"
     centroider: Annotated[
-        Literal["window", "wide", "moment", "fit", "box3", "box5"] | None,
+        Literal["window", "wide", "moment", "fit", "psf", "box3", "box5"] | None,
         Meta(
             description='What the tracker finds its stars by: `"window"`, a Gaussian that follows the star and is as wide; '
-            '`"wide"`, one half as wide again; `"moment"`, the plain first moment; `"fit"`, the least squares of a PSF; '
+            '`"wide"`, one half as wide again; `"moment"`, the plain first moment; `"fit"`, the least squares of a Gaussian; '
+            '`"psf"`, that of the PSF of `[tracker.optics]`, which is `fit` where codes are judged; '
             '`"box3"` or `"box5"`, the centre of mass of so many pixels a side. '
             '`quantisation = "auto"` judges codes by it, too.',
             extra={"default": '`"window"`; to judge codes, all of them'},
@@ -424,3 +425,8 @@ class Verify(Table, frozen=True):
             extra={"default": "a tenth of the faintest star's light over its disc (4 pi sigma^2)"},
         ),
     ] = None
+
+    @property
+    def judge(self) -> Literal["window", "wide", "moment", "fit", "box3", "box5"] | None:
+        """`centroider` where a star is a Gaussian."""
+        return "fit" if self.centroider == "psf" else self.centroider

@@ -322,7 +322,7 @@ class Comparison:
         images_e, true_px = (seen.sky_e, seen.shown_e), (seen.x_px, seen.y_px)
         each = {
             kind: [self.finder.placed(of, image_e, true_px, kind) for of, image_e in zip(windowed, images_e, strict=True)]
-            for kind in FAMILY
+            for kind in dict.fromkeys([*FAMILY, self.finder.centroider])
         }
         sky, shown = each[self.finder.centroider]
         assumed = shown if seen.assumed_e is seen.shown_e else self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
@@ -337,7 +337,9 @@ class Comparison:
         for k in np.flatnonzero(wanted):
             (tally.stars if found[k] else tally.lost).append(self._star(seen, int(k), sky, shown, assumed))
         for kind, (there, here) in each.items():
-            tally.off_px[kind] += [math.hypot(*here.against(there, int(k))[1:]) for k in np.flatnonzero(found)]
+            tally.off_px.setdefault(kind, []).extend(
+                math.hypot(*here.against(there, int(k))[1:]) for k in np.flatnonzero(found)
+            )
         tally.vanished += len(sky.found) - len(shown.found)
         self._follow(seen, shown.found, wanted)
         self._count_mirrored(seen, shown.found, wanted)

@@ -12,8 +12,9 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.frame import Bench
 from hilstar.scene.psf import GaussianPsf, Psf
-from hilstar.tracker.centroiders import Centroider, star_places
+from hilstar.tracker.centroiders import Centroider, psf_places, star_places
 from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground, find_stars
+from hilstar.twin.glass import told_psf
 from hilstar.units import magnitude
 
 USUAL: Centroider = "window"
@@ -57,6 +58,7 @@ class StarFinder:
     psf: Psf
     background: LocalBackground
     centroider: Centroider = USUAL
+    told: Psf | None = None  # a star's PSF as shown, where the tracker's is no Gaussian: what `psf` fits
 
     def match(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
         """The stars of a noiseless image (h, w) at their places (n,), where the bench's own centroider finds them."""
@@ -90,6 +92,8 @@ class StarFinder:
         stamps = padded[(row[:, None] + near + far - reach)[:, :, None], (column[:, None] + near + far - reach)[:, None, :]]
         middle = np.full(len(stars), reach)
         dx_px, dy_px = star_places(stamps, kind, self.psf.width_px, (middle, middle))
+        if kind == "psf" and self.told is not None:
+            dx_px, dy_px = psf_places(stamps, told_psf(self.told, (row, column), len(near)), (dx_px, dy_px))
         x_px, y_px = found.x_px.copy(), found.y_px.copy()
         x_px[index], y_px[index] = column + dx_px, row + dy_px
         return Matched(replace(found, x_px=x_px, y_px=y_px), matched.index)
@@ -101,14 +105,22 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     settings = CentroidSettings(window_sigma_px=max(1.0, *psf.width_px))
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * psf.peak_share
     under = LocalBackground(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
-    return StarFinder(settings, psf, under, bench.config.verify.centroider or USUAL)
+    told = None
+    if bench.config.verify.centroider == "psf" and not isinstance(bench.tracker_psf, GaussianPsf):
+        told = bench.tracker_psf.blurred(float(np.sqrt(np.mean(_shown_px2(bench, monitor_px_per_px)))))
+    return StarFinder(settings, psf, under, bench.config.verify.centroider or USUAL, told)
 
 
 def seen_psf(bench: Bench, monitor_px_per_px: float) -> Psf:
     """The Gaussian nearest to a star on the tracker, in its pixels: sprite, monitor pixel and the tracker's own PSF."""
-    spread = [(s**2 + 1 / 6) / monitor_px_per_px**2 for s in bench.psf.width_px]  # two squares: sampled, and shown
+    spread = _shown_px2(bench, monitor_px_per_px)
     x, y = (math.sqrt(a + own**2) for a, own in zip(spread, bench.tracker_psf.width_px, strict=True))
     return GaussianPsf((x, y))
+
+
+def _shown_px2(bench: Bench, monitor_px_per_px: float) -> list[float]:
+    """Variances along x and y of a star's light on the monitor, px^2 of the tracker: two squares, sampled and shown."""
+    return [(s**2 + 1 / 6) / monitor_px_per_px**2 for s in bench.psf.width_px]
 
 
 def faintest_e_per_s(bench: Bench) -> float:

@@ -1,0 +1,67 @@
+"""A detector whose rows are exposed one after the other, before the sky or a screen that lights row by row."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.config import Tracker
+from hilstar.frame.view import View
+from hilstar.run.sync import SHORTEST_LIT
+from hilstar.scene.frame_motion import Scan
+
+S_PER_US = 1e-6
+
+
+def rolled(view: View, tracker: Tracker) -> View:
+    """An exposure with the rows of a tracker's shutter; the same where all pixels are exposed at once.
+
+    `q_icrs_to_cam` and `t_ns` are then those in the middle of the middle row's exposure.
+    """
+    detector = tracker.detector
+    if detector.shutter != "rolling":
+        return view
+    readout_s = tracker.resolution_px[1] * detector.row_time_us * S_PER_US
+    return replace(view, scan=Scan((0, 1 if detector.row_direction == "down" else -1), readout_s, view.scan.hold_s))
+
+
+@dataclass(frozen=True, slots=True)
+class RowBeat:
+    """A screen that lights row by row before rows that are exposed in turn: `rows` of the tracker, `screen` of the display.
+
+    Frame k lights the screen's middle row `phase_s` + k periods after the middle of the exposure of the tracker's middle row.
+    """
+
+    rows: Scan
+    screen: Scan
+    period_s: float
+    phase_s: float
+
+    @property
+    def hold_s(self) -> float:
+        """How long a row of the screen is lit by a frame."""
+        return min(max(self.screen.hold_s, SHORTEST_LIT * self.period_s), self.period_s)
+
+    @property
+    def frames(self) -> range:
+        """The frames that any row may see."""
+        reach_s = (self.rows.whole_s + self.screen.scanout_s) / 2
+        first = math.floor((-reach_s - self.hold_s - self.phase_s) / self.period_s)
+        return range(first, math.ceil((reach_s - self.phase_s) / self.period_s) + 1)
+
+    def begin_s(self, frame: int) -> float:
+        """When a frame lights the screen's middle row."""
+        return self.phase_s + frame * self.period_s
+
+    def shares(self, frame: int, screen_late_s: FloatArray, row_late_s: FloatArray) -> FloatArray:
+        """What a frame gives to places (n,) of an exposure's light, relative to the mean light of the screen.
+
+        `screen_late_s` (n,) is how long after its middle row the screen lights a place, `row_late_s` (n,) how long after its
+        own the tracker exposes it.
+        """
+        begin, exposed = self.begin_s(frame) + screen_late_s, row_late_s - self.rows.hold_s / 2
+        lit = np.minimum(begin + self.hold_s, exposed + self.rows.hold_s) - np.maximum(begin, exposed)
+        return np.asarray(np.maximum(lit, 0.0) * (self.period_s / (self.hold_s * self.rows.hold_s)))

@@ -19,6 +19,7 @@ from hilstar.cli.calibrate import alignment, dots, geometric, photometric, plan,
 from hilstar.cli.campaign import campaign
 from hilstar.cli.catalogue import catalogue
 from hilstar.cli.compare import compare
+from hilstar.cli.confront import confront
 from hilstar.cli.convert import convert
 from hilstar.cli.demo import demo
 from hilstar.cli.doctor import doctor
@@ -42,7 +43,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
     "Attitude streams": (send, attitude, convert, keys),
     "Check what is shown": (simulate, verify, compare, budget, catalogue, report),
-    "Test the tracker": (assess, campaign),
+    "Test the tracker": (assess, campaign, confront),
     "Calibrate": (first_light, latency),
     "Study": (study, benchmark),
     "This machine": (doctor,),

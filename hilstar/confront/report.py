@@ -116,6 +116,7 @@ def _fwhms(session: Session) -> FloatArray:
 
 
 def words_of(verdict: Verdict) -> str:
+    """One photograph in a line."""
     return (
         f"{verdict.counted} stars to V = 6.5 within {verdict.rms_px:.3f} px and {verdict.rms_mag:.3f} mag, background chi2"
         f" {verdict.background_chi2:.3f}, {len(verdict.unexplained)} sources unexplained, {len(verdict.missing)} stars missing"

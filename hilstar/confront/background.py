@@ -133,6 +133,20 @@ def find_sources(sigmas: FloatArray, threshold: float = THRESHOLD) -> Sources:
     return Sources(mx[order], my[order], peak[order], length[order], width[order], single)
 
 
+def source_mask(sources: Sources, sigmas: FloatArray, grow_px: int) -> BoolArray:
+    """Pixels of an image (height, width) within some pixels of a source, or of an end of a long one."""
+    height, width = sigmas.shape
+    spots = sigmas > THRESHOLD
+    rows = np.clip(np.rint(sources.y_px).astype(np.intp), 0, height - 1)
+    columns = np.clip(np.rint(sources.x_px).astype(np.intp), 0, width - 1)
+    spots[rows, columns] = True
+    lit = np.asarray(ndimage.binary_dilation(spots, iterations=grow_px))
+    for k in np.flatnonzero(sources.length_px > 2 * grow_px):
+        half = round(float(sources.length_px[k]) / 2) + grow_px
+        lit[max(rows[k] - half, 0) : rows[k] + half + 1, max(columns[k] - half, 0) : columns[k] + half + 1] = True
+    return lit
+
+
 def _kernel(shape: tuple[int, ...]) -> FloatArray:
     spot = np.zeros((17, 17))
     spot[8, 8] = 1

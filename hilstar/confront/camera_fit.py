@@ -270,16 +270,17 @@ def fit_camera(
     """
     bare = tuple(pointings)
     count = sum(len(one.x_px) for one in photographs)
-    camera, bare, floor = _settled(base, bare, photographs, () if fixed else MODELS["pinhole"])
-    chosen, held = "fixed" if fixed else "pinhole", {}
-    if not fixed:
-        best = math.inf
-        for name, names in MODELS.items():
-            if 2 * count < STARS_A_NUMBER * (len(names) + 3 * len(bare)):
-                break
-            held[name] = _held_out(camera, bare, photographs, names, floor)
-            if held[name] < GAIN * best:
-                best, chosen = held[name], name
+    numbers = 3 * len(bare)
+    models = {"fixed": ()} if fixed else {n: names for n, names in MODELS.items() if 2 * count > STARS_A_NUMBER * (len(names) + numbers)}
+    if not models:
+        models = {"pinhole": MODELS["pinhole"]}
+    # the error of a place by the largest model, so that all are weighed alike
+    camera, bare, floor = _settled(base, bare, photographs, list(models.values())[-1])
+    chosen, best, held = next(iter(models)), math.inf, {}
+    for name, names in models.items():
+        held[name] = _held_out(base, bare, photographs, names, floor)
+        if held[name] < GAIN * best:
+            best, chosen = held[name], name
     names = () if fixed else MODELS[chosen]
     camera, bare, floor = _settled(base, bare, photographs, names)
     if refraction:
@@ -287,8 +288,7 @@ def fit_camera(
             one if one.zenith else _with_zenith(camera, one, places, floor)
             for one, places in zip(bare, photographs, strict=True)
         )
-        plain_px = held.get(chosen) or _held_out(camera, bare, photographs, names, floor)
-        held[chosen] = plain_px
+        plain_px = _held_out(camera, bare, photographs, names, floor)
         bent_px = _held_out(camera, bent, photographs, names, floor)
         held[f"{chosen}, refraction"] = bent_px
         if bent_px < GAIN * plain_px:

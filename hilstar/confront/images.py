@@ -119,16 +119,16 @@ def _grey(path: Path, pixels: npt.NDArray[Any], facts: _Facts) -> FloatArray:
 def _levels(path: Path, dn: FloatArray) -> tuple[float, float]:
     """The step between levels, and where they end. Raises InputError for an image without any structure, or full of light."""
     values = np.unique(dn)
+    top = float(values[-1])
+    at_top = dn >= top
+    share = float(at_top.mean())
+    if share > MAX_SATURATED_SHARE and top > 0:
+        raise InputError(f"{path}: {share:.0%} of its pixels are saturated at {top:g}; expose shorter, or at a darker sky")
     if len(values) < 3:
         raise InputError(f"{path}: every pixel is {' or '.join(f'{v:g}' for v in values)}; give a frame with stars")
     # a saturated level may be one less than a multiple of the step, as 65535 is
     inner = values[:-1]
     step = float(np.diff(inner).min())
-    top = float(values[-1])
-    at_top = dn >= top
-    share = float(at_top.mean())
-    if share > MAX_SATURATED_SHARE:
-        raise InputError(f"{path}: {share:.0%} of its pixels are saturated at {top:g}; give a shorter exposure or a darker sky")
     bits = math.ceil(math.log2(max(top, 1) + 1))
     ceiling = float(2**bits - 1)
     clipped = int(at_top.sum()) >= SATURATED_PIXELS or top >= ceiling - step
@@ -176,7 +176,7 @@ def _fits_facts(header: Any) -> _Facts:
 
 
 def _picture(path: Path, data: bytes) -> tuple[npt.NDArray[Any], _Facts]:
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings(), Image.open(BytesIO(data)) as picture:
@@ -191,6 +191,8 @@ def _picture(path: Path, data: bytes) -> tuple[npt.NDArray[Any], _Facts]:
             return np.asarray(picture), _Facts(t_ns, exposure_s, "", notes)
     except InputError:
         raise
+    except UnidentifiedImageError as error:
+        raise InputError(f"{path}: is no image; {ADVICE}") from error
     except Exception as error:  # whatever a damaged file makes Pillow raise
         raise InputError(f"{path}: cannot be read as an image ({one_line(str(error))}); {ADVICE}") from error
 

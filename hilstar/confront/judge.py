@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.confront.background import source_mask
 from hilstar.confront.light import BRIGHT_V_MAG
 from hilstar.confront.session import MATCH_PX, Session, Shot
 from hilstar.confront.sky import planets_seen
@@ -29,6 +30,7 @@ EXPECTED_SNR = 15.0  # of a star that is missing where no source is
 NEFF_PX = 4 * math.pi  # pixels whose noise a source's signal has: those of the Gaussian of 1 px by which it was found
 SAME_LIGHT = 0.15  # a star explains a source where it has so much of its light
 PLANET_RAD = math.radians(3 / 60)
+EDGE_PX = 3.0  # a star so far outside an image has light on it
 HALO_PX = 15.0  # about a saturated star, sources are its own light
 LIT_SIGMA, MASK_PX, MAX_CHI = 0.1, 5, 5.0
 CELLS = 4
@@ -221,7 +223,7 @@ class Judge:
         width, height = shot.photo.size_px
         x, y = session.camera.pointings[number].places_px(session.camera.camera, shot.sky.vectors)
         with np.errstate(invalid="ignore"):
-            star = np.flatnonzero((x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5))
+            star = np.flatnonzero((x > -EDGE_PX) & (x < width - 1 + EDGE_PX) & (y > -EDGE_PX) & (y < height - 1 + EDGE_PX))
         return Expected(star, x[star], y[star], session.predicted_dn(number, star, x[star], y[star]))
 
     def _rows(self, number: int, expected: Expected) -> list[StarRow]:
@@ -264,6 +266,7 @@ class Judge:
         pixel_dn = math.sqrt(float(np.median(session.pixels.variance_dn2(shot.level.level))))
         near, hot = _saturated(shot), ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
         height, width = light_sigma.shape
+        trails = [(sources.x_px[k], sources.y_px[k], sources.length_px[k] / 2 + MASK_PX) for k in np.flatnonzero(sources.trail)]
         reach = max(3.0, PLANET_RAD * session.camera.camera.focal_length_px)
 
         def why(k: int) -> str:
@@ -274,7 +277,7 @@ class Judge:
             if sources.trail[k]:
                 return f"a trail {sources.length_px[k]:.0f} px long"
             light_dn = SAME_LIGHT * sources.snr[k] * pixel_dn * math.sqrt(NEFF_PX)
-            beside = [] if tree is None else tree.query_ball_point(at, max(MATCH_PX + 0.5, sources.width_px[k] / 2))
+            beside = [] if tree is None else tree.query_ball_point(at, max(MATCH_PX + 0.5, sources.length_px[k] / 2))
             if beside and expected.dn[beside].sum() > light_dn:
                 return sky.name(int(expected.star[max(beside, key=lambda j: expected.dn[j])]))
             column, row = min(max(round(at[0]), 0), width - 1), min(max(round(at[1]), 0), height - 1)
@@ -282,6 +285,8 @@ class Judge:
                 return "a hot pixel"
             if sources.single[k]:
                 return "one pixel: hot, or a cosmic ray"
+            if any(math.dist(at, (x, y)) < half for x, y, half in trails):
+                return "beside a trail"
             return "light of a bright star" if near(*at) or light_sigma[row, column] > sources.snr[k] / 4 else ""
 
         return [
@@ -300,15 +305,8 @@ class Judge:
 
     def _background(self, shot: Shot, light_sigma: FloatArray) -> BoolArray:
         """Pixels without light of stars and sources."""
-        lit, sources = np.abs(light_sigma) > LIT_SIGMA, shot.sources
-        height, width = lit.shape
-        rows, columns = np.rint(sources.y_px).astype(np.intp), np.rint(sources.x_px).astype(np.intp)
-        spots = np.zeros_like(lit)
-        spots[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)] = True
-        lit |= ndimage.binary_dilation(spots, iterations=MASK_PX)
-        for k in np.flatnonzero((sources.length_px > 2 * MASK_PX) | (sources.snr > 100)):
-            half = round(float(sources.length_px[k]) / 2) + MASK_PX
-            lit[max(rows[k] - half, 0) : rows[k] + half + 1, max(columns[k] - half, 0) : columns[k] + half + 1] = True
+        lit = np.abs(light_sigma) > LIT_SIGMA
+        lit |= source_mask(shot.sources, shot.level.above(shot.photo.dn), MASK_PX)
         return np.asarray(~(lit | self.hot | self.dead))
 
     def _dated(self, number: int) -> DatedBy | None:
@@ -373,4 +371,11 @@ def _dim_regions(rows: Sequence[StarRow], size_px: tuple[int, int]) -> tuple[lis
         depth = [one[2] for one in every_cell if math.isfinite(one[2])]
         deep = f", those seen {np.median(depth):.2f} mag too faint" if depth else ""
         words.append(f"{name}: {lost} of {count} stars are missing{deep}: cloud, an obstacle, or vignetting")
-    return words, lambda row: cell(row) in dim
+    faint = max(DIM_MAG, DIM_SIGMAS * spread)
+
+    def in_dim(row: StarRow) -> bool:
+        down, across = cell(row)
+        beside = any((down + a, across + b) in dim for a in (-1, 0, 1) for b in (-1, 0, 1))
+        return beside and row.off_mag > faint
+
+    return words, in_dim

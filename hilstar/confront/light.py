@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +19,9 @@ from hilstar.units import MAD_TO_SIGMA
 MAG = 2.5 / math.log(10)
 # A quantum efficiency is corrected by exp(tilt x + bow x^2), x = ln(wavelength / 550 nm): the largest of both, the stars that
 # each takes, and the spread of B-V that they need.
-MAX_CORRECTION, STARS_FOR_CORRECTION, MIN_COLOURS_MAG = (6.0, 14.0), (15, 30), 0.2
-CORRECTION_ROUNDS, CORRECTION_STEP = 5, 0.05
+MAX_CORRECTION, STARS_FOR_CORRECTION, MIN_COLOURS_MAG = np.array([10.0, 30.0]), (15, 30), 0.2
+CORRECTION_PRIOR = np.array([3.0, 10.0])
+CORRECTION_ROUNDS, CORRECTION_STEP, CORRECTION_FLOOR_MAG, CORRECTION_HUBER = 8, 0.05, 0.05, 1.5
 NO_CORRECTION = (0.0, 0.0)
 FOLDS, GAIN = 5, 0.985
 BRIGHT_V_MAG = 6.5  # to which rms errors are stated
@@ -149,14 +151,43 @@ def _correction(stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use
     count = sum(int(use.sum()) >= least + plain.shape[1] for least in STARS_FOR_CORRECTION)
     if not count or np.std(np.nan_to_num(stars.bv_mag[use])) < MIN_COLOURS_MAG:
         return NO_CORRECTION
+    weight, target = np.hypot(stars.sigma_mag, CORRECTION_FLOOR_MAG)[use], stars.instrument_mag[use]
+    plain = plain[use]
+
+    def loss(values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Huber's loss and a weak prior; the residuals in sigmas, and the other columns' coefficients."""
+        off, kept = target - magnitudes(_pair(values))[use], np.ones(len(target))
+        for _ in range(CORRECTION_ROUNDS):
+            rows = plain * (np.sqrt(kept) / weight)[:, None]
+            left = (off - plain @ np.linalg.lstsq(rows, off * np.sqrt(kept) / weight, rcond=None)[0]) / weight
+            kept = np.minimum(1.0, CORRECTION_HUBER / np.maximum(np.abs(left), CORRECTION_HUBER))
+        size = np.abs(left)
+        huber = np.where(size < CORRECTION_HUBER, size**2 / 2, CORRECTION_HUBER * (size - CORRECTION_HUBER / 2))
+        return float(huber.sum() + ((values / CORRECTION_PRIOR) ** 2).sum() / 2), left, kept
+
     values: FloatArray = np.zeros(2)
+    best, off, kept = loss(values)
     for _ in range(CORRECTION_ROUNDS):
-        base = magnitudes(_pair(values))
-        slopes = [(magnitudes(_pair(values + step)) - base) / CORRECTION_STEP for step in CORRECTION_STEP * np.eye(2)[:count]]
-        found = _robust(np.column_stack([plain, *slopes]), stars.instrument_mag - base, stars.sigma_mag, use)
+        base = magnitudes(_pair(values))[use]
+        moved = [magnitudes(_pair(values + step))[use] for step in CORRECTION_STEP * np.eye(2)[:count]]
+        slopes = np.column_stack([*plain.T, *((one - base) / CORRECTION_STEP for one in moved)]) / weight[:, None]
+        prior = np.zeros(slopes.shape[1])
+        prior[plain.shape[1] :] = 1 / CORRECTION_PRIOR[:count] ** 2
+        downhill = slopes.T @ (kept * off)
+        downhill[plain.shape[1] :] -= values[:count] * prior[plain.shape[1] :]
         step = np.zeros(2)
-        step[:count] = found.values[plain.shape[1] :]
-        values = np.clip(values + np.clip(step, -2, 2), *np.array([[-1], [1]]) * MAX_CORRECTION)
+        step[:count] = np.linalg.solve(slopes.T @ (kept[:, None] * slopes) + np.diag(prior + 1e-9), downhill)[plain.shape[1] :]
+        for share in (1.0, 0.4, 0.15, 0.05):
+            trial = np.clip(values + share * step, -MAX_CORRECTION, MAX_CORRECTION)
+            new = loss(trial)
+            if new[0] < best:
+                break
+        else:
+            break
+        done = best - new[0] < 0.01
+        values, (best, off, kept) = trial, new
+        if done:
+            break
     return _pair(values)
 
 
@@ -293,12 +324,13 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
             notes.append(f"the pedestal is the bench file's, {offset:g} DN ({told})")
     low, high = np.percentile(level, [5, 95])
     sigma = {"pedestal_dn": offset_sigma}
-    slope, at_zero, slope_sigma = _line(level - offset, variance)
-    if high - offset > MIN_LEVEL_RANGE * (low - offset) and slope > 5 * slope_sigma:
-        gain = 1 / slope
-        sigma["gain_e_per_dn"] = gain * slope_sigma / slope
-        read2 = max(at_zero - step_dn**2 / 12, 0.0)
-        return PixelFit(gain, offset, math.sqrt(read2) * gain, step_dn, sigma, points, tuple(notes))
+    line = _line(level - offset, variance)
+    if high - offset > MIN_LEVEL_RANGE * (low - offset) and line.slope > 5 * line.slope_sigma:
+        gain = 1 / line.slope
+        read = math.sqrt(max(line.at_zero - step_dn**2 / 12, 0.0))
+        sigma["gain_e_per_dn"] = gain * line.slope_sigma / line.slope
+        sigma["read_noise_e"] = gain * min(line.at_zero_sigma / max(2 * read, 1e-9), math.sqrt(line.at_zero_sigma))
+        return PixelFit(gain, offset, read * gain, step_dn, sigma, points, tuple(notes))
     # one level alone: shot noise of what is above the pedestal, and the bench's read noise
     signal, noise2 = float(np.median(level)) - offset, float(np.median(variance)) - step_dn**2 / 12
     gain, read_e = assumed.gain_e_per_dn, assumed.read_noise_e
@@ -311,19 +343,27 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
     return PixelFit(gain, offset, read_e, step_dn, sigma, points, tuple(notes))
 
 
-def _line(x: FloatArray, y: FloatArray) -> tuple[float, float, float]:
-    """Slope, value at 0 and the slope's sigma, without what lies far off; errors of y go as y."""
+class _Line(NamedTuple):
+    slope: float
+    at_zero: float
+    slope_sigma: float
+    at_zero_sigma: float
+
+
+def _line(x: FloatArray, y: FloatArray) -> _Line:
+    """Slope and value at 0 with their sigmas, without what lies far off; errors of y go as y."""
     kept = np.ones(len(x), dtype=bool)
-    slope = at_zero = sigma = math.nan
+    slope = at_zero = math.nan
+    sigma = np.full(2, math.nan)
     for _ in range(ROUNDS):
         weight = 1 / np.maximum(np.median(y) * 0.5, y)[kept]
         design = np.column_stack([x[kept], np.ones(kept.sum())]) * weight[:, None]
         (slope, at_zero), *_ = np.linalg.lstsq(design, y[kept] * weight, rcond=None)
         off = y - slope * x - at_zero
         spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept] * weight)))
-        sigma = spread * math.sqrt(float(np.linalg.pinv(design.T @ design)[0, 0]))
+        sigma = spread * np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
         kept = np.abs(off) < CLIP * spread * np.maximum(np.median(y) * 0.5, y)
-    return float(slope), float(at_zero), float(sigma)
+    return _Line(float(slope), float(at_zero), float(sigma[0]), float(sigma[1]))
 
 
 def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[float, float] | None:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_optics, channel_rates
-from hilstar.confront.background import SkyLevel, Sources, find_sources, sky_level
+from hilstar.confront.background import SkyLevel, Sources, find_sources, sky_level, source_mask
 from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera
 from hilstar.confront.images import Photograph
 from hilstar.confront.light import (
@@ -42,12 +42,13 @@ MATCH_PX = 2.5
 BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
 PSF_STARS = 60
 TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 14.0
-MAX_FAINT_MAG = 1.0  # beyond the faintest star that is found, stars are not looked for
+BRIGHTEST = 15  # sources that tell a photograph's focus and rest
 SATURATED_SHARE = 0.97
 TONE_ROUNDS = 5
 PASSES = 2
+SOURCE_PX = 4  # about a source whose pixels tell nothing of the background
 SCATTER_SNR = 10.0
-LINEAR_DONE = 0.002
+LINEAR_DONE = 0.004
 
 
 @dataclass(slots=True)
@@ -125,6 +126,9 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
         raise InputError(f"{photo.path}: {_why_not(field, base, sky, sources, points, start)}")
     kept = np.flatnonzero(points)
     matched = replace(found, source=kept[found.source])
+    wide_px = float(np.median(sources.width_px[np.sort(matched.source)[:BRIGHTEST]]))
+    if wide_px > WIDE_PX:
+        raise InputError(f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in focus")
     return Shot(
         photo, level, sources, sky, Pointing(found.q_icrs_to_cam), found.focal_length_px, matched, np.empty(0, dtype=np.intp)
     )
@@ -147,7 +151,7 @@ def _solve(field: Field, base: Camera, sky: DatedSky, start: FloatArray | None) 
 
 def _why_not(field: Field, base: Camera, sky: DatedSky, sources: Sources, points: BoolArray, start: FloatArray | None) -> str:
     """What is seen of a photograph without an attitude, and what to do."""
-    bright = np.flatnonzero(points)[:20]
+    bright = np.flatnonzero(points)[:BRIGHTEST]
     length, width = np.median(sources.length_px[bright]), np.median(sources.width_px[bright])
     if sources.trail.sum() >= MIN_MATCHED or (length > TRAILED_PX and length > TRAILED_RATIO * width):
         trails = sources.length_px[sources.trail] if sources.trail.sum() >= MIN_MATCHED else np.array([length])
@@ -189,11 +193,12 @@ def run_session(
     if fixed is not None or off < max(LINEAR_OFF, LINEAR_SIGMAS * session.light.sigma["linearity"]):
         return session
     power = 1.0
-    for _ in range(TONE_ROUNDS):
+    for number in range(TONE_ROUNDS):
         power *= session.light.linearity
         shots = [_linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)]
-        session = fit.of(shots, power, session.camera)
-        if abs(session.light.linearity - 1) < LINEAR_DONE:
+        done = number == TONE_ROUNDS - 1 or (number > 0 and abs(session.light.linearity - 1) < LINEAR_DONE)
+        session = fit.of(shots, power, None if done else session.camera)
+        if done:
             break
     return session
 
@@ -229,7 +234,7 @@ class _Fitting:
     fixed: FixedCamera | None
 
     def of(self, shots: Sequence[Shot], power: float, before: CameraFit | None = None) -> Session:
-        """The session of shots whose levels were made linear by a power."""
+        """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
         return _fitted(self, shots, power, before)
 
 
@@ -248,12 +253,15 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
     camera = before or fit_camera(start.base, pointings, first, fixed=fixed is not None, refraction=False)
     pixels = _pixels(shots, start.assumed) if fixed is None else fixed.pixels
     gain = pixels.gain_e_per_dn
-    for number in range(PASSES):
+    passes = PASSES if before is None else 1
+    for number in range(passes):
         for shot, pointing in zip(shots, camera.pointings, strict=True):
             _identify(shot, camera.camera, pointing)
         psf = _psf(shots, gain) if fixed is None else fixed.psf
         for shot in shots:
             _measure(shot, psf, gain)
+        if before is not None:
+            continue
         places = [_places(shot) for shot in shots]
         turned = [replace(one, zenith=None) for one in camera.pointings] if number == 0 else list(camera.pointings)
         camera = fit_camera(
@@ -268,7 +276,11 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
 
 def _pixels(shots: Sequence[Shot], assumed: Assumed) -> PixelFit:
     """The detector by the background of all photographs."""
-    points = np.concatenate([transfer_points(s.photo.dn, s.level.level, s.level.above(s.photo.dn) > 4.0) for s in shots])
+    parts = []
+    for s in shots:
+        above = s.level.above(s.photo.dn)
+        parts.append(transfer_points(s.photo.dn, s.level.level, source_mask(s.sources, above, SOURCE_PX)))
+    points = np.concatenate(parts)
     height, width = shots[0].photo.dn.shape
     side = shots[0].level.block_px
     y, x = np.mgrid[side // 2 : height : side, side // 2 : width : side]

@@ -83,6 +83,7 @@ KERNEL_PX = 1.0  # sigma of the Gaussian by which sources are looked for
 THRESHOLD = 5.0
 MIN_TRAIL_PX, MIN_TRAIL_RATIO = 18.0, 5.0
 MAX_SOURCES = 20_000
+MAX_MASK_PX = 80  # half of what is left out about a long source
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +143,7 @@ def source_mask(sources: Sources, sigmas: FloatArray, grow_px: int) -> BoolArray
     spots[rows, columns] = True
     lit = np.asarray(ndimage.binary_dilation(spots, iterations=grow_px))
     for k in np.flatnonzero(sources.length_px > 2 * grow_px):
-        half = round(float(sources.length_px[k]) / 2) + grow_px
+        half = min(round(float(sources.length_px[k]) / 2), MAX_MASK_PX) + grow_px
         lit[max(rows[k] - half, 0) : rows[k] + half + 1, max(columns[k] - half, 0) : columns[k] + half + 1] = True
     return lit
 

@@ -271,7 +271,8 @@ def fit_camera(
     bare = tuple(pointings)
     count = sum(len(one.x_px) for one in photographs)
     numbers = 3 * len(bare)
-    models = {"fixed": ()} if fixed else {n: names for n, names in MODELS.items() if 2 * count > STARS_A_NUMBER * (len(names) + numbers)}
+    enough = {name: names for name, names in MODELS.items() if 2 * count > STARS_A_NUMBER * (len(names) + numbers)}
+    models: dict[str, tuple[str, ...]] = {"fixed": ()} if fixed else enough
     if not models:
         models = {"pinhole": MODELS["pinhole"]}
     # the error of a place by the largest model, so that all are weighed alike

@@ -27,8 +27,8 @@ from hilstar.scene.camera import Lens
 from hilstar.scene.psf import GaussianPsf, read_psf
 from hilstar.sky.spectrum import Curve
 
-GRID = 5  # field points along each side of the PSF file
-PER_PX, HALF_PX = 6, 6  # samples a pixel, and half of a PSF image's side
+GRID = 4  # field points along each side of the PSF file
+PER_PX, HALF_PX = 4, 6  # samples a pixel, and half of a PSF image's side
 MODEL = "confront: "  # before the PSF's own numbers in the file's history
 SCREEN_PX, SCREEN_PITCH_UM, FILLED = (1920, 1080), 265.5, 0.95  # of a bench whose file has no monitor: a 24 inch screen
 PLACEHOLDER = "[monitor]\nresolution_px = [1920, 1080]\npixel_pitch_um = 265.5\n[collimator]\nfocal_length_mm = 1000.0\n"

@@ -30,7 +30,7 @@ EXIF_IFD, EXIF_DATE, EXIF_OFFSET, EXIF_EXPOSURE = 0x8769, 0x9003, 0x9011, 0x829A
 UTC = re.compile(r"^\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d+)?)?)?Z?$")
 NAMED_TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:_]?(\d\d)[-:_]?(\d\d)")
 MIN_SIDE_PX = 64
-GREY_SHARE = 0.01  # of an RGB picture's pixels whose channels may differ where it is a grey one
+BRIGHT_SHARE, GREY_SPREAD = 1e-3, 0.05  # of an RGB picture's brightest pixels, by how much channels of a grey one may differ
 SATURATED_PIXELS = 3  # so many at the largest value, and none near below it, is a clipped level
 MAX_SATURATED_SHARE = 0.05
 
@@ -99,13 +99,15 @@ def _grey(path: Path, pixels: npt.NDArray[Any], facts: _Facts) -> FloatArray:
     if pixels.ndim == 3 and pixels.shape[2] in {2, 4}:
         pixels = pixels[..., :-1]  # without opacity
     if pixels.ndim == 3 and pixels.shape[2] == 3:
-        spread = np.ptp(pixels, axis=2)
-        if (spread > 0).mean() > GREY_SHARE:
+        mean = pixels.mean(axis=2)
+        bright = mean >= np.quantile(mean, 1 - BRIGHT_SHARE)
+        spread = np.ptp(pixels.astype(np.float64), axis=2)[bright]
+        if np.median(spread) > GREY_SPREAD * np.median(mean[bright]):
             raise InputError(
                 f"{path}: has three colours for each pixel, which a camera interpolated; give the raw frame, or one channel"
                 " of it as a grey image"
             )
-        pixels = pixels[..., 1]
+        pixels = mean
     if pixels.ndim == 3 and 1 in {pixels.shape[0], pixels.shape[2]}:
         pixels = pixels.squeeze()
     if pixels.ndim != 2 or pixels.dtype.kind not in "uif":

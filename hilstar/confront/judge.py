@@ -19,6 +19,7 @@ from hilstar.confront.light import BRIGHT_V_MAG
 from hilstar.confront.session import MATCH_PX, Session, Shot
 from hilstar.confront.sky import planets_seen
 from hilstar.frame.view import STILL
+from hilstar.rotation import to_matrix
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
 from hilstar.tracker.centroids import EIGHT_NEIGHBOURS
 from hilstar.twin.simulator import Simulator
@@ -36,6 +37,7 @@ LIT_SIGMA, MASK_PX, MAX_CHI = 0.1, 5, 5.0
 CELLS = 4
 DIM_MAG, DIM_STARS, DIM_SIGMAS = 0.25, 2, 4.0
 HOT_SIGMAS, HOT_SHARE, HOT_LIGHT = 6.0, 0.75, 0.5
+MOVED_PX = 5.0  # by which stars move between photographs that tell them from hot pixels
 NOT_COUNTED = frozenset({"saturated", "blended", "missing", "dim region"})
 
 
@@ -164,7 +166,9 @@ class Judge:
             counts[0] += (off > HOT_SIGMAS) & alone
             counts[1] += off < -HOT_SIGMAS
         least = max(1, math.ceil(HOT_SHARE * len(session.shots)))
-        if len(session.shots) == 1:  # stars too may have one pixel: what no neighbour shares at all
+        axes = np.array([to_matrix(one.q_icrs_to_cam)[2] for one in session.camera.pointings])
+        moved_px = np.ptp(axes, axis=0).max() * session.camera.camera.focal_length_px
+        if moved_px < MOVED_PX:  # stars too may have one pixel, in each photograph: what no neighbour shares at all
             counts[0] *= around < 0.1 * np.abs(off) + 2 * math.sqrt(8)
         return counts[0] >= least, counts[1] >= least
 
@@ -272,19 +276,15 @@ class Judge:
         def why(k: int) -> str:
             at = float(sources.x_px[k]), float(sources.y_px[k])
             planet = next((name for name, place in planets.items() if math.dist(place, at) < reach), "")
-            if planet:
-                return planet
-            if sources.trail[k]:
-                return f"a trail {sources.length_px[k]:.0f} px long"
+            if planet or sources.trail[k]:
+                return planet or f"a trail {sources.length_px[k]:.0f} px long"
             light_dn = SAME_LIGHT * sources.snr[k] * pixel_dn * math.sqrt(NEFF_PX)
             beside = [] if tree is None else tree.query_ball_point(at, max(MATCH_PX + 0.5, sources.length_px[k] / 2))
             if beside and expected.dn[beside].sum() > light_dn:
                 return sky.name(int(expected.star[max(beside, key=lambda j: expected.dn[j])]))
             column, row = min(max(round(at[0]), 0), width - 1), min(max(round(at[1]), 0), height - 1)
-            if hot[row, column]:
-                return "a hot pixel"
-            if sources.single[k]:
-                return "one pixel: hot, or a cosmic ray"
+            if hot[row, column] or sources.single[k]:
+                return "a hot pixel" if hot[row, column] else "one pixel: hot, or a cosmic ray"
             if any(math.dist(at, (x, y)) < half for x, y, half in trails):
                 return "beside a trail"
             return "light of a bright star" if near(*at) or light_sigma[row, column] > sources.snr[k] / 4 else ""

@@ -239,7 +239,7 @@ def _robust(design: FloatArray, target: FloatArray, sigma: FloatArray, use: Bool
         covariance = np.linalg.pinv(rows.T @ rows)
         kept = use & (np.abs(off) < CLIP * np.hypot(sigma, max(spread, 0.01)))
     model = design @ values
-    return _Robust(values, np.sqrt(np.diag(covariance)), model, target - model)
+    return _Robust(values, np.sqrt(np.maximum(np.diag(covariance), 0)), model, target - model)
 
 
 def _held_out(design: FloatArray, target: FloatArray, sigma: FloatArray, use: BoolArray) -> float:
@@ -313,6 +313,9 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
     """The detector by photon transfer; `pedestal` and its sigma where levels told it."""
     notes = []
     offset, offset_sigma = pedestal or (assumed.offset_dn, math.nan)
+    if not len(points):
+        notes.append("no part of the background is free of sources: the detector is the bench file's")
+        return PixelFit(assumed.gain_e_per_dn, offset, assumed.read_noise_e, step_dn, {}, points, tuple(notes))
     level, variance = points.T
     if pedestal is None:
         notes.append(f"the pedestal is the bench file's, {offset:g} DN: levels of these photographs do not tell it")

@@ -31,7 +31,7 @@ MAX_SOURCES = 60  # brightest sources that may prove an attitude
 NEAR = 0.006  # of the image's diagonal: within it a star and a source are one
 # Chance is that of as many random places on the image; with 1e5 candidates at most, 1e-9 leaves 1e-4 for a false attitude.
 MAX_CHANCE = 1e-9
-MAX_CANDIDATES = 60_000
+MAX_CANDIDATES = 20_000  # of a hypothesis
 MIN_MATCHED = 5
 
 

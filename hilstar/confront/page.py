@@ -29,7 +29,7 @@ GRID = 5
 VIEWS = ("image", "prediction", "residual")
 STYLE = """<style>
 .views { position: relative; background: #000 } .views img { width: 100%; display: none; image-rendering: pixelated }
-.views img.on { display: block } .views svg { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none }
+.views img.on { display: block } .views.all img { display: inline-block; width: 33.33% } .views.all svg { display: none } .views svg { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none }
 button { font: inherit; padding: .15em .8em } button.on { font-weight: 700 } .bad { color: #c0182b }
 @media print { .views img { display: block; width: 33%; float: left } button { display: none } }
 </style>"""
@@ -38,9 +38,10 @@ for (const box of document.querySelectorAll(".frame")) {
   const images = box.querySelectorAll("img"), buttons = box.querySelectorAll("button"); let timer = 0;
   const show = k => { images.forEach((one, i) => one.classList.toggle("on", i === k));
     buttons.forEach((one, i) => one.classList.toggle("on", i === k)); };
-  buttons.forEach((one, k) => one.addEventListener("click", () => { clearInterval(timer); timer = 0;
-    if (k < 3) { show(k); return; } let at = 0; show(0); timer = setInterval(() => show(at = 1 - at), 600); }));
-  show(0);
+  const all = on => box.querySelector(".views").classList.toggle("all", on);
+  buttons.forEach((one, k) => one.addEventListener("click", () => { clearInterval(timer); timer = 0; all(k === 4);
+    if (k !== 3) { show(k); return; } let at = 0; show(0); timer = setInterval(() => show(at = 1 - at), 600); }));
+  all(true); show(4);
 }
 </script>"""
 
@@ -130,7 +131,7 @@ def _frame(verdict: Verdict, pictures: Pictures) -> str:
         f'<img alt="{name}" src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
         for name, data in zip(VIEWS, pictures.views, strict=True)
     )
-    buttons = "".join(f"<button>{name}</button> " for name in (*VIEWS, "blink"))
+    buttons = "".join(f"<button>{name}</button> " for name in (*VIEWS, "blink", "side by side"))
     return (
         f'<h2>{escaped(verdict.shot.photo.name)}</h2><div class="frame"><p>{buttons}</p>'
         f'<div class="views">{images}{over}</div></div>'
@@ -192,7 +193,7 @@ def _places(rows: Sequence[Any]) -> str:
     with panels_of(f"Stars of 20 sigmas and more are {rms:.3f} px rms an axis off their places", height_inch=4.6) as panels:
         axes = panels[0]
         arrows = axes.quiver(x, y, dx, dy, angles="xy", color=BLUE, width=0.003, scale=2.0, scale_units="width")
-        axes.quiverkey(arrows, 0.85, 1.03, 0.1, "0.1 px", labelpos="E")
+        axes.quiverkey(arrows, 0.88, -0.12, 0.1, "0.1 px", labelpos="E")
         axes.set(xlabel="x [px]", ylabel="y [px]", aspect="equal")
         axes.invert_yaxis()
     return _image(panels[0].figure, "places seen less predicted over the field")

@@ -12,6 +12,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.confront.excess import Excess
 from hilstar.confront.judge import Verdict
+from hilstar.confront.light import LINEAR_OFF, LINEAR_SIGMAS
 from hilstar.confront.session import Session
 
 MAX_RMS_PX, MAX_RMS_MAG, CHI2 = 0.15, 0.2, (0.8, 1.25)  # with --strict, of each photograph
@@ -136,13 +137,8 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
         f" {pixels.step_dn:.3g} DN), read noise {pixels.read_noise_e:.2f} e-, pedestal {pixels.pedestal_dn:.0f} DN",
     ]
     if not session.fixed:
-        tone = (
-            f"a tone curve: DN go as light to the power {session.power:.3f} (gamma {1 / session.power:.2f}); other figures are"
-            " of the image without it"
-            if session.power != 1.0
-            else f"DN go as light to the power {light.linearity:.3f} +- {light.sigma['linearity']:.3f}: no tone curve"
-        )
-        found.append(f"light: zero point {light.zero_point_mag:.2f} mag, colour term {light.colour_term:+.3f} (B-V); {tone}")
+        zero = f"zero point {light.zero_point_mag:.2f} mag, colour term {light.colour_term:+.3f} (B-V)"
+        found.append(f"light: {zero}; {_tone(session)}")
     if session.fixed:
         found.append(
             "air: "
@@ -156,6 +152,17 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
     if excess is not None:
         found.append(f"scatter of {excess.stars} stars: {excess.rms_px:.3f} px an axis, {excess.rms_mag:.3f} mag")
     return found
+
+
+def _tone(session: Session) -> str:
+    """Whether DN go as light, in words."""
+    power, light = session.power, session.light
+    if power != 1.0:
+        return f"a tone curve: DN go as light to the power {power:.3f} (gamma {1 / power:.2f}); other figures are without it"
+    sigma = light.sigma["linearity"]
+    said = f"DN go as light to the power {light.linearity:.3f} +- {sigma:.3f}"
+    bent = abs(light.linearity - 1) > max(LINEAR_OFF, LINEAR_SIGMAS * sigma)
+    return f"{said}: a tone curve that is no power, which stays in all figures" if bent else f"{said}: no tone curve"
 
 
 def _dated(verdict: Verdict) -> Iterator[str]:

@@ -44,11 +44,12 @@ PSF_STARS = 60
 TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 14.0
 BRIGHTEST = 15  # sources that tell a photograph's focus and rest
 SATURATED_SHARE = 0.97
-TONE_ROUNDS = 5
+TONE_ROUNDS = 7
 PASSES = 2
 SOURCE_PX = 4  # about a source whose pixels tell nothing of the background
 SCATTER_SNR = 10.0
 LINEAR_DONE = 0.004
+MAX_TONE_STEP = 1.35
 
 
 @dataclass(slots=True)
@@ -192,15 +193,14 @@ def run_session(
     off = abs(session.light.linearity - 1)
     if fixed is not None or off < max(LINEAR_OFF, LINEAR_SIGMAS * session.light.sigma["linearity"]):
         return session
-    power = 1.0
-    for number in range(TONE_ROUNDS):
-        power *= session.light.linearity
-        shots = [_linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)]
-        done = number == TONE_ROUNDS - 1 or (number > 0 and abs(session.light.linearity - 1) < LINEAR_DONE)
-        session = fit.of(shots, power, None if done else session.camera)
-        if done:
-            break
-    return session
+    power, trial = 1.0, session
+    for _ in range(TONE_ROUNDS):
+        power *= min(max(trial.light.linearity, 1 / MAX_TONE_STEP), MAX_TONE_STEP)
+        linear = [_linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)]
+        trial = fit.of(linear, power, session.camera)
+        if abs(trial.light.linearity - 1) < LINEAR_DONE:
+            return fit.of(trial.shots, power)
+    return session  # no power makes it linear: its figures say so
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,8 @@ HALF = STAMP_PX // 2
 GAUSS3 = np.array([-math.sqrt(0.6) / 2, 0.0, math.sqrt(0.6) / 2]), np.array([5 / 18, 8 / 18, 5 / 18])  # nodes within a pixel
 MIN_SIGMA_PX, MAX_SIGMA_PX = 0.15, 5.0
 MEAN_BV_MAG = 0.65
-PLACE_STEPS, SHAPE_ROUNDS = 12, 2
+PLACE_STEPS, SHAPE_ROUNDS = 8, 2
+PLACE_DONE_PX = 1e-3
 MODEL_ERROR = 0.01  # share of a pixel's light by which the model may be wrong: so no bright star outvotes all others
 STARS_FOR = ((40, 6), (12, 2), (0, 1))  # stars that a number of terms of the field takes
 
@@ -171,7 +172,7 @@ def measure(stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, ga
         x += np.clip(move[:, 0], -0.5, 0.5)
         y += np.clip(move[:, 1], -0.5, 0.5)
         flux, level = flux + move[:, 2], level + move[:, 3]
-        if np.abs(move[:, :2]).max(initial=0) < 1e-4:
+        if np.quantile(np.abs(move[:, :2]), 0.98) < PLACE_DONE_PX:
             break
     covariance = np.linalg.inv(normal)
     counted = np.isfinite(stamps.variance).sum(axis=(1, 2))

@@ -29,7 +29,8 @@ GRID = 5
 VIEWS = ("image", "prediction", "residual")
 STYLE = """<style>
 .views { position: relative; background: #000 } .views img { width: 100%; display: none; image-rendering: pixelated }
-.views img.on { display: block } .views.all img { display: inline-block; width: 33.33% } .views.all svg { display: none } .views svg { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none }
+.views img.on { display: block } .views.all img { display: inline-block; width: 33.33% }
+.views.all svg { display: none } .views svg { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none }
 button { font: inherit; padding: .15em .8em } button.on { font-weight: 700 } .bad { color: #c0182b }
 @media print { .views img { display: block; width: 33%; float: left } button { display: none } }
 </style>"""
@@ -193,7 +194,7 @@ def _places(rows: Sequence[Any]) -> str:
     with panels_of(f"Stars of 20 sigmas and more are {rms:.3f} px rms an axis off their places", height_inch=4.6) as panels:
         axes = panels[0]
         arrows = axes.quiver(x, y, dx, dy, angles="xy", color=BLUE, width=0.003, scale=2.0, scale_units="width")
-        axes.quiverkey(arrows, 0.88, -0.12, 0.1, "0.1 px", labelpos="E")
+        axes.quiverkey(arrows, 0.86, 0.04, 0.1, "0.1 px", labelpos="E")
         axes.set(xlabel="x [px]", ylabel="y [px]", aspect="equal")
         axes.invert_yaxis()
     return _image(panels[0].figure, "places seen less predicted over the field")

@@ -50,9 +50,13 @@ class StarPsf:
         return found
 
     def fwhm_px(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """Full width at half maximum of what pixels get, (n,): of the core and a pixel, mean of both axes."""
+        """Full width at half maximum of what pixels get, (n,): of core, wings and a pixel, all made round."""
         core = self.core(x_px, y_px, np.full(len(x_px), MEAN_BV_MAG))
-        return np.asarray(math.sqrt(8 * math.log(2)) * np.sqrt((core[:, 0] + core[:, 1]) / 2 + 1 / 12))
+        narrow, wide = (core[:, 0] + core[:, 1]) / 2 + 1 / 12, np.full(len(x_px), self.wing_sigma_px**2 + 1 / 12)
+        radius = np.linspace(0, 12, 1201)
+        parts = ((1 - self.wing_share, narrow), (self.wing_share, wide))
+        light = np.sum([share / v[:, None] * np.exp(-(radius**2) / (2 * v[:, None])) for share, v in parts], axis=0)
+        return np.asarray(2 * radius[(light > light[:, :1] / 2).sum(axis=1) - 1])
 
     def on_pixels(self, dx: FloatArray, dy: FloatArray, core: FloatArray) -> FloatArray:
         """Shares (n, rows, columns) of light in pixels at offsets dx (n, columns), dy (n, rows) from the stars."""

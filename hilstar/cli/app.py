@@ -20,6 +20,7 @@ from hilstar.cli.calibrate import alignment, dots, geometric, photometric, plan,
 from hilstar.cli.campaign import campaign
 from hilstar.cli.catalogue import catalogue
 from hilstar.cli.compare import compare
+from hilstar.cli.confront import confront
 from hilstar.cli.convert import convert
 from hilstar.cli.demo import demo
 from hilstar.cli.doctor import doctor
@@ -45,7 +46,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
     "Attitude streams": (send, attitude, convert, answers, fmu, keys),
     "Check what is shown": (simulate, verify, compare, budget, catalogue, report),
-    "Test the tracker": (assess, campaign, tracker),
+    "Test the tracker": (assess, campaign, tracker, confront),
     "Calibrate": (first_light, latency),
     "Study": (study, benchmark),
     "This machine": (doctor,),

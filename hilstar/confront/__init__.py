@@ -1,0 +1,1 @@
+"""Photographs of the sky against what hilstar predicts of them."""

@@ -1,0 +1,166 @@
+"""The background of a photograph, smooth over the field, and the noise about it; sources above both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from hilstar.arrays import BoolArray, FloatArray
+from hilstar.tracker.centroids import EIGHT_NEIGHBOURS
+from hilstar.units import MAD_TO_SIGMA
+
+MIN_BLOCKS = 12  # along the shorter side; a block is 64 px or less
+BLOCK_PX = 64
+MIN_BLOCK_PX = 16
+CLIP = 2.5  # sigmas beyond which a pixel of a block is a star's
+CLIPPED = 0.9543  # sigma of a normal distribution cut at 2.5 sigma
+ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class SkyLevel:
+    """Level and noise (height, width) of a photograph between its stars, DN, and whether a pixel is a star's."""
+
+    level: FloatArray
+    noise: FloatArray
+    block_px: int
+
+    def above(self, dn: FloatArray) -> FloatArray:
+        """A photograph above its background, in sigmas."""
+        return np.asarray((dn - self.level) / self.noise)
+
+
+def sky_level(dn: FloatArray, step: float, bad: BoolArray | None = None) -> SkyLevel:
+    """The background of an image (height, width) in whole steps of `step`: means of blocks without their stars, smooth between.
+
+    Pixels that are `bad` do not count.
+    """
+    height, width = dn.shape
+    side = int(np.clip(min(height, width) // MIN_BLOCKS, MIN_BLOCK_PX, BLOCK_PX))
+    rows, columns = max(height // side, 1), max(width // side, 1)
+    high, wide = height // rows, width // columns
+    blocks = dn[: rows * high, : columns * wide].reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows, columns, -1)
+    use = np.ones(blocks.shape, dtype=bool)
+    if bad is not None:
+        use = ~bad[: rows * high, : columns * wide].reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows, columns, -1)
+    middle = np.median(blocks, axis=2, keepdims=True)
+    sigma = MAD_TO_SIGMA * np.median(np.abs(blocks - middle), axis=2, keepdims=True) + step / 2
+    for _ in range(ROUNDS):
+        kept = use & (np.abs(blocks - middle) <= CLIP * sigma)
+        count = np.maximum(kept.sum(axis=2, keepdims=True), 1)
+        middle = (blocks * kept).sum(axis=2, keepdims=True) / count
+        sigma = np.sqrt(((blocks - middle) ** 2 * kept).sum(axis=2, keepdims=True) / count) / CLIPPED
+        sigma = np.maximum(sigma, step / 12**0.5)
+    # a block full of a bright star's light is as its neighbours
+    level, noise = (
+        ndimage.median_filter(part[..., 0], 3, mode="nearest") if min(part.shape[:2]) > 2 else part[..., 0]
+        for part in (middle, sigma)
+    )
+    places = [(np.arange(size) - (one - 1) / 2) / one for size, one in ((height, high), (width, wide))]
+    return SkyLevel(_between(level, *places), np.maximum(_between(noise, *places), step / 12**0.5), side)
+
+
+def _between(blocks: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
+    """Values of blocks at places, cubic between their middles and straight on beyond."""
+    from scipy.interpolate import make_interp_spline
+
+    for axis, at in ((0, rows), (1, columns)):
+        count = blocks.shape[axis]
+        if count == 1:
+            blocks = np.repeat(blocks, len(at), axis=axis)
+            continue
+        spline = make_interp_spline(np.arange(count), blocks, k=min(3, count - 1), axis=axis)
+        inner = np.clip(at, 0, count - 1)
+        slope = spline.derivative()(inner)
+        beyond = (at - inner).reshape((-1, 1) if axis == 0 else (1, -1))
+        blocks = spline(inner) + slope * beyond
+    return np.asarray(blocks)
+
+
+KERNEL_PX = 1.0  # sigma of the Gaussian by which sources are looked for
+THRESHOLD = 5.0
+MIN_TRAIL_PX, MIN_TRAIL_RATIO = 18.0, 5.0
+MAX_SOURCES = 20_000
+MAX_MASK_PX = 80  # half of what is left out about a long source
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """Sources (n,) of a photograph, brightest first: places, px, signal over noise, and the length and width of each, px.
+
+    `single` says that one pixel has all of the light: it is the detector's, or a cosmic ray.
+    """
+
+    x_px: FloatArray
+    y_px: FloatArray
+    snr: FloatArray
+    length_px: FloatArray
+    width_px: FloatArray
+    single: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+    @property
+    def trail(self) -> BoolArray:
+        """Which are long and thin."""
+        return (self.length_px > MIN_TRAIL_PX) & (self.length_px > MIN_TRAIL_RATIO * self.width_px)
+
+
+def find_sources(sigmas: FloatArray, threshold: float = THRESHOLD) -> Sources:
+    """Sources of an image in sigmas: connected pixels of it, smoothed, above a threshold."""
+    norm = float(np.sqrt((_kernel(sigmas.shape) ** 2).sum()))
+    smooth = ndimage.gaussian_filter(sigmas, KERNEL_PX, mode="nearest", truncate=4.0) / norm
+    above = smooth > threshold
+    labels, count = ndimage.label(above, structure=EIGHT_NEIGHBOURS)
+    y, x = np.nonzero(above)
+    blob, value = labels[y, x] - 1, smooth[y, x]
+    total = np.maximum(np.bincount(blob, value, minlength=count), 1e-9)
+    mx, my = (np.bincount(blob, value * part, minlength=count) / total for part in (x, y))
+    area = np.maximum(np.bincount(blob, minlength=count), 1)
+    dx, dy = x - mx[blob], y - my[blob]
+    xx, yy, xy = (
+        np.bincount(blob, part, minlength=count) / area + 1 / 12 * same
+        for part, same in ((dx * dx, 1), (dy * dy, 1), (dx * dy, 0))
+    )
+    middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    length, width = np.sqrt(12 * (middle + spread)), np.sqrt(12 * np.maximum(middle - spread, 1 / 12))
+    peak = np.zeros(count)
+    np.maximum.at(peak, blob, value)
+    order = np.argsort(-peak * np.sqrt(area), kind="stable")[:MAX_SOURCES]
+    single = _single(sigmas, mx[order], my[order])
+    return Sources(mx[order], my[order], peak[order], length[order], width[order], single)
+
+
+def source_mask(sources: Sources, sigmas: FloatArray, grow_px: int) -> BoolArray:
+    """Pixels of an image (height, width) within some pixels of a source, or of an end of a long one."""
+    height, width = sigmas.shape
+    spots = sigmas > THRESHOLD
+    rows = np.clip(np.rint(sources.y_px).astype(np.intp), 0, height - 1)
+    columns = np.clip(np.rint(sources.x_px).astype(np.intp), 0, width - 1)
+    spots[rows, columns] = True
+    lit = np.asarray(ndimage.binary_dilation(spots, iterations=grow_px))
+    for k in np.flatnonzero(sources.length_px > 2 * grow_px):
+        half = min(round(float(sources.length_px[k]) / 2), MAX_MASK_PX) + grow_px
+        lit[max(rows[k] - half, 0) : rows[k] + half + 1, max(columns[k] - half, 0) : columns[k] + half + 1] = True
+    return lit
+
+
+def _kernel(shape: tuple[int, ...]) -> FloatArray:
+    spot = np.zeros((17, 17))
+    spot[8, 8] = 1
+    return np.asarray(ndimage.gaussian_filter(spot, KERNEL_PX, truncate=4.0))
+
+
+def _single(sigmas: FloatArray, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
+    """Whether the highest pixel about a place has no light beside it: less than a star of 0.35 px of sigma leaves there."""
+    padded = np.pad(sigmas, 3)
+    reach = np.arange(-1, 2)
+    rows, columns = (np.rint(place).astype(np.intp)[:, None] + reach + 3 for place in (y_px, x_px))
+    patch = padded[rows[:, :, None], columns[:, None, :]].reshape(len(x_px), 9)
+    best = patch.argmax(axis=1)
+    row, column = np.rint(y_px).astype(np.intp) + best // 3 + 2, np.rint(x_px).astype(np.intp) + best % 3 + 2
+    around = [padded[row + dy, column + dx] for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0))]
+    return np.asarray(np.mean(around, axis=0) + 0.75 < 0.04 * padded[row, column])

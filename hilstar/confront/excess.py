@@ -1,0 +1,142 @@
+"""What the scatter of stars about the prediction is made of, each part with how it was told apart from the others.
+
+Parts of the detector and of colour are fitted to residuals, and what as many random columns would take is taken off again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.confront.judge import StarRow, Verdict
+from hilstar.confront.session import Session
+from hilstar.confront.star_psf import field_terms
+
+MIN_STARS = 12
+SCALE_HEIGHT_M = 8000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of the scatter: rms in the whole's unit, NaN where it is not known, and how it was told."""
+
+    name: str
+    rms: float
+    how: str
+
+
+@dataclass(frozen=True, slots=True)
+class Excess:
+    """The scatter of clean stars to V = 6.5 in all photographs, mag and px an axis, and what it is made of."""
+
+    rms_mag: float
+    rms_px: float
+    stars: int
+    light: tuple[Part, ...]
+    places: tuple[Part, ...]
+
+
+def split_excess(session: Session, verdicts: Sequence[Verdict]) -> Excess | None:
+    """The parts of the scatter; None with fewer than MIN_STARS stars."""
+    every = [(v, row) for v in verdicts for row in v.stars if row.counted and math.isfinite(row.off_mag)]
+    if len(every) < MIN_STARS:
+        return None
+    rows = [row for _, row in every]
+    x, y, off_mag = (np.array([getattr(row, name) for row in rows]) for name in ("x_px", "y_px", "off_mag"))
+    off = np.array([(row.x_px - row.x_predicted_px, row.y_px - row.y_predicted_px) for row in rows])
+    bv = np.nan_to_num(np.array([row.b_v_mag for row in rows]))
+    size = session.shots[0].photo.size_px
+    phase = 2 * np.pi * np.column_stack([x, y])
+    phases = np.column_stack([np.cos(phase), np.sin(phase)])
+    terms = field_terms(x, y, size)[:, 2:]
+    light = _light(session, every, off_mag, bv, phases, terms)
+    radial = np.column_stack([x, y]) - np.array(session.camera.camera.principal_point_px)
+    lateral = (bv - bv.mean())[:, None] * radial / math.hypot(*size)
+    columns = [np.column_stack([lateral[:, k], (bv - bv.mean())]) for k in (0, 1)]
+    noise = np.concatenate([shot_sigma(v, row) for v, row in every])
+    whole = _ms(off.ravel())
+    parts = [
+        Part("photon and background noise", math.sqrt(_ms(noise)), "the fit's own errors, by the detector's gain and noise"),
+        Part(
+            "place within the pixel",
+            math.sqrt(sum(_taken(phases, off[:, k]) for k in (0, 1)) / 2),
+            "what repeats with the place in the pixel: the model of the PSF, and the pixel's own response",
+        ),
+        Part(
+            "colour",
+            math.sqrt(sum(_taken(columns[k], off[:, k]) for k in (0, 1)) / 2),
+            "what goes with B-V and with B-V times the radius: lateral colour, the air's dispersion",
+        ),
+    ]
+    places = (*parts, _rest(whole, parts))
+    return Excess(math.sqrt(_ms(off_mag)), math.sqrt(whole), len(rows), light, places)
+
+
+def shot_sigma(verdict: Verdict, row: StarRow) -> FloatArray:
+    """One sigma of a star's place, px, (1,)."""
+    shot = verdict.shot
+    return np.asarray(shot.found.sigma_px[shot.star == row.star][:1])
+
+
+def _light(
+    session: Session,
+    every: Sequence[tuple[Verdict, StarRow]],
+    off_mag: FloatArray,
+    bv: FloatArray,
+    phases: FloatArray,
+    terms: FloatArray,
+) -> tuple[Part, ...]:
+    rows = [row for _, row in every]
+    noise = np.array([1.0857 * row.sigma_dn / row.dn for row in rows])
+    sigma_v = np.array([v.shot.sky.within(np.array([row.star]))[0][0] for v, row in every])
+    known = np.array(["variable" in row.flags or "double" in row.flags for row in rows])
+    steady = _ms(off_mag[~known]) if (~known).sum() >= MIN_STARS else _ms(off_mag)
+    parts = [
+        Part("photon and background noise", math.sqrt(_ms(noise)), "the fit's own errors, by the detector's gain and noise"),
+        Part("catalogue: V's own error", math.sqrt(_ms(sigma_v)), "Hipparcos' errors of V"),
+        Part(
+            "catalogue: variables and doubles",
+            math.sqrt(max(_ms(off_mag) - steady, 0.0)),
+            f"the scatter with {int(known.sum())} known variables and doubles less that without",
+        ),
+        Part("colour", math.sqrt(_taken(np.column_stack([bv, bv**2]), off_mag)), "what goes with B-V: the tracker's curve"),
+        Part("flat field", math.sqrt(_taken(terms, off_mag)), "what slopes over the field beyond the vignetting in the radius"),
+        Part("place within the pixel", math.sqrt(_taken(phases, off_mag)), "what repeats with the place in the pixel"),
+        scintillation(session),
+    ]
+    return (*parts, _rest(_ms(off_mag), parts))
+
+
+def scintillation(session: Session) -> Part:
+    """Young's law (1967, AJ 72, 747) by aperture, exposure and the air mass that refraction told; at sea level."""
+    tracker = session.file.config.tracker
+    altitudes = [one.altitude_deg for one in session.camera.pointings if one.altitude_deg is not None]
+    if not altitudes or tracker.exposure_s <= 0:
+        return Part("scintillation", math.nan, "not known: no air mass, as refraction was not fitted")
+    mass = float(np.mean([1 / math.sin(math.radians(one)) for one in altitudes]))
+    sigma = 0.09 * (tracker.aperture_mm / 10) ** (-2 / 3) * mass**1.75 / math.sqrt(2 * tracker.exposure_s)
+    how = f"Young's law at sea level: air mass {mass:.2f}, the bench's {tracker.aperture_mm:g} mm and {tracker.exposure_s:g} s"
+    return Part("scintillation", sigma, f"{how}; not measured")
+
+
+def _rest(whole: float, parts: Sequence[Part]) -> Part:
+    measured = [one for one in parts if math.isfinite(one.rms) and one.name != "scintillation"]
+    rest = whole - math.fsum(one.rms**2 for one in measured)
+    return Part("unexplained", math.sqrt(max(rest, 0.0)), "what is left of the squares, scintillation among it")
+
+
+def _ms(values: FloatArray) -> float:
+    return float((values**2).mean()) if len(values) else 0.0
+
+
+def _taken(columns: FloatArray, off: FloatArray) -> float:
+    """The mean square that columns take of residuals, less what as many random ones would."""
+    count = columns.shape[1]
+    design = columns - columns.mean(axis=0)
+    model = design @ np.linalg.lstsq(design, off - off.mean(), rcond=None)[0]
+    rest = _ms(off - off.mean() - model)
+    return float(max(_ms(model) - rest * count / max(len(off) - count, 1), 0.0))

@@ -1,0 +1,402 @@
+"""The light of photographs: zero point, colour, vignetting and linearity by stars; gain, pedestal and noise by pixels.
+
+Magnitudes are compared with what hilstar computes of each star's spectrum through the tracker's curves. A residual is a
+star's instrument magnitude less the fitted one: positive where the photograph has less light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.units import MAD_TO_SIGMA
+
+MAG = 2.5 / math.log(10)
+# A quantum efficiency is corrected by exp(tilt x + bow x^2), x = ln(wavelength / 550 nm): the largest of both, the stars that
+# each takes, and the spread of B-V that they need.
+MAX_CORRECTION, STARS_FOR_CORRECTION, MIN_COLOURS_MAG = np.array([10.0, 30.0]), (15, 30), 0.2
+CORRECTION_PRIOR = np.array([3.0, 10.0])
+CORRECTION_ROUNDS, CORRECTION_STEP, CORRECTION_FLOOR_MAG, CORRECTION_HUBER = 8, 0.05, 0.05, 1.5
+NO_CORRECTION = (0.0, 0.0)
+FOLDS, GAIN = 5, 0.985
+BRIGHT_V_MAG = 6.5  # to which rms errors are stated
+TRUSTED_SNR = 20.0
+CLIP, ROUNDS = 3.5, 8
+MIN_STARS = 8
+BLOCK_PX = 32
+SKY_CURVATURE = 0.03  # of the sky's light: by how much its shade differs from one photograph to another beyond a slope
+MIN_LEVEL_RANGE = 1.25  # of background levels, from which their noise tells the gain
+LINEAR_OFF, LINEAR_SIGMAS = 0.04, 4.0  # by how much a power differs from 1 where a tone curve is stated
+
+Correction = tuple[float, float]
+Magnitudes = Callable[[Correction], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class StarLight:
+    """Stars (n,) of all photographs: which one, flux with one sigma, DN, V, B-V, the square of the radius, and whether clean.
+
+    The radius is in half diagonals from the principal point.
+    """
+
+    image: IntArray
+    dn: FloatArray
+    sigma_dn: FloatArray
+    v_mag: FloatArray
+    bv_mag: FloatArray
+    radius2: FloatArray
+    clean: BoolArray
+
+    @property
+    def instrument_mag(self) -> FloatArray:
+        """-2.5 log10 of DN."""
+        return np.asarray(-2.5 * np.log10(np.maximum(self.dn, 1e-9)))
+
+    @property
+    def sigma_mag(self) -> FloatArray:
+        """One sigma of it by noise."""
+        return np.asarray(MAG * self.sigma_dn / np.maximum(self.dn, 1e-9))
+
+    @property
+    def bright(self) -> BoolArray:
+        """Clean stars to V = 6.5."""
+        return self.clean & (self.v_mag <= BRIGHT_V_MAG)
+
+
+@dataclass(frozen=True, slots=True)
+class LightFit:
+    """Zero points (images,) of DN, mag, about the tracker's own magnitudes, vignetting (mag at r^2, r^4 = 1).
+
+    `correction` is that of the quantum efficiency: tilt and bow. `zero_point_mag` and `colour_term` are
+    about Johnson V: -2.5 log10(DN) = V + colour_term (B-V) - zero point. DN go as light to the power `linearity`. `sigma` has
+    one sigma of figures by name. `mag` (n,) is what each star should have, without the photograph's offset.
+    """
+
+    offsets_mag: FloatArray
+    vignetting_mag: tuple[float, float]
+    correction: Correction
+    zero_point_mag: float
+    colour_term: float
+    linearity: float
+    residual_mag: FloatArray
+    held_out_mag: dict[str, float] = field(default_factory=dict)
+    sigma: dict[str, float] = field(default_factory=dict)
+    mag: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def illumination(self, radius2: FloatArray) -> FloatArray:
+        """Light relative to the axis at squares of radii."""
+        a, b = self.vignetting_mag
+        return np.asarray(10 ** (-0.4 * (a * radius2 + b * radius2**2)))
+
+
+def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: LightFit | None = None) -> LightFit:
+    """The light of stars; `magnitudes` are theirs (n,) through a quantum efficiency of a tilt.
+
+    With `held` the camera is that one's, and each photograph's offset (the air, the exposure) alone is fitted.
+    """
+    if held is not None:
+        return _offsets_alone(stars, images, magnitudes(NO_CORRECTION), held)
+    ones = np.eye(images)[stars.image]
+    r2 = stars.radius2
+    use = _trusted(stars, ones)
+    vignetting: dict[str, list[FloatArray]] = {"even": []}
+    if use.sum() >= MIN_STARS + images:
+        vignetting |= {"r^2": [r2], "r^2, r^4": [r2, r2**2]}
+    correction = _correction(stars, magnitudes, np.column_stack([ones, r2]), use)
+    base = magnitudes(correction)
+    off = stars.instrument_mag - base
+    held_out, chosen, best = {}, "even", math.inf
+    for name, columns in vignetting.items():
+        held_out[name] = _held_out(np.column_stack([ones, *columns]), off, stars.sigma_mag, use)
+        if held_out[name] < GAIN * best:
+            best, chosen = held_out[name], name
+    found = _robust(np.column_stack([ones, *vignetting[chosen]]), off, stars.sigma_mag, use)
+    terms = (*found.values[images:].tolist(), 0.0, 0.0)[:2]
+    about_v = _about_v(stars, base, use, ones, vignetting[chosen])
+    sigma = {name: about_v.sigma[k] for k, name in enumerate(("linearity", "colour_term"))}
+    sigma |= {"zero_point_mag": float(about_v.sigma[2 : 2 + images].mean())}
+    return LightFit(
+        offsets_mag=found.values[:images],
+        vignetting_mag=(terms[0], terms[1]),
+        correction=correction,
+        zero_point_mag=-float(about_v.values[2 : 2 + images].mean()),
+        colour_term=float(about_v.values[1]),
+        linearity=float(about_v.values[0]),
+        residual_mag=found.off,
+        held_out_mag=held_out,
+        sigma=sigma,
+        mag=base + found.model - ones @ found.values[:images],
+    )
+
+
+def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:
+    """Clean stars that should have TRUSTED_SNR by their V: of fainter ones only those are found that came out bright."""
+    clean = stars.clean & (stars.dn > 0)
+    bright = clean & (stars.dn > TRUSTED_SNR * stars.sigma_dn)
+    if not bright.any():
+        return clean
+    plain = _robust(ones, stars.instrument_mag - stars.v_mag, stars.sigma_mag, bright)
+    expected_dn = 10 ** (-0.4 * (stars.v_mag + ones @ plain.values))
+    found = clean & (expected_dn > TRUSTED_SNR * np.median(stars.sigma_dn[bright]))
+    return found if found.sum() >= MIN_STARS else clean
+
+
+def _correction(stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use: BoolArray) -> Correction:
+    """Tilt and bow of the quantum efficiency by which stars of all colours fit best."""
+    count = sum(int(use.sum()) >= least + plain.shape[1] for least in STARS_FOR_CORRECTION)
+    if not count or np.std(np.nan_to_num(stars.bv_mag[use])) < MIN_COLOURS_MAG:
+        return NO_CORRECTION
+    weight, target = np.hypot(stars.sigma_mag, CORRECTION_FLOOR_MAG)[use], stars.instrument_mag[use]
+    plain = plain[use]
+
+    def loss(values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Huber's loss and a weak prior; the residuals in sigmas, and the other columns' coefficients."""
+        off, kept = target - magnitudes(_pair(values))[use], np.ones(len(target))
+        for _ in range(CORRECTION_ROUNDS):
+            rows = plain * (np.sqrt(kept) / weight)[:, None]
+            left = (off - plain @ np.linalg.lstsq(rows, off * np.sqrt(kept) / weight, rcond=None)[0]) / weight
+            kept = np.minimum(1.0, CORRECTION_HUBER / np.maximum(np.abs(left), CORRECTION_HUBER))
+        size = np.abs(left)
+        huber = np.where(size < CORRECTION_HUBER, size**2 / 2, CORRECTION_HUBER * (size - CORRECTION_HUBER / 2))
+        return float(huber.sum() + ((values / CORRECTION_PRIOR) ** 2).sum() / 2), left, kept
+
+    values: FloatArray = np.zeros(2)
+    best, off, kept = loss(values)
+    for _ in range(CORRECTION_ROUNDS):
+        base = magnitudes(_pair(values))[use]
+        moved = [magnitudes(_pair(values + step))[use] for step in CORRECTION_STEP * np.eye(2)[:count]]
+        slopes = np.column_stack([*plain.T, *((one - base) / CORRECTION_STEP for one in moved)]) / weight[:, None]
+        prior = np.zeros(slopes.shape[1])
+        prior[plain.shape[1] :] = 1 / CORRECTION_PRIOR[:count] ** 2
+        downhill = slopes.T @ (kept * off)
+        downhill[plain.shape[1] :] -= values[:count] * prior[plain.shape[1] :]
+        step = np.zeros(2)
+        step[:count] = np.linalg.solve(slopes.T @ (kept[:, None] * slopes) + np.diag(prior + 1e-9), downhill)[plain.shape[1] :]
+        for share in (1.0, 0.4, 0.15, 0.05):
+            trial = np.clip(values + share * step, -MAX_CORRECTION, MAX_CORRECTION)
+            new = loss(trial)
+            if new[0] < best:
+                break
+        else:
+            break
+        done = best - new[0] < 0.01
+        values, (best, off, kept) = trial, new
+        if done:
+            break
+    return _pair(values)
+
+
+def _pair(values: FloatArray) -> Correction:
+    return float(values[0]), float(values[1])
+
+
+def _about_v(stars: StarLight, base: FloatArray, use: BoolArray, ones: FloatArray, vignetting: Sequence[FloatArray]) -> _Robust:
+    """The power of the light that DN follow, and about V the colour term and zero points."""
+    bv = np.nan_to_num(stars.bv_mag)
+    both = _robust(np.column_stack([base, ones, *vignetting]), stars.instrument_mag, stars.sigma_mag, use)
+    # a zero point at V = 0 of a line with a free slope lies far from the stars: that of slope 1 is stated
+    plain = _robust(np.column_stack([bv, ones, *vignetting]), stars.instrument_mag - stars.v_mag, stars.sigma_mag, use)
+    return replace(
+        both, values=np.concatenate([both.values[:1], plain.values]), sigma=np.concatenate([both.sigma[:1], plain.sigma])
+    )
+
+
+def _offsets_alone(stars: StarLight, images: int, base: FloatArray, held: LightFit) -> LightFit:
+    shape = held.vignetting_mag[0] * stars.radius2 + held.vignetting_mag[1] * stars.radius2**2
+    off = stars.instrument_mag - base - shape
+    ones = np.eye(images)[stars.image]
+    found = _robust(ones, off, stars.sigma_mag, _trusted(stars, ones))
+    return replace(held, offsets_mag=found.values, residual_mag=found.off, mag=base + shape)
+
+
+@dataclass(frozen=True, slots=True)
+class _Robust:
+    values: FloatArray
+    sigma: FloatArray
+    model: FloatArray
+    off: FloatArray
+
+
+def _robust(design: FloatArray, target: FloatArray, sigma: FloatArray, use: BoolArray) -> _Robust:
+    """Least squares without what lies far off; its errors by the scatter that is left."""
+    kept, floor = use & np.isfinite(target), 0.05
+    values: FloatArray = np.zeros(design.shape[1])
+    covariance = np.full((design.shape[1],) * 2, np.nan)
+    for _ in range(ROUNDS):
+        if kept.sum() <= design.shape[1]:
+            break
+        weight = 1 / np.hypot(sigma, floor)[kept]
+        rows = design[kept] * weight[:, None]
+        values = np.asarray(np.linalg.lstsq(rows, target[kept] * weight, rcond=None)[0], dtype=np.float64)
+        off = target - design @ values
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept]))) * math.sqrt(kept.sum() / (kept.sum() - design.shape[1]))
+        floor = math.sqrt(max(spread**2 - float(np.median(sigma[kept])) ** 2, 1e-6))
+        covariance = np.linalg.pinv(rows.T @ rows)
+        kept = use & (np.abs(off) < CLIP * np.hypot(sigma, max(spread, 0.01)))
+    model = design @ values
+    return _Robust(values, np.sqrt(np.maximum(np.diag(covariance), 0)), model, target - model)
+
+
+def _held_out(design: FloatArray, target: FloatArray, sigma: FloatArray, use: BoolArray) -> float:
+    """Rms of stars that were held out, mag, each counted up to 0.5."""
+    off = np.full(len(target), np.nan)
+    number = np.cumsum(use)
+    for fold in range(FOLDS):
+        out = use & (number % FOLDS == fold)
+        off[out] = _robust(design, target, sigma, use & ~out).off[out]
+    found = np.clip(off[use], -0.5, 0.5)
+    return math.sqrt(float((found**2).mean())) if len(found) else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class PixelFit:
+    """What pixels tell of the detector: gain, pedestal, read noise, with one sigma where known, and the points (n, 2) of it.
+
+    Points are the background's level and its variance, DN, DN^2. `notes` say what was assumed.
+    """
+
+    gain_e_per_dn: float
+    pedestal_dn: float
+    read_noise_e: float
+    step_dn: float
+    sigma: dict[str, float]
+    points: FloatArray
+    notes: tuple[str, ...] = ()
+
+    def variance_dn2(self, level_dn: FloatArray) -> FloatArray:
+        """Variance of a pixel at a level."""
+        light = np.maximum(level_dn - self.pedestal_dn, 0) / self.gain_e_per_dn
+        return np.asarray(light + (self.read_noise_e / self.gain_e_per_dn) ** 2 + self.step_dn**2 / 12)
+
+
+def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> FloatArray:
+    """Levels and variances (n, 2) of blocks of an image, by differences of neighbours, without pixels of stars.
+
+    A shading within a block counts for nothing: the smooth level is taken off first.
+    """
+    off = dn - level
+    free = ~star
+    parts = []
+    for one, two, both in (
+        (off[:, 1:], off[:, :-1], free[:, 1:] & free[:, :-1]),
+        (off[1:], off[:-1], free[1:] & free[:-1]),
+    ):
+        height, width = (size // BLOCK_PX * BLOCK_PX for size in one.shape)
+        shape = height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX
+        difference = ((one - two)[:height, :width]).reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
+        use = both[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
+        middle = level[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2).mean(axis=1)
+        spread = np.sqrt(np.maximum((difference**2 * use).sum(axis=1) / np.maximum(use.sum(axis=1), 1), 1e-12))
+        use &= np.abs(difference) < 4 * spread[:, None]
+        count = use.sum(axis=1)
+        variance = (difference**2 * use).sum(axis=1) / np.maximum(count, 1) / 2
+        full = count > BLOCK_PX**2 / 2
+        parts.append(np.column_stack([middle, variance])[full])
+    return np.concatenate(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Assumed:
+    """What the bench file says of the detector, taken where photographs cannot tell."""
+
+    offset_dn: float
+    read_noise_e: float
+    gain_e_per_dn: float
+
+
+def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: Assumed) -> PixelFit:
+    """The detector by photon transfer; `pedestal` and its sigma where levels told it."""
+    notes = []
+    offset, offset_sigma = pedestal or (assumed.offset_dn, math.nan)
+    if not len(points):
+        notes.append("no part of the background is free of sources: the detector is the bench file's")
+        return PixelFit(assumed.gain_e_per_dn, offset, assumed.read_noise_e, step_dn, {}, points, tuple(notes))
+    level, variance = points.T
+    if pedestal is None:
+        notes.append(f"the pedestal is the bench file's, {offset:g} DN: levels of these photographs do not tell it")
+    else:
+        offset_sigma = math.hypot(offset_sigma, SKY_CURVATURE * float(np.median(level)))
+        if abs(offset - assumed.offset_dn) < 3 * offset_sigma:
+            told = f"{offset:.0f} +- {offset_sigma:.0f} DN by the skies' levels"
+            offset = assumed.offset_dn
+            notes.append(f"the pedestal is the bench file's, {offset:g} DN ({told})")
+    low, high = np.percentile(level, [5, 95])
+    sigma = {"pedestal_dn": offset_sigma}
+    line = _line(level - offset, variance)
+    if high - offset > MIN_LEVEL_RANGE * (low - offset) and line.slope > 5 * line.slope_sigma:
+        gain = 1 / line.slope
+        read = math.sqrt(max(line.at_zero - step_dn**2 / 12, 0.0))
+        sigma["gain_e_per_dn"] = gain * line.slope_sigma / line.slope
+        sigma["read_noise_e"] = gain * min(line.at_zero_sigma / max(2 * read, 1e-9), math.sqrt(line.at_zero_sigma))
+        return PixelFit(gain, offset, read * gain, step_dn, sigma, points, tuple(notes))
+    # one level alone: shot noise of what is above the pedestal, and the bench's read noise
+    signal, noise2 = float(np.median(level)) - offset, float(np.median(variance)) - step_dn**2 / 12
+    gain, read_e = assumed.gain_e_per_dn, assumed.read_noise_e
+    if signal > 0 and noise2 > 0:
+        gain = (signal + math.sqrt(signal**2 + 4 * noise2 * read_e**2)) / (2 * noise2)
+        notes.append(f"the background has one level: the gain takes the bench file's read noise, {read_e:g} e-")
+    else:
+        notes.append("the background is at the pedestal: the gain is the bench file's")
+        read_e = math.sqrt(max(noise2, 0.0)) * gain
+    return PixelFit(gain, offset, read_e, step_dn, sigma, points, tuple(notes))
+
+
+class _Line(NamedTuple):
+    slope: float
+    at_zero: float
+    slope_sigma: float
+    at_zero_sigma: float
+
+
+def _line(x: FloatArray, y: FloatArray) -> _Line:
+    """Slope and value at 0 with their sigmas, without what lies far off; errors of y go as y."""
+    kept = np.ones(len(x), dtype=bool)
+    slope = at_zero = math.nan
+    sigma = np.full(2, math.nan)
+    for _ in range(ROUNDS):
+        weight = 1 / np.maximum(np.median(y) * 0.5, y)[kept]
+        design = np.column_stack([x[kept], np.ones(kept.sum())]) * weight[:, None]
+        (slope, at_zero), *_ = np.linalg.lstsq(design, y[kept] * weight, rcond=None)
+        off = y - slope * x - at_zero
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept] * weight)))
+        sigma = spread * np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
+        kept = np.abs(off) < CLIP * spread * np.maximum(np.median(y) * 0.5, y)
+    return _Line(float(slope), float(at_zero), float(sigma[0]), float(sigma[1]))
+
+
+def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[float, float] | None:
+    """The level without light, and its sigma, by skies of different brightness; None where they cannot tell.
+
+    `levels` (blocks,) of each photograph at `places` (blocks, 2). A sky's light is one shade over the image, common to all
+    photographs, times a slope of its own. Sigma is by leaving out a photograph at a time.
+    """
+    medians = [float(np.median(one)) for one in levels]
+    if len(levels) < 2 or max(medians) < MIN_LEVEL_RANGE * max(min(medians), 1e-9):
+        return None
+    from scipy.optimize import minimize_scalar
+
+    plane = np.column_stack([np.ones(len(places)), places])
+
+    def best(some: Sequence[FloatArray]) -> float:
+        lowest = min(float(one.min()) for one in some)
+
+        def loss(pedestal: float) -> float:
+            logs = np.log(np.array(some) - pedestal)
+            off = (logs - logs.mean(axis=0)).T
+            off = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
+            return float((off**2).sum())
+
+        return float(minimize_scalar(loss, bounds=(lowest - 2 * abs(lowest), 0.98 * lowest), method="bounded").x)
+
+    whole = best(levels)
+    if len(levels) == 2:
+        return whole, abs(whole) / 2
+    parts = [best([*levels[:k], *levels[k + 1 :]]) for k in range(len(levels))]
+    usable = [p for k, p in enumerate(parts) if max(m := medians[:k] + medians[k + 1 :]) > MIN_LEVEL_RANGE * min(m)]
+    sigma = float(np.std(usable)) * math.sqrt(max(len(usable) - 1, 1)) if len(usable) > 1 else abs(whole) / 2
+    return whole, max(sigma, 0.01 * min(medians))

@@ -1,0 +1,422 @@
+"""From photographs to one camera: attitudes, stars by a PSF, geometry and light of all photographs together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_optics, channel_rates
+from hilstar.confront.background import SkyLevel, Sources, find_sources, sky_level, source_mask
+from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera
+from hilstar.confront.images import Photograph
+from hilstar.confront.light import (
+    LINEAR_OFF,
+    LINEAR_SIGMAS,
+    NO_CORRECTION,
+    Assumed,
+    Correction,
+    LightFit,
+    PixelFit,
+    StarLight,
+    fit_light,
+    fit_pedestal,
+    fit_pixels,
+    transfer_points,
+)
+from hilstar.confront.lost_in_space import MIN_MATCHED, Field, Solved, solve_lost
+from hilstar.confront.sky import DatedSky, dated_sky
+from hilstar.confront.star_psf import HALF, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
+from hilstar.errors import InputError
+from hilstar.rotation import conjugate, rotate
+from hilstar.scene.camera import Camera
+from hilstar.sky.spectrum import Curve
+from hilstar.units import flux_ratio, magnitude
+
+MATCH_PX = 2.5
+BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
+PSF_STARS = 60
+TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 14.0
+BRIGHTEST = 15  # sources that tell a photograph's focus and rest
+SATURATED_SHARE = 0.97
+TONE_ROUNDS = 7
+PASSES = 2
+SOURCE_PX = 4  # about a source whose pixels tell nothing of the background
+SCATTER_SNR = 10.0
+LINEAR_DONE = 0.004
+MAX_TONE_STEP = 1.35
+
+
+@dataclass(slots=True)
+class Shot:
+    """One photograph on its way: its background and sources, its sky, its pointing, and the stars on it.
+
+    `star` (n,) are rows of `sky`, with the `measured` figures of each and whether it is `clean`: alone, and not saturated.
+    """
+
+    photo: Photograph
+    level: SkyLevel
+    sources: Sources
+    sky: DatedSky
+    pointing: Pointing
+    focal_length_px: float
+    matched: Solved
+    star: IntArray
+    stamps: Stamps | None = None
+    measured: Measured | None = None
+    saturated: BoolArray | None = None
+    blended: BoolArray | None = None
+
+    @property
+    def clean(self) -> BoolArray:
+        """Stars that count in fits."""
+        if self.saturated is None or self.blended is None:
+            raise AssertionError("measured first")
+        return ~self.saturated & ~self.blended
+
+    @property
+    def found(self) -> Measured:
+        """The stars' figures."""
+        if self.measured is None:
+            raise AssertionError("measured first")
+        return self.measured
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What all photographs together say: the camera, its PSF, its light and its pixels."""
+
+    file: BenchFile
+    shots: tuple[Shot, ...]
+    camera: CameraFit
+    psf: StarPsf
+    light: LightFit
+    stars: StarLight
+    pixels: PixelFit
+    power: float
+    fixed: bool
+
+    def predicted_dn(self, number: int, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """DN of stars (n,), rows of the sky of photograph `number`, at their places on it."""
+        sky, light = self.shots[number].sky, self.light
+        columns = np.stack([sky.v_mag[star], sky.bv_mag[star], sky.vi_mag[star]])
+        mag = _Magnitudes(self.file, columns)(NO_CORRECTION if self.fixed else light.correction)
+        shade = light.illumination(radius2_of(self.camera.camera, x_px, y_px))
+        return np.asarray(10 ** (-0.4 * (mag + light.offsets_mag[number])) * shade)
+
+
+def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArray | None) -> Shot:
+    """A photograph with its attitude. Raises InputError where it has none: what is seen, and what to do."""
+    level = sky_level(photo.dn, photo.step_dn)
+    sources = find_sources(level.above(photo.dn))
+    sky = dated_sky(file, photo.t_ns)
+    points = ~sources.single & ~sources.trail
+    field = _field(sources, points, photo)
+    if len(field.places_px) < MIN_MATCHED:
+        raise InputError(
+            f"{photo.path}: {len(field.places_px)} sources stand out of its noise, and an attitude takes {MIN_MATCHED}; expose"
+            " longer, open the cap, or look at a sky without cloud"
+        )
+    found = _solve(field, base, sky, start)
+    if found is None:
+        raise InputError(f"{photo.path}: {_why_not(field, base, sky, sources, points, start)}")
+    kept = np.flatnonzero(points)
+    matched = replace(found, source=kept[found.source])
+    wide_px = float(np.median(sources.width_px[np.sort(matched.source)[:BRIGHTEST]]))
+    if wide_px > WIDE_PX:
+        raise InputError(f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in focus")
+    return Shot(
+        photo, level, sources, sky, Pointing(found.q_icrs_to_cam), found.focal_length_px, matched, np.empty(0, dtype=np.intp)
+    )
+
+
+def _field(sources: Sources, points: BoolArray, photo: Photograph) -> Field:
+    width, height = photo.size_px
+    places = np.column_stack([sources.x_px - (width - 1) / 2, sources.y_px - (height - 1) / 2])[points]
+    return Field(places, width, height)
+
+
+def _solve(field: Field, base: Camera, sky: DatedSky, start: FloatArray | None) -> Solved | None:
+    if start is not None:
+        near = rotate(conjugate(start), np.array([[0.0, 0.0, 1.0]]))[0]
+        found = solve_lost(field, base.focal_length_px, sky.vectors, near)
+        if found is not None:
+            return found
+    return solve_lost(field, base.focal_length_px, sky.vectors)
+
+
+def _why_not(field: Field, base: Camera, sky: DatedSky, sources: Sources, points: BoolArray, start: FloatArray | None) -> str:
+    """What is seen of a photograph without an attitude, and what to do."""
+    bright = np.flatnonzero(points)[:BRIGHTEST]
+    length, width = np.median(sources.length_px[bright]), np.median(sources.width_px[bright])
+    if sources.trail.sum() >= MIN_MATCHED or (length > TRAILED_PX and length > TRAILED_RATIO * width):
+        trails = sources.length_px[sources.trail] if sources.trail.sum() >= MIN_MATCHED else np.array([length])
+        return (
+            f"its stars are trails of about {np.median(trails):.0f} px; give a frame of a camera at rest, or a shorter exposure"
+        )
+    if width > WIDE_PX:
+        return f"its sources are {width:.0f} px wide; focus the lens, or give a frame in focus"
+    mirrored = replace(field, places_px=field.places_px * [-1, 1])
+    if _solve(mirrored, base, sky, start) is not None:
+        return "is mirrored: its stars fit the sky only with left and right exchanged; flip the image"
+    seen = f"has {len(field.places_px)} sources, and no part of the sky fits them"
+    degrees = math.degrees(2 * math.atan(field.width_px / 2 / base.focal_length_px))
+    asked = " near --radec" if start is not None else ""
+    return f"{seen}{asked} at {degrees:.3g} deg of width within 20 %; check focal_length_mm and pixel_pitch_um" + (
+        "" if start is not None else ", or give --radec RA,DEC,ROLL"
+    )
+
+
+def run_session(
+    file: BenchFile,
+    photos: Sequence[Photograph],
+    base: Camera,
+    start: FloatArray | None,
+    *,
+    fixed: FixedCamera | None = None,
+) -> Session:
+    """Everything about photographs of one camera; with `fixed` that camera, to which only attitudes and offsets are fitted.
+
+    Raises InputError for a photograph without an attitude.
+    """
+    shots = [open_shot(file, photo, base, start) for photo in photos]
+    assumed = Assumed(*(getattr(file.config.tracker.detector, name) for name in ("offset_dn", "read_noise_e", "gain_e_per_dn")))
+    focal = float(np.median([shot.focal_length_px for shot in shots]))
+    base = replace(base, focal_length_px=focal) if fixed is None else fixed.camera
+    fit = _Fitting(file, base, assumed, fixed)
+    session = fit.of(shots, 1.0)
+    off = abs(session.light.linearity - 1)
+    if fixed is not None or off < max(LINEAR_OFF, LINEAR_SIGMAS * session.light.sigma["linearity"]):
+        return session
+    power, trial = 1.0, session
+    for _ in range(TONE_ROUNDS):
+        power *= min(max(trial.light.linearity, 1 / MAX_TONE_STEP), MAX_TONE_STEP)
+        linear = [_linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)]
+        trial = fit.of(linear, power, session.camera)
+        if abs(trial.light.linearity - 1) < LINEAR_DONE:
+            return fit.of(trial.shots, power)
+    return session  # no power makes it linear: its figures say so
+
+
+@dataclass(frozen=True, slots=True)
+class FixedCamera:
+    """A camera file's own optics and detector, for --fixed."""
+
+    camera: Camera
+    psf: StarPsf
+    light: LightFit
+    pixels: PixelFit
+
+
+def _linear(shot: Shot, photo: Photograph, power: float) -> Shot:
+    """The shot with levels that go as light: those of the file to the power 1 / `power`, full scale as it is."""
+    full = photo.full_dn
+    dn = full * (np.maximum(photo.dn, 0) / full) ** (1 / power)
+    middle = float(np.median(photo.dn)) / full
+    step = photo.step_dn / power * max(middle, photo.step_dn / full) ** (1 / power - 1)
+    linear = replace(photo, dn=dn, step_dn=step)
+    level = sky_level(dn, step)
+    return replace(shot, photo=linear, level=level)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fitting:
+    """What a fit starts from: the bench, its camera, its detector, and the camera that is held, if any."""
+
+    file: BenchFile
+    base: Camera
+    assumed: Assumed
+    fixed: FixedCamera | None
+
+    def of(self, shots: Sequence[Shot], power: float, before: CameraFit | None = None) -> Session:
+        """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
+        return _fitted(self, shots, power, before)
+
+
+def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: CameraFit | None) -> Session:
+    fixed = start.fixed
+    pointings = [shot.pointing for shot in shots] if before is None else list(before.pointings)
+    first = [
+        Places(
+            s.sources.x_px[s.matched.source],
+            s.sources.y_px[s.matched.source],
+            np.full(len(s.matched.star), 0.15),
+            s.sky.vectors[s.matched.star],
+        )
+        for s in shots
+    ]
+    camera = before or fit_camera(start.base, pointings, first, fixed=fixed is not None, refraction=False)
+    pixels = _pixels(shots, start.assumed) if fixed is None else fixed.pixels
+    gain = pixels.gain_e_per_dn
+    passes = PASSES if before is None else 1
+    for number in range(passes):
+        for shot, pointing in zip(shots, camera.pointings, strict=True):
+            _identify(shot, camera.camera, pointing)
+        psf = _psf(shots, gain) if fixed is None else fixed.psf
+        for shot in shots:
+            _measure(shot, psf, gain)
+        if before is not None:
+            continue
+        places = [_places(shot) for shot in shots]
+        turned = [replace(one, zenith=None) for one in camera.pointings] if number == 0 else list(camera.pointings)
+        camera = fit_camera(
+            start.base, turned, places, fixed=fixed is not None, refraction=number == PASSES - 1 or fixed is not None
+        )
+        for shot, pointing in zip(shots, camera.pointings, strict=True):
+            shot.pointing = pointing
+    stars = _star_light(shots, camera.camera)
+    light = fit_light(stars, len(shots), _magnitudes(start.file, shots), None if fixed is None else fixed.light)
+    return Session(start.file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None)
+
+
+def _pixels(shots: Sequence[Shot], assumed: Assumed) -> PixelFit:
+    """The detector by the background of all photographs."""
+    parts = []
+    for s in shots:
+        above = s.level.above(s.photo.dn)
+        parts.append(transfer_points(s.photo.dn, s.level.level, source_mask(s.sources, above, SOURCE_PX)))
+    points = np.concatenate(parts)
+    height, width = shots[0].photo.dn.shape
+    side = shots[0].level.block_px
+    y, x = np.mgrid[side // 2 : height : side, side // 2 : width : side]
+    places = np.column_stack([x.ravel() / width, y.ravel() / height]) - 0.5
+    pedestal = fit_pedestal([s.level.level[y, x].ravel() for s in shots], places)
+    return fit_pixels(points, max(s.photo.step_dn for s in shots), pedestal, assumed)
+
+
+def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
+    """Which stars of the catalogue are sources of the shot, and which of them stand alone and are not saturated."""
+    width, height = shot.photo.size_px
+    x, y = pointing.places_px(camera, shot.sky.vectors)
+    with np.errstate(invalid="ignore"):
+        inside = np.flatnonzero((x > HALF) & (x < width - 1 - HALF) & (y > HALF) & (y < height - 1 - HALF))
+    tree = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px]))
+    off, source = map(np.asarray, tree.query(np.column_stack([x[inside], y[inside]]), distance_upper_bound=MATCH_PX))
+    near = np.isfinite(off)
+    star, source = inside[near], source[near]
+    first = np.unique(source, return_index=True)[1]  # stars are in order of light: the brightest has a source
+    star, source = star[np.sort(first)], source[np.sort(first)]
+    every = cKDTree(np.column_stack([x[inside], y[inside]]))
+    v = shot.sky.v_mag
+    blended = np.zeros(len(star), dtype=bool)
+    for k, one in enumerate(star):
+        beside = inside[every.query_ball_point([x[one], y[one]], BLEND_PX)]
+        beside = beside[beside != one]
+        blended[k] = bool((v[beside] < v[one] + BLEND_MAG).any())
+    if len(shot.sources) > 1:
+        snr = shot.sources.snr
+        apart, other = (np.asarray(part)[:, -1] for part in tree.query(tree.data[source], k=2))
+        blended |= (apart < BLEND_PX) & (snr[other] > flux_ratio(BLEND_MAG) * snr[source])
+    shot.star = star
+    above = shot.photo.dn - shot.level.level
+    variance = shot.level.noise**2
+    shot.stamps = cut_stamps(above, variance, shot.sources.x_px[source], shot.sources.y_px[source], shot.sky.bv_mag[star])
+    top = cut_stamps(shot.photo.dn, variance, shot.sources.x_px[source], shot.sources.y_px[source], shot.sky.bv_mag[star])
+    middle = top.values[:, HALF - 3 : HALF + 4, HALF - 3 : HALF + 4]
+    shot.saturated = middle.max(axis=(1, 2)) >= SATURATED_SHARE * shot.photo.full_dn
+    shot.blended = blended
+
+
+def _psf(shots: Sequence[Shot], gain: float) -> StarPsf:
+    """The PSF by the brightest clean stars of all shots."""
+    clean = [shot.clean for shot in shots]
+    stamps = join([shot.stamps.at(mask) for shot, mask in zip(shots, clean, strict=True) if shot.stamps is not None])
+    if len(stamps) < 3:
+        stamps = join([shot.stamps for shot in shots if shot.stamps is not None])
+    light = stamps.values[:, 2:-2, 2:-2].sum(axis=(1, 2)) / np.sqrt(np.median(stamps.variance, axis=(1, 2)))
+    best = np.zeros(len(stamps), dtype=bool)
+    best[np.argsort(-light)[:PSF_STARS]] = True
+    stamps = stamps.at(best)
+    return fit_psf(stamps, *_middles(stamps), shots[0].photo.size_px, gain)
+
+
+def _middles(stamps: Stamps) -> tuple[FloatArray, FloatArray]:
+    """First places: centres of gravity of the 5 x 5 middle pixels."""
+    part = np.maximum(stamps.values[:, HALF - 2 : HALF + 3, HALF - 2 : HALF + 3], 0)
+    total = np.maximum(part.sum(axis=(1, 2)), 1e-9)
+    reach = np.arange(-2, 3)
+    return stamps.column + part.sum(axis=1) @ reach / total, stamps.row + part.sum(axis=2) @ reach / total
+
+
+def _measure(shot: Shot, psf: StarPsf, gain: float) -> None:
+    if shot.stamps is None:
+        raise AssertionError("identified first")
+    shot.measured = measure(shot.stamps, psf, *_middles(shot.stamps), gain)
+
+
+def _places(shot: Shot) -> Places:
+    """Places that count in a fit of the geometry: those of clean stars."""
+    use = shot.clean & (shot.found.dn > SCATTER_SNR * shot.found.sigma_dn)
+    if use.sum() < MIN_MATCHED:
+        use = shot.clean
+    if use.sum() < 3:
+        use = np.ones(len(shot.star), dtype=bool)
+    found = shot.found
+    return Places(found.x_px[use], found.y_px[use], found.sigma_px[use], shot.sky.vectors[shot.star[use]])
+
+
+def radius2_of(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """Squares of radii from the principal point, in half diagonals."""
+    (cx, cy), (width, height) = camera.principal_point_px, camera.resolution_px
+    return np.asarray(((x_px - cx) ** 2 + (y_px - cy) ** 2) / ((width**2 + height**2) / 4))
+
+
+def _star_light(shots: Sequence[Shot], camera: Camera) -> StarLight:
+    parts = []
+    for k, shot in enumerate(shots):
+        found = shot.found
+        radius2 = radius2_of(camera, found.x_px, found.y_px)
+        sky = shot.sky
+        parts.append(
+            (
+                np.full(len(shot.star), k),
+                found.dn,
+                found.sigma_dn,
+                sky.v_mag[shot.star],
+                sky.bv_mag[shot.star],
+                radius2,
+                shot.clean,
+            )
+        )
+    return StarLight(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+class _Magnitudes:
+    """Magnitudes of the session's stars by hilstar's own spectra, through a corrected quantum efficiency."""
+
+    def __init__(self, file: BenchFile, columns: FloatArray) -> None:
+        self._file, self._columns = file, list(columns)
+        self._kept: dict[Correction, FloatArray] = {}
+
+    def __call__(self, correction: Correction) -> FloatArray:
+        if correction not in self._kept:
+            optics = bench_optics(self._file.config.tracker, self._file.folder)
+            optics = replace(optics, quantum_efficiency=corrected(optics.quantum_efficiency, correction))
+            rates = channel_rates(self._file.config.sky, optics)
+            self._kept[correction] = magnitude(rates(*self._columns))
+        return self._kept[correction]
+
+
+def _magnitudes(file: BenchFile, shots: Sequence[Shot]) -> _Magnitudes:
+    rows = [np.stack([s.sky.v_mag[s.star], s.sky.bv_mag[s.star], s.sky.vi_mag[s.star]]) for s in shots]
+    return _Magnitudes(file, np.concatenate(rows, axis=1))
+
+
+PIVOT_NM = 550.0
+KNOT_NM = 20.0
+
+
+def corrected(curve: Curve, correction: Correction) -> Curve:
+    """A quantum efficiency times exp(tilt x + bow x^2), x = ln(wavelength / 550 nm), at most 1."""
+    if correction == NO_CORRECTION:
+        return curve
+    ends = curve.wavelength_nm[[0, -1]]
+    nm = np.union1d(curve.wavelength_nm, np.linspace(ends[0], ends[-1], max(2, round(float(np.ptp(ends)) / KNOT_NM))))
+    x = np.log(nm / PIVOT_NM)
+    value = curve(nm) * np.exp(correction[0] * x + correction[1] * x * x)
+    return Curve(nm, value / max(1.0, float(value.max())))

@@ -34,15 +34,17 @@ class Convention(Table, frozen=True):
 
     scalar: Annotated[
         Literal["first", "last"],
-        Meta(description="Where the scalar of `q` stands, in JSON and in what a Python function gives."),
+        Meta(description='Where the scalar of `q` stands, `"first"` or `"last"`, in JSON and in what a Python function gives.'),
     ] = "first"
     direction: Annotated[
         Literal["icrs_to_cam", "cam_to_icrs"],
-        Meta(description="What it turns: ICRS components into the tracker's (`icrs_to_cam`), or the other way."),
+        Meta(
+            description='`"icrs_to_cam"`: it turns ICRS components into the tracker\'s. `"cam_to_icrs"`: the other way round.'
+        ),
     ] = "icrs_to_cam"
     frame: Annotated[
         Literal["cam", "body"],
-        Meta(description="Whose axes: the camera's, or the spacecraft's body's, which `[tracker] q_body_to_cam` relates."),
+        Meta(description='`"cam"`: the camera\'s axes. `"body"`: the spacecraft\'s, which `[tracker] q_body_to_cam` relates.'),
     ] = "cam"
 
 
@@ -88,8 +90,8 @@ class AnswersSettings(Table, frozen=True):
     source: Annotated[
         Literal["serial", "udp", "tcp", "zmq", "file"],
         Meta(
-            description="The road: a serial line, UDP, TCP, ZeroMQ, or a file to which something appends; what is appended "
-            "after the start counts."
+            description='The road: a `"serial"` line, `"udp"`, `"tcp"`, `"zmq"`, or a `"file"` to which something appends: '
+            "what is appended after the start counts."
         ),
     ]
     format: Annotated[
@@ -106,7 +108,7 @@ class AnswersSettings(Table, frozen=True):
         Meta(
             description="ZeroMQ: the address to which hilstar's SUB socket connects. UDP: `udp://ADDRESS:PORT`, another way to "
             "write `bind`.",
-            extra={"default": "`tcp://127.0.0.1:5562`"},
+            extra={"default": "`tcp://127.0.0.1:5562` for ZeroMQ"},
         ),
     ] = None
     bind: Annotated[
@@ -169,7 +171,10 @@ class AnswersSettings(Table, frozen=True):
     convention: Annotated[Convention, Meta(description="What the quaternion turns into what.")] = Convention()
     stamp: Annotated[
         Literal["middle", "start", "end", "arrival"],
-        Meta(description='Where in the exposure the tracker\'s stamp stands. `"arrival"`: it is not used, or there is none.'),
+        Meta(
+            description='Where in the exposure the tracker\'s stamp stands: in its `"middle"`, at its `"start"` or `"end"`. '
+            '`"arrival"`: it is not used, or there is none.'
+        ),
     ] = "middle"
     clock: Annotated[
         Literal["own", "unix", "host"],
@@ -209,7 +214,10 @@ class AnswersSettings(Table, frozen=True):
     ] = None
     checksum: Annotated[
         Literal["none", "crc16-ccitt-false", "crc16-xmodem", "crc32", "sum8", "xor8"],
-        Meta(description="A frame's checksum. Without one a damaged frame may be taken for an answer."),
+        Meta(
+            description='A frame\'s checksum: `"crc16-ccitt-false"`, `"crc16-xmodem"`, `"crc32"`, `"sum8"`, `"xor8"`. '
+            'With `"none"` a damaged frame may be taken for an answer.'
+        ),
     ] = "none"
     checksum_at: Annotated[
         Byte | None, Meta(description="Its first byte; below 0 from the end.", extra={"default": "the end of the frame"})
@@ -217,7 +225,9 @@ class AnswersSettings(Table, frozen=True):
     checksum_from: Annotated[
         Annotated[int, Meta(ge=0, lt=MAX_FRAME_BYTES)], Meta(description="The first byte that it covers.")
     ] = 0
-    checksum_order: Annotated[Literal["big", "little"], Meta(description="The order of its bytes.")] = "big"
+    checksum_order: Annotated[
+        Literal["big", "little"], Meta(description='The order of its bytes, `"big"` or `"little"` end first.')
+    ] = "big"
     match: Annotated[
         tuple[FrameMatch, ...],
         Meta(

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from hilstar.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, RenderSettings, Tracker
-from hilstar.bench.glass import bench_glass_psf, glass_in, through_glass
+from hilstar.bench.glass import bench_glass_psf, decentre_px, glass_in, through_glass
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import load_distortion, load_geometry, monitor_camera
 from hilstar.scene.camera import Camera, bounded
@@ -94,14 +94,31 @@ def real_monitor(config: BenchConfig, path: Path) -> Camera:
 
 def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
     """The tracker, with its flight model where it has one, else its glass's distortion. Raises InputError."""
+    optics = tracker.optics
+    if optics.focus_um_per_k and optics.psf == GAUSSIAN:
+        raise InputError("[tracker.optics] focus_um_per_k: a Gaussian has no focus; give psf a file, or leave it out")
     camera = monitor_camera(
-        tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_MISALIGNMENT, tracker.principal_point_px
+        tracker.resolution_px,
+        tracker.pixel_pitch_um,
+        tracker.focal_length_mm * (1 + optics.focal_length_ppm_per_k * 1e-6 * optics.warmer_k),
+        NO_MISALIGNMENT,
+        tracker.principal_point_px,
     )
+    right, down = decentre_px(tracker)
+    if right or down:
+        x, y = camera.principal_point_px
+        camera = dataclasses.replace(camera, principal_point_px=(x + right, y + down))
     path = folder / (tracker.distortion or tracker.optics.psf)
     if tracker.distortion is not None:
         camera = load_distortion(path, camera)
     camera = through_glass(camera, tracker, folder)
     return camera if camera.lens is None else _bounded(camera, tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
+
+
+def flight_camera(tracker: Tracker, folder: Path, true: Camera) -> Camera:
+    """The `true` tracker as its software knows it: at the reference temperature, the lens in its place. Raises InputError."""
+    optics = replace(tracker.optics, temperature_k=tracker.optics.reference_temperature_k, decentre_x_um=0.0, decentre_y_um=0.0)
+    return true if optics == tracker.optics else tracker_camera(replace(tracker, optics=optics), folder)
 
 
 def _bounded(camera: Camera, margin_px: float, path: Path) -> Camera:

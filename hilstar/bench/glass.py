@@ -34,11 +34,22 @@ def glass_in(tracker: Tracker, folder: Path) -> Glass | None:
 def bench_glass_psf(glass: Glass, tracker: Tracker, folder: Path) -> GlassPsf:
     """A tracker's glass at its focus; the same again is the same object. Says what the file does not cover."""
     shares = _mean_shares(glass, tracker, folder)
-    return _glass_psf(glass, tracker.optics.focus_um, tuple(shares.tolist()), tracker.resolution_px)
+    optics = tracker.optics
+    focus_um = optics.focus_um + optics.focus_um_per_k * optics.warmer_k
+    return _glass_psf(glass, focus_um, decentre_px(tracker), tuple(shares.tolist()), tracker.resolution_px)
+
+
+def decentre_px(tracker: Tracker) -> tuple[float, float]:
+    """How far a tracker's lens stands beside its place, px."""
+    return tracker.optics.decentre_x_um / tracker.pixel_pitch_um, tracker.optics.decentre_y_um / tracker.pixel_pitch_um
 
 
 @lru_cache(maxsize=4)
-def _glass_psf(glass: Glass, focus_um: float, shares: tuple[float, ...], resolution_px: tuple[int, int]) -> GlassPsf:
+def _glass_psf(
+    glass: Glass, focus_um: float, moved_px: tuple[float, float], shares: tuple[float, ...], resolution_px: tuple[int, int]
+) -> GlassPsf:
+    if any(moved_px):
+        glass = replace(glass, places_px=glass.places_px + np.array(moved_px))
     found = glass_psf(glass, focus_um, np.array(shares))
     width, height = resolution_px
     corners = np.array([(x, y) for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])

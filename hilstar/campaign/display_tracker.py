@@ -161,5 +161,6 @@ def _optics_keys(config: BenchConfig) -> tuple[object, ...]:
         tracker.resolution_px,
         tracker.principal_point_px,
         tracker.distortion,
+        tracker.optics,
     )
     return config.monitor, config.collimator, config.verify, lens

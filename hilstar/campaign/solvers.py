@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.cameras import tracker_psf
+from hilstar.bench.cameras import flight_camera, tracker_psf
 from hilstar.bench.config import GAUSSIAN
 from hilstar.bench.config.hardware import TrackerOptics
 from hilstar.campaign.display_tracker import DisplayTracker
@@ -66,7 +66,7 @@ class CentroidErrors:
     """Centroids of one image against the truth: counts, and x and y errors (n,), px, measured minus true, of matched stars.
 
     `stars` are on the detector, `matched` of them were found within MATCH_PX, and `false` finds belong to no star. Errors are
-    those of stars that are neither clipped, nor at the edge, nor crowded; `v_mag` (n,) are their magnitudes.
+    those of stars that are neither clipped, nor at the edge, nor crowded; `v_mag` (n,) are their magnitudes, `star` their rows.
     """
 
     stars: int
@@ -76,6 +76,7 @@ class CentroidErrors:
     dx_px: FloatArray
     dy_px: FloatArray
     v_mag: FloatArray
+    star: npt.NDArray[np.void]
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,11 +148,12 @@ class CentroidSolver:
             places = self._fitted(exposure, tracker, truth[good], (found.x_px[index[good]], found.y_px[index[good]]))
             dx_px, dy_px = places[0] - x_px, places[1] - y_px
         counts = len(truth), len(found), matched, len(found) - matched
-        errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good])
+        errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good], truth[good])
         if len(x_px) < MIN_STARS:
             return Answer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
         true = normalise(tracker.camera.rays(x_px, y_px))
-        seen = normalise(tracker.camera.rays(x_px + dx_px, y_px + dy_px))
+        known = flight_camera(tracker.config.tracker, tracker.file.folder, tracker.camera)
+        seen = normalise(known.rays(x_px + dx_px, y_px + dy_px))
         # Weights are the stars' light, the inverse of photon noise's variance.
         return Answer(multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors)
 

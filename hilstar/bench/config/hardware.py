@@ -24,6 +24,7 @@ AS_ASSUMED = {"default": "as the bench assumes"}
 
 
 GAUSSIAN = "gaussian"
+LENS_K = 293.0
 DEFAULT_PSF_SIGMA_PX = (0.55, 0.55)
 
 
@@ -49,6 +50,28 @@ class TrackerOptics(Table, frozen=True):
         float,
         Meta(ge=-1e6, le=1e6, description="Where the detector stands along the axis, as the file of `psf` counts it."),
     ] = 0.0
+    temperature_k: Annotated[float, Meta(ge=50, le=500, description="Temperature of the lens.")] = LENS_K
+    reference_temperature_k: Annotated[
+        float, Meta(ge=50, le=500, description="Temperature at which `focus_um` and `focal_length_mm` hold.")
+    ] = LENS_K
+    focus_um_per_k: Annotated[
+        float, Meta(ge=-1e4, le=1e4, description="What each kelvin above that adds to `focus_um`; needs a file of `psf`.")
+    ] = 0.0
+    focal_length_ppm_per_k: Annotated[
+        float, Meta(ge=-1e4, le=1e4, description="What each kelvin above that adds to the focal length, in millionths.")
+    ] = 0.0
+    decentre_x_um: Annotated[
+        float,
+        Meta(
+            ge=-1e4, le=1e4, description="How far the lens stands to the right of its place: principal point and PSFs with it."
+        ),
+    ] = 0.0
+    decentre_y_um: Annotated[float, Meta(ge=-1e4, le=1e4, description="The same, down.")] = 0.0
+
+    @property
+    def warmer_k(self) -> float:
+        """Kelvin above the reference temperature."""
+        return self.temperature_k - self.reference_temperature_k
 
 
 class Tracker(Table, frozen=True):

@@ -11,6 +11,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import bench_optics, bench_stars
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import say_once
+from hilstar.campaign.cases import attitude_error_arcsec
 from hilstar.campaign.plan import Centroiding, parse_plan
 from hilstar.campaign.solvers import choose_solver
 from hilstar.errors import InputError
@@ -138,7 +139,14 @@ def test_the_monitor_s_light_goes_through_the_glass_by_place(bench):
 def test_a_campaign_varies_the_focus(bench, tmp_path):
     bench({"tracker.detector": {"gain_e_per_dn": 5, "full_well_e": 70000}})
     write_glass(tmp_path / "psf.fits", glass_of(stack(3, focuses_um=(0.0, 10.0))))
-    (tmp_path / "plan.toml").write_text(plan_text({"key": "tracker.optics.focus_um", "values": [0.0, 8.0]}, cases=2))
+    (tmp_path / "plan.toml").write_text(
+        plan_text(
+            {"key": "tracker.optics.focus_um", "values": [0.0, 8.0]},
+            {"key": "tracker.optics.temperature_k", "minimum": 283.0, "maximum": 303.0},
+            {"key": "tracker.optics.decentre_x_um", "values": [0.0, 5.0]},
+            cases=2,
+        )
+    )
     result = run_hilstar("campaign", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1")
     assert result.returncode == 0, result.stderr
     assert len(read_columns(tmp_path / "out" / "cases.parquet")["case"]) == 2
@@ -171,7 +179,7 @@ def test_what_the_file_does_not_cover_is_said(bench, caplog):
 
 @pytest.mark.parametrize("psf", ["glass", "gaussian"])
 def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(bench, psf):
-    """To 6e-3 px between the points of its file (measured 4.6e-3); a window and the Gaussian see the light beside it, and other spectra move it less."""
+    """To 6e-3 px between the points of its file (measured 4.6e-3); the Gaussian sees the light beside it."""
     file = bench() if psf == "glass" else None
     glass = tracker_psf(file.config.tracker, file.folder) if file else GaussianPsf((0.6, 0.7))
     rng = np.random.default_rng(3)
@@ -232,3 +240,37 @@ def test_verify_takes_the_psf_centroider(bench, tmp_path):
     found = json.loads(done.stdout)
     assert found["centroider"] == "psf"
     assert found["centroid_error_px_by"]["psf"]["rms"] < 0.1
+
+
+def test_a_warmer_or_decentred_lens_moves_focus_scale_and_place(bench):
+    """Through the keys' own coefficients; the flight software knows nothing of it, so its attitude is off by the decentring."""
+    still = bench()
+    write_glass(still.folder / "psf.fits", glass_of(stack(3, focuses_um=(0.0, 10.0))))
+    warm = {"temperature_k": 303.0, "focus_um_per_k": 0.6, "focal_length_ppm_per_k": 20.0}
+    cameras, psfs = [], []
+    for keys in ({"focus_um": 6.0}, warm, {"focus_um": 6.0, "decentre_x_um": 26.0}):
+        tables = {"tracker": TRACKER, "tracker.optics": {"psf": "psf.fits", **keys}, "sky": {"spectrum": "blackbody"}}
+        (still.folder / "bench.toml").write_text(bench_text(tables))
+        file = read_bench_file(still.folder / "bench.toml")
+        cameras.append(tracker_camera(file.config.tracker, file.folder))
+        psfs.append(tracker_psf(file.config.tracker, file.folder))
+    assert cameras[1].focal_length_px == pytest.approx(cameras[0].focal_length_px * (1 + 200e-6), rel=1e-12)
+    assert cameras[2].principal_point_px[0] == cameras[0].principal_point_px[0] + 2.0
+    x, y = np.array([60.0]), np.array([200.0])
+    lit = [psf.of_stars(at, y, psf.mean_shares, np.ones(1)) for psf, at in zip(psfs, (x, x, x + 2), strict=True)]
+    assert lit[1] == pytest.approx(lit[0], abs=1e-7)
+    assert lit[2] == pytest.approx(lit[0], abs=1e-4)
+    with Simulator(file) as tracker:
+        shot = tracker.expose(tracker.view(np.array(ORION_Q), np.zeros(3)), None)
+        solver = choose_solver("centroids", Centroiding(centroider="psf"), file.folder, 60.0)
+        q = solver.solve(shot, tracker).q_icrs_to_cam
+    off = attitude_error_arcsec(np.array(ORION_Q), q)
+    assert np.abs(off[1]) == pytest.approx(np.degrees(2 * 13e-3 / 12) * 3600, rel=0.02)
+    assert np.abs(off[0]) < 20
+
+
+def test_a_gaussian_has_no_focus_that_a_temperature_could_move(tmp_path):
+    (tmp_path / "bench.toml").write_text(bench_text({"tracker.optics": {"focus_um_per_k": 1.0}}))
+    done = run_hilstar_here("simulate", tmp_path / "bench.toml", "--radec", "84,0,0", "--png", tmp_path / "a.png")
+    assert done.returncode == 2
+    assert "focus_um_per_k: a Gaussian has no focus; give psf a file" in done.stderr

@@ -1,0 +1,45 @@
+"""What a tracker's glass does to its stars' places, split by what would take it away: distortion, colour, and the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+
+MIN_STARS = 40  # for 26 coefficients
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSplit:
+    """Errors of stars' places, px (n, 2): in all, what a distortion takes, what B-V takes besides, and the rest."""
+
+    total: FloatArray
+    distortion: FloatArray
+    colour: FloatArray
+
+    @property
+    def psf(self) -> FloatArray:
+        """What neither takes: the PSF's shape against pixel and window, and noise where the errors have it."""
+        return np.asarray(self.total - self.distortion - self.colour)
+
+    def rms_px(self) -> dict[str, float]:
+        """The rms distance of each part, px."""
+        parts = {"total": self.total, "distortion": self.distortion, "colour": self.colour, "psf": self.psf}
+        return {name: float(np.sqrt((part**2).sum(axis=1).mean())) for name, part in parts.items()}
+
+
+def split_errors(places_px: FloatArray, bv_mag: FloatArray, errors_px: FloatArray, size_px: tuple[int, int]) -> ErrorSplit:
+    """Errors (n, 2) of stars at places (n, 2): by least squares a cubic of the place, and B-V times a line of the place.
+
+    A distortion file can hold the first, a correction by catalogue colour the second. Raises ValueError for under MIN_STARS.
+    """
+    if len(places_px) < MIN_STARS:
+        raise ValueError(f"{len(places_px)} stars; a split takes {MIN_STARS}")
+    u, v = ((place - (size - 1) / 2) / (size / 2) for place, size in zip(places_px.T, size_px, strict=True))
+    by_place = np.stack([u**j * v**k for j in range(4) for k in range(4 - j)], axis=1)
+    by_colour = (bv_mag - bv_mag.mean())[:, None] * np.stack([np.ones_like(u), u, v], axis=1)
+    found = np.linalg.lstsq(np.hstack([by_place, by_colour]), errors_px, rcond=None)[0]
+    count = by_place.shape[1]
+    return ErrorSplit(errors_px, by_place @ found[:count], by_colour @ found[count:])

@@ -6,7 +6,9 @@ import contextlib
 import json
 import os
 import socket
+import struct
 import tty
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -163,6 +165,28 @@ def test_a_babbling_tracker_is_bounded_and_its_good_answers_still_come(tmp_path,
         assert set(source.refusals()) <= {"framing", "crc", "format"}
     os.close(slave)
     os.close(master)
+
+
+def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(tmp_path, rng):
+    """Half a second's worth of the bound, which would take a core for seconds: most of it is dropped, and answers go on."""
+    path, notices = tmp_path / "tracker.bin", Notices()
+    fields = ", ".join(f'{{ name = "{name}", at = {4 * k}, type = "f32" }}' for k, name in enumerate(("qw", "qx", "qy", "qz")))
+    keys = 'source = "file"\npath = "tracker.bin"\nformat = "frame"\nframing = "fixed"\nlength = 20\nchecksum = "crc32"\n'
+    body = struct.pack("<4f", *Q)
+    frame = body + zlib.crc32(body).to_bytes(4, "big")
+    path.touch()
+    with reading(tmp_path, keys + f"fields = [{fields}]", notices) as source:
+        gathered(source, 1, lambda: path.write_bytes(frame))
+
+        def append(data: bytes) -> None:
+            with path.open("ab") as file:
+                file.write(data)
+
+        append(rng.bytes(250_000))
+        wait_for(lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 10, "what is dropped")
+        (answer, *_) = gathered(source, 1, lambda: append(2 * frame))
+        assert np.allclose(answer.q_icrs_to_cam, Q, atol=1e-7)
+        assert notices.counts().get("receiver-failed", 0) == 0
 
 
 def test_a_road_that_is_not_there_is_refused_before_the_run(tmp_path):

@@ -72,8 +72,9 @@ def test_a_serial_line_is_read_asked_and_comes_back(tmp_path):
     port = tmp_path / "port"
     port.symlink_to(os.ttyname(slave))
     with reading(tmp_path, f'source = "serial"\nport = "{port}"\npoll_hex = "55 AA"\npoll_hz = 50') as source:
-        os.write(master, STREAM + b"\x05nonsense\0")
-        assert_answers(gathered(source, 3))
+        # What is written before the process has opened the port is flushed.
+        assert_answers(gathered(source, 3, lambda: os.write(master, STREAM)))
+        os.write(master, b"\x05nonsense\0")
         wait_for(lambda: source.take(20) == [] and source.refusals() == {"framing": 1}, "the refusal")
         assert os.read(master, 2) == b"\x55\xaa"
         os.close(slave)
@@ -176,12 +177,12 @@ def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(
     frame = body + zlib.crc32(body).to_bytes(4, "big")
     path.touch()
     with reading(tmp_path, keys + f"fields = [{fields}]", notices) as source:
-        gathered(source, 1, lambda: path.write_bytes(frame))
 
         def append(data: bytes) -> None:
             with path.open("ab") as file:
                 file.write(data)
 
+        gathered(source, 1, lambda: append(frame))
         append(rng.bytes(250_000))
         wait_for(lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 10, "what is dropped")
         (answer, *_) = gathered(source, 1, lambda: append(2 * frame))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import http.server
 import json
 import os
 import socket
 import struct
+import threading
 import tty
 import zlib
 from collections.abc import Callable, Iterator
@@ -208,3 +210,45 @@ def test_a_recorded_file_is_decoded_and_explained(tmp_path):
     explained = run_hilstar_here(*given, "--explain", "--quaternion", "0.6,0,-0.8,0").stdout
     assert 'write [answers] convention = { scalar = "first", direction = "cam_to_icrs", frame = "cam" }' in explained
     assert_refused(run_hilstar_here(*given[:3], tmp_path / "none.bin"), 2, "none.bin")
+
+
+def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
+    """A page, another program, and nobody: each at the address where a run's page usually is."""
+    shown = {"q": [0.6, 0, -0.8, 0], "ra_deg": 1, "dec_deg": 2, "roll_deg": 3, "rate_deg_s": None, "age_ms": 4}
+    for body, marked in (
+        (json.dumps({"state": {"attitude": shown}}), True),
+        ('{"state": {"attitude": null}}', False),
+        ("<a>", False),
+    ):
+
+        class Page(http.server.BaseHTTPRequestHandler):
+            said = body.encode()
+
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.end_headers()
+                self.wfile.write(self.said)
+
+        tracker = tmp_path / "tracker.jsonl"
+        tracker.touch()
+        (tmp_path / "bench.toml").write_text(
+            SMALL_BENCH + '\n[attitude]\nsource = "udp"\n[answers]\nsource = "file"\npath = "tracker.jsonl"\nformat = "json"\n'
+        )
+        over = threading.Event()
+
+        def answer_until_over(tracker=tracker, over=over) -> None:
+            while not over.wait(0.1):
+                with tracker.open("ab") as file:
+                    file.write(b'{"q":[0.6,0,0.8,0]}\n')
+
+        with http.server.HTTPServer(("127.0.0.1", 0), Page) as server:
+            monkeypatch.setattr("hilstar.console.listener.PORT", server.server_port)
+            threads = [threading.Thread(target=each) for each in (server.handle_request, answer_until_over)]
+            for thread in threads:
+                thread.start()
+            found = run_hilstar_here("answers", tmp_path / "bench.toml", "--explain", "--seconds", "1").stdout
+            over.set()
+            for thread in threads:
+                thread.join()
+        assert "scalar first cam_to_icrs" in found
+        assert ("> scalar first cam_to_icrs" in found) == marked

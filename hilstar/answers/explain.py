@@ -11,7 +11,7 @@ from hilstar.answers.answer import Answer
 from hilstar.answers.formats import CHECKSUMS, AnswerDecoder, Conventions, RefusedAnswer
 from hilstar.arrays import FloatArray
 from hilstar.bench.config.answers import Convention, field_format
-from hilstar.errors import shortened
+from hilstar.errors import printable, shortened
 from hilstar.rotation import angle_between_rad, conjugate, multiply, normalise, to_radec_roll_deg
 from hilstar.units import ARCSEC_PER_RAD
 
@@ -85,9 +85,9 @@ def byte_lines(raw: bytes, decoder: AnswerDecoder) -> list[str]:
     settings = decoder.settings
     if settings.format != "frame":
         text = raw[:1] in {b"{", b" "}
-        return [f"  {shortened(raw.decode(errors='replace')) if text else hex_line(raw)}"]
+        return [f"  {printable(shortened(raw.decode(errors='replace'))) if text else hex_line(raw)}"]
     lines = [f"  {hex_line(raw)}"]
-    if settings.checksum != "none":
+    if settings.checksum != "none" and raw:
         _, size = CHECKSUMS[settings.checksum]
         at = (-size if settings.checksum_at is None else settings.checksum_at) % len(raw)
         said = decoder.frames.fault(raw) or f"{settings.checksum}, right"

@@ -34,12 +34,13 @@ from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import INT64, AnswerPacket, Refusal, checked_sample, decode
 from hilstar.attitude.wire.source import Components
 from hilstar.bench.config.answers import MAX_FRAME_BYTES, AnswersSettings, Convention, FrameField, FrameLength, field_format
-from hilstar.errors import InputError, one_line
-from hilstar.rotation import conjugate, multiply, normalise, rotate
+from hilstar.errors import InputError, one_line, printable, shortened
+from hilstar.rotation import conjugate, multiply, normalise, to_matrix
 from hilstar.units import NS_PER_S
 
 MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
 MAX_JSON_BYTES = 65_536  # with the centroids of a thousand stars
+MAX_STARS, MAX_HIP, MAX_MODE_CHARACTERS = 1_000_000, 2**31 - 1, 64  # a number beyond its limit is left out, a word is cut
 PAUSE_NS = NS_PER_S // 10
 CCSDS_HEADER_BYTES, CCSDS_VERSION_MASK = 6, 0xE0
 SLIP_END, SLIP_ESC, SLIP_ESC_END, SLIP_ESC_ESC = b"\xc0", b"\xdb", b"\xdc", b"\xdd"
@@ -102,8 +103,9 @@ class Conventions:
         t_ns = said.t_ns
         if t_ns is not None and t_ns not in INT64:
             return RefusedAnswer("time", f"t_ns {t_ns} does not fit 64 bits", raw)
-        mode = "" if said.mode is None else str(said.mode)
-        plain = Answer(host_ns, raw, t_ns, None, None, said.valid, mode, said.stars, said.rms_arcsec, _reported(said.centroids))
+        mode = "" if said.mode is None else printable(shortened(said.mode, MAX_MODE_CHARACTERS))[:MAX_MODE_CHARACTERS]
+        stars = said.stars if said.stars is not None and 0 <= said.stars <= MAX_STARS else None
+        plain = Answer(host_ns, raw, t_ns, None, None, said.valid, mode, stars, said.rms_arcsec, _reported(said.centroids))
         if said.q is None or not said.valid:  # without an attitude its numbers may be anything
             return replace(plain, valid=False) if said.q is None else plain
         checked = checked_sample(0, said.q, said.rate)
@@ -111,7 +113,7 @@ class Conventions:
             return RefusedAnswer(checked.reason, checked.detail, raw)
         rate = checked.rate_cam_rad_s
         if rate is not None and self.convention.frame == "body" and self.q_body_to_cam is not None:
-            rate = rotate(normalise(np.array(self.q_body_to_cam)), rate)
+            rate = to_matrix(normalise(np.array(self.q_body_to_cam))) @ rate
         return replace(plain, q_icrs_to_cam=self.q_icrs_to_cam(checked.q_icrs_to_cam), rate_cam_rad_s=rate)
 
 
@@ -121,7 +123,7 @@ def _reported(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
     for row in rows:
         x_px, y_px, dn, hip = [*row, None, None, None, None][:4]
         if x_px is not None and y_px is not None and math.isfinite(x_px) and math.isfinite(y_px):
-            stars.append(ReportedStar(x_px, y_px, dn, None if hip is None or not math.isfinite(hip) else int(hip)))
+            stars.append(ReportedStar(x_px, y_px, dn, int(hip) if hip is not None and 0 < hip <= MAX_HIP else None))
     return tuple(stars)
 
 
@@ -196,7 +198,8 @@ class Measured:
         self._sync = b"" if settings.sync_hex is None else bytes.fromhex(settings.sync_hex)
         self._length, self._ccsds = settings.length, settings.framing == "ccsds"
         self._check, self._certain = check, certain
-        self._kept, self._lost = bytearray(), False
+        self._kept = bytearray()
+        self._silent_bytes = 0  # lost bytes of which nothing more is said
 
     def pause(self) -> Iterator[Cut]:
         """Nothing came for a while: what is kept is no frame from its beginning on, or one whose end is lost."""
@@ -235,16 +238,21 @@ class Measured:
                 yield from self._lose(body or bytes(kept[at : at + 1]), wrong)
                 at += 1
                 continue
-            self._lost = False
+            self._silent_bytes = 0
             at += size
             yield Cut(body)
         del kept[:at]
 
     def _lose(self, raw: bytes, detail: str) -> Iterator[Cut]:
-        """Say what was wrong: each wrong checksum, and other bytes once until a frame is right."""
+        """Say what was wrong: each wrong checksum after sync bytes, of other lost bytes the first of as many as a frame has.
+
+        Where nothing tells where a frame begins, each of a damaged one's bytes is tried.
+        """
         of_checksum = "checksum" in detail
-        if raw and (of_checksum or not self._lost):
-            self._lost = True
+        told = (of_checksum and bool(self._sync)) or self._silent_bytes <= 0
+        self._silent_bytes -= 1
+        if raw and told:
+            self._silent_bytes = len(raw) - 1 if of_checksum else MAX_FRAME_BYTES
             yield Cut(raw, "checksum" if of_checksum else "framing", detail)
 
     def _size(self, at: int) -> int | None:
@@ -324,12 +332,13 @@ def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | Refus
     """An answer of the named numbers of a frame."""
     q = tuple(float(found[name]) for name in ("qw", "qx", "qy", "qz"))
     rate = tuple(float(found[name]) for name in ("wx", "wy", "wz")) if "wx" in found else None
-    times = [found[name] for name in ("t_ns", "t_s", "t_sub") if name in found]
-    if not all(map(math.isfinite, times)):
+    # Each by itself: whole seconds and a fraction stay exact.
+    times_ns = [
+        found[name] * unit_ns for name, unit_ns in (("t_ns", 1), ("t_s", NS_PER_S), ("t_sub", NS_PER_S)) if name in found
+    ]
+    if not all(map(math.isfinite, times_ns)):
         return RefusedAnswer("nan", "its time is not finite", body)
-    t_ns = round(found["t_ns"]) if "t_ns" in found else None
-    if "t_s" in found or "t_sub" in found:  # each by itself: whole seconds and a fraction stay exact
-        t_ns = sum(round(found.get(name, 0) * NS_PER_S) for name in ("t_s", "t_sub"))
+    t_ns = sum(map(round, times_ns)) if times_ns else None
     stars, mode = found.get("stars"), found.get("mode")
     if not all(number is None or math.isfinite(number) for number in (stars, mode)):
         stars = mode = None

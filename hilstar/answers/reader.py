@@ -1,7 +1,8 @@
 """A tracker's answers, read by a process apart: a tracker that is dead, silent, babbling or lying never disturbs a frame.
 
 The other process (`hilstar.attitude.wire.apart_child`) opens the road, asks, stamps, decodes, and hands over answers and counts
-of what it refused. It reads at most MAX_BYTES_PER_S and gives at most MAX_ANSWERS_PER_S; the rest is counted as `flood`.
+of what it refused. It decodes at most MAX_BYTES_PER_S, for at most WORK_SHARE of the time, and gives at most MAX_ANSWERS_PER_S;
+the rest is counted as `flood`: noise in which a frame may begin at every byte would otherwise take a whole core.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ from hilstar.units import NS_PER_S
 
 ZMQ_ENDPOINT = "tcp://127.0.0.1:5562"
 MAX_BYTES_PER_S, MAX_BURST_BYTES = 500_000, 250_000
+WORK_SHARE, MAX_WORK_S = 0.2, 0.1
+PIECE_BYTES = 4096  # decoded in one go, of what is no message
 MAX_ANSWERS_PER_S = 1000
 FLOOD = "flood"
 CHUNK_BYTES, LOOK_MS = 65_536, 100
@@ -102,7 +105,7 @@ class DecodingLink:
         self._question = None if settings.poll_hex is None else bytes.fromhex(settings.poll_hex)
         self._period_s = 1 / settings.poll_hz
         self._next_question = clock.within(0.0)
-        self._bytes_left, self._answers_left = float(MAX_BURST_BYTES), float(MAX_ANSWERS_PER_S)
+        self._bytes_left, self._answers_left, self._work_left_s = float(MAX_BURST_BYTES), float(MAX_ANSWERS_PER_S), MAX_WORK_S
         self._seen_ns = clock.now_ns()
 
     def wait_for_message(self, timeout_ms: int) -> bool:
@@ -121,16 +124,19 @@ class DecodingLink:
         passed_s, self._seen_ns = (now_ns - self._seen_ns) / NS_PER_S, now_ns
         self._bytes_left = min(self._bytes_left + passed_s * MAX_BYTES_PER_S, MAX_BURST_BYTES)
         self._answers_left = min(self._answers_left + passed_s * MAX_ANSWERS_PER_S, MAX_ANSWERS_PER_S)
+        self._work_left_s = min(self._work_left_s + passed_s * WORK_SHARE, MAX_WORK_S)
         refused: Counter[str] = Counter()
         details: dict[str, str] = {}
         given: list[RawMessage] = []
-        for chunk in chunks:
-            data = chunk.parts[-1]
-            if len(data) > self._bytes_left:
+        for chunk, data in self._pieces(chunks):
+            if len(data) > self._bytes_left or self._work_left_s <= 0:
                 refused[FLOOD] += 1
-                details[FLOOD] = f"over {MAX_BYTES_PER_S} bytes a second: dropped unread"
+                details[FLOOD] = (
+                    f"over {MAX_BYTES_PER_S} bytes a second, or noise that takes too long to search: dropped unread"
+                )
                 continue
             self._bytes_left -= len(data)
+            begun_ns = self._clock.now_ns()
             for found in self._decoder.feed(chunk.host_ns, data):
                 if isinstance(found, RefusedAnswer):
                     refused[found.reason] += 1
@@ -141,10 +147,19 @@ class DecodingLink:
                 else:
                     self._answers_left -= 1
                     given.append(chunk._replace(parts=[found.raw, msgspec.msgpack.encode(handed_over(found))], sender=None))
+            self._work_left_s -= (self._clock.now_ns() - begun_ns) / NS_PER_S
         if refused:
             counted = HandedOver(refused=dict(refused), details=details)
             given.append(RawMessage(now_ns, [b"", msgspec.msgpack.encode(counted)]))
         return given
+
+    def _pieces(self, chunks: list[RawMessage]) -> Iterator[tuple[RawMessage, bytes]]:
+        """What came, a message or some bytes of a stream at a time."""
+        for chunk in chunks:
+            data = chunk.parts[-1]
+            size = max(len(data), 1) if self._link.messages else PIECE_BYTES
+            for at in range(0, len(data), size):
+                yield chunk, data[at : at + size]
 
     def close(self) -> None:
         """Close the road."""

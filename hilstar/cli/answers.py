@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from hilstar.arrays import FloatArray
     from hilstar.bench.bench_file import BenchFile
 
-SHOWN_WITHIN_S = 2.0
+SHOWN_WITHIN_S, PAGE_WITHIN_S = 2.0, 0.5
+MAX_STATE_BYTES = 1_000_000
 MAX_ROWS = 100_000  # of the JSON object: the newest
 
 
@@ -46,8 +47,8 @@ def answers(
 ) -> None:
     """Decode a tracker's answers by [answers], live or recorded: each as a line, and why bytes were refused.
 
-    With --explain each answer is compared with what is shown: --radec or --quaternion, or else what the sender of [attitude]
-    says now, where that is a ZeroMQ stream.
+    With --explain each answer is compared with what is shown: --radec or --quaternion, or else the newest frame of a run with
+    --console, or what the sender of [attitude] says now, where that is a ZeroMQ stream.
     """
     from collections import Counter, deque
 
@@ -90,10 +91,15 @@ def _explained(found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: Flo
 
 
 def _shown_now(file: BenchFile) -> FloatArray | None:
-    """What the sender of the attitude says now; None where that road has room for one listener only, or nobody sends."""
+    """What a run's page on this machine shows, or what the sender of the attitude says now.
+
+    None without a page, where that road has room for one listener only or nobody sends.
+    """
     from hilstar.run.open_link import first_attitude, open_link
 
     settings = file.config.attitude
+    if (shown := _shown_by_page()) is not None:
+        return shown
     if settings.source != "zmq" or settings.bind is True or settings.lockstep:
         return None
     try:
@@ -102,6 +108,29 @@ def _shown_now(file: BenchFile) -> FloatArray | None:
     except InputError:
         say(f"{settings.address}: no attitude comes; give what is shown by --radec RA,DEC,ROLL")
         return None
+
+
+def _shown_by_page() -> FloatArray | None:
+    """The attitude of the newest frame of the run whose page is at the usual address; None where there is none."""
+    import http.client
+
+    import msgspec
+    import numpy as np
+
+    from hilstar.console.listener import HOST, PORT
+    from hilstar.console.protocol import ShownAttitude
+    from hilstar.reading import NOT_JSON
+
+    try:
+        connection = http.client.HTTPConnection(HOST, PORT, timeout=PAGE_WITHIN_S)
+        connection.request("GET", "/state")
+        said = msgspec.json.decode(connection.getresponse().read(MAX_STATE_BYTES))
+        connection.close()
+        shown = msgspec.convert(said["state"]["attitude"], ShownAttitude)
+    except (OSError, http.client.HTTPException, *NOT_JSON, LookupError, TypeError):
+        return None  # no run, one without an attitude, or another program
+    say(f"what is shown: RA {shown.ra_deg:.4f}, Dec {shown.dec_deg:.4f}, by the page at {HOST}:{PORT}")
+    return np.array(shown.q)
 
 
 def _live(plan: ReadPlan, seconds: float | None) -> tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]:

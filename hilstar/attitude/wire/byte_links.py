@@ -139,7 +139,7 @@ class UdpBytes(ByteLink):
     def __init__(
         self, place: UdpPlace | Place, allowed: AllowedSenders, notices: Notices, clock: HostClock = HOST_CLOCK
     ) -> None:
-        super().__init__(f"udp://{place}" if isinstance(place, UdpPlace) else f"udp://{place[0]}:{place[1]}", notices, clock)
+        super().__init__(str(place) if isinstance(place, UdpPlace) else f"udp://{place[0]}:{place[1]}", notices, clock)
         self._allowed = allowed if isinstance(place, UdpPlace) else None
         try:
             self._datagrams = Datagrams.bound(place, clock) if isinstance(place, UdpPlace) else Datagrams.connected(*place)

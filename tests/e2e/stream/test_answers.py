@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import http.server
 import json
 import os
 import socket
+import struct
+import threading
 import tty
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -70,8 +74,9 @@ def test_a_serial_line_is_read_asked_and_comes_back(tmp_path):
     port = tmp_path / "port"
     port.symlink_to(os.ttyname(slave))
     with reading(tmp_path, f'source = "serial"\nport = "{port}"\npoll_hex = "55 AA"\npoll_hz = 50') as source:
-        os.write(master, STREAM + b"\x05nonsense\0")
-        assert_answers(gathered(source, 3))
+        # What is written before the process has opened the port is flushed.
+        assert_answers(gathered(source, 3, lambda: os.write(master, STREAM)))
+        os.write(master, b"\x05nonsense\0")
         wait_for(lambda: source.take(20) == [] and source.refusals() == {"framing": 1}, "the refusal")
         assert os.read(master, 2) == b"\x55\xaa"
         os.close(slave)
@@ -165,6 +170,28 @@ def test_a_babbling_tracker_is_bounded_and_its_good_answers_still_come(tmp_path,
     os.close(master)
 
 
+def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(tmp_path, rng):
+    """Half a second's worth of the bound, which would take a core for seconds: most of it is dropped, and answers go on."""
+    path, notices = tmp_path / "tracker.bin", Notices()
+    fields = ", ".join(f'{{ name = "{name}", at = {4 * k}, type = "f32" }}' for k, name in enumerate(("qw", "qx", "qy", "qz")))
+    keys = 'source = "file"\npath = "tracker.bin"\nformat = "frame"\nframing = "fixed"\nlength = 20\nchecksum = "crc32"\n'
+    body = struct.pack("<4f", *Q)
+    frame = body + zlib.crc32(body).to_bytes(4, "big")
+    path.touch()
+    with reading(tmp_path, keys + f"fields = [{fields}]", notices) as source:
+
+        def append(data: bytes) -> None:
+            with path.open("ab") as file:
+                file.write(data)
+
+        gathered(source, 1, lambda: append(frame))
+        append(rng.bytes(250_000))
+        wait_for(lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 10, "what is dropped")
+        (answer, *_) = gathered(source, 1, lambda: append(2 * frame))
+        assert np.allclose(answer.q_icrs_to_cam, Q, atol=1e-7)
+        assert notices.counts().get("receiver-failed", 0) == 0
+
+
 def test_a_road_that_is_not_there_is_refused_before_the_run(tmp_path):
     for keys in ('source = "serial"\nport = "/dev/no-such-port"', f'source = "file"\npath = "{tmp_path}"'):
         with pytest.raises(InputError, match=r"\[answers\]"), reading(tmp_path, keys):
@@ -183,3 +210,45 @@ def test_a_recorded_file_is_decoded_and_explained(tmp_path):
     explained = run_hilstar_here(*given, "--explain", "--quaternion", "0.6,0,-0.8,0").stdout
     assert 'write [answers] convention = { scalar = "first", direction = "cam_to_icrs", frame = "cam" }' in explained
     assert_refused(run_hilstar_here(*given[:3], tmp_path / "none.bin"), 2, "none.bin")
+
+
+def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
+    """A page, another program, and nobody: each at the address where a run's page usually is."""
+    shown = {"q": [0.6, 0, -0.8, 0], "ra_deg": 1, "dec_deg": 2, "roll_deg": 3, "rate_deg_s": None, "age_ms": 4}
+    for body, marked in (
+        (json.dumps({"state": {"attitude": shown}}), True),
+        ('{"state": {"attitude": null}}', False),
+        ("<a>", False),
+    ):
+
+        class Page(http.server.BaseHTTPRequestHandler):
+            said = body.encode()
+
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.end_headers()
+                self.wfile.write(self.said)
+
+        tracker = tmp_path / "tracker.jsonl"
+        tracker.touch()
+        (tmp_path / "bench.toml").write_text(
+            SMALL_BENCH + '\n[attitude]\nsource = "udp"\n[answers]\nsource = "file"\npath = "tracker.jsonl"\nformat = "json"\n'
+        )
+        over = threading.Event()
+
+        def answer_until_over(tracker=tracker, over=over) -> None:
+            while not over.wait(0.1):
+                with tracker.open("ab") as file:
+                    file.write(b'{"q":[0.6,0,0.8,0]}\n')
+
+        with http.server.HTTPServer(("127.0.0.1", 0), Page) as server:
+            monkeypatch.setattr("hilstar.console.listener.PORT", server.server_port)
+            threads = [threading.Thread(target=each) for each in (server.handle_request, answer_until_over)]
+            for thread in threads:
+                thread.start()
+            found = run_hilstar_here("answers", tmp_path / "bench.toml", "--explain", "--seconds", "1").stdout
+            over.set()
+            for thread in threads:
+                thread.join()
+        assert "scalar first cam_to_icrs" in found
+        assert ("> scalar first cam_to_icrs" in found) == marked

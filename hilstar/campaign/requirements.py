@@ -328,13 +328,15 @@ def _repeating(
     taken = part.freedom / n * noise
     square = (part.fitted[:, axes] ** 2).mean(axis=1)
     low, high = (max(each - taken, 0.0) for each in _drawn(square, np.ones(n), rng, c).tolist())
-    if part.freedom:
-        hidden = float(stats.norm.ppf(c)) * noise * math.sqrt(2 * part.freedom / len(axes)) / n
+    if part.freedom:  # the noise in the fit: its own power, and what it adds to that of the part
+        power = noise * (2 * part.freedom * noise / n + 4 * variance) / (n * len(axes))
+        hidden = float(stats.norm.ppf(c)) * math.sqrt(power)
         method = "bootstrap over blocks of cases"
     else:  # no waves were sure: as much power as they would have needed may be there
         hidden = SURE_OF_MANY * math.sqrt(6 * WAVE_COLUMNS) / 3 * noise / n
         method = "what the search for it would have missed"
-    low, high = min(low, max(variance - hidden, 0.0)), max(high, variance + hidden)
+    low = max(variance - math.hypot(variance - min(low, variance), hidden), 0.0)
+    high = variance + math.hypot(max(high, variance) - variance, hidden)
     factor = 1.0
     if require.share is not None and variance > 0:
         size = np.abs(part.fitted[:, axes]).ravel()

@@ -185,6 +185,20 @@ def test_renderers_stand_together_and_cases_in_motion_have_the_error_of_where_th
     assert np.median(np.abs(error[:, :2])) < 10 and np.abs(error[:, :2]).max() < 90
 
 
+def test_late_answers_of_the_case_before_are_neither_s_on_a_clock_of_its_own(tmp_path: Path) -> None:
+    # The latency is three times what is guessed of a tracker whose clock is its own.
+    planted = replace(write_bench(tmp_path, cases=15), latency_s=0.3, answer_hz=3.0, wild=0.0)
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench.read_text().replace('clock = "host"\n', ""))
+    with answering(planted):
+        result = run_hilstar_here(*COMMAND, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = read_columns(tmp_path / "out" / "cases.parquet")
+    assert rows["status"] == ["done"] * 15 and rows["wrong"] == [0] * 15
+    assert min(rows["first_attitude_s"]) > 0.3
+    assert max(abs(error - planted.bias_arcsec[0]) for error in rows["error_x_arcsec"]) < 40
+
+
 def test_a_case_goes_along_a_log(tmp_path: Path) -> None:
     turning = [from_radec_roll_deg(80 + 0.01 * k, 20.0, 0.0).tolist() for k in range(300)]  # 0.1 deg/s, 340 arcsec/s across
     lines = ["t_s,qw,qx,qy,qz", *(",".join(map(repr, [k / 10, *q])) for k, q in enumerate(turning))]

@@ -9,7 +9,6 @@ answers of the last minute. Before the rate has changed enough, D is what is gue
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from hilstar.answers.answer import Answer
 from hilstar.answers.pairing import Lit, LitFrames, residual_arcsec
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.sender_clock import SenderClock
+from hilstar.process.scheduling import HOST_CLOCK, UnixOffset
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ GUESSED_DELAY_S, GUESSED_SIGMA_S = 0.1, 0.1
 FIT_EACH_NS, MIN_FITTED = NS_PER_S, 10
 CUT_SIGMAS = 8.0
 MIN_NOISE_ARCSEC = 0.1  # of the fit: answers without noise have errors of the pairing
-SURE = 3.0  # sigmas of the time by which an answer may be off for its rate
+SURE, MAX_EXCUSED_S = 3.0, 0.3  # sigmas of the time by which an answer may be off for its rate, and at most so long
+KNOWN_AGAIN_NS = NS_PER_S  # between two looks at how far this host's Unix time is off
 JUMP_NS, JUMPS = NS_PER_S, 3  # answers in a row that are later by so much: the tracker's clock was set
 SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0  # without an answer; before the first one
 
@@ -104,10 +105,9 @@ class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
 class AnswerTimes:
     """When the tracker looked: the middle of an answer's exposure on the host's clock."""
 
-    def __init__(
-        self, rules: AnswerRules, unix_ahead_ns: Callable[[], int] = lambda: time.time_ns() - time.monotonic_ns()
-    ) -> None:
-        self._rules, self._unix_ahead_ns = rules, unix_ahead_ns
+    def __init__(self, rules: AnswerRules, unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset) -> None:
+        self._rules, self._unix_offset = rules, unix_offset
+        self._known, self._known_ns = UnixOffset(0, 0), -KNOWN_AGAIN_NS
         self._clock = SenderClock()
         self._late = 0
         self.guess_s = rules.exposure_s / 2 + GUESSED_DELAY_S if rules.latency_s is None else rules.latency_s
@@ -123,7 +123,9 @@ class AnswerTimes:
         if rules.clock == "host":
             return t_ns, 0.0
         if rules.clock == "unix":
-            return t_ns - self._unix_ahead_ns(), 0.0
+            if answer.host_ns - self._known_ns >= KNOWN_AGAIN_NS:
+                self._known, self._known_ns = self._unix_offset(), answer.host_ns
+            return t_ns + self._known.offset_ns, self._known.error_ns / NS_PER_S
         late_ns = self._clock.latency_ns(t_ns, answer.host_ns)
         self._late = self._late + 1 if late_ns is not None and late_ns > JUMP_NS else 0
         if self._late == JUMPS:
@@ -165,7 +167,8 @@ class AnswerJudge:
             if lit is not None:
                 residual = residual_arcsec(answer.q_icrs_to_cam, lit.q)
                 rate = ARCSEC_PER_RAD * lit.rate_rad_s
-                bound = self._rules.wrong_arcsec + SURE * sigma_s * float(np.linalg.norm(rate))
+                excused_s = min(SURE * sigma_s, MAX_EXCUSED_S)
+                bound = self._rules.wrong_arcsec + excused_s * float(np.linalg.norm(rate))
                 verdict = "wrong" if float(np.linalg.norm(residual)) > bound else "right"
         found = Judged(answer, verdict, middle_ns, sigma_s, lit, residual)
         row = self._rows[self._count % MAX_IN_WINDOW]

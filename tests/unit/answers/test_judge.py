@@ -7,8 +7,9 @@ import pytest
 
 from hilstar.answers import judge as judge_module
 from hilstar.answers.answer import Answer
-from hilstar.answers.judge import AnswerJudge, AnswerRules
+from hilstar.answers.judge import AnswerJudge, AnswerRules, AnswerTimes
 from hilstar.answers.pairing import LitFrame, LitFrames, residual_arcsec
+from hilstar.process.scheduling import UnixOffset
 from hilstar.rotation import from_rotation_vector, multiply, propagate
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
@@ -155,6 +156,12 @@ def test_of_more_answers_than_it_keeps_the_newest_count(monkeypatch):
     figures = judge.figures(2 * NS_PER_S, {})
     assert figures.right == 250 and figures.rate_hz == pytest.approx(1000)
     assert figures.mean_arcsec == pytest.approx([2.0, 0.0, 0.0], abs=1e-3)
+
+
+def test_unix_stamps_are_taken_with_the_hosts_stated_error():
+    times = AnswerTimes(AnswerRules(EXPOSURE_S, "end", "unix"), lambda: UnixOffset(-(10**18), 3_000_000))
+    # The stamp is the exposure's end: its middle is half an exposure earlier.
+    assert times.middle(Answer(7 * NS_PER_S, b"", 10**18 + 5 * NS_PER_S)) == (5 * NS_PER_S - NS_PER_S // 20, 0.003)
 
 
 def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():

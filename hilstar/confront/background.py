@@ -17,6 +17,7 @@ MIN_BLOCK_PX = 16
 CLIP = 2.5  # sigmas beyond which a pixel of a block is a star's
 CLIPPED = 0.9543  # sigma of a normal distribution cut at 2.5 sigma
 ROUNDS = 4
+BRIGHT_BLOCK, NOISY_BLOCK = 0.5, 1.2  # sigmas over its neighbours' median, and times their noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +54,11 @@ def sky_level(dn: FloatArray, step: float, bad: BoolArray | None = None) -> SkyL
         middle = (blocks * kept).sum(axis=2, keepdims=True) / count
         sigma = np.sqrt(((blocks - middle) ** 2 * kept).sum(axis=2, keepdims=True) / count) / CLIPPED
         sigma = np.maximum(sigma, step / 12**0.5)
-    # a block full of a bright star's light is as its neighbours
-    level, noise = (
-        ndimage.median_filter(part[..., 0], 3, mode="nearest") if min(part.shape[:2]) > 2 else part[..., 0]
-        for part in (middle, sigma)
-    )
+    level, noise = middle[..., 0], sigma[..., 0]
+    if min(level.shape) > 2:  # a block full of a bright star's light is as its neighbours
+        others, quiet = (ndimage.median_filter(part, 3, mode="nearest") for part in (level, noise))
+        bright = level > others + BRIGHT_BLOCK * quiet
+        level, noise = np.where(bright, others, level), np.minimum(noise, NOISY_BLOCK * quiet)
     places = [(np.arange(size) - (one - 1) / 2) / one for size, one in ((height, high), (width, wide))]
     return SkyLevel(_between(level, *places), np.maximum(_between(noise, *places), step / 12**0.5), side)
 

@@ -25,7 +25,7 @@ BLACK, WHITE = -2.0, 60.0  # sigmas of the background, between which a picture's
 RESIDUAL = 5.0
 JPEG_QUALITY = 82
 MAX_ROWS = 40
-GRID = 5
+GRID, TILE_PER_PX, TILE_HALF_PX = 5, 8, 3
 VIEWS = ("image", "prediction", "residual")
 STYLE = """<style>
 .views { position: relative; background: #000 } .views img { width: 100%; display: none; image-rendering: pixelated }
@@ -206,13 +206,18 @@ def _psf_grid(session: Session) -> str:
     places = [(x, y) for y in np.linspace(0, height - 1, GRID) for x in np.linspace(0, width - 1, GRID)]
     fwhm = psf.fwhm_px(*np.array(places).T)
     finding = f"Full width at half maximum {fwhm.min():.2f} to {fwhm.max():.2f} px, pixel included"
-    with panels_of(finding, GRID, GRID, share_x=False, height_inch=6.2) as panels:
-        for axes, (x, y), wide in zip(panels, places, fwhm, strict=True):
-            axes.imshow(np.sqrt(psf.samples(x, y, 8, 3)), cmap="gray_r", extent=(-3, 3, 3, -3))
-            axes.set_xticks([])
-            axes.set_yticks([])
-            axes.grid(visible=False)
-            axes.set_xlabel(f"{x:.0f}, {y:.0f} px: {wide:.2f}")
+    tiles = np.array([np.sqrt(psf.samples(x, y, TILE_PER_PX, TILE_HALF_PX)) for x, y in places])
+    side = tiles.shape[-1]
+    mosaic = tiles.reshape(GRID, GRID, side, side).swapaxes(1, 2).reshape(GRID * side, GRID * side)
+    with panels_of(
+        finding, note="Width and height of each tile: 6 px. Numbers: place and width, px.", height_inch=6.6
+    ) as panels:
+        axes = panels[0]  # one picture: 25 panels of their own take a second
+        axes.imshow(mosaic, cmap="gray_r", extent=(0, GRID, GRID, 0))
+        for number, ((x, y), wide) in enumerate(zip(places, fwhm, strict=True)):
+            axes.text(number % GRID + 0.03, number // GRID + 0.97, f"{x:.0f}, {y:.0f}: {wide:.2f}", fontsize=7, color=MUTED)
+        axes.set_xticks(range(GRID + 1), [""] * (GRID + 1))
+        axes.set_yticks(range(GRID + 1), [""] * (GRID + 1))
     return _image(panels[0].figure, "point spread functions over the field")
 
 

@@ -44,12 +44,12 @@ PSF_STARS = 60
 TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 14.0
 BRIGHTEST = 15  # sources that tell a photograph's focus and rest
 SATURATED_SHARE = 0.97
-TONE_ROUNDS = 7
+TONE_ROUNDS = 6
 PASSES = 2
 SOURCE_PX = 4  # about a source whose pixels tell nothing of the background
 SCATTER_SNR = 10.0
 LINEAR_DONE = 0.004
-MAX_TONE_STEP = 1.35
+MAX_TONE_STEP, MIN_POWER = 0.4, 0.1
 
 
 @dataclass(slots=True)
@@ -191,15 +191,24 @@ def run_session(
     fit = _Fitting(file, base, assumed, fixed)
     session = fit.of(shots, 1.0)
     off = abs(session.light.linearity - 1)
-    if fixed is not None or off < max(LINEAR_OFF, LINEAR_SIGMAS * session.light.sigma["linearity"]):
+    if (
+        fixed is not None
+        or session.light.linearity < MIN_POWER
+        or off < max(LINEAR_OFF, LINEAR_SIGMAS * session.light.sigma["linearity"])
+    ):
         return session
-    power, trial = 1.0, session
+    # the root of the logarithm of a session's power over that of the power undone, by secants
+    before, undone = (0.0, math.log(session.light.linearity)), math.log(session.light.linearity)
     for _ in range(TONE_ROUNDS):
-        power *= min(max(trial.light.linearity, 1 / MAX_TONE_STEP), MAX_TONE_STEP)
+        power = math.exp(undone)
         linear = [_linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)]
         trial = fit.of(linear, power, session.camera)
-        if abs(trial.light.linearity - 1) < LINEAR_DONE:
+        left = math.log(max(trial.light.linearity, 0.1))
+        if abs(left) < LINEAR_DONE:
             return fit.of(trial.shots, power)
+        slope = (left - before[1]) / (undone - before[0])
+        step = -left / slope if slope < 0 else left
+        before, undone = (undone, left), undone + min(max(step, -MAX_TONE_STEP), MAX_TONE_STEP)
     return session  # no power makes it linear: its figures say so
 
 

@@ -77,7 +77,7 @@ class FrameMatch(Table, frozen=True):
 class AnswersSettings(Table, frozen=True):
     """Where the answers of the star tracker come from, and what their bytes mean (see [answers](answers.md)).
 
-    Without this table nobody listens. A process of its own reads, decodes and stamps. At most 500 kB and 1000 answers a second
+    Without this table nobody listens. A process of its own reads, decodes and stamps. At most 500 kB and 200 answers a second
     are taken; what is beyond, and what is no answer, is counted by reason.
 
     A field of `fields` is `{ name = "qw", at = 6, type = "i32be", scale = 4.656612873077393e-10 }`: `name` is one of qw, qx,

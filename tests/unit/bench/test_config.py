@@ -145,7 +145,7 @@ def test_what_is_wrong_is_said_with_what_to_write(tmp_path, old, new, words):
         ('[sky]\ntemperature = "hot"\n', '[sky] temperature = "hot"; "ballesteros2012" or "wang2021" is wanted'),
         ("[sky]\nobserver_velocity_km_s = [3e5, 0, 0]\n", "not slower than light"),
         ("[background]\nelectrons_per_px = 1\nzodiacal_v_mag_arcsec2 = 22\n", "write one of them"),
-        ('[verify]\ncentroider = "psf"\n', '[verify] centroider = "psf"; "window" or "wide" or "moment" or "fit" or'),
+        ('[verify]\ncentroider = "centre"\n', '[verify] centroider = "centre"; "window" or "wide" or "moment" or "fit" or'),
         ("[verify]\ncentroider = 3\n", '[verify] centroider = 3; "window" or "wide"'),
         ('[render]\nquantisation = "exactly"\n', '"exact" or "auto" is wanted'),
         ("[render]\ncycle_frames = 0\n", "cycle_frames"),

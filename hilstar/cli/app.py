@@ -29,7 +29,7 @@ from hilstar.cli.fmu import fmu
 from hilstar.cli.frame import frame
 from hilstar.cli.keys import keys
 from hilstar.cli.latency import latency
-from hilstar.cli.optics import map_, zernike
+from hilstar.cli.optics import lens, map_, zernike
 from hilstar.cli.replay import replay
 from hilstar.cli.report import report
 from hilstar.cli.send import send
@@ -148,6 +148,7 @@ sensor.command("import")(import_)
 sensor.command()(measure)
 app.add_typer(sensor, name="sensor", rich_help_panel="Calibrate")
 optics.command("map")(map_)
+optics.command()(lens)
 optics.command()(zernike)
 app.add_typer(optics, name="optics", rich_help_panel="Calibrate")
 service.command()(install)

@@ -1,4 +1,4 @@
-"""hilstar optics: the file of a tracker's glass, from a map of images, or from a pupil's aberrations."""
+"""hilstar optics: the file of a tracker's glass, from a prescription, a map of images, or a pupil's aberrations."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilstar.cli.options import Json, check_files
+from hilstar.cli.options import Json, check_files, parse_numbers
 from hilstar.console.terminal import print_json
+from hilstar.errors import InputError
 from hilstar.files import FITS, check_ending
 
 if TYPE_CHECKING:
     from hilstar.optics.psf_file import Glass
 
+RESOLUTION_FORM = "--resolution W,H in pixels, such as 1024,1024"
 Output = Annotated[Path, typer.Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")]
 Oversampling = Annotated[int, typer.Option(help="Samples a tracker pixel along each axis.", min=1, max=64)]
 Tolerance = Annotated[
@@ -62,7 +64,61 @@ def zernike(
     _tell(output, glass_of_pupil(pupil, oversampling, tolerance), as_json)
 
 
-def _tell(output: Path, glass: Glass, as_json: bool) -> None:
+def lens(
+    prescription: Annotated[
+        Path, typer.Argument(metavar="PRESCRIPTION", help="A lens: .zmx of Zemax, .seq of CODE V, .json of optiland.")
+    ],
+    output: Output,
+    bench: Annotated[
+        Path | None, typer.Option(metavar="BENCH.toml", help="A bench whose tracker has the pixel pitch and resolution.")
+    ] = None,
+    pitch_um: Annotated[
+        float | None, typer.Option("--pitch-um", help="The tracker's pixel pitch, in place of the bench's.", min=0.1, max=1000)
+    ] = None,
+    resolution: Annotated[
+        str | None, typer.Option(metavar="W,H", help="The tracker's resolution, px, in place of the bench's.")
+    ] = None,
+    focuses_um: Annotated[
+        str, typer.Option("--focuses-um", metavar="UM[,...]", help="Focus positions; positive: farther from the lens.")
+    ] = "0",
+    half_px: Annotated[int, typer.Option("--half-px", help="Half of a stamp's side, px.", min=1, max=100)] = 8,
+    oversampling: Annotated[
+        int | None,
+        typer.Option(help="Samples a tracker pixel along each axis; by default as diffraction needs.", min=1, max=64),
+    ] = None,
+    tolerance: Tolerance = 1e-3,
+    as_json: Json = False,
+) -> None:
+    """Make a tracker's glass of a lens's prescription, by tracing it (needs hilstar[lens]).
+
+    Wavelengths and the field are the prescription's; pixel pitch and resolution those of --bench, or as given.
+    """
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.optics.prescription import Plate, glass_of_prescription
+
+    check_ending("-o", output, FITS)
+    check_files([prescription, bench], [output])
+    size: tuple[int, int] | None = None
+    if resolution is not None:
+        wide, high = parse_numbers(resolution, 2, "--resolution", RESOLUTION_FORM)
+        if not (1 <= wide <= 32768 and 1 <= high <= 32768):
+            raise InputError(f"--resolution {resolution}: write {RESOLUTION_FORM}")
+        size = round(wide), round(high)
+    if bench is not None:
+        tracker = read_bench_file(bench).config.tracker
+        pitch_um, size = pitch_um or tracker.pixel_pitch_um, size or tracker.resolution_px
+    if pitch_um is None or size is None:
+        raise InputError("a lens's PSFs need the tracker's pixels; add --bench BENCH.toml, or --pitch-um and --resolution W,H")
+    focuses = parse_numbers(focuses_um, focuses_um.count(",") + 1, "--focuses-um", "--focuses-um in um, such as -20,0,20")
+    found = glass_of_prescription(prescription, Plate(size, pitch_um, tuple(focuses), half_px), oversampling, tolerance)
+    _tell(output, found.glass, as_json, {"focal_length_mm": found.focal_length_mm, "f_number": found.f_number})
+    if not as_json:
+        typer.echo(
+            f"in the bench file, under [tracker]: focal_length_mm = {found.focal_length_mm:.6g}  # F/{found.f_number:.3g}"
+        )
+
+
+def _tell(output: Path, glass: Glass, as_json: bool, more: dict[str, float] | None = None) -> None:
     """Write a glass and say what it holds."""
     import numpy as np
 
@@ -78,6 +134,7 @@ def _tell(output: Path, glass: Glass, as_json: bool) -> None:
         "residual": glass.residual,
         "outside_share": float(glass.outside.max()),
         "relative_illumination": float(glass.illumination.min()),
+        **(more or {}),
         "written": [str(output)],
     }
     if as_json:

@@ -1,12 +1,13 @@
 """Make configs/planar-1897.fits: the glass of P. Rudolph's double Gauss, US patent 583336 (1897), example 2.
 
 The prescription is the patent's, scaled to a focal length of 25 mm, with the modern Schott glasses nearest to its own. It is
-stopped down to F/6.3 and focused where its spots are smallest. Needs `pip install 'hilstar[lens]'`:
-`python tools/make_planar.py`.
+stopped down to F/6.3, focused where its spots are small, and has an assumed filter of 480 to 700 nm. Needs
+`pip install 'hilstar[lens]'`: `python tools/make_planar.py`.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from hilstar.optics.prescription import Plate, traced
 from hilstar.optics.psf_file import write_glass
+from hilstar.sky.spectrum import Curve
 
 # Radius of curvature and thickness behind it, mm, and the glass, for 49.389 mm of focal length.
 # The second half mirrors the first about the stop.
@@ -28,6 +30,7 @@ BEHIND_MM, FOCUS_MM, SCALE = 42.3517, -0.25, 25 / 49.389
 APERTURE_MM, FIELD_DEG = 4.0, 22.0
 WAVELENGTHS_NM = (480.0, 580.0, 700.0)
 PRIMARY_NM = 580.0
+FILTER = Curve(np.array([479.0, 480.0, 700.0, 701.0]), np.array([0.0, 1.0, 1.0, 0.0]))  # assumed: the colours that are traced
 PLATE = Plate((1024, 1024), 13.0, half_px=5)
 SAMPLES, TOLERANCE = 3, 5e-3
 
@@ -63,7 +66,7 @@ def main() -> None:
     made_by = "tools/make_planar.py: US patent 583336 (P. Rudolph, 1897), example 2, scaled, at F/6.3, traced by optiland"
     found = traced(planar(), PLATE, SAMPLES, TOLERANCE, made_by)
     path = Path(__file__).parent.parent / "configs" / "planar-1897.fits"
-    write_glass(path, found.glass)
+    write_glass(path, replace(found.glass, transmission=FILTER))
     print(f"f {found.focal_length_mm:.4f} mm, F/{found.f_number:.3f}, {len(found.glass.basis)} components")
 
 

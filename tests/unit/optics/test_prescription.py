@@ -74,4 +74,5 @@ def test_the_ready_lens_is_a_bench_s_glass():
     assert path.stat().st_size < 400_000
     assert "583336" in glass.history[0]
     assert glass.lens is not None
-    assert file.config.tracker.focal_length_mm == pytest.approx(float(glass.history[1].split()[2]), rel=1e-3)
+    focal_mm = float(" ".join(glass.history).split("focal length ")[1].split()[0])
+    assert file.config.tracker.focal_length_mm == pytest.approx(focal_mm, rel=1e-3)

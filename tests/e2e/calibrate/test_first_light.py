@@ -159,7 +159,7 @@ def test_the_page_needs_nothing_beside_it(whole):
     folder, found, _ = whole
     page = (folder / "s" / "first-light.html").read_text()
     assert not re.search(r"(src|href)=['\"](?!data:|#)", page)
-    assert page.count("data:image/png;base64,") == 10
+    assert page.count("data:image/png;base64,") == 11
     for step in found["steps"]:
         assert f'id="{step["name"]}"' in page
     assert found["bench_sha256"] in page

@@ -317,8 +317,8 @@ def _settled(
 def _held_out(
     camera: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], names: tuple[str, ...], floor_px: float
 ) -> float:
-    """Rms error of stars that were held out, px an axis, each counted up to HUBER + 1 of its sigmas."""
-    squares, count = 0.0, 0
+    """Rms error of stars that were held out, px an axis, weighed by their errors, each counted up to HUBER + 1 sigmas."""
+    squares = weights = 0.0
     for fold in range(FOLDS):
         out = [np.arange(len(one.x_px)) % FOLDS == fold for one in photographs]
         kept = [one.at(~mask) for one, mask in zip(photographs, out, strict=True)]
@@ -327,10 +327,10 @@ def _held_out(
             tested = one.at(mask)
             x, y = pointing.places_px(found, tested.vectors)
             off = np.column_stack([tested.x_px - x, tested.y_px - y])
-            limit = (HUBER + 1) * np.hypot(tested.sigma_px, floor_px)[:, None]
-            squares += float((np.clip(np.nan_to_num(off, nan=1e3), -limit, limit) ** 2).sum())
-            count += off.size
-    return math.sqrt(squares / max(count, 1))
+            sigma = np.hypot(tested.sigma_px, floor_px)[:, None]
+            squares += float((np.clip(np.nan_to_num(off / sigma, nan=1e3), -HUBER - 1, HUBER + 1) ** 2).sum())
+            weights += 2 * float((1 / sigma**2).sum())
+    return math.sqrt(squares / max(weights, 1e-12))
 
 
 def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: float) -> Pointing:

@@ -29,6 +29,7 @@ TRUSTED_SNR = 20.0
 CLIP, ROUNDS = 3.5, 8
 MIN_STARS = 8
 BLOCK_PX = 32
+MIN_VARIANCE_DN2 = 1e-9
 SKY_CURVATURE = 0.03  # of the sky's light: by how much its shade differs from one photograph to another beyond a slope
 MIN_LEVEL_RANGE = 1.25  # of background levels, from which their noise tells the gain
 LINEAR_OFF, LINEAR_SIGMAS = 0.04, 4.0  # by how much a power differs from 1 where a tone curve is stated
@@ -358,14 +359,17 @@ def _line(x: FloatArray, y: FloatArray) -> _Line:
     kept = np.ones(len(x), dtype=bool)
     slope = at_zero = math.nan
     sigma = np.full(2, math.nan)
+    scale = np.maximum(np.maximum(np.median(y) * 0.5, y), MIN_VARIANCE_DN2)
     for _ in range(ROUNDS):
-        weight = 1 / np.maximum(np.median(y) * 0.5, y)[kept]
+        if kept.sum() < 3:  # levels without noise
+            return _Line(math.nan, math.nan, math.nan, math.nan)
+        weight = 1 / scale[kept]
         design = np.column_stack([x[kept], np.ones(kept.sum())]) * weight[:, None]
         (slope, at_zero), *_ = np.linalg.lstsq(design, y[kept] * weight, rcond=None)
         off = y - slope * x - at_zero
         spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept] * weight)))
         sigma = spread * np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
-        kept = np.abs(off) < CLIP * spread * np.maximum(np.median(y) * 0.5, y)
+        kept = np.abs(off) < CLIP * spread * scale
     return _Line(float(slope), float(at_zero), float(sigma[0]), float(sigma[1]))
 
 

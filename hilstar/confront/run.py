@@ -61,7 +61,12 @@ def confront(
     if twice is not None:
         raise InputError(f"{twice}: two images have this name; give each a name of its own")
     held = fixed_camera(file, max(photo.step_dn for photo in photos)) if fixed else None
-    session = run_session(file, photos, _base(file, photos), start, fixed=held)
+    try:
+        session = run_session(file, photos, _base(file, photos), start, fixed=held)
+    except np.linalg.LinAlgError as error:
+        raise InputError(
+            f"{photos[0].path}: its levels allow no fit ({error}); give raw frames, 8 to 16 bits of grey"
+        ) from error
     make_directory(output)
     tracker = bench if fixed and has_screen else write_tracker(output, session, has_screen)
     judge = Judge(session, tracker)

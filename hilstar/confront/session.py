@@ -41,8 +41,8 @@ from hilstar.units import flux_ratio, magnitude
 MATCH_PX = 2.5
 BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
 PSF_STARS = 60
-TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 14.0
-BRIGHTEST = 15  # sources that tell a photograph's focus and rest
+TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 12.0
+BRIGHTEST = 10  # sources that tell a photograph's focus and rest
 SATURATED_SHARE = 0.97
 TONE_ROUNDS = 6
 PASSES = 2

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import msgspec
 import typer
 
-from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 from hilstar.errors import one_line
 
 if TYPE_CHECKING:
@@ -80,6 +79,8 @@ def report(summary: RunSummary, as_json: bool) -> None:
         "packets": f"{packets.received} received, {packets.refused} refused{turned_away}",
     }
     if summary.clock:
+        from hilstar.attitude.clock.sender_clock import KNOWN_MODES  # brings NumPy, which Tab and --help do not need
+
         absolute = "" if summary.clock.mode in KNOWN_MODES else " above the minimum"
         if summary.receive_latency_ms:
             lines["receive latency"] = f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"

@@ -16,9 +16,11 @@ from tests.support.planted_tracker import Planted
 NS_PER_S = 1_000_000_000
 
 
-def write_ledger(path: Path, frames_s: FloatArray, frames_q: FloatArray | None, start_ns: int = 5 * NS_PER_S) -> Path:
+def write_ledger(
+    path: Path, frames_s: FloatArray, frames_q: FloatArray | None, start_ns: int = 5 * NS_PER_S, bench: str = SMALL_BENCH
+) -> Path:
     """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the attitudes (n, 4), or none."""
-    head = {"bench_text": SMALL_BENCH, "bench_file": str(path.parent / "bench.toml"), "bench_sha256": "of a test"}
+    head = {"bench_text": bench, "bench_file": str(path.parent / "bench.toml"), "bench_sha256": "of a test"}
     with path.open("wb") as file:
         topic = JsonTopic(FRAME_TOPIC, "hilstar.Frame", schema_of(FrameRecord, "hilstar.Frame"))
         writer = McapWriter(file.fileno(), {"frame": topic}, RUN_METADATA, head)
@@ -43,7 +45,7 @@ def write_telemetry(path: Path, tau_s: FloatArray, reported: FloatArray, start_s
     return path
 
 
-def write_run(folder: Path, planted: Planted) -> tuple[Path, Path]:
+def write_run(folder: Path, planted: Planted, bench: str = SMALL_BENCH) -> tuple[Path, Path]:
     """The ledger and the telemetry of a planted run."""
-    ledger = write_ledger(folder / "run.mcap", planted.frames_s, planted.frames_q)
+    ledger = write_ledger(folder / "run.mcap", planted.frames_s, planted.frames_q, bench=bench)
     return ledger, write_telemetry(folder / "telemetry.csv", planted.tau_s, planted.reported)

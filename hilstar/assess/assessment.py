@@ -13,10 +13,12 @@ from hilstar.answers.judge import TO_MIDDLE, AnswerRules, Stamp
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.assess.bench_effects import (
     DisplayCost,
+    GlassCost,
     Slice,
     display_cost,
     display_errors,
     field_magnitudes,
+    glass_cost,
     noise_limit,
     slices_of,
 )
@@ -125,6 +127,7 @@ class Assessment:
     wrong: tuple[WrongAnswer, ...]
     display: DisplayCost | None
     limit_arcsec: Axes | None
+    glass: GlassCost | None
     by_rate: tuple[Slice, ...]
     by_magnitude: tuple[Slice, ...]
     t_s: FloatArray
@@ -202,12 +205,13 @@ def assess_files(
     freedom = parts.fov.freedom + parts.pixel.freedom + 1
     by_rate = slices_of(np.degrees(np.linalg.norm(found.rate_rad_s, axis=1)), parts.left, error, freedom)
     by_magnitude: tuple[Slice, ...] = ()
-    display = limit = None
+    display = limit = glass = None
     try:
         file = run.bench_file()
         say("the field's stars")
         by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
         limit = noise_limit(file, found.commanded_q)
+        glass = glass_cost(file, found.commanded_q)
         if settings.display_attitudes:
             say("the display's own error")
             some = np.unique(np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int))
@@ -230,6 +234,7 @@ def assess_files(
         ),
         display=display,
         limit_arcsec=limit,
+        glass=glass,
         by_rate=by_rate,
         by_magnitude=by_magnitude,
         t_s=t_s,

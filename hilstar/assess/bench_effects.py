@@ -12,15 +12,22 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.assess.budget import Axes
+from hilstar.assess.budget import Axes, axes_of_variance
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_stars
-from hilstar.bench.cameras import tracker_camera
+from hilstar.bench.cameras import tracker_camera, tracker_psf
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.rotation import normalise, to_matrix
-from hilstar.twin.noise import attitude_limits_arcsec
+from hilstar.scene.camera import Camera
+from hilstar.tracker.centroiders import star_places
+from hilstar.twin.glass import StarGlass, told_psf
+from hilstar.twin.glass_errors import MIN_STARS as MIN_SPLIT_STARS
+from hilstar.twin.glass_errors import split_errors
+from hilstar.twin.noise import attitude_limits_arcsec, field_stars
 from hilstar.twin.verify.star_finder import star_finder
 from hilstar.twin.verify.twin import Twin
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
@@ -29,6 +36,7 @@ BINS, MIN_IN_BIN = 5, 20
 FIELDS = 400  # attitudes at which the field's light is summed; other answers take the nearest of them
 LIMIT_FIELDS = 12  # attitudes whose stars tell the limit of the noise
 MIN_STARS = 3
+GLASS_FIELDS, GLASS_STARS = 40, 20  # attitudes, and the brightest stars of each, that tell a glass's part
 SURE = 3.0
 
 
@@ -135,6 +143,72 @@ def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> Floa
     root = np.sqrt(weight)[:, None]
     found, *_ = np.linalg.lstsq((cross * root[:, :, None]).reshape(-1, 3), ((seen - true) * root).ravel(), rcond=None)
     return np.asarray(found)
+
+
+@dataclass(frozen=True, slots=True)
+class GlassCost:
+    """What the bench's glass does to the places of a field's brightest stars, by its file and not by the answers.
+
+    `rms_px` and `fov_arcsec` have all of it (`total`), and what each correction would leave: a distortion file, one by
+    catalogue colour, both. `fov_arcsec` is the attitude's error about its mean over `attitudes`, one sigma.
+    """
+
+    centroider: str
+    stars: int
+    attitudes: int
+    rms_px: dict[str, float]
+    fov_arcsec: dict[str, Axes]
+
+    def line(self) -> str:
+        """For a person."""
+        left = {name: f"{axes.cross or 0.0:.2g}" for name, axes in self.fov_arcsec.items()}
+        return (
+            f"{left['total']} arcsec across by the PSF file, as `{self.centroider}` finds {self.stars} stars; distortion"
+            f" corrected {left['without_distortion']}, colour {left['without_colour']}, both {left['without_both']}"
+        )
+
+
+def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
+    """The glass's part of the field-of-view error along attitudes (n, 4); None without a glass, or with too few stars."""
+    tracker, fields = file.config.tracker, []
+    psf, camera = tracker_psf(tracker, file.folder), tracker_camera(tracker, file.folder)
+    if not isinstance(psf, GlassPsf):
+        return None
+    stars, glass, kind = bench_stars(file.config, file.folder), StarGlass(file, psf), file.config.verify.judge or "window"
+    reach = math.ceil(4 * max(1.0, *psf.width_px))
+    some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, GLASS_FIELDS).astype(int))
+    for q in normalise(q_icrs_to_cam[some]):
+        rows = field_stars(stars, camera, q)[:GLASS_STARS]
+        pixels = np.rint(rows["y_px"]).astype(np.intp), np.rint(rows["x_px"]).astype(np.intp)
+        true = np.stack([rows["x_px"] - pixels[1], rows["y_px"] - pixels[0]], axis=1)
+        stamps = told_psf(psf, pixels, 2 * reach + 1, glass.shares_of(stars, rows["hip"]))(*true.T)
+        found = np.stack(star_places(stamps, kind, psf.width_px), axis=1)
+        lit = stamps.sum(axis=(1, 2)) > 0  # a corner may be dark
+        if lit.sum() >= MIN_STARS:
+            fields.append((rows[lit], (found - true)[lit]))
+    if sum(len(rows) for rows, _ in fields) < MIN_SPLIT_STARS:
+        return None
+    rows, errors = (np.concatenate(parts) for parts in zip(*fields, strict=True))
+    split = split_errors(np.stack([rows["x_px"], rows["y_px"]], axis=1), rows["bv"], errors, camera.resolution_px)
+    parts = {
+        "total": split.total,
+        "without_distortion": split.total - split.distortion,
+        "without_colour": split.total - split.colour,
+        "without_both": split.psf,
+    }
+    ends = np.cumsum([len(each) for each, _ in fields])[:-1]
+    fov = {}
+    for name, off in parts.items():
+        turns = np.array([_field_turn(camera, each, px) for (each, _), px in zip(fields, np.split(off, ends), strict=True)])
+        fov[name] = axes_of_variance(turns.var(axis=0))
+    rms_px = {name: float(np.sqrt((off**2).sum(axis=1).mean())) for name, off in parts.items()}
+    return GlassCost(kind, len(rows), len(fields), rms_px, fov)
+
+
+def _field_turn(camera: Camera, rows: npt.NDArray[np.void], off_px: FloatArray) -> FloatArray:
+    """The attitude's error (3,), arcsec, by stars whose places are off by `off_px` (n, 2)."""
+    true, seen = (normalise(camera.rays(rows["x_px"] + dx, rows["y_px"] + dy)) for dx, dy in ((0.0, 0.0), off_px.T))
+    return ARCSEC_PER_RAD * turn_between(true, seen, rows["electrons_per_s"])
 
 
 @dataclass(frozen=True, slots=True)

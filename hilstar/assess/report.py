@@ -45,6 +45,7 @@ def budget_of(found: Assessment) -> dict[str, Any]:
         "availability": found.lock.availability,
         "wrong": found.wrong,
         "limit_arcsec": found.limit_arcsec,
+        **({} if found.glass is None else {"glass": found.glass}),
     }
 
 
@@ -107,6 +108,9 @@ def rows_of(found: Assessment) -> Iterator[FigureRow]:
         yield FigureRow("display's own error", "roll", found.display.roll_arcsec, "arcsec")
         yield FigureRow("display's own error, share seen", "", found.display.seen)
     yield from limit_rows(found.limit_arcsec)
+    for name, axes in found.glass.fov_arcsec.items() if found.glass is not None else ():
+        for axis in ("cross", "roll"):
+            yield FigureRow(f"glass {name.replace('_', ' ')}", axis, getattr(axes, axis), "arcsec")
 
 
 def write_tables(directory: Path, found: Assessment) -> None:
@@ -158,6 +162,7 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("wrong", f"{len(found.wrong)}, {where} {named}" if found.wrong else "none"),
         ("display's own error", own),
         ("limit of its stars", limit_text(found.limit_arcsec)),
+        *([("glass", found.glass.line())] if found.glass is not None else []),
     ]
 
 

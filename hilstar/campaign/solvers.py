@@ -167,10 +167,7 @@ class CentroidSolver:
         stamps = padded[(pixels[0][:, None] + near)[:, :, None], (pixels[1][:, None] + near)[:, None, :]]
         shares = None
         if glass is not None and self._wanted.psf_spectrum == "star":
-            order = np.argsort(tracker.stars.hip)
-            at = np.searchsorted(tracker.stars.hip, truth["hip"], sorter=order)
-            which = order[np.minimum(at, len(order) - 1)]
-            shares = glass.shares(tracker.stars, np.where(truth["hip"] > 0, which, -1))
+            shares = glass.shares_of(tracker.stars, truth["hip"])
         told = told_psf(psf, pixels, len(near), shares)
         x_px, y_px = psf_places(stamps, told, (first[0] - pixels[1], first[1] - pixels[0]))
         return pixels[1] + x_px, pixels[0] + y_px

@@ -110,6 +110,12 @@ class StarGlass:
             found[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
         return found
 
+    def shares_of(self, stars: Stars, hip: IntArray) -> FloatArray:
+        """The same by Hipparcos numbers (n,) of `stars`, 0 for a body."""
+        order = np.argsort(stars.hip)
+        at = np.minimum(np.searchsorted(stars.hip, hip, sorter=order), len(order) - 1)
+        return self.shares(stars, np.where(hip > 0, order[at], -1))
+
     def _through(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
         rates = np.stack([band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1)
         return np.asarray(rates @ self._of_band / rates.sum(axis=1, keepdims=True))

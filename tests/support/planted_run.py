@@ -24,12 +24,13 @@ def write_ledger(
     frames_q: FloatArray | None,
     start_ns: int = 5 * NS_PER_S,
     records: Sequence[AnswerRecord | FaultRecord] = (),
+    bench: str = SMALL_BENCH,
 ) -> Path:
     """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the attitudes (n, 4), or none.
 
     The sender's clock is the host's; `records` are written among the frames by their host time.
     """
-    head = {"bench_text": SMALL_BENCH, "bench_file": str(path.parent / "bench.toml"), "bench_sha256": "of a test"}
+    head = {"bench_text": bench, "bench_file": str(path.parent / "bench.toml"), "bench_sha256": "of a test"}
     with path.open("wb") as file:
         writer = McapWriter(file.fileno(), TOPICS, RUN_METADATA, head)
         waiting = sorted(records, key=lambda each: each.host_ns, reverse=True)
@@ -57,7 +58,7 @@ def write_telemetry(path: Path, tau_s: FloatArray, reported: FloatArray, start_s
     return path
 
 
-def write_run(folder: Path, planted: Planted) -> tuple[Path, Path]:
+def write_run(folder: Path, planted: Planted, bench: str = SMALL_BENCH) -> tuple[Path, Path]:
     """The ledger and the telemetry of a planted run."""
-    ledger = write_ledger(folder / "run.mcap", planted.frames_s, planted.frames_q)
+    ledger = write_ledger(folder / "run.mcap", planted.frames_s, planted.frames_q, bench=bench)
     return ledger, write_telemetry(folder / "telemetry.csv", planted.tau_s, planted.reported)

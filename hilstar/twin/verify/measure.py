@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.moving import wide_bodies
 from hilstar.monitor.calibration import Calibration
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import Psf
 from hilstar.tracker.centroiders import FAMILY, Centroider
@@ -256,6 +258,24 @@ class Measured:
     true_calibration: Calibration | None
     gl_renderer: str
     wide_bodies: list[str]
+    glass: GlassEffect | None = None
+
+
+class GlassEffect(NamedTuple):
+    """What the file of a tracker's PSF does to stars, at 95 %: px from chief ray to centroid, and mag of vignetting."""
+
+    px: float
+    mag: float
+
+
+def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
+    """The effect of a glass on stars where they are; None for a PSF that is the same everywhere, and without a star."""
+    if not isinstance(psf, GlassPsf) or not stars:
+        return None
+    x, y = np.array([(star.x_px, star.y_px) for star in stars]).T
+    to_x, to_y, light = psf.centroids_px(x, y, psf.mean_shares)
+    fainter = [abs(magnitude(float(one))) for one in light if one > 0]
+    return GlassEffect(*(float(np.percentile(part, 95)) for part in (np.hypot(to_x - x, to_y - y), fainter or [0.0])))
 
 
 def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
@@ -358,6 +378,7 @@ class Comparison:
             true_calibration=None if name is None else true_calibration(bench, name),
             gl_renderer=bench.renderer.gl_renderer,
             wide_bodies=wide_bodies(bench.moving, bench.camera),
+            glass=glass_effect(bench.tracker_psf, self.tally.stars),
         )
 
     def _glow(self) -> GlowFit:

@@ -17,6 +17,7 @@ from hilstar.twin.verify.measure import GeometryFit, Measured, Star, fit_geometr
 MAX_LEFT = 0.5
 # A cause is named where it accounts for more than this share of the stars.
 MIN_SHARE = 0.5
+CURE = '; [verify] centroider = "psf" fits it, hilstar assess says which correction takes how much'
 MIRROR_WORDS = {"x": "its columns reversed", "y": "its rows reversed", "swap": "its axes swapped"}
 
 
@@ -184,6 +185,14 @@ def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
     mag, px = p95(errors.floor_mag()), p95(errors.floor_px())
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
+    glass = measured.glass
+    beside = glass is not None and px > limits.centroid_px and glass.px > MIN_SHARE * px
+    if glass is not None and (beside or (mag > limits.flux_mag and glass.mag > MIN_SHARE * mag)):
+        return [
+            f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the glass of"
+            f" [tracker.optics] psf has centroids {glass.px:.3f} px beside their chief rays and light {glass.mag:.3f} mag under"
+            f" the axis's at 95 %{CURE if limits.centroider != 'psf' else ''}"
+        ]
     return [
         f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the tracker's PSF is too"
         " narrow or too wide for its pixels, or lies beside its chief ray, so that nothing can be said about the display"

@@ -17,10 +17,14 @@ from hilstar.arrays import FloatArray
 from hilstar.assess import report
 from hilstar.assess.bench_effects import display_cost, slices_of, turn_between
 from hilstar.assess.lock import lock_of
+from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.run.record.commanded import Commanded
 from hilstar.run.record.ledger_records import AnswerRecord
+from hilstar.twin.glass_errors import split_errors
+from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
+from tests.support.glass import SIDE_PX, stack
 from tests.support.planted_run import write_ledger, write_run, write_telemetry
 from tests.support.planted_tracker import Planted, Sizes, plant, scalar_first, scan, still
 
@@ -94,6 +98,33 @@ def test_a_ledgers_own_answers_give_the_budget_of_a_file_of_them(tmp_path: Path,
     assert [each["row"] for each in found["wrong"]] == (planted.wild + 1 + (planted.wild >= 50)).tolist()
     empty = write_ledger(tmp_path / "empty.mcap", planted.frames_s[:9], planted.frames_q[:9])
     assert_refused(run_hilstar_here("assess", empty, "-o", tmp_path / "c"), 2, "no answers of a tracker", "give its telemetry")
+
+
+def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path: Path, planted: Planted) -> None:
+    """By the file of the PSF: lateral colour and coma in closed form, most of which a distortion takes, and colour besides."""
+    write_glass(tmp_path / "psf.fits", glass_of(stack()))
+    tracker = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "transmission": None}
+    ledger, telemetry = write_run(tmp_path, planted, bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}}))
+    run = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "out", "--json", "--display-attitudes", "0")
+    glass = json.loads(run.stdout)["glass"]
+    px = glass["rms_px"]
+    assert glass["stars"] > 200 and glass["centroider"] == "window"
+    assert px["total"] > 1.5 * px["without_distortion"] > 1.5 * px["without_both"] > 0
+    assert px["without_colour"] < px["total"]
+    assert glass["fov_arcsec"]["total"]["cross"] > glass["fov_arcsec"]["without_both"]["cross"] > 0
+    assert "glass without colour,roll," in (tmp_path / "out" / "budget.csv").read_text()
+
+
+def test_a_split_finds_what_was_put_together() -> None:
+    rng = np.random.default_rng(5)
+    places, bv = rng.uniform(0, 256, (400, 2)), rng.uniform(-0.3, 1.8, 400)
+    u = (places - 127.5) / 128
+    distortion, colour = 0.3 * u * (u**2).sum(axis=1, keepdims=True), 0.1 * (bv - bv.mean())[:, None] * u
+    rest = rng.normal(0, 0.01, (400, 2))
+    split = split_errors(places, bv, distortion + colour + rest, (256, 256))
+    assert split.distortion == pytest.approx(distortion, abs=0.01)
+    assert split.colour == pytest.approx(colour, abs=0.01)
+    assert split.rms_px()["psf"] == pytest.approx(np.sqrt((rest**2).sum(axis=1).mean()), rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -234,12 +234,17 @@ def test_a_told_psf_without_its_centroider_is_refused(tmp_path):
             parse_plan(tmp_path / "plan.toml", f'bench = "b.toml"\ncases = 1\n[centroids]\n{keys}\n')
 
 
-def test_verify_takes_the_psf_centroider(bench, tmp_path):
-    bench({"verify": {"centroider": "psf"}, "sky": {"faintest_v_mag": 4.5}})
-    done = run_hilstar_here("verify", tmp_path / "bench.toml", "--fields", "1", "--json")
-    found = json.loads(done.stdout)
-    assert found["centroider"] == "psf"
-    assert found["centroid_error_px_by"]["psf"]["rms"] < 0.1
+def test_verify_names_the_glass_and_the_psf_centroider_mends_it(bench, tmp_path):
+    """Coma and lateral colour of 0.3 px in the corners: a window has stars beside their chief rays."""
+    found = {}
+    for kind in ("window", "psf"):
+        bench({"verify": {"centroider": kind, "centroid_px": 0.05, "flux_mag": 0.5}, "sky": {"faintest_v_mag": 4.5}})
+        found[kind] = json.loads(run_hilstar_here("verify", tmp_path / "bench.toml", "--fields", "1", "--json").stdout)
+    assert found["psf"]["centroider"] == "psf"
+    assert found["psf"]["centroid_error_px_by"]["psf"]["rms"] < 0.1
+    said, mended = (" ".join(found[kind]["reasons"]) for kind in ("window", "psf"))
+    assert "the glass of [tracker.optics] psf has centroids" in said and '[verify] centroider = "psf" fits it' in said
+    assert "chief rays" not in mended
 
 
 def test_a_warmer_or_decentred_lens_moves_focus_scale_and_place(bench):

@@ -17,7 +17,6 @@ from hilstar.confront.session import Session
 from hilstar.confront.star_psf import field_terms
 
 MIN_STARS = 12
-SCALE_HEIGHT_M = 8000.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -191,7 +191,7 @@ def fixed_camera(file: BenchFile, step_dn: float) -> FixedCamera:
     tracker = file.config.tracker
     camera = tracker_camera(tracker, file.folder)
     psf, vignetting = _psf_of(file)
-    light = LightFit(np.zeros(1), vignetting, NO_CORRECTION, math.nan, math.nan, 1.0, np.empty(0))
+    light = LightFit(np.zeros(1), vignetting, NO_CORRECTION, math.nan, math.nan, 1.0)
     detector = tracker.detector
     read_e = math.sqrt(max(detector.electronics_e**2 - (step_dn**2 - 1) / 12 * detector.gain_e_per_dn**2, 0.0))
     pixels = PixelFit(detector.gain_e_per_dn, detector.offset_dn, read_e, step_dn, {}, np.empty((0, 2)))

@@ -84,8 +84,6 @@ class LightFit:
     zero_point_mag: float
     colour_term: float
     linearity: float
-    residual_mag: FloatArray
-    held_out_mag: dict[str, float] = field(default_factory=dict)
     sigma: dict[str, float] = field(default_factory=dict)
     mag: FloatArray = field(default_factory=lambda: np.empty(0))
 
@@ -111,11 +109,11 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
     correction = _correction(stars, magnitudes, np.column_stack([ones, r2]), use)
     base = magnitudes(correction)
     off = stars.instrument_mag - base
-    held_out, chosen, best = {}, "even", math.inf
+    chosen, best = "even", math.inf
     for name, columns in vignetting.items():
-        held_out[name] = _held_out(np.column_stack([ones, *columns]), off, stars.sigma_mag, use)
-        if held_out[name] < GAIN * best:
-            best, chosen = held_out[name], name
+        held_out = _held_out(np.column_stack([ones, *columns]), off, stars.sigma_mag, use)
+        if held_out < GAIN * best:
+            best, chosen = held_out, name
     found = _robust(np.column_stack([ones, *vignetting[chosen]]), off, stars.sigma_mag, use)
     terms = (*found.values[images:].tolist(), 0.0, 0.0)[:2]
     about_v = _about_v(stars, base, use, ones, vignetting[chosen])
@@ -128,8 +126,6 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
         zero_point_mag=-float(about_v.values[2 : 2 + images].mean()),
         colour_term=float(about_v.values[1]),
         linearity=float(about_v.values[0]),
-        residual_mag=found.off,
-        held_out_mag=held_out,
         sigma=sigma,
         mag=base + found.model - ones @ found.values[:images],
     )
@@ -212,7 +208,7 @@ def _offsets_alone(stars: StarLight, images: int, base: FloatArray, held: LightF
     off = stars.instrument_mag - base - shape
     ones = np.eye(images)[stars.image]
     found = _robust(ones, off, stars.sigma_mag, _trusted(stars, ones))
-    return replace(held, offsets_mag=found.values, residual_mag=found.off, mag=base + shape)
+    return replace(held, offsets_mag=found.values, mag=base + shape)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,6 @@ from hilstar.bench.config.values import NotNegative, Positive, Signed
 from hilstar.errors import InputError, shortened
 from hilstar.toml_tables import Table
 
-SOURCES = ("serial", "udp", "tcp", "zmq", "file")
 QUATERNION = ("qw", "qx", "qy", "qz")
 RATE = ("wx", "wy", "wz")
 MAX_FRAME_BYTES = 4096
@@ -242,12 +241,6 @@ class AnswersSettings(Table, frozen=True):
             extra={"default": "none; required for frame", "form": '[{ name = "qw", at = N, type = "f32be" }, ...]'},
         ),
     ] = ()
-
-    @property
-    def scalar_name(self) -> str:
-        """The convention in words, as `--explain` and the page say it."""
-        c = self.convention
-        return f"scalar {c.scalar}, {c.direction.replace('cam', c.frame)}"
 
 
 def field_format(type_name: str) -> tuple[str, int, bool] | None:

@@ -327,7 +327,7 @@ class CaseTally:
         """Count an exposure."""
         self.frames += 1
         self.stars_in_view += len(exposure.truth)
-        self._digest.update(exposure.dn.tobytes())
+        self._digest.update(np.ascontiguousarray(exposure.dn))
 
     def hear(self, exposure: Exposure, answer: Answer, end_s: float) -> None:
         """Count the answer to an exposure that ends so long after the case's begin."""

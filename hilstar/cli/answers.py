@@ -45,7 +45,7 @@ def answers(
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Decode a tracker's answers by [answers], live or recorded: each as a line, and why bytes were refused.
+    """Decode a tracker's answers by `[answers]`, live or recorded: each as a line, and why bytes were refused.
 
     With --explain each answer is compared with what is shown: --radec or --quaternion, or else the newest frame of a run with
     --console, or what the sender of [attitude] says now, where that is a ZeroMQ stream.

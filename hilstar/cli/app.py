@@ -107,6 +107,7 @@ def built(application: Application, name: str | None) -> Any:
 app = Application(
     cls=Commands,
     pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",  # "rich" would swallow a table's name, as in [answers]
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 calibrate = typer.Typer(

@@ -19,7 +19,6 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray, IntArray
@@ -33,7 +32,6 @@ CLIP_SIGMAS = 3.0
 BLOCK_PX, NOISIER_PERCENT = 32, 90
 CLIPPED_SIGMA = 0.986578  # the sigma of a normal distribution cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
 MIN_STEP_PX = 1e-7
-EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 # Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10 times the
 # plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
@@ -181,13 +179,11 @@ def find_stars(
     settings = settings or CentroidSettings()
     _check(image)
     under = background or estimate_background(image)
-    signal = np.subtract(image, under.level, dtype=np.float64)
-    blobs = _find_blobs(signal, settings.threshold_sigma * under.noise, settings.minimum_pixels)
-    padded = _padded(signal, settings)
-    x_px, y_px = _refine(padded, blobs, settings)
-    stamps, _, _ = _stamps(padded, x_px, y_px, settings.radius_px)
+    blobs = _find_blobs(image, under.level, settings.threshold_sigma * under.noise, settings.minimum_pixels)
+    x_px, y_px = _refine(image, under.level, blobs, settings)
+    stamps, _, _ = _stamps(image, under.level, x_px, y_px, settings.radius_px)
     flux = stamps.sum(axis=(1, 2))
-    height, width = signal.shape
+    height, width = image.shape
     reach = settings.radius_px
     inside = (np.rint(x_px) >= reach) & (np.rint(x_px) < width - reach)
     inside &= (np.rint(y_px) >= reach) & (np.rint(y_px) < height - reach)
@@ -209,12 +205,13 @@ def _check(image: npt.NDArray[Any]) -> None:
         raise InputError("centroids: the image has a pixel that is NaN or infinite; give finite numbers")
 
 
-def _find_blobs(signal: FloatArray, threshold: float, minimum_pixels: int) -> _Blobs:
-    """Connected pixels above the threshold, diagonals included, in the order of the rows that meet them."""
-    above = signal > threshold
-    labels, found = ndimage.label(above, structure=EIGHT_NEIGHBOURS)
-    y, x = np.divmod(np.flatnonzero(above), signal.shape[1])
-    blob, value = labels[y, x] - 1, signal[y, x]
+def _find_blobs(image: npt.NDArray[Any], level: float, threshold: float, minimum_pixels: int) -> _Blobs:
+    """Connected pixels more than the threshold above the level, diagonals included, in the order of the rows that meet them."""
+    cut = level + threshold
+    lit = np.flatnonzero(image > (math.floor(cut) if image.dtype.kind in "iu" else cut))  # whole numbers are compared as such
+    y, x = np.divmod(lit, image.shape[1])
+    blob, value = _components(lit, x, image.shape), image.ravel()[lit].astype(np.float64) - level
+    found = int(blob.max(initial=-1)) + 1
     pixels = np.bincount(blob, minlength=found)
     flux = np.bincount(blob, value, minlength=found)
     peak = np.zeros(found)
@@ -225,26 +222,56 @@ def _find_blobs(signal: FloatArray, threshold: float, minimum_pixels: int) -> _B
     return _Blobs(x_px[kept], y_px[kept], peak[kept], pixels[kept])
 
 
-def _padded(signal: FloatArray, settings: CentroidSettings) -> FloatArray:
-    """The image among zeros: a centre moves by at most a radius, so it may leave the image, and its window is one more."""
-    return np.pad(signal, 2 * settings.radius_px)
+def _components(lit: IntArray, column: IntArray, shape: tuple[int, int]) -> IntArray:
+    """The component (n,) of each lit pixel of an image, from its place in the flat image, in order, and its column.
+
+    Only lit pixels are looked at: each that has a neighbour takes the smaller root of the two, and roots are followed to
+    their ends, until no two neighbours differ. Components are numbered by their first pixels.
+    """
+    height, width = shape
+    number = np.zeros(height * width, dtype=np.int32)
+    number[lit] = np.arange(1, len(lit) + 1)
+    pairs = []
+    for step, edge in ((1, width - 1), (width - 1, 0), (width, -1), (width + 1, width - 1)):
+        first = np.flatnonzero((column != edge) & (lit + step < height * width))
+        second = number[lit[first] + step].astype(np.intp) - 1
+        pairs.append(np.stack([first, second])[:, second >= 0])
+    pair, root = np.concatenate(pairs, axis=1), np.arange(len(lit))
+    while pair.size:
+        ends = root[pair]
+        differ = ends[0] != ends[1]
+        pair, ends = pair[:, differ], ends[:, differ]
+        np.minimum.at(root, ends.max(axis=0), ends.min(axis=0))
+        while not np.array_equal(above := root[root], root):
+            root = above
+    return np.unique(root, return_inverse=True)[1]
 
 
 def _stamps(
-    padded: FloatArray, x_px: FloatArray, y_px: FloatArray, radius_px: int
+    image: npt.NDArray[Any], level: float, x_px: FloatArray, y_px: FloatArray, radius_px: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Squares of the padded image around n places: values (n, k, k), and the pixels' offsets dx (n, 1, k), dy (n, k, 1)."""
+    """Squares of an image around n places: values over the level (n, k, k), and the pixels' offsets dx (n, 1, k), dy (n, k, 1).
+
+    Beyond the image values are 0.
+    """
     reach = np.arange(-radius_px, radius_px + 1)
     column, row = (np.rint(place).astype(np.intp)[:, None] + reach for place in (x_px, y_px))
-    values = padded[row[:, :, None] + 2 * radius_px, column[:, None, :] + 2 * radius_px]
+    height, width = image.shape
+    values = image[row.clip(0, height - 1)[:, :, None], column.clip(0, width - 1)[:, None, :]].astype(np.float64) - level
+    for place, size, axes in ((row, height, np.s_[:, :, None]), (column, width, np.s_[:, None, :])):
+        beyond = (place < 0) | (place >= size)
+        if beyond.any():
+            values *= ~beyond[axes]
     return values, (column - x_px[:, None])[:, None, :], (row - y_px[:, None])[:, :, None]
 
 
-def _refine(padded: FloatArray, blobs: _Blobs, settings: CentroidSettings) -> tuple[FloatArray, FloatArray]:
-    return (_gaussian_centres if settings.window == "gaussian" else _plain_centres)(padded, blobs, settings)
+def _refine(image: npt.NDArray[Any], level: float, blobs: _Blobs, settings: CentroidSettings) -> tuple[FloatArray, FloatArray]:
+    return (_gaussian_centres if settings.window == "gaussian" else _plain_centres)(image, level, blobs, settings)
 
 
-def _gaussian_centres(padded: FloatArray, blobs: _Blobs, settings: CentroidSettings) -> tuple[FloatArray, FloatArray]:
+def _gaussian_centres(
+    image: npt.NDArray[Any], level: float, blobs: _Blobs, settings: CentroidSettings
+) -> tuple[FloatArray, FloatArray]:
     """Places (n,), px, where the Gaussian-weighted first moment is zero, by Newton's steps.
 
     The slope of the weighted moment is <d^2>/s^2 - 1 of its flux. A centre that leaves its window, or whose window holds no
@@ -255,7 +282,7 @@ def _gaussian_centres(padded: FloatArray, blobs: _Blobs, settings: CentroidSetti
     sigma2 = settings.window_sigma_px**2
     lost = np.zeros(place.shape[1], dtype=np.bool_)
     for _ in range(settings.iterations):
-        values, dx, dy = _stamps(padded, place[0], place[1], settings.radius_px)
+        values, dx, dy = _stamps(image, level, place[0], place[1], settings.radius_px)
         weighted = values * np.exp(-0.5 * (dx**2 + dy**2) / sigma2)
         total = weighted.sum(axis=(1, 2))
         lost |= total <= 0
@@ -274,7 +301,9 @@ def _gaussian_centres(padded: FloatArray, blobs: _Blobs, settings: CentroidSetti
     return place[0], place[1]
 
 
-def _plain_centres(padded: FloatArray, blobs: _Blobs, settings: CentroidSettings) -> tuple[FloatArray, FloatArray]:
+def _plain_centres(
+    image: npt.NDArray[Any], level: float, blobs: _Blobs, settings: CentroidSettings
+) -> tuple[FloatArray, FloatArray]:
     """Places (n,), px: the centre of gravity of the square around the last place, until no square moves.
 
     A square without light, or whose centre of gravity lies outside it, leaves the blob's own.
@@ -282,7 +311,7 @@ def _plain_centres(padded: FloatArray, blobs: _Blobs, settings: CentroidSettings
     start = np.stack([blobs.x_px, blobs.y_px])
     place, middle = start, np.rint(start)
     for _ in range(settings.iterations):
-        values, dx, dy = _stamps(padded, middle[0], middle[1], settings.radius_px)
+        values, dx, dy = _stamps(image, level, middle[0], middle[1], settings.radius_px)
         total = values.sum(axis=(1, 2))
         sums = np.stack([(values * dx).sum(axis=(1, 2)), (values * dy).sum(axis=(1, 2))])
         step = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
@@ -322,7 +351,7 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     offset_px = tile_px * np.arange(S_CURVE_PHASES) + middle_px
     ones = np.ones(S_CURVE_PHASES)
     stars = _Blobs(offset_px + true_px, middle_px + true_px, ones, ones.astype(np.intp))
-    x_px, y_px = _refine(_padded(strip, settings), stars, settings)
+    x_px, y_px = _refine(strip, 0.0, stars, settings)
     curves = SCurve(x_px - offset_px, x_px - offset_px - true_px), SCurve(y_px - middle_px, y_px - middle_px - true_px)
     if any((np.diff(curve.measured_px) <= 0).any() for curve in curves):
         raise InputError(

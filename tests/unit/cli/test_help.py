@@ -50,3 +50,9 @@ def test_the_version_stands_in_one_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["project"]["dynamic"] == ["version"]
     assert project["tool"]["hatch"]["version"]["path"] == "hilstar/version.py"
+
+
+def test_help_shows_the_name_of_a_table(capsys):
+    """Rich takes [word] for markup, and shows nothing of it."""
+    assert not app(["answers", "--help"], standalone_mode=False)
+    assert "by [answers]" in capsys.readouterr().out

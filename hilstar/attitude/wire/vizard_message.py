@@ -10,8 +10,6 @@ proto2 and are refused. Field numbers are those of Basilisk's vizMessage.proto (
 skipped. Of a field that is given twice the last counts, as in protobuf; one that is absent is 0 or empty.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterator
@@ -67,7 +65,7 @@ class _FieldReader:
             yield number, kind, message[at : at + size]
             at += size
 
-    def read(self, message: memoryview, form: Form) -> dict[str, Any]:
+    def read(self, message: memoryview, form: "Form") -> dict[str, Any]:
         """The fields of a message that its form names. Raises WireFormatError."""
         found: dict[str, Any] = {}
         for number, kind, value in self.fields(message):

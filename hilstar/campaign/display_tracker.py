@@ -1,7 +1,5 @@
 """The virtual tracker before the display: each frame shown during an exposure, through the twin, to DN."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

@@ -1,7 +1,5 @@
 """hilstar calibrate: a bench's geometry by dots or attitudes, its monitor by patches, its scale by stars."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """hilstar doctor: what this machine has and lacks, and whether a bench file is plausible."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """hilstar first-light: the first day on a bench, step by step; it resumes where it stopped."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -113,8 +111,8 @@ def first_light(
 
 @contextmanager
 def _shown(
-    listener: PageListener | None, control: bool, file: files.BenchFile
-) -> Iterator[tuple[Callable[[str], None], Callable[[Pattern], object]]]:
+    listener: "PageListener | None", control: bool, file: "files.BenchFile"
+) -> "Iterator[tuple[Callable[[str], None], Callable[[Pattern], object]]]":
     """The audience of a session's lines and patterns: the terminal and, if there is one, the page."""
     if listener is None:
         yield say, lambda pattern: None
@@ -131,8 +129,8 @@ def _shown(
 
 
 def _image_source(
-    file: files.BenchFile, grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
-) -> ImageSource:
+    file: "files.BenchFile", grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
+) -> "ImageSource":
     """The source of images. Raises InputError for options that exclude each other."""
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode, VirtualBench

@@ -1,7 +1,5 @@
 """hilstar replay: an attitude log on the monitor."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

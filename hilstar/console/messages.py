@@ -5,8 +5,6 @@ written, the number that is complete (a seqlock) and a CRC, so that a reader not
 overwritten. Each ring has one writer. The memory has no name (memfd): it is gone with the last process that has it open.
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import os
@@ -286,7 +284,7 @@ class SharedMemory:
         self.frames, self.states, self.events, self.answers, self.pictures = rings
 
     @classmethod
-    def make(cls, picture_bytes: int) -> SharedMemory:
+    def make(cls, picture_bytes: int) -> "SharedMemory":
         """New memory for pictures of at most `picture_bytes`."""
         return cls(os.memfd_create("hilstar-console"), picture_bytes)
 

@@ -1,7 +1,5 @@
 """A run's report: the operator's page as one file with the whole run in it, and its figures as JSON."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import math

@@ -3,8 +3,6 @@
 The frame loop only leaves its newest frame here; a thread of the status words it, so that no terminal delays a frame.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import sys
@@ -53,7 +51,7 @@ class StatusLine(NamedTuple):
 class RunStatus:
     """What a run is doing, from the newest frame that `see` was given."""
 
-    def __init__(self, source: RunSource, ledger: LedgerSwitch | None = None) -> None:
+    def __init__(self, source: RunSource, ledger: "LedgerSwitch | None" = None) -> None:
         self._source = source
         self._ledger = ledger
         self._begun_ns = time.monotonic_ns()
@@ -61,11 +59,11 @@ class RunStatus:
         self._running: Running | None = None
         self._before = (self._begun_ns, 0, 0)  # when the lines were last made: host time, frames, packets
 
-    def follow(self, running: Running) -> None:
+    def follow(self, running: "Running") -> None:
         """Take the run, which goes on counting."""
         self._running = running
 
-    def see(self, shown: Shown) -> None:
+    def see(self, shown: "Shown") -> None:
         """Take the newest frame; costs the frame loop one assignment."""
         self._shown = shown
 
@@ -123,7 +121,7 @@ class RunStatus:
         yield StatusLine("display", f"{self._source.refresh_hz:g} Hz, {self._source.renderer}")
 
 
-def _attitude_line(shown: Shown) -> StatusLine:
+def _attitude_line(shown: "Shown") -> StatusLine:
     attitude = shown.attitude
     if attitude is None:
         return StatusLine("attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False)
@@ -138,7 +136,7 @@ def _attitude_line(shown: Shown) -> StatusLine:
     return StatusLine("attitude", text + (": STALE" if shown.stale else ""), not shown.stale)
 
 
-def _tracker_line(found: TrackerFigures) -> StatusLine:
+def _tracker_line(found: "TrackerFigures") -> StatusLine:
     def three(values: list[float] | None) -> str:
         return "-" if values is None else ", ".join(f"{value:.1f}" for value in values)
 
@@ -183,7 +181,7 @@ def _live(status: RunStatus, stop: threading.Event) -> None:
             stop.wait(LIVE_EACH_S)
 
 
-def _table(lines: list[StatusLine]) -> Table:
+def _table(lines: list[StatusLine]) -> "Table":
     from rich.table import Table
     from rich.text import Text
 

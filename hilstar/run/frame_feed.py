@@ -4,8 +4,6 @@ The loop copies a frame's levels into one of few buffers: 0.1 ms at 1080p, and n
 lit pixels and sends them. Where it has not done so with all buffers, the frame is not handed on.
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """For your own tests: two skies compared star by star, so that a golden frame holds on another driver."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -18,8 +18,6 @@ Laws of the byte stream, whose frames are each followed by 0x00:
 The layout is that of firmware_protocol/protocol.toml.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """A run's shared memory, read ten times a second and worded for the page: state, health, chart points, events, pictures."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import struct

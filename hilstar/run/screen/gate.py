@@ -1,7 +1,5 @@
 """A bench on its display, past the start-up gate: swaps are timed, and a display whose timing cannot be trusted is refused."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The monitor's window: frames on it, their pacing by its refresh, the square that a photodiode watches, and its keys."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

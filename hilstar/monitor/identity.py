@@ -7,6 +7,7 @@ import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 
@@ -113,16 +114,24 @@ class MonitorIdentity(Table, frozen=True):
         why = "EDID unreadable" if self.edid_sha256 else "no EDID"
         return f"{why}: the monitor is told apart by connector and mode alone"
 
+    def known(self) -> dict[str, Any]:
+        """What is known, by its keys."""
+        return {key: value for key, value in msgspec.to_builtins(self).items() if value not in ("", None, ())}
+
     def toml(self) -> str:
-        """The table of a calibration or geometry file; what is not known is left out."""
-        known = {key: value for key, value in msgspec.to_builtins(self).items() if value not in ("", None, ())}
-        return f"[{TABLE}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in known.items())
+        """The table of a calibration file."""
+        return f"[{TABLE}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in self.known().items())
+
+
+def sha256_of(data: bytes) -> str:
+    """The SHA-256 of what was read; "" for nothing."""
+    return hashlib.sha256(data).hexdigest() if data else ""
 
 
 def edid_identity(edid: bytes) -> MonitorIdentity:
     """What an EDID says, with its SHA-256; empty for none."""
     found = read_edid(edid) if edid else None
-    sha256 = hashlib.sha256(edid).hexdigest() if edid else ""
+    sha256 = sha256_of(edid)
     if found is None:
         return MonitorIdentity(edid_sha256=sha256)
     return MonitorIdentity(

@@ -185,7 +185,8 @@ def show_cases(this: "Campaign", directory: "Directory", asked: Showing) -> None
                 running.optional_frames(asked.frames, bench, screen) as feed,
             ):
                 ledger = LedgerSwitch()
-                told = RunSource(where, bench.renderer.gl_renderer, bench.config.monitor.refresh_hz, math.inf)
+                renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
+                told = RunSource(where, renderer, refresh_hz, math.inf, running.forced_on(screen))
                 parts = PageParts(bench, notices, ledger, lambda path: Ledger(path, bench, notices), screen)
                 page, status = RunDescription("campaign", "campaign", where), RunStatus(told, ledger)
                 with running.followed(listener, False, page, parts, status, frames=feed) as (sink, follower, _):

@@ -12,7 +12,7 @@ import typer
 from hilstar.console.run_status import RunStatus
 from hilstar.console.terminal import report, say
 from hilstar.errors import InputError, MachineError
-from hilstar.notices import Notices
+from hilstar.notices import Notice, Notices
 from hilstar.process.programs import Service
 from hilstar.units import NS_PER_S
 
@@ -36,7 +36,12 @@ if TYPE_CHECKING:
 UTC_MARK = "{utc}"  # stands for the time in a ledger's name
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
-    bool, typer.Option("--force", help="Show on a display that the start-up checks refuse; the refusal is logged.")
+    bool,
+    typer.Option(
+        "--force",
+        help="Show on a display that the start-up checks refuse, or on a monitor that the bench's files were not measured on;"
+        " status, page and ledger go on saying so.",
+    ),
 ]
 LedgerFile = Annotated[
     Path | None,
@@ -117,8 +122,13 @@ def shown_bench(file: "BenchFile", headless: bool, windowed: bool, force: bool, 
         return
     from hilstar.run.screen.gate import open_screen
 
-    with open_screen(file, windowed=windowed, force=force, timed=timed) as screen:
+    with open_screen(file, datetime.now(UTC).date(), windowed=windowed, force=force, timed=timed) as screen:
         yield screen.bench, screen
+
+
+def forced_on(screen: Any) -> str:
+    """What is wrong with a screen that is shown by --force; "" for nothing, and headless."""
+    return "" if screen is None else "; ".join(screen.forced)
 
 
 def say_of_light(bench: Any) -> None:
@@ -202,10 +212,13 @@ def dated_ledger(path: Path | None) -> Path | None:
 @contextmanager
 def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> "Iterator[LedgerSwitch]":
     """The run's ledger, which also keeps its events; without a path it starts switched off."""
+    from hilstar.bench.measured_on import SHOWN_ANYWAY
     from hilstar.run.record.ledger import Ledger, LedgerSwitch
 
     ledger = LedgerSwitch(None if path is None else Ledger(path, bench, notices, overwrite, split))
     notices.listen(ledger.notice)
+    for line in bench.output.get("forced", ()):
+        ledger.notice(Notice.now("forced", f"{line}: {SHOWN_ANYWAY}"))
     with ledger:
         yield ledger
 

@@ -179,7 +179,7 @@ def serve(
         running.say_units(fields)
         running.say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
-        told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest)
+        told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest, running.forced_on(screen))
         status = RunStatus(told, kept)
         parts = PageParts(
             bench,

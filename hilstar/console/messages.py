@@ -87,6 +87,7 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     hidden: str = ""
     display_lost: str = ""
     gamma: str = ""
+    forced: str = ""
     ledger: LedgerState | None = None
     note: str = ""
     faults: list[str] = []

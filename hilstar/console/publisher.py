@@ -220,6 +220,7 @@ class WatchedRun:
             hidden="" if shown is None else shown.on_screen.hidden,
             display_lost="" if screen is None else screen.window.gone or "",
             gamma=self._notices.lasting.get(GAMMA, ""),
+            forced="" if screen is None else printable("; ".join(screen.forced)),
             ledger=self._ledger(),
             faults=[] if faults is None else faults.on(),
             rates=self._notices.lasting.get(WRONG, ""),

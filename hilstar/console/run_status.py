@@ -32,12 +32,14 @@ ALIVE_NS, ALIVE_PERIODS = NS_PER_S, 3.0
 
 @dataclass(frozen=True, slots=True)
 class RunSource:
-    """What a run shows: where its attitudes come from, on what it is drawn, and how many frames there will be."""
+    """What a run shows: where its attitudes come from, on what it is drawn, how many frames there will be, and what is wrong
+    with the screen that --force shows it on."""
 
     attitudes: str
     renderer: str
     refresh_hz: float
     frames: float = math.inf
+    forced: str = ""
 
 
 class StatusLine(NamedTuple):
@@ -84,7 +86,7 @@ class RunStatus:
             return "no frame yet"
         attitude, tally, packets = _attitude_line(shown), running.loop.tally, running.packets
         told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
-        return f"attitude {attitude.text}; {told}"
+        return f"attitude {attitude.text}; {told}" + ("; shown by --force" if self._source.forced else "")
 
     def lines(self, now_ns: int) -> list[StatusLine]:
         """The status at a host time; rates are since it was last asked for."""
@@ -117,6 +119,8 @@ class RunStatus:
             failed = f"; failed: {ledger.failure}" if ledger.failure else ""
             text = printable(f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}")
             yield StatusLine("ledger", text, ledger.failure is None)
+        if self._source.forced:
+            yield StatusLine("forced", printable(self._source.forced), False)
         yield StatusLine("source", self._source.attitudes)
         yield StatusLine("display", f"{self._source.refresh_hz:g} Hz, {self._source.renderer}")
 

@@ -20,6 +20,7 @@ from msgspec import Meta
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import write_whole
+from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.response import (
     MAX_LEVELS,
     TRIPLES,
@@ -53,7 +54,8 @@ class Calibration:
     `uniformity` is a coarse grid (rows, columns) of relative light, rows from top to bottom, each value at the middle of its
     equal share of the screen; None where the light is the same everywhere. `noise` is the relative repeatability of a patch.
     `weights` are the shares of the primaries in white as the tracker sees them, of sum 1; None where they are not known.
-    `black` of the response is that of the whole screen. `sha256` covers the bytes of every file that was read.
+    `black` of the response is that of the whole screen. `sha256` covers the bytes of every file that was read. `identity` is
+    that of the monitor that was measured, None where the file does not say.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Calibration:
     instrument: str = ""
     unit: str = "relative"
     notes: dict[str, str] = field(default_factory=dict)
+    identity: MonitorIdentity | None = None
 
     @property
     def can_steal_bits(self) -> bool:
@@ -149,6 +152,7 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
         instrument=head.instrument,
         unit=head.unit,
         notes={key: text for key, text in msgspec.structs.asdict(file.notes).items() if text},
+        identity=file.monitor_identity,
     )
 
 
@@ -195,14 +199,16 @@ def primary_responses(source: str | Path, bits: int) -> tuple[Response, ...]:
     return tuple(tables[name] for name in ("rgb" if "r" in tables else "www"))
 
 
-def with_uniformity(source: str | Path, bits: int, path: Path, grid: FloatArray | None) -> tuple[Path, ...]:
+def with_uniformity(
+    source: str | Path, bits: int, path: Path, grid: FloatArray | None, identity: MonitorIdentity | None = None, when: str = ""
+) -> tuple[Path, ...]:
     """Write a calibration's light with another grid of relative light (rows, columns), or with none; the files, TOML first.
 
-    `source` is a built-in name or a file, as for `load_calibration`. Raises InputError.
+    `source` is a built-in name or a file, as for `load_calibration`; `when` dates a built-in's. Raises InputError.
     """
     response, weights, noise, notes = f"{path.stem}.csv", None, 0.0, NotesTable()
     if str(source) in FORMULAS:
-        head = CalibrationHead("photometric", "", "", f"none: the formula {source}", "relative", bits, response)
+        head = CalibrationHead("photometric", "", when, f"none: the formula {source}", "relative", bits, response)
         columns, weights = {"w": _formula(str(source), bits).light}, WeightsTable(*REC709_WEIGHTS)
     else:
         origin = _path_of(source)
@@ -210,7 +216,8 @@ def with_uniformity(source: str | Path, bits: int, path: Path, grid: FloatArray 
         columns = read_response(beside(origin, file.calibration.response, "[calibration] response"), bits)
         head = msgspec.structs.replace(file.calibration, response=response)
         weights, noise, notes = file.weights, file.noise.relative if file.noise else 0.0, file.notes
-    table = write_calibration(path, head, columns, noise, notes, weights)
+        identity = identity or file.monitor_identity
+    table = write_calibration(path, head, columns, noise, notes, weights, identity=identity)
     return (path, table) if grid is None else (path, table, add_uniformity(path, grid))
 
 
@@ -283,6 +290,7 @@ class CalibrationFile(Table, frozen=True):
     uniformity: UniformityTable | None = None
     noise: NoiseTable | None = None
     notes: NotesTable = msgspec.field(default_factory=NotesTable)
+    monitor_identity: MonitorIdentity | None = None
 
 
 KIND = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
@@ -403,6 +411,8 @@ def write_calibration(
     noise: float,
     notes: NotesTable,
     weights: WeightsTable | None = None,
+    *,
+    identity: MonitorIdentity | None = None,
 ) -> Path:
     """Write the TOML and, beside it, the response it names; the CSV's path. Raises InputError where they cannot be written."""
     table = path.parent / head.response
@@ -415,6 +425,8 @@ def write_calibration(
     if weights is not None:
         lines += ["[weights]", *(f"{name} = {share!r}" for name, share in msgspec.structs.asdict(weights).items()), ""]
     lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
+    if identity is not None:
+        lines += ["", identity.toml()]
     write_whole(table, comment + ",".join(["code", *columns]) + "\n" + rows)
     write_whole(path, "\n".join(lines) + "\n")
     return table

@@ -24,6 +24,7 @@ from hilstar.bench.bench_file import BenchFile, read_bench_or_heads
 from hilstar.bench.build import bench_calibration, bench_optics
 from hilstar.bench.cameras import FieldsOfView, fields_of_view
 from hilstar.errors import HilstarError, MachineError
+from hilstar.monitor.identity import read_edid
 from hilstar.monitor.window.output_settings import findings
 from hilstar.monitor.window.randr import lit_outputs
 from hilstar.monitor.window.window import displays, window_renderer
@@ -39,8 +40,6 @@ COLUMNS = ("hilstar", "machine", "OpenGL", "display server", "monitors", "links"
 TO_FILL = "(write it here)"
 NOT_THERE = "none"
 SYS, PROC = Path("/sys"), Path("/proc")
-EDID_HEADER = bytes.fromhex("00ffffffffffff00")
-EDID_BYTES, DESCRIPTORS, DESCRIPTOR_BYTES, NAME_TAG = 128, (54, 72, 90, 108), 18, 0xFC
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,33 +163,6 @@ LOOKS: dict[str, Callable[[], str]] = {
     "catalogue": _catalogue,
     "files": lambda: f"{resource_path('shaders', 'splat.frag')}, {resource_path('configs', 'demo.toml')}",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Edid:
-    """What a monitor says of itself (VESA E-EDID 1.4, section 3): three letters of its maker, its model, year and size."""
-
-    maker: str
-    product: int
-    name: str
-    year: int
-    size_cm: tuple[int, int]
-
-    def line(self) -> str:
-        """The monitor for a person."""
-        width_cm, height_cm = self.size_cm
-        return f"{self.maker} {self.name or f'{self.product:04x}'} ({self.year}, {width_cm} x {height_cm} cm)"
-
-
-def read_edid(data: bytes) -> Edid | None:
-    """An EDID's first block read; None where it is none. Its serial number (bytes 12 to 15, and a text) is left out."""
-    if len(data) < EDID_BYTES or data[:8] != EDID_HEADER or sum(data[:EDID_BYTES]) % 256:
-        return None
-    code = int.from_bytes(data[8:10], "big")
-    maker = "".join(chr(64 + (code >> shift & 31)) for shift in (10, 5, 0))
-    texts = [data[at + 5 : at + DESCRIPTOR_BYTES] for at in DESCRIPTORS if data[at : at + 5] == bytes((0, 0, 0, NAME_TAG, 0))]
-    name = texts[0].split(b"\n")[0].decode("cp437").strip() if texts else ""
-    return Edid(maker, int.from_bytes(data[10:12], "little"), name, 1990 + data[17], (data[21], data[22]))
 
 
 def row() -> dict[str, str]:

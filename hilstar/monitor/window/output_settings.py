@@ -26,11 +26,13 @@ WRONG, DOUBTFUL, RIGHT = "wrong", "doubtful", "right"
 
 @dataclass(frozen=True, slots=True)
 class OutputState:
-    """An output as RandR describes it: its mode and the preferred ones (px), its transform (rows of a 3 x 3 matrix),
-    rotation, properties and EDID (b"" for none); the other outputs that are lit, and the screen's providers (GPUs)."""
+    """An output as RandR describes it: its mode and the preferred ones (px), its refresh (0 where that is not known), its
+    transform (rows of a 3 x 3 matrix), rotation, properties and EDID (b"" for none); the other outputs that are lit, and the
+    screen's providers (GPUs)."""
 
     name: str
     mode_px: Pair
+    refresh_hz: float = 0.0
     preferred_px: tuple[Pair, ...] = ()
     transform: tuple[float, ...] = IDENTITY
     rotated: bool = False
@@ -38,6 +40,11 @@ class OutputState:
     edid: bytes = b""
     others: tuple[str, ...] = ()
     providers: tuple[str, ...] = ()
+
+    @property
+    def transformed(self) -> bool:
+        """Whether X resamples frames for it (fractional scaling)."""
+        return max(abs(a - b) for a, b in zip(self.transform, IDENTITY, strict=True)) > TRANSFORM_TOLERANCE
 
     def fields(self) -> dict[str, object]:
         """Everything but the EDID, as `doctor --json` and a ledger have it."""
@@ -100,8 +107,7 @@ def findings(state: OutputState, bits: int, pixel_pitch_um: float | None = None)
 
 
 def _geometry_findings(state: OutputState) -> Iterator[Finding]:
-    off = max(abs(a - b) for a, b in zip(state.transform, IDENTITY, strict=True))
-    if off > TRANSFORM_TOLERANCE:
+    if state.transformed:
         mend = f"xrandr --output {state.name} --transform none"
         yield Finding(f"{state.name} has a transform (fractional scaling), which resamples every frame; {mend}", True)
     if state.preferred_px and state.mode_px not in state.preferred_px:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.run.doctor import COLUMNS, EDID_HEADER, read_edid, row, table
+from hilstar.monitor.identity import read_edid
+from hilstar.run.doctor import COLUMNS, row, table
 from tests.support.commands import run_hilstar_here
 
 SERIAL, SERIAL_TEXT = 305419896, "CN0F00BAR123"
@@ -19,7 +20,7 @@ SERIAL, SERIAL_TEXT = 305419896, "CN0F00BAR123"
 def edid(name: str = "DELL U2412M") -> bytes:
     """An EDID as VESA's E-EDID 1.4 lays it out, with a serial number in both of its places."""
     block = bytearray(128)
-    block[:8] = EDID_HEADER
+    block[:8] = bytes.fromhex("00ffffffffffff00")
     block[8:10] = (4 << 10 | 5 << 5 | 12).to_bytes(2, "big")  # "DEL"
     block[10:12] = (0xA07B).to_bytes(2, "little")
     block[12:16] = SERIAL.to_bytes(4, "little")

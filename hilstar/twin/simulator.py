@@ -201,7 +201,8 @@ class Simulator(Closing):
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
         # light of faults has the mean colour of the stars (see `by_channel`)
-        colour = None if stars.colours is None else np.average(stars.colours, axis=0, weights=stars.electrons_per_s)
+        rates, colours = stars.rates_e_per_s, stars.colours
+        colour = None if colours is None else rates @ colours[: len(rates)] / rates.sum()
         added = with_channels(_exposed(faults.added_truth()), colour)
         truth = np.concatenate([truth, added])
         return Exposure(view, dn, mean_e, truth, light.capped, faults.names)

@@ -1,9 +1,11 @@
 #version 330 core
 // Levels to the screen: their codes, turned as the optics need them, and aids for aligning the bench.
-// Compiled for each orientation: on llvmpipe every branch costs at every pixel. QUARTER_TURNS, FLIP_X, FLIP_Y, STEALING, AIDS.
+// Compiled for each orientation: on llvmpipe every branch costs at every pixel. QUARTER_TURNS, FLIP_X, FLIP_Y, STEALING, APART, AIDS.
 
 uniform usampler2D levels;
 uniform usampler2D triples;  // with bit stealing the codes of each level, in rows of TABLE_WIDTH
+uniform usampler2D green;    // levels of primaries that are driven apart; red's are `levels`
+uniform usampler2D blue;
 uniform float white;         // the largest code
 uniform ivec2 size_px;       // of the image
 uniform ivec2 screen_px;
@@ -35,8 +37,11 @@ ivec2 image_pixel(ivec2 screen) {
 #endif
 }
 
-uvec3 codes_of(uint level) {
-#ifdef STEALING
+uvec3 codes_of(ivec2 pixel) {
+    uint level = texelFetch(levels, pixel, 0).r;
+#ifdef APART
+    return uvec3(level, texelFetch(green, pixel, 0).r, texelFetch(blue, pixel, 0).r);
+#elif defined(STEALING)
     return texelFetch(triples, ivec2(int(level) % TABLE_WIDTH, int(level) / TABLE_WIDTH), 0).rgb;
 #else
     return uvec3(level);
@@ -48,7 +53,7 @@ void main() {
     ivec2 screen = ivec2(gl_FragCoord.x, screen_px.y - 1 - int(gl_FragCoord.y));
     ivec2 pixel = image_pixel(screen);
     bool inside = all(lessThan(uvec2(pixel), uvec2(size_px)));  // a negative number is huge without its sign
-    uvec3 codes = inside ? codes_of(texelFetch(levels, pixel, 0).r) : uvec3(0u);
+    uvec3 codes = inside ? codes_of(pixel) : uvec3(0u);
 #ifdef AIDS
     bool blank = (overlay & 4) != 0, on_patch = (overlay & 8) != 0 && !blank;
     if (on_patch) codes = uvec3(patch_code);

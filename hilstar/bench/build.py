@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from msgspec.structs import replace
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import Float32Array, FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.cameras import bench_camera, display_psf, tracker_camera, tracker_psf
+from hilstar.bench.colours import Colours, mixed_for
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, Tracker
-from hilstar.bench.config.bench_config import epoch_utc_ns, has_observer, sky_jd
+from hilstar.bench.config.bench_config import drives_apart, epoch_utc_ns, has_observer, sky_jd
 from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
 from hilstar.bench.effort import BEST, CHEAP, IN_TIME_SHARE, SURELY_IN_TIME, Effort, FieldCost, Light, plan_effort
@@ -28,7 +29,9 @@ from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_lay
 from hilstar.frame.truth import StarInView, brightest_in_view
 from hilstar.frame.view import Canvas, View
 from hilstar.monitor.balance import Seen
-from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
+from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration, primary_responses
+from hilstar.monitor.primaries import chromatic_primaries, read_primaries
+from hilstar.monitor.quantise import Panel
 from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.render.backend import Target, level_cost
 from hilstar.render.numpy_backend import headless_context, open_backend
@@ -88,7 +91,10 @@ def assembled(
 def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: Sources, timed: bool) -> Bench:
     render, calibration = file.config.render, bench_calibration(file.config, file.folder)
     psf = display_psf(render)
-    white_e_per_s = render.flux_at_white_e_per_s or brightest_peak_e_per_s(stars, psf, render.brightest_v_mag)
+    colours = bench_colours(file.config, file.folder, stars.catalog)
+    stars = stars if colours is None else colours.on(stars)
+    drive = 1.0 if stars.primaries is None or colours is None else colours.drive(stars.primaries)
+    white_e_per_s = render.flux_at_white_e_per_s or brightest_peak_e_per_s(stars, psf, render.brightest_v_mag, drive)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())
     camera = bench_camera(file.config, file.folder)
@@ -105,6 +111,8 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
         exposure_frames=file.config.exposure_frames,
         cost=partial(level_cost, context=context),
     )
+
+    panels = () if colours is None else primary_panels(file, colours, white_e_per_s, uniformity)
 
     def bench_by(effort: Effort | None) -> Bench:
         config, codes = file.config, render.quantisation
@@ -124,8 +132,10 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
             sides=() if effort is None else effort.sides,
             seen=light.seen,
         )
+        if colours is not None:
+            target = dataclasses.replace(target, primaries=tuple(target.of_primary(one) for one in panels))
         faintest = QUANTISERS[codes].faintest_e_per_s(light.panel, psf)
-        shown, faint = split_by_rate(stars, faintest)
+        shown, faint = split_by_rate(stars, faintest, drive)
         return Bench(
             file=file,
             config=config,
@@ -137,13 +147,19 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
             darkest=darkest,
             flux_at_white_e_per_s=white_e_per_s,
             faintest_shown_e_per_s=faintest,
-            stars=moved(stars, sources.moving),
-            shown_stars=moved(shown, sources.moving),
+            stars=seen_with(stars),
+            shown_stars=seen_with(shown),
             faint_stars=faint,
             sources=sources,
             tracker_psf=tracker_psf(config.tracker, file.folder),
             renderer=open_backend(target, context),
+            colours=colours,
+            panel=Panel(calibration.response, white_e_per_s, uniformity, panels),
         )
+
+    def seen_with(some: Stars) -> Stars:
+        among = moved(some, sources.moving)
+        return among if colours is None else colours.on(among)
 
     chooses = render.effort == "auto" or render.quantisation == "auto"
     bench = bench_by(plan_effort(render, light) if chooses else None)
@@ -327,16 +343,59 @@ def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:
     return load_calibration(source, config.monitor.bits, bit_stealing=config.render.bit_stealing)
 
 
-def brightest_peak_e_per_s(stars: Stars, psf: Psf, brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG) -> float:
+def bench_primaries(monitor: Monitor, folder: Path) -> tuple[Curve, ...] | None:
+    """The spectra of a monitor's primaries, None where they are not known. Raises InputError."""
+    primaries = monitor.primaries
+    if primaries.file is not None:
+        return read_primaries(folder / primaries.file)
+    given = [one for one in (primaries.xy_r, primaries.xy_g, primaries.xy_b) if one is not None]
+    return chromatic_primaries(given, primaries.width_nm) if given else None
+
+
+def named_channels(tracker: Tracker, folder: Path) -> dict[str, Optics]:
+    """The tracker's light-gathering part of each channel by its key."""
+    return dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, folder), strict=True))
+
+
+def bench_colours(config: BenchConfig, folder: Path, catalog: Catalog) -> Colours | None:
+    """What a bench mixes its primaries for; None where all three have one code, or stolen bits. Raises InputError."""
+    if not drives_apart(config):
+        return None
+    primaries, monitor = bench_primaries(config.monitor, folder), config.monitor
+    if primaries is None:
+        raise InputError(
+            '[tracker.detector] bayer, and [render] colour = "star" with it, need the light of the primaries; write'
+            ' [monitor.primaries] file, or xy_r to xy_b; or colour = "white"'
+        )
+    places_px = [orientation_of(monitor).in_image(*place) for place in monitor.primaries.places_px]
+    rates_by = partial(channel_rates, config.sky)
+    return mixed_for(primaries, named_channels(config.tracker, folder), places_px, rates_by, star_kinds(config, catalog))
+
+
+def primary_panels(
+    file: BenchFile, colours: Colours, white_e_per_s: float, uniformity: Float32Array | None, name: str | None = None
+) -> tuple[Panel, ...]:
+    """The panel of each primary of a monitor, of the calibration `name` (by default the bench's). Raises InputError."""
+    monitor = file.config.monitor
+    name = name or monitor.calibration
+    responses = primary_responses(name if name in BUILT_IN else file.folder / name, monitor.bits)
+    each = zip(responses, colours.of_white.tolist(), strict=True)
+    return tuple(Panel(response, white_e_per_s * share, uniformity) for response, share in each)
+
+
+def brightest_peak_e_per_s(
+    stars: Stars, psf: Psf, brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG, drive: FloatArray | float = 1.0
+) -> float:
     """Full scale where the file gives no flux for it: the brightest pixel of the brightest star at or below that magnitude.
 
-    Brighter stars may clip. With the default magnitude and a catalogue of brighter stars alone, none does. Raises InputError
-    when no star remains.
+    A star counts `drive` (n,) times, as much of white as its colour asks for. Brighter stars may clip. With the default
+    magnitude and a catalogue of brighter stars alone, none does. Raises InputError when no star remains.
     """
     magnitude = DEFAULT_BRIGHTEST_V_MAG if brightest_v_mag is None else brightest_v_mag
-    wanted = stars.electrons_per_s[stars.v_mag >= magnitude]
+    rates = stars.electrons_per_s * drive
+    wanted = rates[stars.v_mag >= magnitude]
     if not len(wanted) and magnitude == DEFAULT_BRIGHTEST_V_MAG:
-        wanted = stars.electrons_per_s
+        wanted = rates
     if not len(wanted):
         key, better = ("[render] brightest_v_mag", "smaller") if len(stars) else ("[sky] faintest_v_mag", "larger")
         raise InputError(f"{key} leaves no star; write a {better} magnitude, or [render] flux_at_white_e_per_s")

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.colours import Colours, lit_alone
 from hilstar.bench.config import BenchConfig, Vector
 from hilstar.bench.effort import Effort
 from hilstar.errors import InputError
@@ -54,7 +55,8 @@ class Frame:
 
     `light` is float32 (channels, height, width), electrons per second, and `linear` (height, width) all channels together;
     `levels`, uint8 or uint16 (height, width), are indices into the response's table; `codes` are the code values, the same
-    array or with bit stealing (height, width, 3); `truth` is a structured array of TRUTH_DTYPE, a row for each star whose
+    array or with bit stealing (height, width, 3). Where the primaries are driven apart, levels and codes are one array
+    (height, width, 3). `truth` is a structured array of TRUTH_DTYPE, a row for each star whose
     sprite touches the monitor, and `star` (n,) the places of the same stars in the bench's, negative for light that a fault
     adds. `t_ns` is the moment for which bodies were placed.
     """
@@ -107,7 +109,8 @@ class Bench:
     `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of white, None where that is 1 everywhere, and
     `darkest` its minimum. `tracker_psf` is how its optics spread a star.
     `sources` are the sky's light beside stars, whose bodies have places among `stars` and `shown_stars`.
-    `output` says how the display's output is set that its frames are shown on; {} without one.
+    `output` says how the display's output is set that its frames are shown on; {} without one. `panel` is the monitor's light
+    by its levels. Where its primaries are driven apart, `colours` says what for, and stars have the light of each.
     """
 
     file: BenchFile
@@ -125,23 +128,20 @@ class Bench:
     faint_stars: Stars
     tracker_psf: Psf
     renderer: Backend
+    panel: Panel
+    colours: Colours | None = None
     sources: Sources = NO_SOURCES
     output: dict[str, object] = field(default_factory=dict, repr=False)
 
     def with_stars(self, stars: Stars) -> Bench:
         """The bench with the same renderer and other stars, all of which are shown."""
-        shown, none = split_by_rate(stars, 0.0)
+        shown, none = split_by_rate(stars if self.colours is None else self.colours.on(stars), 0.0)
         return replace(self, stars=stars, shown_stars=shown, faint_stars=none, sources=NO_SOURCES)
 
     @property
     def moving(self) -> MovingSky | None:
         """The bodies, the satellites and the observer; None where the sky stands still."""
         return self.sources.moving
-
-    @property
-    def panel(self) -> Panel:
-        """The monitor's light by its levels."""
-        return Panel(self.calibration.response, self.flux_at_white_e_per_s, self.uniformity)
 
     @property
     def quantiser(self) -> type[Quantiser]:
@@ -241,11 +241,19 @@ class Bench:
 
     def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
+        sprites = self._driven(sprites)
         self.renderer.draw(sprites, frame)
-        clipped = None if sprites is None else self._clipped(sprites)
+        clipped = None if sprites is None else self._clipped(sprites, self.shown_stars)
         if sprites is None or clipped is None or not len(clipped):
             return Drawn(self.renderer, sprites, () if sprites is None else sprites.over_white)
         return Drawn(self.renderer, sprites, (*designations(self.shown_stars, sprites, clipped), *sprites.over_white))
+
+    def _driven(self, sprites: Sprites | None) -> Sprites | None:
+        """Sprites with those of each primary, where those are driven apart."""
+        if sprites is None or self.colours is None:
+            return sprites
+        parts = self.colours.parts(sprites, self.shown_stars)
+        return replace(sprites, primaries=tuple(lit_alone(part) for part in parts))
 
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
         """How many stars in view at an attitude are too faint for the monitor."""
@@ -257,7 +265,7 @@ class Bench:
         if self.sources.diffuse:
             lights = (*lights, LightMap(np.zeros((1, 1), dtype=np.float32), lasting=False))
         if lights:
-            self.renderer.draw(replace(self.sprites(WARM_UP_ATTITUDE), extended=lights))
+            self.renderer.draw(self._driven(replace(self.sprites(WARM_UP_ATTITUDE), extended=lights)))
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
         self.renderer.begin_anew()
@@ -280,11 +288,12 @@ class Bench:
         sprites = self._light(self._all_layers, self.stars, view, faults)
         shown = self.light(view, faults)
         self.renderer.begin_anew()
-        self.renderer.draw(shown, number)
+        self.renderer.draw(self._driven(shown), number)
         levels = Levels(self.renderer.levels().copy())
         drawn = len(sprites) == len(shown) and not (len(self.faint_stars) or self.renderer.target.sides)
+        drawn &= self.colours is None
         light = linear_light(self.renderer, sprites, self.stars, drawn)
-        truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites))
+        truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites, self.stars))
         if sprites.discs:
             discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
             found = disc_stars(self.stars, (disc.name for disc in discs))
@@ -292,7 +301,11 @@ class Bench:
             rows = truth_table(self.stars, found, *self.camera.project(middles))
             rows["clipped"] = np.isin(rows["name"], sprites.over_white)
             truth, star = np.append(truth, rows), np.append(star, found)
-        truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
+        drive: FloatArray | float = 1.0
+        if self.colours is not None:
+            truth = self.colours.on_truth(truth, self.stars, star)
+            drive = self.colours.drive(self.colours.shares_of(self.stars, star))
+        truth["drawn"] = truth["electrons_per_s"] * drive >= self.faintest_shown_e_per_s
         order = np.argsort(truth["v_mag"], kind="stable")
         return Frame(view.q_icrs_to_cam, light, levels, self.code_values(levels), truth[order], star[order], t_ns)
 
@@ -324,13 +337,17 @@ class Bench:
     def code_values(self, levels: Levels) -> Codes:
         """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""
         rgb = self.calibration.response.rgb
-        if rgb is None:
+        if rgb is None:  # codes of primaries that are driven apart are their levels, too
             return levels
         return np.asarray(rgb[levels], dtype=code_dtype(self.calibration.response.bits))
 
-    def _clipped(self, sprites: Sprites) -> IntArray:
-        size_px = self.camera.resolution_px
-        return clipped_sprites(sprites, self.psf, self.flux_at_white_e_per_s, size_px, self.uniformity, self.darkest)
+    def _clipped(self, sprites: Sprites, stars: Stars) -> IntArray:
+        parts = (sprites,) if self.colours is None else self.colours.parts(replace(sprites, extended=()), stars)
+        over = [
+            clipped_sprites(part, self.psf, one.flux_at_white_e_per_s, self.camera.resolution_px, self.uniformity, self.darkest)
+            for part, one in zip(parts, self.panel.primaries or (self.panel,), strict=True)
+        ]
+        return over[0] if len(over) == 1 else np.unique(np.concatenate(over))
 
     def close(self) -> None:
         """Free the GL context."""

@@ -182,6 +182,19 @@ def primary_lights(source: str | Path, bits: int) -> FloatArray:
     return np.asarray(light * (shares / shares.sum())[:, None])
 
 
+def primary_responses(source: str | Path, bits: int) -> tuple[Response, ...]:
+    """The response of each primary, relative to its own white: a calibration's columns r, g and b, or its grey one for all.
+
+    Raises InputError as `load_calibration` does.
+    """
+    if str(source) in FORMULAS:
+        return (_formula(str(source), bits),) * 3
+    path = _path_of(source)
+    columns = read_response(beside(path, read_toml(path).calibration.response, "[calibration] response"), bits)
+    tables = {name: table_response(bits, (light - light[0]) / (light[-1] - light[0])) for name, light in columns.items()}
+    return tuple(tables[name] for name in ("rgb" if "r" in tables else "www"))
+
+
 def with_uniformity(source: str | Path, bits: int, path: Path, grid: FloatArray | None) -> tuple[Path, ...]:
     """Write a calibration's light with another grid of relative light (rows, columns), or with none; the files, TOML first.
 

@@ -40,12 +40,14 @@ class Panel:
     """A monitor as light becomes levels on it: its response, the light of white, and the relative light of each pixel.
 
     `uniformity` float32 (height, width) is each pixel's light relative to what the response says (None: 1 everywhere).
-    Raises InputError where it is not positive and finite.
+    `primaries` are the panels of red, green and blue alone where they are driven apart; `response` is then that of grey.
+    Raises InputError where the uniformity is not positive and finite.
     """
 
     response: Response
     flux_at_white_e_per_s: float
     uniformity: Float32Array | None = None
+    primaries: tuple[Panel, ...] = ()
 
     def __post_init__(self) -> None:
         if self.uniformity is not None and not (np.isfinite(self.uniformity).all() and (self.uniformity > 0).all()):
@@ -283,9 +285,21 @@ def mask_turn(frame: int) -> float:
 
 
 def shown_light(levels: Levels, panel: Panel) -> FloatArray:
-    """The light of levels (height, width) on a monitor: electrons per second above the black level, float64."""
+    """The light of levels (height, width) on a monitor: electrons per second above the black level, float64.
+
+    Of levels (height, width, 3) it is the sum of the primaries'.
+    """
+    if levels.ndim == 3:
+        return np.asarray(sum(primary_lights(levels, panel)))
     light = panel.response.light[levels] * panel.flux_at_white_e_per_s
     return light if panel.uniformity is None else light * panel.uniformity
+
+
+def primary_lights(levels: Levels, panel: Panel) -> list[FloatArray]:
+    """The light (height, width) of each primary of levels (height, width, 3); of levels (height, width) all light together."""
+    if levels.ndim == 2:
+        return [shown_light(levels, panel)]
+    return [shown_light(Levels(levels[..., k]), one) for k, one in enumerate(panel.primaries)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,8 @@ Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -50,7 +51,7 @@ class Target:
 
     `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere). `sides` are those
     of fainter stars' sprites, by falling rates, of the same parity as the footprint. `seen` is how the tracker sees the
-    monitor, for `exact` and `temporal`.
+    monitor, for `exact` and `temporal`. Where the `primaries` are driven apart, each has its own target.
     """
 
     resolution_px: tuple[int, int]
@@ -61,6 +62,14 @@ class Target:
     uniformity: Float32Array | None = None
     sides: SpriteSides = ()
     seen: Seen = AS_USUAL
+    primaries: tuple[Target, ...] = ()
+
+    def of_primary(self, panel: Panel) -> Target:
+        """The target of a primary with the light of a panel: sprites are as large as those of a white star as bright."""
+        share = panel.flux_at_white_e_per_s / self.flux_at_white_e_per_s
+        sides = tuple(SpriteSide(side.below_e_per_s * share, side.side_px) for side in self.sides)
+        white_e_per_s = panel.flux_at_white_e_per_s
+        return replace(self, response=panel.response, flux_at_white_e_per_s=white_e_per_s, sides=sides, primaries=())
 
     def panel(self) -> Panel | None:
         """The monitor, None without a response. Raises InputError for a map that does not fit."""
@@ -106,6 +115,8 @@ class Backend(ABC):
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw the linear image and the levels of `sprites` (None: blank); read them with `linear` and `levels`.
 
+        A target of `primaries` takes those of `sprites.primaries`, and has no linear image then.
+
         `frame` counts the frames shown, for `temporal` alone: a number not above the last one's begins a new sequence.
         """
 
@@ -124,12 +135,17 @@ class Backend(ABC):
     def levels(self) -> Levels:
         """The levels of the last draw (height, width), uint8 up to 256 levels, else uint16; the next draw overwrites them.
 
+        Of a target of `primaries` they are (height, width, 3).
+
         A target without a response has none: TypeError.
         """
 
     @abstractmethod
-    def show_on(self, view: ScreenView) -> None:
-        """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in."""
+    def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
+        """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in.
+
+        Its levels are red's codes where those `beside` it, of the same context, have green's and blue's.
+        """
 
     @abstractmethod
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:

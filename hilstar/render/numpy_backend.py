@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.aids import LINE_SHARE, lay_over
 from hilstar.render.backend import EGL_LIBRARY, NO_FRAME, Backend, ScreenView, Target
+from hilstar.render.primaries_backend import PrimariesBackend
 from hilstar.render.reference import add_stars, extended_image
 from hilstar.scene.extended import ExtendedLight
 from hilstar.scene.sprites import Sprites
@@ -33,6 +35,8 @@ log = logging.getLogger(__name__)
 
 def open_backend(target: Target, context: Context | None) -> Backend:
     """The backend of a target: OpenGL in a context, NumPy without one (see `headless_context`)."""
+    if target.primaries:
+        return PrimariesBackend(target, [open_backend(one, context) for one in target.primaries])
     if context is None:
         return NumpyBackend(target)
     from hilstar.render.renderer import Renderer  # moderngl, which nothing needs where NumPy draws
@@ -114,17 +118,17 @@ class NumpyBackend(Backend):
             raise TypeError("this target has no monitor response, so no levels")
         return self._levels
 
-    def show_on(self, view: ScreenView) -> None:
+    def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
         """See `Backend.show_on`."""
-        self._screen = view
+        self._screen, self._shown_with = view, (self, *beside)
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
         """See `Backend.present`."""
         view = self._screen
         turn, (width, height) = view.orientation, view.orientation.screen_px(view.screen_px)
-        shown = self.levels()[:height, :width]
+        shown = [one.levels()[:height, :width] for one in self._shown_with]
         codes = np.zeros((height, width, 3), dtype=np.uint16)
-        codes[: len(shown), : shown.shape[1]] = shown[..., None] if view.triples is None else view.triples[shown]
+        codes[: len(shown[0]), : shown[0].shape[1]] = np.stack(shown, -1) if view.triples is None else view.triples[shown[0]]
         cross_x, cross_y = map(round, view.cross_px)
         lay_over(codes, overlay, patch_code, int(LINE_SHARE * (2**view.bits - 1)), (cross_x, cross_y))
         codes = np.rot90(codes, -turn.quarter_turns)[:: -1 if turn.flip_y else 1, :: -1 if turn.flip_x else 1].copy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import moderngl
@@ -62,10 +63,13 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
 
 
 class Presenter:
-    """Draws a texture of levels on the screen of its context; `table` has the codes of each level."""
+    """Draws a texture of levels on the screen of its context; `table` has the codes of each level.
 
-    def __init__(self, levels: moderngl.Texture, view: ScreenView) -> None:
-        self._texture = levels
+    With `others` the levels are red's codes, and theirs are green's and blue's.
+    """
+
+    def __init__(self, levels: moderngl.Texture, view: ScreenView, others: Sequence[moderngl.Texture] = ()) -> None:
+        self._texture, self._others = levels, others
         self._ctx = levels.ctx
         self._view = view
         with self._ctx:
@@ -79,12 +83,14 @@ class Presenter:
         """The program without or with crosshair, grid, blank and patch, for this orientation alone."""
         view, orientation = self._view, self._view.orientation
         flips = {"FLIP_X": orientation.flip_x, "FLIP_Y": orientation.flip_y}
-        wanted = flips | {"STEALING": view.triples is not None, "AIDS": aids}
+        wanted = flips | {"STEALING": view.triples is not None, "APART": bool(self._others), "AIDS": aids}
         defines = (f"QUARTER_TURNS {orientation.quarter_turns % 4}", *(name for name, is_set in wanted.items() if is_set))
         program = build_program(self._ctx, "full.vert", "present.frag", defines)
         values: dict[str, Any] = {
             "levels": 0,
             "triples": 1,
+            "green": 2,
+            "blue": 3,
             "white": float(2**view.bits - 1),
             "size_px": view.resolution_px,
             "screen_px": view.screen_px,
@@ -127,6 +133,8 @@ class Presenter:
             self._ctx.viewport = (0, 0, *self._view.screen_px)
             self._texture.use(0)
             self.table.use(1)
+            for unit, other in enumerate(self._others, 2):
+                other.use(unit)
             program, vao = self._aided if overlay else self._plain
             if overlay:
                 program["overlay"], program["patch_code"] = overlay, patch_code

@@ -6,6 +6,7 @@ This room is the only user of moderngl.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Self
 
@@ -353,9 +354,10 @@ class Renderer(Backend):
             self._linear_fbo.read_into(self._linear_image, components=1, dtype="f4", alignment=1)
         return self._linear_image
 
-    def show_on(self, view: ScreenView) -> None:
+    def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
         """See `Backend.show_on`."""
-        self._screen, self._presenter = view, Presenter(self.codes_texture, view)
+        others = [one.codes_texture for one in beside if isinstance(one, Renderer)]
+        self._screen, self._presenter = view, Presenter(self.codes_texture, view, others)
         self.tables.append(self._presenter.table)
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:

@@ -143,6 +143,23 @@ def times(light: ExtendedLight, factor: float) -> ExtendedLight:
     return replace(light, times=light.times * factor)
 
 
+def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLight:
+    """Light a part of a pixel to the right and down of its place; of a map by cubic splines."""
+    if not (right_px or down_px):
+        return light
+    if isinstance(light, LightMap):
+        from scipy.ndimage import shift
+
+        image, cover = (
+            None if one is None else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, one.max())
+            for one in (light.image, light.cover)
+        )
+        corner = light.corner_px[0] - 1, light.corner_px[1] - 1
+        return light if image is None else replace(light, image=image, cover=cover, corner_px=corner, lasting=False)
+    x_px, y_px = light.camera.principal_point_px
+    return replace(light, camera=replace(light.camera, principal_point_px=(x_px + right_px, y_px + down_px)))
+
+
 def clipped(edges_px: tuple[float, float, float, float], resolution_px: tuple[int, int]) -> Rectangle | None:
     """The pixels of an image within left, top, right and bottom (the last two excluded); None where there is none."""
     (left, right), (top, bottom) = (

@@ -53,6 +53,13 @@ class Orientation:
         x, y = ((0, 1), (1, 0), (0, -1), (-1, 0))[self.quarter_turns % 4]
         return (-x, -y) if self.flip_y else (x, y)
 
+    def in_image(self, right: float, down: float) -> tuple[float, float]:
+        """A step on the screen, right and down, in image axes."""
+        right, down = -right if self.flip_x else right, -down if self.flip_y else down
+        for _ in range(self.quarter_turns % 4):
+            right, down = down, -right
+        return right, down
+
 
 @dataclass(frozen=True, slots=True)
 class Scan:

@@ -101,6 +101,7 @@ class Sprites:
     the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
     `extended` is the frame's light other than stars, in the order in which it is drawn; `discs` names the bodies among it, and
     `over_white` those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for `star`.
+    `primaries` are the sprites of each of the monitor's primaries, where those are driven apart.
     """
 
     data: npt.NDArray[np.void]
@@ -115,6 +116,7 @@ class Sprites:
     added: tuple[AddedLight, ...] = ()
     discs: tuple[str, ...] = ()
     over_white: tuple[str, ...] = ()
+    primaries: tuple[Sprites, ...] = ()
 
     def __len__(self) -> int:
         return len(self.data)
@@ -228,23 +230,28 @@ def with_sprites(sprites: Sprites, parts: Sequence[Sprites]) -> Sprites:
 def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
     """The sprites of each channel of the tracker: every light times its share there; the sprites themselves where it has one.
 
-    `stars` are those among which `sprites.star` has its places. Light that is neither a star's nor a body's, as a fault's, has
-    the mean colour of the stars.
+    `stars` are those among which `sprites.star` has its places.
     """
-    if stars.colours is None:
-        return [sprites]
+    return [sprites] if stars.colours is None else by_share(sprites, stars, stars.colours)
+
+
+def by_share(sprites: Sprites, stars: Stars, shares: FloatArray) -> list[Sprites]:
+    """The sprites once for each column of `shares` (stars, columns): every light times its star's or body's share.
+
+    Light that is neither a star's nor a body's, as a fault's, has the mean share of the stars.
+    """
     alone = len(stars.rates_e_per_s)
-    shares = np.vstack([stars.colours, stars.rates_e_per_s @ stars.colours[:alone] / (stars.rates_e_per_s.sum() or 1.0)])
+    shares = np.vstack([shares, stars.rates_e_per_s @ shares[:alone] / (stars.rates_e_per_s.sum() or 1.0)])
     bodies = {name: alone + k for k, name in enumerate(stars.bodies)}
     of_sprites = np.where(sprites.star < 0, -1, sprites.star)
     of_extended = [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended]
-    channels = []
+    parts = []
     for share in shares.T:
         data = sprites.data.copy()
         data["electrons_per_s"] *= share[of_sprites].astype(np.float32)
         extended = tuple(times(light, float(share[k])) for light, k in zip(sprites.extended, of_extended, strict=True))
-        channels.append(replace(sprites, data=data, extended=extended))
-    return channels
+        parts.append(replace(sprites, data=data, extended=extended))
+    return parts
 
 
 def clipped_sprites(

@@ -45,7 +45,8 @@ class Stars:
     part of the arrays. Those that `near` does not find (satellites) come first.
 
     `colours` (n, channels) are the shares of `electrons_per_s` that each channel of the tracker has, which sum to 1; None where
-    it has one channel.
+    it has one channel. `primaries` (n, 3) are the light that each of a monitor's primaries gives of it, as shares of
+    `electrons_per_s`; None where they are not driven apart.
     """
 
     hip: npt.NDArray[np.int32]
@@ -60,6 +61,7 @@ class Stars:
     velocity_km_s: FloatArray | None = None
     bodies: tuple[str, ...] = ()
     colours: FloatArray | None = None
+    primaries: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.hip)
@@ -103,12 +105,12 @@ class Stars:
         return [name or hip for name, hip in zip(self.names(which), self.hip[which].tolist(), strict=True)]
 
 
-def split_by_rate(stars: Stars, faintest_e_per_s: float) -> tuple[Stars, Stars]:
-    """The stars of at least `faintest_e_per_s` electrons per second, and the fainter ones, each in their own cells.
+def split_by_rate(stars: Stars, faintest_e_per_s: float, drive: FloatArray | float = 1.0) -> tuple[Stars, Stars]:
+    """The stars of at least `faintest_e_per_s` electrons per second times `drive`, and the fainter ones, each in own cells.
 
     The first are `stars` itself where no star is fainter.
     """
-    kept = stars.electrons_per_s >= faintest_e_per_s
+    kept = stars.electrons_per_s * drive >= faintest_e_per_s
     return stars if kept.all() else _selected(stars, kept), _selected(stars, ~kept)
 
 
@@ -126,6 +128,7 @@ def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
         catalog=stars.catalog,
         row=stars.row[order],
         colours=None if stars.colours is None else stars.colours[order],
+        primaries=None if stars.primaries is None else stars.primaries[order],
     )
 
 

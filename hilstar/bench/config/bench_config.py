@@ -15,7 +15,16 @@ from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.answers import AnswersSettings, check_answers
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
-from hilstar.bench.config.hardware import Collimator, Monitor, SyncSettings, Tracker, Verify, check_channels, check_sync
+from hilstar.bench.config.hardware import (
+    Collimator,
+    Monitor,
+    SyncSettings,
+    Tracker,
+    Verify,
+    check_channels,
+    check_primaries,
+    check_sync,
+)
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES, RenderSettings
 from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SkySettings, SpacecraftSettings
 from hilstar.errors import InputError, shortened
@@ -86,6 +95,13 @@ def has_observer(config: BenchConfig) -> bool:
     bodies = config.sky.bodies
     shown = bodies.planets or bodies.moon or bodies.sun or bodies.earth or bodies.satellites is not None
     return shown or config.spacecraft.orbit is not None
+
+
+def drives_apart(config: BenchConfig) -> bool:
+    """Whether the codes of the primaries are each its own, for the colours of stars."""
+    if config.render.colour is not None or config.render.bit_stealing:
+        return config.render.colour == "star"
+    return getattr(config.tracker.detector, "bayer", None) is not None
 
 
 def from_source(config: BenchConfig) -> bool:
@@ -174,6 +190,8 @@ def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
         # A bench's hash covers the default white, and the Julian year of `epoch_utc`.
         if render.flux_at_white_e_per_s is None and render.brightest_v_mag is None:
             render = msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG)
+        if render.colour == "depth":
+            render = msgspec.structs.replace(render, bit_stealing=True)
         if sky.epoch_utc not in {FROM_SOURCE, UNIX} and (utc_ns := epoch_utc_ns(config)) is not None:
             sky = msgspec.structs.replace(sky, epoch_jyear=jyear(utc_ns))
         return msgspec.structs.replace(config, render=render, sky=sky)
@@ -228,12 +246,26 @@ def _check_meaning(config: BenchConfig) -> None:
     if faults.endpoint is not None and faults.endpoint == config.attitude.address:
         raise InputError(f"[faults] endpoint = {faults.endpoint}: the attitude comes from there; write another port")
     check_channels(config.tracker)
+    check_primaries(config.monitor.primaries)
+    _check_colour(config)
     check_sync(config.sync, config.tracker, config.monitor, config.attitude)
     try:
         check_road(config.attitude)
     except InputError as error:
         raise InputError(f"[attitude] {error}") from error
     _check_answers(config)
+
+
+def _check_colour(config: BenchConfig) -> None:
+    render = config.render
+    if render.bit_stealing and render.colour not in (None, "depth"):
+        raise InputError(
+            f'[render] colour = "{render.colour}" and bit_stealing: the codes of r, g and b serve one; write one of them'
+        )
+    if render.colour == "star" and not config.monitor.primaries.known:
+        raise InputError(
+            '[render] colour = "star" needs the light of the primaries; write [monitor.primaries] file, or xy_r to _b'
+        )
 
 
 def _check_answers(config: BenchConfig) -> None:

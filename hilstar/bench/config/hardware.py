@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Annotated, Literal
 
@@ -10,7 +11,7 @@ from msgspec import Meta
 
 from hilstar.bench.config.attitude import AttitudeSettings
 from hilstar.bench.config.values import Frequency, NotNegative, Point, Positive, Rotation, Sigma, Size
-from hilstar.errors import InputError
+from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.toml_tables import Table
 from hilstar.tracker.settings import DetectorSettings, PixelPitch
 
@@ -26,6 +27,23 @@ AS_ASSUMED = {"default": "as the bench assumes"}
 GAUSSIAN = "gaussian"
 LENS_K = 293.0
 DEFAULT_PSF_SIGMA_PX = (0.55, 0.55)
+THIRD = 1 / 3
+LAYOUTS: dict[str, tuple[tuple[float, float], ...]] = {
+    "white": ((0.0, 0.0),) * 3,
+    "rgb-stripe": ((-THIRD, 0.0), (0.0, 0.0), (THIRD, 0.0)),
+    "bgr-stripe": ((THIRD, 0.0), (0.0, 0.0), (-THIRD, 0.0)),
+    "vertical": ((0.0, -THIRD), (0.0, 0.0), (0.0, THIRD)),
+}
+WHITE_TOO = "its white has a subpixel of its own, so red, green and blue do not add up; take a panel of three primaries"
+SHARED = (
+    "its pixels share subpixels, so a pixel's light depends on its neighbours' codes; take a panel whose pixels have all three"
+)
+REFUSED_LAYOUTS = dict.fromkeys(("rgbw", "wrgb", "rgwb", "woled"), WHITE_TOO)
+REFUSED_LAYOUTS |= dict.fromkeys(("pentile", "rgbg", "diamond", "delta"), SHARED)
+Chromaticity = Annotated[
+    tuple[Annotated[float, Meta(ge=0, le=0.8)], Annotated[float, Meta(ge=1e-3, le=0.9)]], Meta(extra={"form": "[x, y]"})
+]
+Offset = tuple[Annotated[float, Meta(ge=-1, le=1)], Annotated[float, Meta(ge=-1, le=1)]]
 
 
 class TrackerOptics(Table, frozen=True):
@@ -188,21 +206,84 @@ def check_channels(tracker: Tracker) -> None:
 
 
 class PrimariesSettings(Table, frozen=True):
-    """The light of the monitor's red, green and blue.
+    """The light of the monitor's red, green and blue, and where it lies within a pixel.
 
     With it `hilstar budget` says how many electrons per second each channel of the tracker has of each primary at full light:
     all of them together are full scale. The condition number says how much larger an error of the primaries' mixture can be
-    than that of the channels' light.
+    than that of the channels' light. `[render] colour = "star"` mixes each star's light of them ([colour](colour.md)).
+
+    A primary's response is that of its column in the calibration file, or the grey one. Light that one primary's drive adds
+    to another's is part of its spectrum, as measured at full drive.
     """
 
     file: Annotated[
         str | None,
         Meta(
             description="The path of a CSV file with the header `wavelength_nm,r,g,b`: the relative spectral power per nm of "
-            "each primary at full drive, all in one unit.",
+            "each primary at full drive, all in one unit. Or that of an ArgyllCMS `.ccss` with the display's own samples: its "
+            "primaries are those three of which all others are mixtures.",
             extra={"default": "not known"},
         ),
     ] = None
+    xy_r: Annotated[
+        Chromaticity | None,
+        Meta(
+            description="In place of `file`, with the next two: CIE 1931 x and y of each primary. Its spectrum is a Gaussian "
+            "of about that chromaticity, and all three together are D65: approximate, as every run says.",
+            extra={"default": "by `file`"},
+        ),
+    ] = None
+    xy_g: Annotated[Chromaticity | None, Meta(description="Of green.", extra={"default": "by `file`"})] = None
+    xy_b: Annotated[Chromaticity | None, Meta(description="Of blue.", extra={"default": "by `file`"})] = None
+    width_nm: Annotated[
+        float, Meta(ge=1, le=200, description="Full width at half maximum of each primary that is given by `xy_`.")
+    ] = 30.0
+    layout: Annotated[
+        str,
+        Meta(
+            description='`"white"`: all three have their light in the pixel\'s middle. `"rgb-stripe"`, `"bgr-stripe"`: side by '
+            'side, a third of a pixel apart. `"vertical"`: red above green above blue. A pixel with a fourth subpixel, or that '
+            "shares subpixels, is refused."
+        ),
+    ] = "white"
+    offsets_px: Annotated[
+        tuple[Offset, Offset, Offset] | None,
+        Meta(
+            description="In place of `layout`: where the light of red, green and blue lies, in pixels from the middle, right "
+            "and down on the screen.",
+            extra={"default": "by `layout`", "form": "[[x, y], [x, y], [x, y]]"},
+        ),
+    ] = None
+
+    @property
+    def known(self) -> bool:
+        """Whether the primaries' light is known."""
+        return self.file is not None or self.xy_r is not None
+
+    @property
+    def places_px(self) -> tuple[tuple[float, float], ...]:
+        """Where each primary's light lies within a pixel, right and down on the screen."""
+        return self.offsets_px or LAYOUTS[self.layout]
+
+
+def check_primaries(primaries: PrimariesSettings) -> None:
+    """Refuse (InputError) primaries that are given twice or in part, and layouts that three primaries of a pixel have not."""
+    given = [key for key in ("xy_r", "xy_g", "xy_b") if getattr(primaries, key) is not None]
+    if primaries.file is not None and given:
+        raise InputError(f"[monitor.primaries] has file and {given[0]}; write one of them")
+    if given and len(given) < len(LAYOUTS["white"]):
+        missing = next(key for key in ("xy_r", "xy_g", "xy_b") if key not in given)
+        raise InputError(f"[monitor.primaries] has {given[0]} and no {missing}; write xy_r, xy_g and xy_b")
+    if primaries.layout in REFUSED_LAYOUTS:
+        raise InputError(f'[monitor.primaries] layout = "{primaries.layout}": {REFUSED_LAYOUTS[primaries.layout]}')
+    if primaries.layout not in LAYOUTS:
+        names = ", ".join(f'"{name}"' for name in LAYOUTS)
+        meant = did_you_mean(primaries.layout, tuple(LAYOUTS))
+        raise InputError(
+            f"[monitor.primaries] layout = {shortened(json.dumps(primaries.layout))}: {meant}write {names}, or offsets_px"
+        )
+    if primaries.offsets_px is not None and primaries.layout != "white":
+        raise InputError("[monitor.primaries] has layout and offsets_px; write one of them")
 
 
 class Monitor(Table, frozen=True):

@@ -62,6 +62,16 @@ class RenderSettings(Table, frozen=True):
             "and `serve`, `replay` and `budget` say so."
         ),
     ] = False
+    colour: Annotated[
+        Literal["white", "star", "depth"] | None,
+        Meta(
+            description='What the primaries are mixed for. `"white"`: one code for all three. `"star"`: each star\'s light is '
+            "the mixture that is nearest to its own as the tracker sees it: with the same electrons in each channel of three; "
+            "of one channel with the same electrons and the same mean wavelength of those, as far as the primaries reach "
+            '([colour](colour.md)). It needs `[monitor.primaries]`. `"depth"`: as `bit_stealing = true`.',
+            extra={"default": '`"depth"` with `bit_stealing`, else `"star"` with `[tracker.detector] bayer`, else `"white"`'},
+        ),
+    ] = None
     cycle_frames: Annotated[
         Annotated[int, Meta(ge=1, le=256)] | None,
         Meta(

@@ -1,0 +1,245 @@
+"""What a bench mixes its primaries for, star by star: with each channel's electrons, or the nearest spectrum of one channel.
+
+Three channels: the mixture has the star's electrons in each, or is the nearest in electrons (non-negative least squares).
+
+One channel has one number of electrons, and three primaries to make it of. The mixture is the one with the star's own mean
+wavelength of detected photons, so that lateral colour acts as in the sky; of those, the one whose cumulative spectrum of
+detected photons is nearest to the star's (Cramer's distance, which is finite for the lines of a laser too). Its sum is held.
+Both ask the same of a star: its electrons through some curves of wavelength, which the tables of its rates give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.errors import InputError
+from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
+from hilstar.scene.extended import shifted
+from hilstar.scene.sprites import Sprites, by_share
+from hilstar.sky.electrons import Optics, all_channels
+from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
+from hilstar.sky.stars import Stars
+
+STEP_NM = 0.25  # of the spectra of primaries
+KNOT_STEPS = 8
+MEAN_WEIGHT = 1e3  # per nm: a mean wavelength within reach is met to 1e-3 nm
+UNSEEN = 1e-6  # share of white
+WITHIN, WITHIN_NM = 1e-6, 0.1  # within the gamut: of a star's electrons, and of its mean wavelength
+SCALE_K = np.geomspace(1500.0, 60_000.0, 400)
+
+# The electrons (n,) of stars of V = 0, B-V (n,), V-I (n,) and types through some optics.
+RatesBy = Callable[[Optics], Callable[..., FloatArray]]
+
+
+@dataclass(frozen=True, slots=True)
+class Colours:
+    """The primaries of a bench's monitor before its tracker.
+
+    `matrix` is that of a white of 1 electron per second, `of_white` (3,) each primary's share of that, and `by_primary`
+    (channels, 3) each channel's share of the electrons of a primary. `places_px` (3, 2) is where a primary's light lies within
+    a pixel of the image. `mean_nm` (3,) is the primaries' mean wavelength of the photons that the tracker detects.
+    """
+
+    matrix: ChannelMatrix
+    places_px: FloatArray
+    mean_nm: FloatArray
+    _gram: FloatArray
+    _curves: tuple[Callable[..., FloatArray], ...]
+    _kinds: FloatArray | None
+    _scale: FloatArray
+
+    @property
+    def of_white(self) -> FloatArray:
+        """Each primary's share of white (3,), in electrons of all channels."""
+        return np.asarray(self.matrix.e_per_s.sum(axis=0))
+
+    @property
+    def by_primary(self) -> FloatArray:
+        """Each channel's share (channels, 3) of the electrons of a primary."""
+        return np.asarray(self.matrix.e_per_s / self.of_white)
+
+    @property
+    def mono(self) -> bool:
+        """Whether the tracker has one channel."""
+        return len(self.matrix.channels) == 1
+
+    def wanted(self, stars: Stars, which: IntArray | None = None) -> FloatArray:
+        """What the mixtures of stars are made for: shares of channels (n, channels), or the means of a star's photons (n, 4).
+
+        Those are wavelength and the cumulative spectra's products with the primaries'. Bodies count by their B-V.
+        """
+        which = np.arange(len(stars)) if which is None else which
+        if stars.colours is not None:
+            return np.asarray(stars.colours[which])
+        row = stars.row[which]
+        listed, none = row >= 0, np.full(len(which), np.nan)
+        vi = np.where(listed, stars.catalog.vi_mag[np.maximum(row, 0)], none) if len(stars.catalog) else none
+        kind = None
+        if self._kinds is not None:
+            kind = np.where(listed[:, None], self._kinds[np.maximum(row, 0)], np.nan)
+        flux = [one(np.zeros(len(which)), stars.bv_mag[which], vi, kind) for one in self._curves]
+        return np.stack(flux[1:], axis=1) / flux[0][:, None]
+
+    def shares(self, wanted: FloatArray) -> FloatArray:
+        """The light of each primary (n, 3) for what is `wanted`, as shares of a star's electrons."""
+        if not self.mono:
+            return nearest_mixtures(self._gram, wanted @ self.by_primary)
+        away = self.mean_nm - self.mean_nm.mean()
+        gram = self._gram + MEAN_WEIGHT * np.outer(away, away)
+        mean = (wanted[:, :1] - self.mean_nm.mean()) * away
+        found = nearest_mixtures(gram, wanted[:, 1:] + MEAN_WEIGHT * mean, whole=True)
+        return np.asarray(found / found.sum(axis=1, keepdims=True))  # of 1e-11
+
+    def on(self, stars: Stars) -> Stars:
+        """The stars with the light of each primary."""
+        return stars if stars.primaries is not None else replace(stars, primaries=self.shares(self.wanted(stars)))
+
+    def drive(self, shares: FloatArray) -> FloatArray:
+        """How much of white stars of so much light of each primary (n, 3) ask for, relative to a white star, (n,)."""
+        return np.asarray((shares / self.of_white).max(axis=1))
+
+    def shown(self, shares: FloatArray) -> FloatArray:
+        """What mixtures (n, 3) have of what is `wanted`: shares of channels (n, channels), or the mean wavelength (n, 1)."""
+        return np.asarray(shares @ (self.mean_nm[:, None] if self.mono else self.by_primary.T))
+
+    def off(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
+        """How far off mixtures are (n,): the share of a star's electrons in the wrong channel, or the mean wavelength's nm."""
+        shown = self.shown(shares)
+        return np.asarray(np.abs(shown - wanted[:, : shown.shape[1]]).sum(axis=1))
+
+    def in_gamut(self, off: FloatArray) -> BoolArray:
+        """Whether stars that are so far `off` have their colour."""
+        return np.asarray(off < (WITHIN_NM if self.mono else WITHIN))
+
+    def temperature_factor(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
+        """The colour temperatures of mixtures (n,) over those of their stars, by black bodies of the same colour.
+
+        The colour is blue's electrons over red's, or the mean wavelength.
+        """
+        found = [np.interp(_index(one), self._scale, SCALE_K) for one in (self.shown(shares), wanted)]
+        return np.asarray(found[0] / found[1])
+
+    def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
+        """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where light is none's, their mean."""
+        shares = self.on(stars).primaries
+        if shares is None:
+            raise AssertionError("made above")
+        mean = stars.rates_e_per_s @ shares[: len(stars.rates_e_per_s)] / (stars.rates_e_per_s.sum() or 1.0)
+        return np.vstack([shares, mean])[np.where(star < 0, -1, star)]
+
+    def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
+        """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.
+
+        `off_gamut` is the share of electrons in the wrong channel; of one channel the mean wavelengths wanted and shown stand
+        for it. Light that is no star's has NaN.
+        """
+        own = np.flatnonzero(star >= 0)
+        wanted, shares = self.wanted(stars, star[own]), self.shares_of(stars, star[own])
+        shown, off, rate = self.shown(shares), self.off(wanted, shares), truth["electrons_per_s"][own]
+        added = {"temperature_shown_k": truth["temperature_k"][own] * self.temperature_factor(wanted, shares)}
+        if self.mono:
+            added |= {"wavelength_nm": wanted[:, 0], "wavelength_shown_nm": shown[:, 0]}
+            added["electrons_shown_per_s"] = rate * shares.sum(axis=1)
+        else:
+            for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
+                added |= {f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)}
+            added["off_gamut"] = off
+        known = [*(truth.dtype.names or ()), "in_gamut"]
+        kinds = [*truth.dtype.descr, *((name, "f8") for name in added if name not in known), ("in_gamut", "?")]
+        found = np.zeros(len(truth), dtype=kinds)
+        for name in truth.dtype.names or ():
+            found[name] = truth[name]
+        for name, values in added.items():
+            found[name] = np.nan
+            found[name][own] = values
+        found["in_gamut"][own] = self.in_gamut(off)
+        return found
+
+    def parts(self, sprites: Sprites, stars: Stars) -> tuple[Sprites, ...]:
+        """The sprites of each primary, each light where that primary has to be drawn for it to lie in its place."""
+        if stars.primaries is None:
+            raise AssertionError("the stars of a bench that drives its primaries apart have their shares")
+        bias = 0.5 if sprites.footprint_px % 2 else 0.0  # as in pack_sprites
+        found = []
+        for light, (right, down) in zip(by_share(sprites, stars, stars.primaries), self.places_px.tolist(), strict=True):
+            x_px, y_px = light.x_px - right, light.y_px - down
+            for column, place_px in enumerate((x_px, y_px)) if right or down else ():
+                pixel = np.floor(place_px + bias)
+                light.data["pixel"][:, column], light.data["fraction_px"][:, column] = pixel, place_px - pixel
+            extended = tuple(shifted(one, -right, -down) for one in light.extended)
+            found.append(replace(light, x_px=x_px, y_px=y_px, extended=extended))
+        return tuple(found)
+
+
+def lit_alone(sprites: Sprites) -> Sprites:
+    """Sprites without those that have no light of this primary."""
+    lit = np.flatnonzero(sprites.data["electrons_per_s"])
+    if len(lit) == len(sprites):
+        return sprites
+    x_px, y_px = sprites.x_px[lit], sprites.y_px[lit]
+    return replace(sprites, data=sprites.data[lit], star=sprites.star[lit], x_px=x_px, y_px=y_px)
+
+
+def _index(colour: FloatArray) -> FloatArray:
+    """A number that rises with temperature, of shares of channels (n, 3) or means (n, 1 or more)."""
+    if colour.shape[1] != len(PRIMARIES):
+        return -colour[:, 0]
+    tiny = np.finfo(np.float64).tiny
+    return np.asarray(np.log(np.maximum(colour[:, -1], tiny)) - np.log(np.maximum(colour[:, 0], tiny)))
+
+
+def mixed_for(
+    primaries: tuple[Curve, ...],
+    channels: dict[str, Optics],
+    places_px: npt.ArrayLike,
+    rates_by: RatesBy,
+    kinds: FloatArray | None = None,
+) -> Colours:
+    """The colours of a monitor's primaries before a tracker of these channels.
+
+    `kinds` (catalogue, 2) are the types by which `rates_by` counts, if it does. Raises InputError where the tracker sees
+    nothing of a primary.
+    """
+    matrix = channel_matrix(primaries, channels, 1.0)
+    of_white = matrix.e_per_s.sum(axis=0)
+    unseen = [name for name, share in zip(PRIMARIES, of_white, strict=True) if share < UNSEEN]
+    if unseen:
+        raise InputError(
+            f'[render] colour = "star": the tracker sees nothing of the primary {", ".join(unseen)}; write colour = "white"'
+        )
+    optics = all_channels(list(channels.values()))
+    nm = np.arange(optics.range_nm[0], optics.range_nm[1] + STEP_NM, STEP_NM)
+    seen = optics.quantum_efficiency(nm) * optics.transmission(nm) * nm
+    density = np.array([one(nm) for one in primaries]) * seen
+    density /= density.sum(axis=1, keepdims=True)
+    mean_nm = density @ nm
+    if len(channels) > 1:
+        by_primary = matrix.e_per_s / of_white
+        return Colours(matrix, np.asarray(places_px), mean_nm, by_primary.T @ by_primary, (), kinds, _scale(channels, True))
+    up_to = np.cumsum(density, axis=1)
+    gram = up_to @ up_to.T * STEP_NM
+    # The part of a cumulative spectrum above a wavelength: a photon there adds as much to a star's product with it.
+    above = np.cumsum(up_to[:, ::-1], axis=1)[:, ::-1] * STEP_NM
+    knots = nm[::KNOT_STEPS]
+    plain = optics.quantum_efficiency
+    edge_nm = plain.wavelength_nm if len(plain.wavelength_nm) else np.array(optics.range_nm)
+    knots = np.unique(np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm]))
+    weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, one) for one in above)]
+    curves = tuple(rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * one))) for one in weights)
+    return Colours(matrix, np.asarray(places_px), mean_nm, gram, curves, kinds, _scale(channels, False))
+
+
+def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:
+    """The rising index of black bodies of SCALE_K."""
+    found = []
+    for optics in channels.values():
+        curves = optics.quantum_efficiency, optics.transmission
+        nm, weight = integration_nodes(*curves)
+        photons = blackbody_exitance_w_m2_m(nm, SCALE_K[:, None]) * nm * curves[0](nm) * curves[1](nm) * weight
+        found.append(photons.sum(axis=1) if by_channel else photons @ nm / photons.sum(axis=1))
+    return np.maximum.accumulate(_index(np.stack(found, axis=1)))

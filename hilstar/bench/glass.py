@@ -63,9 +63,9 @@ def _glass_psf(
 
 
 @lru_cache(maxsize=32)
-def say_once(line: str) -> None:
-    """Warn of what a glass does not cover or is not taken for, each line once."""
-    log.warning("[tracker.optics] psf: %s", line)
+def say_once(line: str, about: str = "[tracker.optics] psf") -> None:
+    """Warn of what a glass does not cover or is not taken for, or of what else a tracker is `about`, each line once."""
+    log.warning("%s: %s", about, line)
 
 
 def _mean_shares(glass: Glass, tracker: Tracker, folder: Path) -> FloatArray:

@@ -39,6 +39,7 @@ from hilstar.scene.psf import GaussianPsf, Psf
 from hilstar.tracker.centroiders import Places, psf_places
 from hilstar.tracker.centroids import CentroidSettings, estimate_background, find_stars
 from hilstar.tracker.identify import wahba
+from hilstar.tracker.mosaic import software_image, software_psf_px
 from hilstar.twin.glass import StarGlass, told_psf
 from hilstar.twin.live_exposure import LiveTracker
 from hilstar.twin.pictures import write_dn_picture
@@ -122,15 +123,19 @@ class CentroidSolver:
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
         """Centroid errors, and the attitude by the matched stars."""
-        wanted, psf = self._wanted, tracker.canvas.psf
+        wanted, psf, detector = self._wanted, tracker.canvas.psf, tracker.config.tracker.detector
+        if wanted.centroider == "psf" and detector.bayer is not None:
+            raise InputError('[centroids] centroider = "psf": pixels of a mosaic have a PSF each; leave it out, or bayer')
+        width_px = software_psf_px(psf.width_px, detector)
         settings = CentroidSettings(
             threshold_sigma=wanted.threshold_sigma,
             minimum_pixels=wanted.minimum_pixels,
             window=wanted.window,
-            window_sigma_px=wanted.window_sigma_px or max(1.0, *psf.width_px),
-            psf_sigma_px=psf.width_px if wanted.remove_s_curve else None,
+            window_sigma_px=wanted.window_sigma_px or max(1.0, *width_px),
+            psf_sigma_px=width_px if wanted.remove_s_curve else None,
         )
-        found, truth, (height, width) = find_stars(exposure.dn, settings), exposure.truth, exposure.dn.shape
+        image, truth, (height, width) = software_image(exposure.dn, detector), exposure.truth, exposure.dn.shape
+        found = find_stars(image, settings)
         with np.errstate(invalid="ignore"):
             off_x, off_y = (np.abs(truth[name] - (side - 1) / 2) for name, side in (("x_px", width), ("y_px", height)))
             truth = truth[(off_x <= width / 2) & (off_y <= height / 2) & truth["drawn"]]
@@ -214,7 +219,7 @@ class FunctionSolver:
         """The function's answer. Raises SolverFault where it raises, takes too long, or its answer is no attitude."""
         try:
             with time_limit(self._timeout_s):
-                answer = self._function(exposure.dn.copy(), tracker_facts(tracker))
+                answer = self._function(given_image(exposure, tracker), tracker_facts(tracker))
         except TimeoutError as error:
             raise SolverFault(f"the solver took longer than {self._timeout_s:g} s") from error
         except Exception as error:
@@ -222,6 +227,11 @@ class FunctionSolver:
         if answer is None:
             return Answer(None, "the solver found no attitude")
         return Answer(checked_attitude(answer, "the solver"))
+
+
+def given_image(exposure: Exposure, tracker: SolvedTracker) -> npt.NDArray[np.uint16]:
+    """The DN (height, width) that a solver gets, its own: of a mosaic as `[tracker.detector] solver_image` says."""
+    return np.asarray(np.rint(software_image(exposure.dn, tracker.config.tracker.detector)), dtype=np.uint16)
 
 
 def tracker_facts(tracker: SolvedTracker) -> dict[str, Any]:
@@ -287,9 +297,9 @@ class CommandSolver:
         with temporary_folder("solver") as folder:
             image, picture = folder / "image.fits", folder / "image.png"
             if any(IMAGE in word for word in self._words):
-                fits.PrimaryHDU(exposure.dn).writeto(image)  # the DN alone: no pointing, and no truth
+                fits.PrimaryHDU(given_image(exposure, tracker)).writeto(image)  # the DN alone: no pointing, and no truth
             if any(PICTURE in word for word in self._words):
-                write_dn_picture(picture, exposure.dn)
+                write_dn_picture(picture, given_image(exposure, tracker))
             words = self._words
             for place, text in (
                 ("{fov_deg}", f"{facts['fov_deg']:.9g}"),

@@ -17,6 +17,7 @@ from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag
 from hilstar.sky.stars import Stars
 
 ERROR_DECIMALS = 4  # errors in a written table
+CHANNEL_COLUMNS = ("electrons_r_per_s", "electrons_g_per_s", "electrons_b_per_s")
 
 TRUTH_DTYPE = np.dtype(
     [
@@ -65,6 +66,21 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
         # Back to the catalogue's decimals from float32.
         truth[name][listed] = np.round(getattr(catalog, name)[row].astype(np.float64), 3)
     return truth
+
+
+def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> npt.NDArray[np.void]:
+    """Rows (n,) with the electrons per second of each channel of a tracker of three, by its shares (n, 3) or (3,) of a star's.
+
+    `colours` None, of a tracker with one channel: the rows themselves.
+    """
+    if colours is None:
+        return truth
+    found = np.zeros(len(truth), dtype=[*truth.dtype.descr, *((name, "f8") for name in CHANNEL_COLUMNS)])
+    for name in truth.dtype.names or ():
+        found[name] = truth[name]
+    for name, share in zip(CHANNEL_COLUMNS, np.moveaxis(colours, -1, 0), strict=True):
+        found[name] = truth["electrons_per_s"] * share
+    return found
 
 
 def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float) -> npt.NDArray[np.void]:

@@ -176,6 +176,12 @@ def _lobe(middle_nm: float, below: float, above: float) -> FloatArray:
     return np.asarray(np.exp(-((away * np.where(away < 0, below, above)) ** 2) / 2))
 
 
+def reddest_nm(primaries: Sequence[Curve], least: float = 0.01) -> float:
+    """The longest wavelength at which a primary has `least` of its largest power."""
+    lit = [curve.wavelength_nm[curve.value > least * curve.value.max()].max() for curve in primaries]
+    return float(max(lit))
+
+
 def channel_matrix(primaries: Sequence[Curve], channels: Mapping[str, Optics], white_e_per_s: float) -> ChannelMatrix:
     """The matrix of a monitor and a tracker: all primaries give `white_e_per_s` in all channels together.
 

@@ -68,6 +68,22 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     full_well_e: Annotated[Charge, Meta(description="Charge above this is lost, or spills with `blooming`.")] = 70_000.0
     bits: Annotated[int, Meta(ge=1, le=16, description="Bits of a DN.")] = 12
     offset_dn: Annotated[Amount, Meta(description="Added by the ADC.")] = 0.0
+    bayer: Annotated[
+        Literal["rggb", "bggr", "grbg", "gbrg"] | None,
+        Meta(
+            description='Colours of the pixels, each row of two from the top left: `"rggb"` has red in pixel (0, 0). It needs '
+            "`[tracker] quantum_efficiency_r`, `_g` and `_b`, each that of the pixels of its colour ([colour](colour.md)).",
+            extra={"default": "no mosaic: mono"},
+        ),
+    ] = None
+    solver_image: Annotated[
+        Literal["superpixel", "mosaic"],
+        Meta(
+            description='With `bayer`, where `hilstar tracker` and the solvers of `campaign` find stars. `"superpixel"`: the '
+            'mean of the four squares of 2 x 2 that a pixel belongs to. `"mosaic"`: the raw pixels. Places are those of the '
+            "whole mosaic either way."
+        ),
+    ] = "superpixel"
     fill_factor: Annotated[
         float,
         Meta(ge=1e-3, le=1, description="Share of a pixel that takes light: `quantum_efficiency` is that of its open part."),
@@ -221,6 +237,11 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
                 f"readout_hz = {self.readout_hz:g}; write a frequency within read_noise_table, whose frequencies rise: "
                 f"{hz[0]:g} to {hz[-1]:g}"
             )
+
+    @property
+    def takes_superpixels(self) -> bool:
+        """Whether stars are found in the luminance of a mosaic."""
+        return self.bayer is not None and self.solver_image == "superpixel"
 
     @property
     def dark_factor(self) -> float:

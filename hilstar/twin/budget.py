@@ -17,8 +17,9 @@ from hilstar.bench.frame import Bench, clipping_hip, named
 from hilstar.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
-from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, read_primaries
+from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, read_primaries, reddest_nm
 from hilstar.monitor.quantise import Panel
+from hilstar.sky.electrons import Optics, all_channels, class_shares
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
@@ -33,6 +34,7 @@ USUAL: Centroider = "fit"  # what most trackers do
 COMPARED_MAG = 6.0
 By = Centroider | Literal["all"]
 MAX_NAMED = 20
+RED_NM = 700.0  # beyond it a monitor has next to no light
 MIN_ERROR = 1e-6  # the smallest error that the chart draws
 
 
@@ -63,6 +65,15 @@ class NotDrawn:
 
 
 @dataclass(frozen=True, slots=True)
+class RedShare:
+    """The share of a star's electrons that is light from `from_nm` on, by spectral class, in a channel or in "all" of them."""
+
+    channel: str
+    from_nm: float
+    by_class: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
 class LightBudget:
     """The range of stars that a bench can show; its fields are the keys of the JSON object of `hilstar budget`.
 
@@ -87,6 +98,7 @@ class LightBudget:
     centroider: By
     centroid_rms_px: dict[str, float | None]
     primaries: ChannelMatrix | None
+    near_infrared: list[RedShare]
 
 
 def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
@@ -106,10 +118,12 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     half = np.array([-0.5, 0.5])
     corner_share = float(bench.psf.shares(half, half[:, None]).max())  # a star on the corner of four pixels
     file, tracker = bench.config.monitor.primaries.file, bench.config.tracker
-    primaries = None
+    channels = dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, bench.file.folder), strict=True))
+    primaries, ends_nm = None, [RED_NM]
     if file is not None:
-        channels = dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, bench.file.folder), strict=True))
-        primaries = channel_matrix(read_primaries(bench.file.folder / file), channels, white)
+        spectra = read_primaries(bench.file.folder / file)
+        primaries = channel_matrix(spectra, channels, white)
+        ends_nm.append(reddest_nm(spectra))
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return LightBudget(
         method=render.quantisation + (" with bit stealing" if render.bit_stealing else ""),
@@ -126,7 +140,15 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         centroider=by,
         centroid_rms_px=next((row.axis_rms_px for row in rows if row.below_white_mag == COMPARED_MAG), dict.fromkeys(FAMILY)),
         primaries=primaries,
+        near_infrared=red_shares(channels, ends_nm),
     )
+
+
+def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[RedShare]:
+    """What a tracker of these channels has of light from each wavelength on: all together, and each of several channels."""
+    each = channels if len(channels) > 1 else {}
+    every = {"all": all_channels(list(channels.values())), **each}
+    return [RedShare(name, nm, class_shares(one, nm)) for nm in ends_nm for name, one in every.items()]
 
 
 def zero_point_mag(bench: Bench) -> float:
@@ -264,6 +286,10 @@ def budget_lines(found: LightBudget) -> list[str]:
         for channel, rates in zip(one.channels, one.e_per_s.tolist(), strict=True):
             shares = (f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True))
             lines.append(f"{channel:22}{', '.join(shares)}")
+    for red in found.near_infrared:
+        by_class = " ".join(f"{kind} {100 * share:.1f}" for kind, share in red.by_class.items())
+        channel = "" if red.channel == "all" else f"  {red.channel}"
+        lines.append(f"{f'from {red.from_nm:.0f} nm, % of e-':22}{by_class}{channel}")
     every = found.centroider == "all"
     kinds = f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}" if every else f"{'centroid rms':>14}"
     lines += ["", f"{'V':>6}{'flux rms':>12}{'max mag':>10}{kinds}{'max px':>9}" + ("" if every else f"{'max arcsec':>12}")]

@@ -18,6 +18,7 @@ from hilstar.errors import InputError
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.scene.psf import Psf
 from hilstar.sky.catalog import Catalog
+from hilstar.sky.electrons import Optics
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import Stars
 from hilstar.tracker.centroiders import Pixels, ToldPsf
@@ -52,27 +53,28 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
 
 
 class StarGlass:
-    """A `psf` and the shares of its wavelengths in the light of a bench's stars."""
+    """A `psf` and the shares of its wavelengths in the light of a bench's stars, through one channel's `optics` or all."""
 
-    def __init__(self, file: BenchFile, psf: GlassPsf, band_nm: float = BAND_NM) -> None:
-        self.psf, self._config = psf, file.config
+    def __init__(self, file: BenchFile, psf: GlassPsf, optics: Optics | None = None, band_nm: float = BAND_NM) -> None:
+        self.psf, self._config, self._mean = psf, file.config, psf.mean_shares
         self._catalog: Catalog | None = None
         self._of_row = np.empty((0, 0))
         self._bands: list[StarRates] = []
         self._of_band = np.ones((0, 1))
         if len(psf.wavelengths_nm) > 1:
-            self._cut(file, band_nm)
+            flat = self._cut(file, optics or bench_optics(file.config.tracker, file.folder), band_nm)
+            if optics is not None and self._bands:
+                self._mean = flat @ self._of_band / flat.sum()
 
-    def _cut(self, file: BenchFile, band_nm: float) -> None:
-        """Bands that overlap as triangles do, so that they sum to the tracker's own."""
-        optics = bench_optics(file.config.tracker, file.folder)
+    def _cut(self, file: BenchFile, optics: Optics, band_nm: float) -> FloatArray:
+        """Bands that overlap as triangles do, so that they sum to the tracker's own; each one's response to even photons."""
         low_nm, high_nm = optics.range_nm
         nodes_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / band_nm) + 1)
         fine_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / KNOT_NM) + 1)
         own_nm = optics.quantum_efficiency.wavelength_nm
         knots_nm = np.union1d(np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)])
         efficiency = optics.quantum_efficiency(knots_nm)
-        shares, of_band = NodeSpline(self.psf.wavelengths_nm)(knots_nm), []
+        shares, of_band, flat = NodeSpline(self.psf.wavelengths_nm)(knots_nm), [], []
         for number in range(len(nodes_nm)):
             part = efficiency * np.interp(knots_nm, nodes_nm, np.eye(len(nodes_nm))[number])
             response = part * optics.transmission(knots_nm) * np.gradient(knots_nm)
@@ -83,16 +85,18 @@ class StarGlass:
             except InputError:  # so little light that some spectrum has none: the bands beside it stand for it
                 continue
             self._bands.append(rates)
-            of_band.append(response @ shares / response.sum())
+            flat.append(response.sum())
+            of_band.append(response @ shares / flat[-1])
         self._of_band = np.array(of_band)
+        return np.array(flat)
 
     def shares(self, stars: Stars, which: IntArray) -> FloatArray:
         """The shares (n, L) of stars at places (n,) of `stars`; those of light without a spectrum where a place is negative."""
         if not self._bands:
-            return self.psf.mean_shares
+            return self._mean
         if self._catalog is not stars.catalog:
             self._catalog, self._of_row = stars.catalog, np.full((len(stars.catalog), self._of_band.shape[1]), np.nan)
-        found = np.tile(self.psf.mean_shares, (len(which), 1))
+        found = np.tile(self._mean, (len(which), 1))
         rows = np.where(which >= 0, stars.row[np.maximum(which, 0)], -1)
         listed, body = rows >= 0, (rows < 0) & (which >= 0)
         new = np.unique(rows[listed][np.isnan(self._of_row[rows[listed], 0])])

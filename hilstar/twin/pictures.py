@@ -100,6 +100,10 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
     header["OFFSET"] = (tracker.detector.offset_dn, "[adu]")
     header["FULLWELL"] = (tracker.detector.full_well_e, "[electron]")
     header["BITS"] = (tracker.detector.bits, "of the ADC")
+    if tracker.detector.bayer is not None:
+        header["BAYERPAT"] = (tracker.detector.bayer.upper(), "colours, from the first pixel of the file")
+        header["XBAYROFF"] = header["YBAYROFF"] = 0
+        header["ROWORDER"] = ("TOP-DOWN", "the first row of the file is the top")
     if exposure.faults:
         header["FAULTS"] = ", ".join(exposure.faults)[:MAX_CARD]
     header["NSTARS"] = (len(exposure.truth), "stars in view")

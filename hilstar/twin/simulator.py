@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import Float32Array, FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_optics, bench_sources, bench_stars, moved
+from hilstar.bench.build import bench_channels, bench_optics, bench_sources, bench_stars, moved
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.config.bench_config import sky_jd
 from hilstar.bench.fault_views import tracker_view
+from hilstar.bench.glass import say_once
 from hilstar.bench.scenario import Scenario, Timetable
 from hilstar.errors import InputError
 from hilstar.frame.bodies import disc_stars
@@ -29,7 +30,7 @@ from hilstar.frame.fault_kinds import CosmicRays, Now
 from hilstar.frame.fault_light import FaultView
 from hilstar.frame.faults import FaultLayer
 from hilstar.frame.layers import light_of, seen_in, sky_layers
-from hilstar.frame.truth import TRUTH_DTYPE, added_truth, truth_table
+from hilstar.frame.truth import TRUTH_DTYPE, added_truth, truth_table, with_channels
 from hilstar.frame.view import STILL, Canvas, View
 from hilstar.optics.glass_psf import GlassPsf
 from hilstar.process.closing import Closing
@@ -40,11 +41,12 @@ from hilstar.scene.camera import Camera, linear_shares
 from hilstar.scene.exposure_motion import MIDDLE_S, own_row_s
 from hilstar.scene.frame_motion import EVERY, Scan
 from hilstar.scene.paths import Paths
-from hilstar.scene.sprites import Sprites, join_sprites, without_stars
-from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
+from hilstar.scene.sprites import Sprites, by_channel, join_sprites, without_stars
+from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.sky.zodiacal import ZodiacalLight, sunward, tabled_light
 from hilstar.tracker.detector import Detector
+from hilstar.tracker.mosaic import in_pixels
 from hilstar.tracker.settings import MAX_E, DetectorSettings
 from hilstar.twin.glass import StarGlass
 from hilstar.twin.shutter import rolled
@@ -63,6 +65,8 @@ LATTICE = 17  # places along each side of a detector at which zodiacal light is 
 EXPOSURE_DTYPE = np.dtype(
     [*TRUTH_DTYPE.descr, ("x_centroid_px", "f8"), ("y_centroid_px", "f8"), ("relative_illumination", "f8")]
 )
+CLIPPED_PX = 3  # a side of the square about a star with pixels of every colour beside its own
+NO_MOSAIC = 'quantum_efficiency_r, _g and _b without a mosaic: each pixel adds them up; write [tracker.detector] bayer = "rggb"'
 BODY_MAX_E = 0.5 * MAX_E  # room for dark current and cosmic rays
 Noise = Literal["full", "none"]
 
@@ -83,8 +87,10 @@ class FrameNoise:
 class Exposure:
     """One frame of the virtual tracker: DN (height, width), the electrons expected in it, and its stars.
 
-    `truth` has the rows of EXPOSURE_DTYPE: places are those at the middle of the exposure (NaN behind the camera), and
-    `clipped` stars reach full well or the ADC's last code. `capped` stars have paths coarser than they should be.
+    DN and electrons are those of the raw mosaic where the tracker has one. `truth` has the rows of EXPOSURE_DTYPE, and of three
+    channels CHANNEL_COLUMNS: what a star gives where all pixels have that colour. Places are those at the middle of the
+    exposure (NaN behind the camera), and `clipped` stars reach full well or the ADC's last code. `capped` stars have paths
+    coarser than they should be.
     """
 
     view: View
@@ -121,6 +127,13 @@ class Simulator(Closing):
         self.canvas = detector_canvas(self.file, self.camera)
         psf = self.canvas.psf
         self.glass = StarGlass(self.file, psf) if isinstance(psf, GlassPsf) else None
+        self._glasses = [self.glass]
+        if (bayer := tracker.detector.bayer) is not None:
+            channels = bench_channels(tracker, self.file.folder)
+            self._glasses = [StarGlass(self.file, psf, one) if isinstance(psf, GlassPsf) else None for one in channels]
+        elif len(tracker.quantum_efficiencies) > 1:
+            say_once(NO_MOSAIC, "[tracker]")
+        self._bayer = bayer
         self._background = TrackerBackground(self.config, self.file.folder, self.camera, refuse=self._refuse)
         self.background_e = self._background.steady_e
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
@@ -187,7 +200,11 @@ class Simulator(Closing):
         dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self.glass)
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
-        truth = np.concatenate([truth, _exposed(faults.added_truth())])
+        # light of faults has the mean colour of the stars (see `by_channel`)
+        rates, colours = stars.rates_e_per_s, stars.colours
+        colour = None if colours is None else rates @ colours[: len(rates)] / rates.sum()
+        added = with_channels(_exposed(faults.added_truth()), colour)
+        truth = np.concatenate([truth, added])
         return Exposure(view, dn, mean_e, truth, light.capped, faults.names)
 
     def _digitised(self, mean_e: FloatArray, rng: np.random.Generator | None) -> npt.NDArray[np.uint16]:
@@ -198,14 +215,20 @@ class Simulator(Closing):
 
     def _exposed_e(self, sprites: Sprites, stars: Stars, seconds: float) -> FloatArray:
         """Electrons of each pixel (h, w) by sprites of `stars` in some time."""
-        if self.glass is None:
+        channels = [sprites] if self._bayer is None else by_channel(sprites, stars)
+        images = (self._image(light, stars, glass) for light, glass in zip(channels, self._glasses, strict=True))
+        return np.multiply(in_pixels(images, self._bayer), seconds)
+
+    def _image(self, sprites: Sprites, stars: Stars, glass: StarGlass | None) -> Float32Array:
+        """Electrons per second of each pixel (h, w) of one colour, in memory that the next image takes."""
+        if glass is None:
             self.renderer.draw(sprites)
-            return np.multiply(self.renderer.linear(), seconds, dtype=np.float64)
-        image = self.glass.psf.image(sprites, self.glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
+            return self.renderer.linear()
+        image = glass.psf.image(sprites, glass.shares(stars, sprites.star), self.config.tracker.resolution_px)
         if sprites.extended:
             self.renderer.draw(without_stars(sprites))
             image += self.renderer.linear()
-        return np.multiply(image, seconds, dtype=np.float64)
+        return image
 
     def close(self) -> None:
         """Free the GL context."""
@@ -367,12 +390,17 @@ def exposure_truth(
     inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
     inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
     place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
+    if stars.colours is not None:  # of other colours, the brightest pixel may be a neighbour of the star's own
+        from scipy.ndimage import maximum_filter
+
+        mean_e = maximum_filter(mean_e, CLIPPED_PX)
     truth["clipped"][inside] = mean_e[place] > canvas.full_e
     if glass is not None:
         found = glass.psf.centroids_px(x_px[inside], y_px[inside], glass.shares(stars, star[inside]))
         for name, value in zip(("x_centroid_px", "y_centroid_px", "relative_illumination"), found, strict=True):
             truth[name][inside] = value
     truth["clipped"] |= np.isin(truth["name"], light.over_white)
+    truth = with_channels(truth, None if stars.colours is None else stars.colours[star])
     return truth[np.argsort(truth["v_mag"], kind="stable")]
 
 
@@ -407,12 +435,14 @@ class TrackerBackground:
     """
 
     def __init__(self, config: BenchConfig, folder: Path, camera: Camera, *, refuse: bool = True) -> None:
-        self.steady_e = background_e(config, folder)
+        self._bayer, tracker = config.tracker.detector.bayer, config.tracker
+        channels = (bench_optics(tracker, folder),) if self._bayer is None else bench_channels(tracker, folder)
+        self.steady_e = in_pixels((background_e(config, optics) for optics in channels), self._bayer)
         self._config, self._refuse, self._beyond = config, refuse, False
-        self._light: ZodiacalLight | None = None
+        self._lights: list[ZodiacalLight] = []
         if config.background.zodiacal is None:
             return
-        self._light = ZodiacalLight.through(bench_optics(config.tracker, folder))
+        self._lights = [ZodiacalLight.through(optics) for optics in channels]
         places = camera.grid_px(LATTICE)
         rays = camera.rays(*places)
         self._rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -421,14 +451,15 @@ class TrackerBackground:
 
     def of_view_e(self, view: View) -> FloatArray:
         """Electrons per exposure (height, width) in a view. Raises InputError near the Sun."""
-        if self._light is None:
+        if not self._lights:
             return self.steady_e
         seen = sunward(self._rays @ to_matrix(view.q_icrs_to_cam), sky_jd(self._config, view.t_ns))
         found = tabled_light(seen)
         self._say(float(seen.elongation_deg.min()), beyond=not found.tabled.all())
-        e = self._light.electrons_per_s_sr(seen, found) * self._sr * self._config.tracker.exposure_s
-        zodiacal_e = self._down @ e.reshape(LATTICE, LATTICE) @ self._across.T
-        return np.asarray(self.steady_e + zodiacal_e)
+        by_place = self._sr * self._config.tracker.exposure_s
+        channels = [light.electrons_per_s_sr(seen, found) * by_place for light in self._lights]
+        images = (self._down @ e.reshape(LATTICE, LATTICE) @ self._across.T for e in channels)
+        return np.asarray(self.steady_e + in_pixels(images, self._bayer))
 
     def _say(self, nearest_deg: float, *, beyond: bool) -> None:
         """Refuse a field beyond the table, or warn of it where it follows one that was not."""
@@ -440,8 +471,8 @@ class TrackerBackground:
         self._beyond = beyond
 
 
-def background_e(config: BenchConfig, folder: Path) -> FloatArray:
-    """Electrons per exposure in every view, (height, width): level, plus a gradient that is 0 in the middle.
+def background_e(config: BenchConfig, optics: Optics) -> FloatArray:
+    """Electrons per exposure in every view, (height, width), by a channel's optics: level, plus a gradient, 0 in the middle.
 
     Zodiacal light is V mag/arcsec^2 through the tracker's optics, times a pixel's solid angle (thesis eq. 4.10, 4.11).
     """
@@ -450,7 +481,7 @@ def background_e(config: BenchConfig, folder: Path) -> FloatArray:
     level_e = background.electrons_per_px or 0.0
     if background.zodiacal_v_mag_arcsec2 is not None:
         photometry = Photometry(config.sky.zero_point, config.sky.passband_weighting)
-        rate = zodiacal_electrons_per_s_arcsec2(background.zodiacal_v_mag_arcsec2, bench_optics(tracker, folder), photometry)
+        rate = zodiacal_electrons_per_s_arcsec2(background.zodiacal_v_mag_arcsec2, optics, photometry)
         pixel_arcsec = tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm * ARCSEC_PER_RAD
         level_e = rate * pixel_arcsec**2 * tracker.exposure_s
     across_e, down_e = background.gradient_electrons_across

@@ -104,7 +104,8 @@ class Tracker(Table, frozen=True):
 
     A tracker that tells colours apart has `quantum_efficiency_r`, `_g` and `_b` in place of `quantum_efficiency`. Then
     `hilstar frame -o` writes the linear image as a cube of three channels, and a bench's full scale and magnitudes are those of
-    all channels together. So is all that the virtual tracker sees: it has no mosaic yet.
+    all channels together. Each pixel of the virtual tracker has its own colour, by `[tracker.detector] bayer`; without that,
+    it adds up its channels, and says so.
     """
 
     aperture_mm: Annotated[Positive, Meta(description="Diameter of the entrance pupil.")]
@@ -193,6 +194,12 @@ def check_channels(tracker: Tracker) -> None:
     missing = [key for key in (f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb") if key not in given]
     if QUANTUM_EFFICIENCY in given and len(given) > 1:
         raise InputError(f"[tracker] has {QUANTUM_EFFICIENCY} and {list(given)[1]}; write one for all light, or _r, _g and _b")
+    if tracker.detector.bayer is not None and QUANTUM_EFFICIENCY in given:
+        three = ", ".join(f"{QUANTUM_EFFICIENCY}_{one}" for one in "rgb")
+        raise InputError(
+            f'[tracker.detector] bayer = "{tracker.detector.bayer}" has three colours of pixels, and [tracker] one'
+            f" {QUANTUM_EFFICIENCY}; write {three} in its place, or leave bayer out"
+        )
     if missing and QUANTUM_EFFICIENCY not in given:
         key = missing[0] if given else QUANTUM_EFFICIENCY
         raise InputError(f"[tracker] the key {key} is missing; add it (see configs/README.md)")

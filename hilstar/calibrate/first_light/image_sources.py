@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import open_bench, orientation_of
+from hilstar.bench.build import bench_optics, open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
@@ -460,7 +460,7 @@ class VirtualBench(ImageSource):
         self._optics = TwinOptics(self.geometry, tracker_psf(tracker, truth.folder))
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self._glow_e_per_s: FloatArray = self._optics.glow_e_per_s(self._panel)
-        self._sky_e_per_s: FloatArray = background_e(config, truth.folder) / tracker.exposure_s
+        self._sky_e_per_s: FloatArray = background_e(config, bench_optics(tracker, truth.folder)) / tracker.exposure_s
         uniformity = 1.0 if self._panel.uniformity is None else self._panel.uniformity.astype(np.float64)
         self._white_e_per_s: FloatArray = np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
         self._units: dict[bytes, FloatArray] = {}

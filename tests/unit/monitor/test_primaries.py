@@ -107,7 +107,10 @@ def test_the_budget_of_a_bench_has_the_matrix_and_its_condition_number(tmp_path)
     keys = {"quantum_efficiency": None} | {f"quantum_efficiency_{name}": f"{name}.csv" for name in PASSBANDS}
     tables = {"monitor.primaries": {"file": "p.csv"}, "render": {"quantisation": "round", "flux_at_white_e_per_s": 3e5}}
     bench.write_text(bench_text({"tracker": keys, "sky": {"faintest_v_mag": 5.0}}, tables))
-    found = json.loads(run_hilstar_here("budget", bench, "--json").stdout)["primaries"]
+    whole = json.loads(run_hilstar_here("budget", bench, "--json").stdout)
+    found, red = whole["primaries"], whole["near_infrared"]
+    assert [row["from_nm"] for row in red] == [700.0] * 4 + [710.0] * 4 and red[4]["channel"] == "all"  # 1 % of red at 711 nm
+    assert set(red[5]["by_class"]) == set("OBAFGKM")
     wanted = channel_matrix(read_primaries(tmp_path / "p.csv"), optics_of(PASSBANDS), WHITE_E_PER_S)
     digits = 1e-8 * WHITE_E_PER_S  # of the files
     np.testing.assert_allclose(found["e_per_s"], wanted.e_per_s, rtol=1e-6, atol=digits)

@@ -58,7 +58,7 @@ def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(bench):
     for temperature_k, shares in zip(stars.temperature_k[which], found, strict=True):
         light = response * blackbody_exitance_w_m2_m(nm, np.array([temperature_k])[:, None])[0]
         assert shares == pytest.approx(light @ NodeSpline(np.array(WAVELENGTHS_NM))(nm) / light.sum(), abs=SHARES)
-    finer = StarGlass(file, psf, BAND_NM / 2).shares(stars, which)
+    finer = StarGlass(file, psf, band_nm=BAND_NM / 2).shares(stars, which)
     assert found == pytest.approx(finer, abs=SHARES)
 
 

@@ -1,5 +1,7 @@
 """The sending end of every road to hilstar (ZeroMQ, serial line, UDP), and `Sender`, a simulator in Python over any of them."""
 
+from __future__ import annotations  # docs/python-api.md shows annotations as they are written
+
 import re
 import threading
 import time
@@ -39,7 +41,7 @@ Clock = Callable[[], int]
 Numbers = Sequence[float] | FloatArray
 
 
-def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, clock: Clock = time.monotonic_ns) -> "SenderEnd":
+def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, clock: Clock = time.monotonic_ns) -> SenderEnd:
     """The end that `to` names: serial line, UDP, or else ZeroMQ; `clock` (ns) stamps its time replies. Raises InputError."""
     line = serial_target(to)
     if line is None and not to.startswith("udp:"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -38,21 +37,16 @@ class MeasuredOn:
 
 @dataclass(frozen=True, slots=True)
 class MonitorCheck:
-    """What is wrong with a bench's files for the monitor that is there, and what is not known; "" for nothing."""
+    """The monitor that is there (None: not known), what is wrong with a bench's files for it, and what cannot be told."""
 
-    fault: str
-    notice: str
+    now: MonitorIdentity | None
+    fault: str = ""
+    notice: str = ""
 
     def refuse(self, force: bool) -> None:
         """Raise MachineError for a fault, unless it is forced."""
         if self.fault and not force:
             raise MachineError(f"{self.fault}; {WAYS}")
-
-    def told(self, log: logging.Logger) -> list[str]:
-        """Log the forced fault, or the notice; the fault, if there is one."""
-        if self.fault or self.notice:
-            log.warning("%s", f"{self.fault}: {SHOWN_ANYWAY}" if self.fault else self.notice)
-        return [self.fault] if self.fault else []
 
 
 def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
@@ -86,7 +80,7 @@ def check_monitor(file: BenchFile, now: MonitorIdentity | None, today: datetime.
     if now is None:
         unknown = ["this display does not say which monitor it is"]
     notice = f"{'; '.join(unknown)}: whether this is the monitor that was measured is not known" if unknown else ""
-    return MonitorCheck("; ".join(faults), "; ".join(part for part in (notice, doubt) if part))
+    return MonitorCheck(now, "; ".join(faults), "; ".join(part for part in (notice, doubt) if part))
 
 
 def _date(when: str) -> datetime.date | None:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,10 @@ from hilstar.cli.running import Windowed
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory
+
+if TYPE_CHECKING:
+    from hilstar.bench.bench_file import BenchFile as ReadFile
+    from hilstar.monitor.identity import MonitorIdentity
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 RESOLUTION_FORM = "--resolution W,H in pixels, such as 1920,1080"
@@ -82,7 +86,7 @@ def geometric(
     file = read_bench_file(bench_file)
     check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
     found = calibrate_files(file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal)
-    written = write_calibrated(output, found, plot)
+    written = write_calibrated(output, found, plot, _monitor_of(file))
     _report(output, as_json, lambda: summary_of(found, written), lambda: lines_of(found))
 
 
@@ -114,6 +118,20 @@ def psf(
         return
     typer.echo("\n".join(lines_of(found)))
     typer.echo(f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}")
+
+
+def _monitor_of(file: ReadFile) -> MonitorIdentity | None:
+    """The identity of the bench's display, where this machine has it, as large as the bench file says; None elsewhere."""
+    from hilstar.bench.build import orientation_of
+    from hilstar.monitor.window.this_monitor import identity_here
+
+    monitor = file.config.monitor
+    identity = identity_here(monitor.display)
+    width, height = orientation_of(monitor).screen_px(monitor.resolution_px)
+    if identity is None or not identity.mode.startswith(f"{width}x{height}@"):
+        return None
+    say(f"measured on {identity.name()}")
+    return identity
 
 
 def _report(output: Path, as_json: bool, figures: Callable[[], dict[str, Any]], lines: Callable[[], list[str]]) -> None:
@@ -161,7 +179,7 @@ def alignment(
     file = read_bench_file(bench_file)
     check_files([pairs, ledger], [output], file)
     found = align_files(file, pairs, ledger, offset_s or 0.0)
-    write_alignment(output, found, file)
+    write_alignment(output, found, file, _monitor_of(file))
     _report(output, as_json, lambda: summary_of(found) | {"written": [str(output)]}, lambda: lines_of(found))
 
 
@@ -222,15 +240,22 @@ def photometric(
     instrument: Annotated[str, typer.Option(help="Instrument used.")] = "",
     unit: Annotated[str, typer.Option(help="Unit of the values, such as cd/m2 or DN.")] = "",
     plot: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The response and its residuals.")] = None,
+    display: Annotated[
+        str, typer.Option(metavar="INDEX|NAME", help="The display that was measured, where this machine has one.")
+    ] = "0",
     as_json: Json = False,
 ) -> None:
     """Fit the monitor's response to measured patches."""
     from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
+    from hilstar.monitor.window.this_monitor import identity_here
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
-    found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits)
+    identity = identity_here(int(display) if display.isdecimal() else display)
+    found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits, identity)
+    if identity is not None:
+        say(f"measured on {identity.name()}")
     if plot is not None:
         draw_calibration(measured, plot, bits)
         found["written"].append(str(plot))

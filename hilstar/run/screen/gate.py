@@ -69,9 +69,8 @@ def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force:
     The monitor has to be the one that the bench's files were measured on, not too long before `today`.
     """
     monitor = file.config.monitor
-    identity = identity_here(monitor.display)
-    measured = check_monitor(file, identity, today)
-    measured.refuse(force)
+    found = check_monitor(file, identity_here(monitor.display), today)
+    found.refuse(force)
     display = None if windowed else monitor.display
     size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
     sleep_in_waits()
@@ -81,11 +80,11 @@ def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force:
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
             log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)
         screen = Screen(window, bench)
-        screen.forced += measured.told(log)
+        _tell(screen, [found.notice], [found.fault])
         bench.warm_up()
         pass_gate(screen, force)
         bench.output.update({} if screen.output is None else screen.output.fields())
-        bench.output.update({TABLE: {} if identity is None else identity.known(), "forced": screen.forced})
+        bench.output.update({TABLE: {} if found.now is None else found.now.known(), "forced": screen.forced})
         yield screen
 
 
@@ -127,12 +126,19 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
     if window.others:
         others = f"the X screen has other displays, {', '.join(window.others)}: frames may be copied instead of flipped, or"
         doubts.insert(0, f"{others} follow another's refresh; switch them off, or give this one an X screen of its own")
-    for doubt in doubts:
-        log.warning("%s", doubt)
+    _tell(screen, doubts, [])
     wrong = [finding.text for finding in told if finding.refused]
     for fault in (*wrong, *faults(window, monitor, timing), *[changed] * bool(changed)):
         if not force:
             raise MachineError(f"{fault}; or add --force")
+        _tell(screen, [], [fault])
+
+
+def _tell(screen: Screen, doubts: list[str], forced: list[str]) -> None:
+    """Log doubts, and what is shown by --force, which the screen keeps; "" is nothing."""
+    for doubt in filter(None, doubts):
+        log.warning("%s", doubt)
+    for fault in filter(None, forced):
         screen.forced.append(fault)
         log.warning("%s: %s", fault, SHOWN_ANYWAY)
 

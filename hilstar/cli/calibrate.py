@@ -14,7 +14,6 @@ from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory
 
 if TYPE_CHECKING:
-    from hilstar.bench.bench_file import BenchFile as ReadFile
     from hilstar.monitor.identity import MonitorIdentity
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
@@ -86,7 +85,8 @@ def geometric(
     file = read_bench_file(bench_file)
     check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
     found = calibrate_files(file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal)
-    written = write_calibrated(output, found, plot, _monitor_of(file))
+    monitor = file.config.monitor
+    written = write_calibrated(output, found, plot, _monitor_of(monitor.display, monitor.resolution_px))
     _report(output, as_json, lambda: summary_of(found, written), lambda: lines_of(found))
 
 
@@ -120,15 +120,13 @@ def psf(
     typer.echo(f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}")
 
 
-def _monitor_of(file: ReadFile) -> MonitorIdentity | None:
-    """The identity of the bench's display, where this machine has it, as large as the bench file says; None elsewhere."""
-    from hilstar.bench.build import orientation_of
+def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> MonitorIdentity | None:
+    """The identity of the display that was measured, where this machine has it, of those sides; None elsewhere."""
     from hilstar.monitor.window.this_monitor import identity_here
 
-    monitor = file.config.monitor
-    identity = identity_here(monitor.display)
-    width, height = orientation_of(monitor).screen_px(monitor.resolution_px)
-    if identity is None or not identity.mode.startswith(f"{width}x{height}@"):
+    identity = identity_here(display)
+    modes = () if sides_px is None else ("{}x{}@".format(*sides_px), "{1}x{0}@".format(*sides_px))
+    if identity is None or not identity.mode.startswith(modes or ""):
         return None
     say(f"measured on {identity.name()}")
     return identity
@@ -179,7 +177,8 @@ def alignment(
     file = read_bench_file(bench_file)
     check_files([pairs, ledger], [output], file)
     found = align_files(file, pairs, ledger, offset_s or 0.0)
-    write_alignment(output, found, file, _monitor_of(file))
+    monitor = file.config.monitor
+    write_alignment(output, found, file, _monitor_of(monitor.display, monitor.resolution_px))
     _report(output, as_json, lambda: summary_of(found) | {"written": [str(output)]}, lambda: lines_of(found))
 
 
@@ -247,15 +246,12 @@ def photometric(
 ) -> None:
     """Fit the monitor's response to measured patches."""
     from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
-    from hilstar.monitor.window.this_monitor import identity_here
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
-    identity = identity_here(int(display) if display.isdecimal() else display)
+    identity = _monitor_of(int(display) if display.isdecimal() else display)
     found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits, identity)
-    if identity is not None:
-        say(f"measured on {identity.name()}")
     if plot is not None:
         draw_calibration(measured, plot, bits)
         found["written"].append(str(plot))

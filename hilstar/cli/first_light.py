@@ -75,7 +75,6 @@ def first_light(
     Sets the bench file's keys; SESSION keeps the file as it was, the calibration files, session.json and first-light.html.
     """
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.bench.measured_on import SHOWN_ANYWAY
     from hilstar.calibrate.first_light.records import write_page
     from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
     from hilstar.run.sync import beat_line
@@ -98,7 +97,7 @@ def first_light(
     ):
         source.find_monitor(file, datetime.now(UTC).date(), force=force)
         for line in source.forced:
-            tell(f"{FORCED:12} {line}: {SHOWN_ANYWAY}")
+            tell(f"{FORCED:12} {line}")
         session = FirstLightSession(output, file, source, readings, watch)
         code = session.run(frozenset(again or []), tell)
         beats = beat_line(session.beat())

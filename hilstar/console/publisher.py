@@ -457,7 +457,6 @@ class SessionPublisher:
         self._memory = memory
         self._listeners: list[Listener] = []
         self._failed: dict[str, str] = {}
-        self._forced = ""
         self._patterns = 0
 
     def show(self, pattern: "Pattern") -> None:
@@ -475,9 +474,7 @@ class SessionPublisher:
     def say(self, line: str) -> None:
         """Publish a line of the session: a step begins or ends."""
         step, _, words = line.partition(" ")
-        if step == FORCED:
-            self._forced = words.strip()
-        elif words.strip().startswith(FAILED):
+        if step == FORCED or words.strip().startswith(FAILED):
             self._failed[step] = f"{step} {words.strip()}"
         else:
             self._failed.pop(step, None)
@@ -496,7 +493,7 @@ class SessionPublisher:
         """The session's current state."""
         now_ns = time.monotonic_ns()
         failed, shown = list(self._failed.values()), NewestFrame(number=self._patterns, missing=False, blank=False)
-        return RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed, forced=self._forced)
+        return RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
 
     def do(self, order: Order) -> OrderAnswer:
         """Record a mark; a session takes no other order."""

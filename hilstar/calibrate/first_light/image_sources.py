@@ -300,23 +300,25 @@ GRAB_TIMEOUT_S = 120.0
 class _ShownHere(ImageSource):
     """An image source before this program's own display; `dark` is the tracker's image with the monitor switched off."""
 
+    _shows = False  # whether a command shows the patterns
+
     def __init__(self, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
         self._display, self._dark, self._diode = PatternDisplay(), dark, diode
         self.forced = self._display.forced
 
     def find_monitor(self, file: BenchFile, today: datetime.date, *, force: bool) -> None:
-        """Compare the display's monitor with the one of the bench's files."""
+        """Compare the display's monitor with the one of the bench's files; nothing where a command shows the patterns."""
+        if self._shows:
+            return
         self._display.force = force
         found = check_monitor(file, identity_here(file.config.monitor.display), today)
         found.refuse(force)
         self.monitor = found.now
-        self._display.forced += [found.fault] * bool(found.fault)
-        if found.notice:
-            log.warning("%s", found.notice)
+        self._display.forced += found.told(log)
 
     def gate(self, file: BenchFile) -> Timing | None:
         """The display's timing."""
-        return self._display.gate(file)
+        return None if self._shows else self._display.gate(file)
 
     def unlit(self, stem: Path) -> Path | None:
         """The image that the user gave, if any."""
@@ -349,15 +351,6 @@ class GrabCommand(_ShownHere):
         self.sets_exposure = any("{exposure_s}" in word for word in self._words)
         self.identity = f"grab: {command}"
         super().__init__(dark, None if self._shows else diode)
-
-    def gate(self, file: BenchFile) -> Timing | None:
-        """The display's timing, None where the command shows the patterns."""
-        return None if self._shows else super().gate(file)
-
-    def find_monitor(self, file: BenchFile, today: datetime.date, *, force: bool) -> None:
-        """Nothing, where the command shows the patterns."""
-        if not self._shows:
-            super().find_monitor(file, today, force=force)
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Run the command while the pattern is shown. Raises NoImage with the last line of its stderr where it fails."""

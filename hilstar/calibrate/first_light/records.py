@@ -78,8 +78,7 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     """session.json: the bench, where its patterns are seen, and the steps in their order.
 
     `unfinished` has the state of each interrupted step: while it is the same, the images taken are used again. `beat` is that
-    of the tracker's exposures with the display's refresh, measured where it could be. `forced` is what was wrong with the
-    display or its monitor, and was shown by --force.
+    of the tracker's exposures with the display's refresh, measured where it could be; `forced` what --force shows it on.
     """
 
     kind: str

@@ -75,7 +75,7 @@ def reasons(seen: RunState | None, now_ns: int, lately: RecentFrames, refresh_hz
     if now_ns - seen.host_ns > SILENT_NS:
         return [f"the run's process has been silent for {_s(now_ns - seen.host_ns)}"]
     if pace == "session":
-        return [*seen.failed, *_forced(seen)]
+        return seen.failed
     found = [f"the display is lost: {seen.display_lost}"] if seen.display_lost else []
     limit_ns = max(HUNG_NS, HUNG_PERIODS / refresh_hz * NS_PER_S)
     if not seen.alive_ns:
@@ -104,7 +104,8 @@ def _of_rest(seen: RunState, lately: RecentFrames) -> Iterator[str]:
         yield f"the window is {seen.hidden}"
     if seen.gamma:
         yield seen.gamma
-    yield from _forced(seen)
+    if seen.forced:
+        yield f"shown by --force: {seen.forced}"
     if seen.operator_text:
         yield f"changed by the operator: {seen.operator_text}"
     if seen.rates:
@@ -115,11 +116,6 @@ def _of_rest(seen: RunState, lately: RecentFrames) -> Iterator[str]:
         yield f"a fault is on: {', '.join(seen.faults)}"
     if lately.missed_share > MANY_MISSED_SHARE:
         yield f"frames are missing: {lately.missed_share:.0%} of the last second's"
-
-
-def _forced(seen: RunState) -> Iterator[str]:
-    if seen.forced:
-        yield f"shown by --force: {seen.forced}"
 
 
 def _s(time_ns: int) -> str:

@@ -80,7 +80,7 @@ def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force:
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
             log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)
         screen = Screen(window, bench)
-        _tell(screen, [found.notice], [found.fault])
+        screen.forced += found.told(log)
         bench.warm_up()
         pass_gate(screen, force)
         bench.output.update({} if screen.output is None else screen.output.fields())
@@ -126,19 +126,12 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
     if window.others:
         others = f"the X screen has other displays, {', '.join(window.others)}: frames may be copied instead of flipped, or"
         doubts.insert(0, f"{others} follow another's refresh; switch them off, or give this one an X screen of its own")
-    _tell(screen, doubts, [])
+    for doubt in doubts:
+        log.warning("%s", doubt)
     wrong = [finding.text for finding in told if finding.refused]
     for fault in (*wrong, *faults(window, monitor, timing), *[changed] * bool(changed)):
         if not force:
             raise MachineError(f"{fault}; or add --force")
-        _tell(screen, [], [fault])
-
-
-def _tell(screen: Screen, doubts: list[str], forced: list[str]) -> None:
-    """Log doubts, and what is shown by --force, which the screen keeps; "" is nothing."""
-    for doubt in filter(None, doubts):
-        log.warning("%s", doubt)
-    for fault in filter(None, forced):
         screen.forced.append(fault)
         log.warning("%s: %s", fault, SHOWN_ANYWAY)
 

@@ -38,10 +38,11 @@ class MeasuredOn:
 
 @dataclass(frozen=True, slots=True)
 class MonitorCheck:
-    """What is wrong with a bench's files for the monitor that is there, and what is not known; "" for nothing."""
+    """The monitor that is there (None: not known), what is wrong with a bench's files for it, and what cannot be told."""
 
-    fault: str
-    notice: str
+    now: MonitorIdentity | None
+    fault: str = ""
+    notice: str = ""
 
     def refuse(self, force: bool) -> None:
         """Raise MachineError for a fault, unless it is forced."""
@@ -49,10 +50,10 @@ class MonitorCheck:
             raise MachineError(f"{self.fault}; {WAYS}")
 
     def told(self, log: logging.Logger) -> list[str]:
-        """Log the forced fault, or the notice; the fault, if there is one."""
-        if self.fault or self.notice:
-            log.warning("%s", f"{self.fault}: {SHOWN_ANYWAY}" if self.fault else self.notice)
-        return [self.fault] if self.fault else []
+        """The forced fault, if there is one; it is logged, and the notice."""
+        for line in filter(None, (self.fault and f"{self.fault}: {SHOWN_ANYWAY}", self.notice)):
+            log.warning("%s", line)
+        return [self.fault] * bool(self.fault)
 
 
 def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
@@ -75,18 +76,20 @@ def check_monitor(file: BenchFile, now: MonitorIdentity | None, today: datetime.
     """
     days = file.config.monitor.calibration_valid_days
     origins = list(measured_on(file))
-    faults, unknown, doubt = [], [one.lacks for one in origins if one.lacks], ""
+    faults, unknown, doubts = [], [one.lacks for one in origins if one.lacks], []
     for one in origins:
         if one.identity is not None and now is not None:
-            doubt = now.doubt
+            doubts = [now.doubt]
+            if one.identity.brightness is not None and now.brightness is None:
+                doubts.append("the monitor's own settings cannot be read now (DDC/CI)")
             if found := ", ".join(differences(one.identity, now)):
                 faults.append(f"{one.name} was measured on {one.identity.name()}, and this is {now.name()}: {found}")
         if one.date is not None and (age := (today - one.date).days) > days:
             faults.append(f"{one.name} was measured {age} days ago, on {one.date}: [monitor] calibration_valid_days = {days:g}")
     if now is None:
         unknown = ["this display does not say which monitor it is"]
-    notice = f"{'; '.join(unknown)}: whether this is the monitor that was measured is not known" if unknown else ""
-    return MonitorCheck("; ".join(faults), "; ".join(part for part in (notice, doubt) if part))
+    notice = [f"{'; '.join(unknown)}: whether this is the monitor that was measured is not known"] if unknown else []
+    return MonitorCheck(now, "; ".join(faults), "; ".join(filter(None, (*notice, *doubts))))
 
 
 def _date(when: str) -> datetime.date | None:

@@ -447,7 +447,7 @@ def opened_page(
 
 
 CODE_BYTES = 2
-FAILED = "failed:"  # as `first-light` says of a step
+FAILED, FORCED = "failed:", "forced"  # as `first-light` says of a step, and of a monitor
 
 
 class SessionPublisher:
@@ -474,7 +474,7 @@ class SessionPublisher:
     def say(self, line: str) -> None:
         """Publish a line of the session: a step begins or ends."""
         step, _, words = line.partition(" ")
-        if words.strip().startswith(FAILED):
+        if step == FORCED or words.strip().startswith(FAILED):
             self._failed[step] = f"{step} {words.strip()}"
         else:
             self._failed.pop(step, None)

@@ -54,8 +54,7 @@ class Calibration:
     `uniformity` is a coarse grid (rows, columns) of relative light, rows from top to bottom, each value at the middle of its
     equal share of the screen; None where the light is the same everywhere. `noise` is the relative repeatability of a patch.
     `weights` are the shares of the primaries in white as the tracker sees them, of sum 1; None where they are not known.
-    `black` of the response is that of the whole screen. `sha256` covers the bytes of every file that was read. `identity` is
-    that of the monitor that was measured, None where the file does not say.
+    `black` of the response is that of the whole screen. `sha256` covers the bytes of every file that was read.
     """
 
     name: str
@@ -69,7 +68,6 @@ class Calibration:
     instrument: str = ""
     unit: str = "relative"
     notes: dict[str, str] = field(default_factory=dict)
-    identity: MonitorIdentity | None = None
 
     @property
     def can_steal_bits(self) -> bool:
@@ -152,7 +150,6 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
         instrument=head.instrument,
         unit=head.unit,
         notes={key: text for key, text in msgspec.structs.asdict(file.notes).items() if text},
-        identity=file.monitor_identity,
     )
 
 

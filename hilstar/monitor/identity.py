@@ -6,7 +6,6 @@ import hashlib
 import json
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -19,58 +18,6 @@ STRAIGHT = "straight"
 NO_SERIALS = frozenset({0, 1, 0x01010101, 0xFFFFFFFF})  # what makers write who number nothing
 MAX_WEEK = 54  # 0: not stated; 255: the year is the model's (VESA E-EDID 1.4, 3.4.4)
 SHOWN_DIGITS = 12  # of a SHA-256 in a line
-
-
-@dataclass(frozen=True, slots=True)
-class Edid:
-    """What a monitor says of itself (VESA E-EDID 1.4, section 3): its maker's three letters, name, serial number, size.
-
-    `serial` is "" where it has none; `week` is None where that is not stated.
-    """
-
-    maker: str
-    product: int
-    name: str
-    year: int
-    week: int | None
-    size_cm: tuple[int, int]
-    serial: str = field(repr=False)
-
-    @property
-    def model(self) -> str:
-        """Its name, or its product code where it has none."""
-        return self.name or f"{self.product:04x}"
-
-    def line(self) -> str:
-        """The monitor for a person, without its serial number."""
-        width_cm, height_cm = self.size_cm
-        return f"{self.maker} {self.model} ({self.year}, {width_cm} x {height_cm} cm)"
-
-
-def read_edid(data: bytes) -> Edid | None:
-    """An EDID's first block read, by pyedid; None where it is none."""
-    from pyedid import parse_edid  # 0.1 s, with the HTTP library that it imports
-
-    try:
-        found = parse_edid(data)
-    except (ValueError, struct.error):
-        return None
-    # pyedid 1.0.3 reads these two numbers the wrong way round.
-    product, number = (int.from_bytes(data[a:b], "little") for a, b in ((10, 12), (12, 16)))
-    text = _plain(found.serial.replace("\0", "")) if isinstance(found.serial, str) else ""
-    return Edid(
-        maker=found.manufacturer_pnp_id,
-        product=product,
-        name=_plain(found.name or ""),
-        year=found.year,
-        week=found.week if 0 < found.week <= MAX_WEEK else None,
-        size_cm=(round(found.width), round(found.height)),
-        serial=text if text.strip("0 ") else "" if number in NO_SERIALS else str(number),
-    )
-
-
-def _plain(text: str) -> str:
-    return printable(" ".join(text.split()))
 
 
 class MonitorIdentity(Table, frozen=True):
@@ -123,20 +70,35 @@ class MonitorIdentity(Table, frozen=True):
         return f"[{TABLE}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in self.known().items())
 
 
+def edid_identity(edid: bytes) -> MonitorIdentity:
+    """What an EDID says (VESA E-EDID 1.4, section 3), with its SHA-256; that alone where it is damaged, nothing for none."""
+    from pyedid import parse_edid  # 0.1 s, with the HTTP library that it imports
+
+    known = MonitorIdentity(edid_sha256=sha256_of(edid))
+    try:
+        found = parse_edid(edid)
+    except (ValueError, struct.error):
+        return known
+    # pyedid 1.0.3 reads these two numbers the wrong way round.
+    product, number = (int.from_bytes(edid[a:b], "little") for a, b in ((10, 12), (12, 16)))
+    serial = _plain(found.serial) if isinstance(found.serial, str) else ""
+    return msgspec.structs.replace(
+        known,
+        maker=found.manufacturer_pnp_id,
+        model=_plain(found.name or "") or f"{product:04x}",
+        serial=serial if serial.strip("0 ") else "" if number in NO_SERIALS else str(number),
+        week=found.week if 0 < found.week <= MAX_WEEK else None,
+        year=found.year,
+    )
+
+
+def _plain(text: str) -> str:
+    return printable(" ".join(text.replace("\0", "").split()))
+
+
 def sha256_of(data: bytes) -> str:
     """The SHA-256 of what was read; "" for nothing."""
     return hashlib.sha256(data).hexdigest() if data else ""
-
-
-def edid_identity(edid: bytes) -> MonitorIdentity:
-    """What an EDID says, with its SHA-256; empty for none."""
-    found = read_edid(edid) if edid else None
-    sha256 = sha256_of(edid)
-    if found is None:
-        return MonitorIdentity(edid_sha256=sha256)
-    return MonitorIdentity(
-        maker=found.maker, model=found.model, serial=found.serial, week=found.week, year=found.year, edid_sha256=sha256
-    )
 
 
 def differences(was: MonitorIdentity, now: MonitorIdentity) -> Iterator[str]:

@@ -7,6 +7,7 @@ path and no serial number. Of a monitor's EDID only its maker, model, size and y
 from __future__ import annotations
 
 import contextlib
+import datetime
 import os
 import platform
 import re
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from hilstar.attitude.wire.serial_link import adapters, serial_ports
 from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
@@ -23,10 +25,12 @@ from hilstar.attitude.wire.zmq_socket import zmq_version
 from hilstar.bench.bench_file import BenchFile, read_bench_or_heads
 from hilstar.bench.build import bench_calibration, bench_optics
 from hilstar.bench.cameras import FieldsOfView, fields_of_view
+from hilstar.bench.measured_on import MonitorCheck, check_monitor
 from hilstar.errors import HilstarError, MachineError
-from hilstar.monitor.identity import read_edid
+from hilstar.monitor.identity import TABLE, edid_identity
 from hilstar.monitor.window.output_settings import findings
 from hilstar.monitor.window.randr import lit_outputs
+from hilstar.monitor.window.this_monitor import identity_here
 from hilstar.monitor.window.window import displays, window_renderer
 from hilstar.monitor.window.x11 import server_of
 from hilstar.notices import Notices
@@ -60,6 +64,10 @@ class OutputReport:
     faults: list[str]
     state: dict[str, object]
 
+    def lines(self) -> list[str]:
+        """For a person."""
+        return [f"{'check' if self.faults else 'ok':8}{'output':12}{self.line}", *(f"{'':20}{fault}" for fault in self.faults)]
+
 
 @dataclass(frozen=True, slots=True)
 class Examination:
@@ -87,17 +95,45 @@ def examine() -> Examination:
     return Examination(all(check.ok for check in checks if check.required), checks, outputs)
 
 
-def examine_bench(path: Path) -> dict[str, FieldsOfView]:
-    """What the screen and the tracker of a bench file see, or of each of its heads, by the file's name.
+@dataclass(frozen=True, slots=True)
+class BenchReport:
+    """What a bench's screen and tracker see, and its monitor against its files."""
+
+    fields: FieldsOfView
+    monitor: MonitorCheck
+
+    def keys(self) -> dict[str, Any]:
+        """By the keys of `doctor --json`."""
+        now, told = self.monitor.now, {"fault": self.monitor.fault, "notice": self.monitor.notice}
+        return {**self.fields.keys(), **({} if now is None else {"monitor": {TABLE: now.known(), **told}})}
+
+    def lines(self, name: str) -> Iterator[str]:
+        """For a person, by the bench file's name."""
+        yield f"{'ok' if self.fields.warning is None else 'check':8}{name:12}{self.fields.line()}"
+        if self.monitor.now is not None:
+            yield f"{'CHANGED' if self.monitor.fault else 'ok':8}{'monitor':12}{self.monitor.now.name()}"
+            yield from [f"{'':20}{self.monitor.notice}"] * bool(self.monitor.notice)
+
+
+def examine_bench(path: Path | None, today: datetime.date) -> dict[str, BenchReport]:
+    """The report on a bench file, or on each of its heads, by the file's name; none on no file.
 
     Raises InputError where the file, or one that it names, is wrong.
     """
+    if path is None:
+        return {}
     file = read_bench_or_heads(path)
     files = (file,) if isinstance(file, BenchFile) else file.files
     for one in files:
         bench_calibration(one.config, one.folder)
         bench_optics(one.config.tracker, one.folder)
-    return {one.path.name: fields_of_view(one.config, one.folder) for one in files}
+    return {one.path.name: _report_on(one, today) for one in files}
+
+
+def _report_on(file: BenchFile, today: datetime.date) -> BenchReport:
+    now = identity_here(file.config.monitor.display)
+    check = MonitorCheck(None) if now is None else check_monitor(file, now, today)
+    return BenchReport(fields_of_view(file.config, file.folder), check)
 
 
 def _check(name: str, look: Callable[[], str]) -> Check:
@@ -230,8 +266,8 @@ def _monitors() -> str:
         shown += [re.sub(r"^\d+: ", "", display.line()) for display in displays()]
     for path in sorted((SYS / "class/drm").glob("card*-*/edid")):
         with contextlib.suppress(OSError):
-            if (edid := read_edid(path.read_bytes())) is not None:
-                shown.append(f"EDID {edid.line()}")
+            if (found := edid_identity(edid := path.read_bytes())).maker:
+                shown.append(f"EDID {found.maker} {found.model} ({found.year}, {edid[21]} x {edid[22]} cm)")
     return "; ".join(shown) or NOT_THERE
 
 

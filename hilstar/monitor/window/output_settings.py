@@ -41,11 +41,6 @@ class OutputState:
     others: tuple[str, ...] = ()
     providers: tuple[str, ...] = ()
 
-    @property
-    def transformed(self) -> bool:
-        """Whether X resamples frames for it (fractional scaling)."""
-        return max(abs(a - b) for a, b in zip(self.transform, IDENTITY, strict=True)) > TRANSFORM_TOLERANCE
-
     def fields(self) -> dict[str, object]:
         """Everything but the EDID, as `doctor --json` and a ledger have it."""
         return {
@@ -107,7 +102,8 @@ def findings(state: OutputState, bits: int, pixel_pitch_um: float | None = None)
 
 
 def _geometry_findings(state: OutputState) -> Iterator[Finding]:
-    if state.transformed:
+    off = max(abs(a - b) for a, b in zip(state.transform, IDENTITY, strict=True))
+    if off > TRANSFORM_TOLERANCE:
         mend = f"xrandr --output {state.name} --transform none"
         yield Finding(f"{state.name} has a transform (fractional scaling), which resamples every frame; {mend}", True)
     if state.preferred_px and state.mode_px not in state.preferred_px:

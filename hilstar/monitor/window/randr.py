@@ -194,15 +194,9 @@ class Randr:
                     return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in parts)
         return b""
 
-    @property
-    def composited(self) -> bool:
-        """True where a compositing manager is known to run."""
-        return is_composited(self._display)
-
-    @property
-    def by_wayland(self) -> bool:
-        """True where a Wayland compositor draws what X shows."""
-        return has_extension(self._display, b"XWAYLAND")
+    def additions(self) -> dict[str, bool]:
+        """What may stand between X and the displays, and whether it does."""
+        return {"XWayland": has_extension(self._display, b"XWAYLAND"), "a compositing manager": is_composited(self._display)}
 
     def _state(self, resources: Any, number: int, output: Any, modes: dict[int, _Mode]) -> OutputState | None:
         crtc = self._xrandr.XRRGetCrtcInfo(self._display, ctypes.byref(resources), output.crtc)

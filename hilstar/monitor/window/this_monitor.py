@@ -12,6 +12,7 @@ import msgspec
 
 from hilstar.errors import MachineError
 from hilstar.monitor.identity import STRAIGHT, MonitorIdentity, edid_identity, sha256_of
+from hilstar.monitor.window.output_settings import IDENTITY
 from hilstar.monitor.window.randr import Randr
 from hilstar.monitor.window.watch import is_straight
 from hilstar.monitor.window.window import displays
@@ -28,20 +29,23 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
         display = next(one for one in displays() if one.is_named(wanted))
     except (MachineError, StopIteration):
         return None
-    edid, facts = b"", {"connector": display.name, "bits": display.bits}
-    width, height = display.resolution_px
-    facts["mode"] = f"{width}x{height}@{display.refresh_hz:.2f}"
+    edid, ramp, refresh_hz, adds = b"", b"", float(display.refresh_hz), {}
     with contextlib.suppress(OSError), Randr() as randr:
-        state = next((one for one in randr.outputs() if one.name == display.name), None)
-        adds = {"XWayland": randr.by_wayland, "a compositing manager": randr.composited}
-        if state is not None:
-            edid, ramp = state.edid, randr.ramp(display.name)
-            facts["mode"] = f"{width}x{height}@{state.refresh_hz:.2f}"
-            facts["gamma_ramp"] = STRAIGHT if ramp and is_straight(ramp) else sha256_of(ramp)
-            adds["a transform"] = state.transformed
-        facts["window_system"] = tuple(what for what, there in adds.items() if there)
+        ramp, adds = randr.ramp(display.name), randr.additions()
+        for state in randr.outputs():
+            if state.name == display.name:
+                edid, refresh_hz, adds["a transform"] = state.edid, state.refresh_hz, state.transform != IDENTITY
     edid = edid or _edid_of_drm(display.name)
-    return msgspec.structs.replace(edid_identity(edid), **facts, **_by_ddc(edid))
+    width, height = display.resolution_px
+    return msgspec.structs.replace(
+        edid_identity(edid),
+        connector=display.name,
+        mode=f"{width}x{height}@{refresh_hz:.2f}",
+        bits=display.bits,
+        gamma_ramp=STRAIGHT if ramp and is_straight(ramp) else sha256_of(ramp),
+        window_system=tuple(what for what, there in adds.items() if there),
+        **_by_ddc(edid),
+    )
 
 
 def _edid_of_drm(connector: str, drm: Path = DRM) -> bytes:

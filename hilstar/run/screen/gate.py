@@ -69,9 +69,8 @@ def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force:
     The monitor has to be the one that the bench's files were measured on, not too long before `today`.
     """
     monitor = file.config.monitor
-    identity = identity_here(monitor.display)
-    measured = check_monitor(file, identity, today)
-    measured.refuse(force)
+    found = check_monitor(file, identity_here(monitor.display), today)
+    found.refuse(force)
     display = None if windowed else monitor.display
     size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
     sleep_in_waits()
@@ -81,11 +80,11 @@ def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force:
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
             log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)
         screen = Screen(window, bench)
-        screen.forced += measured.told(log)
+        screen.forced += found.told(log)
         bench.warm_up()
         pass_gate(screen, force)
         bench.output.update({} if screen.output is None else screen.output.fields())
-        bench.output.update({TABLE: {} if identity is None else identity.known(), "forced": screen.forced})
+        bench.output.update({TABLE: {} if found.now is None else found.now.known(), "forced": screen.forced})
         yield screen
 
 

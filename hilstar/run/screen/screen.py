@@ -295,8 +295,5 @@ class DisplayPacer(Pacer):
         named["gamma"] = {"frames": self._gamma_frames, "s": self._gamma_ns / NS_PER_S}
         shown = self._screen.window.presented
         output = self._screen.output
-        return (
-            named
-            | {"presented": presented_as(shown), "presented_frames": shown, "output": output and output.fields()}
-            | {"forced": self._screen.forced}
-        )
+        named |= {"presented": presented_as(shown), "presented_frames": shown, "forced": self._screen.forced}
+        return named | {"output": output and output.fields()}

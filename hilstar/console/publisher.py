@@ -133,7 +133,8 @@ class FramePublisher:
 
     def _copy(self, shown: "Shown") -> None:
         """Copy a picture: levels, attitude, and the places of its stars."""
-        levels, sprites = shown.drawn.levels, shown.drawn.sprites
+        drawn, sprites = shown.drawn.levels, shown.drawn.sprites
+        levels = drawn if drawn.ndim == 2 else drawn.max(axis=2)  # the page's picture is grey
         height, width = levels.shape
         places: list[np.ndarray] = []
         if sprites is not None:

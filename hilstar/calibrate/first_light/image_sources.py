@@ -548,6 +548,9 @@ class VirtualBench(ImageSource):
 
     @cached_property
     def _primaries(self) -> FloatArray:
+        if self._panel.primaries:
+            white = self._panel.flux_at_white_e_per_s
+            return np.array([one.response.light * (one.flux_at_white_e_per_s / white) for one in self._panel.primaries])
         monitor = self.truth.config.monitor
         source = monitor.calibration if monitor.calibration in BUILT_IN else self.truth.folder / monitor.calibration
         return primary_lights(source, monitor.bits)

@@ -198,8 +198,8 @@ class LiveTracker(Closing):
         """The DN of an exposure."""
         rows, columns = np.divmod(exposed.lit, self._size_px[0])
         lights = zip(exposed.light_e_per_s.T, self._primaries, strict=True)
-        light = sum(self._optics.lit_image_e_per_s(rows, columns, one, primary) for one, primary in lights)
-        light = light * self.exposure_s
+        light = np.sum([self._optics.lit_image_e_per_s(rows, columns, *each) for each in lights], axis=0)
+        light *= self.exposure_s
         light += self._under_e
         return self._detector.expose(light, self.exposure_s, self._rng)
 

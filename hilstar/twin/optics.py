@@ -8,7 +8,7 @@ density on the image.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -103,7 +103,7 @@ class TwinOptics(Closing):
         self._psf = psf.blurred(side_px / math.sqrt(12))
         self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 
-    def images_e_per_s(self, lights_e_per_s: Sequence[FloatArray], primaries: Sequence[Primary]) -> FloatArray:
+    def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray], primaries: Sequence[Primary]) -> FloatArray:
         """Electrons per second of each tracker pixel by each primary's light (H, W): (primaries, h, w), float64."""
         return np.array([self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)])
 

@@ -9,7 +9,6 @@ import pytest
 from scipy.integrate import trapezoid
 
 from hilstar import load
-from hilstar.bench.build import open_bench
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.unit.monitor.test_primaries import NM, PANELS, bump, written
@@ -89,7 +88,7 @@ def drives(frame, opened):
     alone = (near.sum(axis=0) == 1) & (x > 9) & (y > 9) & (x < 310) & (y < 230) & ~rows["clipped"]
     rows = rows[alone]
     cut = [
-        light[int(round(b)) - 7 : int(round(b)) + 8, int(round(a)) - 7 : int(round(a)) + 8]
+        light[round(float(b)) - 7 : round(float(b)) + 8, round(float(a)) - 7 : round(float(a)) + 8]
         for a, b in zip(x[alone], y[alone], strict=True)
     ]
     return np.array([one.sum(axis=(0, 1)) for one in cut]) * opened.flux_at_white_e_per_s, rows

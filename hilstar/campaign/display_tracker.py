@@ -15,7 +15,7 @@ from hilstar.frame.view import View
 from hilstar.monitor.quantise import primary_lights
 from hilstar.rotation import propagate
 from hilstar.tracker.detector import Detector
-from hilstar.twin.optics import TwinOptics, seen_primaries
+from hilstar.twin.optics import TwinOptics, on_pixels, seen_primaries
 from hilstar.twin.shutter import RowBeat, rolled
 from hilstar.twin.simulator import Exposure, TrackerBackground, detector_canvas, exposure_truth
 from hilstar.twin.verify.twin import true_geometry, true_panel
@@ -79,8 +79,8 @@ class DisplayTracker:
             shown, glow_e_per_s = self._rolling_e_per_s(view, rng)
         else:
             shown, glow_e_per_s = self._light_e_per_s(view), self._glow_e_per_s
-        shown_e_per_s = self._optics.images_e_per_s(shown, self._primaries).sum(axis=0)
-        mean_e = shown_e_per_s * exposure_s + glow_e_per_s * exposure_s + self._background.of_view_e(view)
+        by_primary_e = self._optics.images_e_per_s(shown, self._primaries) * exposure_s
+        mean_e = on_pixels(self._bench, by_primary_e, glow_e_per_s * exposure_s) + self._background.of_view_e(view)
         if rng is None:
             dn = self._detector.expose_noiseless(mean_e, exposure_s)
         else:

@@ -32,7 +32,7 @@ from hilstar.sky.stars import split_by_rate
 from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
-from hilstar.twin.optics import TwinOptics, seen_primaries
+from hilstar.twin.optics import TwinOptics, on_pixels, seen_primaries
 from hilstar.twin.simulator import TrackerBackground, detector_canvas
 from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
@@ -159,6 +159,7 @@ class LiveTracker(Closing):
         self.canvas = detector_canvas(file, self.camera)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         with open_bench(file) as bench:
+            self._bench = bench  # its light; its renderer is closed
             self._size_px, self._bits = bench.camera.resolution_px, self.config.monitor.bits
             self._panel = true_panel(bench)
             self._rgb, self._primaries = bench.calibration.response.rgb, seen_primaries(bench)
@@ -168,7 +169,8 @@ class LiveTracker(Closing):
             faintest = SEEN_SIGMAS * float(np.sqrt(noise_e2)) / self.canvas.psf.peak_share / self.exposure_s
             self.stars, _ = split_by_rate(bench.stars, max(faintest, bench.faintest_shown_e_per_s))
         background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
-        self._under_e = glow_e_per_s * self.exposure_s + background.of_view_e(View(np.array([1.0, 0, 0, 0])))
+        self._glow_e = glow_e_per_s * self.exposure_s
+        self._background_e = background.of_view_e(View(np.array([1.0, 0, 0, 0])))
         self._radius_rad = self.camera.field_radius_rad(0.0)
         self._before: tuple[int, FloatArray] | None = None
         self._last: tuple[int, FloatArray] | None = None
@@ -198,9 +200,8 @@ class LiveTracker(Closing):
         """The DN of an exposure."""
         rows, columns = np.divmod(exposed.lit, self._size_px[0])
         lights = zip(exposed.light_e_per_s.T, self._primaries, strict=True)
-        light = np.sum([self._optics.lit_image_e_per_s(rows, columns, *each) for each in lights], axis=0)
-        light *= self.exposure_s
-        light += self._under_e
+        by_primary = np.array([self._optics.lit_image_e_per_s(rows, columns, *one) for one in lights]) * self.exposure_s
+        light = on_pixels(self._bench, by_primary, self._glow_e) + self._background_e
         return self._detector.expose(light, self.exposure_s, self._rng)
 
     def solve(self, exposed: Exposed) -> Solved:

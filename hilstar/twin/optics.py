@@ -23,7 +23,8 @@ from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import pack_sprites
+from hilstar.scene.sprites import mean_colour, pack_sprites
+from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
 # Squares along a pixel's side. Against twelve, a star's centroid is off by 1e-5 px and its flux by 2e-6 mag on the demo's
@@ -92,6 +93,20 @@ def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
     spectra = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm) if isinstance(psf, GlassPsf) else None
     places = [(float(x), float(y)) for x, y in colours.places_px]
     return tuple(Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places))
+
+
+def on_pixels(bench: Bench, by_primary: FloatArray, glow: FloatArray) -> FloatArray:
+    """What the detector's pixels (h, w) have of each primary's light (primaries, h, w) and of a glow of white's colour (h, w).
+
+    Those of a mosaic have their own channel's. Grey light has the mean colour of the stars there, for its own is not known.
+    """
+    bayer, colours = bench.config.tracker.detector.bayer, bench.colours
+    if bayer is None:
+        return np.asarray(by_primary.sum(axis=0) + glow)
+    shares = mean_colour(bench.stars)[:, None] if colours is None else colours.by_primary
+    of_glow = shares @ (np.ones(1) if colours is None else colours.of_white)
+    channels = zip(shares, of_glow, strict=True)
+    return in_pixels((np.tensordot(share, by_primary, 1) + part * glow for share, part in channels), bayer)
 
 
 class TwinOptics(Closing):

@@ -101,7 +101,7 @@ def drives_apart(config: BenchConfig) -> bool:
     """Whether the codes of the primaries are each its own, for the colours of stars."""
     if config.render.colour is not None or config.render.bit_stealing:
         return config.render.colour == "star"
-    return getattr(config.tracker.detector, "bayer", None) is not None
+    return config.tracker.detector.bayer is not None
 
 
 def from_source(config: BenchConfig) -> bool:

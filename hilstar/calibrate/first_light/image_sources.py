@@ -128,6 +128,14 @@ class ImageSource:
         """Record the display's square by a photodiode; None where there is none. Raises InputError, MachineError."""
         return None
 
+    def clock_ns(self) -> int:
+        """The clock of a warm-up."""
+        return time.monotonic_ns()
+
+    def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
+        """Go on showing a pattern for `seconds`."""
+        time.sleep(seconds)
+
     def close(self) -> None:
         """Free the display."""
 
@@ -328,6 +336,11 @@ class _ShownHere(ImageSource):
         """Record the user's photodiode."""
         return None if self._diode is None else self._diode.watch(self._display, file, seconds)
 
+    def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
+        """Go on showing a pattern."""
+        end_s = time.monotonic() + seconds
+        self._display.show_until(file, pattern, lambda: time.monotonic() > end_s)
+
     def close(self) -> None:
         """Close the window."""
         self._display.close()
@@ -351,6 +364,10 @@ class GrabCommand(_ShownHere):
         self.sets_exposure = any("{exposure_s}" in word for word in self._words)
         self.identity = f"grab: {command}"
         super().__init__(dark, None if self._shows else diode)
+
+    def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
+        """Go on showing a pattern; nothing but wait, where the command shows it."""
+        (ImageSource if self._shows else _ShownHere).hold(self, file, pattern, seconds)
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Run the command while the pattern is shown. Raises NoImage with the last line of its stderr where it fails."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import logging
+import math
 import shlex
 import time
 import zlib
@@ -337,9 +338,12 @@ class _ShownHere(ImageSource):
         return None if self._diode is None else self._diode.watch(self._display, file, seconds)
 
     def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
-        """Go on showing a pattern."""
-        end_s = time.monotonic() + seconds
-        self._display.show_until(file, pattern, lambda: time.monotonic() > end_s)
+        """Go on showing a pattern, or wait where a command shows it."""
+        if self._shows:
+            super().hold(file, pattern, seconds)
+        else:
+            end_s = time.monotonic() + seconds
+            self._display.show_until(file, pattern, lambda: time.monotonic() > end_s)
 
     def close(self) -> None:
         """Close the window."""
@@ -364,10 +368,6 @@ class GrabCommand(_ShownHere):
         self.sets_exposure = any("{exposure_s}" in word for word in self._words)
         self.identity = f"grab: {command}"
         super().__init__(dark, None if self._shows else diode)
-
-    def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
-        """Go on showing a pattern; nothing but wait, where the command shows it."""
-        (ImageSource if self._shows else _ShownHere).hold(self, file, pattern, seconds)
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Run the command while the pattern is shown. Raises NoImage with the last line of its stderr where it fails."""
@@ -505,6 +505,7 @@ class VirtualBench(ImageSource):
         uniformity = 1.0 if self._panel.uniformity is None else self._panel.uniformity.astype(np.float64)
         self._white_e_per_s: FloatArray = np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
         self._units: dict[bytes, FloatArray] = {}
+        self._on_for_ns = 0
         if bench.config.render.bit_stealing:
             _ = self._primaries  # refused now where they are not known
 
@@ -514,11 +515,28 @@ class VirtualBench(ImageSource):
         frames = [np.ascontiguousarray(off_screen(on_screen(codes, mine), its)) for codes in pattern.frames]
         shown = max(1, round(exposure_s * file.config.monitor.refresh_hz))
         image = self._image_e_per_s([frames[number % len(frames)] for number in range(shown if len(frames) > 1 else 1)])
-        return self._exposed(image + self._glow_e_per_s, exposure_s, stem)
+        half_ns = round(NS_PER_S * max(exposure_s, self.truth.config.certify.virtual.seconds_a_reading) / 2)
+        light = (image + self._glow_e_per_s) * self._warmth((self._on_for_ns + half_ns) / NS_PER_S)
+        self._on_for_ns += 2 * half_ns
+        return self._exposed(light, exposure_s, stem)
 
     def unlit(self, stem: Path) -> Path | None:
         """The tracker's image of a monitor that is switched off."""
         return self._exposed(np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem)
+
+    def _warmth(self, on_for_s: float) -> float:
+        """Light relative to that of a warm monitor, by the truth's [certify.virtual]; the first pattern switches it on."""
+        virtual = self.truth.config.certify.virtual
+        cold = virtual.cold_percent / 100 * math.exp(-on_for_s / (60 * virtual.warm_up_min))
+        return 1 - cold + virtual.drift_percent_per_h / 100 * on_for_s / 3600
+
+    def clock_ns(self) -> int:
+        """Time since the monitor was switched on: each image takes the truth's `seconds_a_reading`."""
+        return self._on_for_ns
+
+    def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
+        """Let the clock go on."""
+        self._on_for_ns += round(NS_PER_S * seconds)
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
         """A simulated photodiode: the true panel's delay and scan-out, with a little jitter."""

@@ -17,12 +17,12 @@ from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, blac
 from hilstar.calibrate.first_light.photometry import calibration_of, calibration_source
 from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, Verdict
 from hilstar.calibrate.geometric.dots import DOT_PX
-from hilstar.calibrate.warm_up import fitted_white, judge_warm_up, watch_white
+from hilstar.calibrate.warm_up import AHEAD_S, S_PER_H, fitted_white, judge_warm_up, watch_white
 from hilstar.charts import BLUE, MUTED, chart, label_ends, write_csv
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import load_calibration, weights_of_grid, with_uniformity
 from hilstar.tracker.centroids import noisiest_background
-from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, magnitude
+from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, NS_PER_S, magnitude
 
 APART_TRACKER_PX, APART_SIGMAS = 10.0, 16.0  # from dot to dot
 # Radius of the circle about a dot whose light is summed. At most a quarter of a period, so that no two of the four lattices
@@ -140,7 +140,7 @@ def warm_up(context: StepContext) -> StepOutcome:
     t_s, light = watch_white(
         read, context.source.clock_ns, lambda seconds: context.source.hold(file, hold, seconds), context.watched_s
     )
-    found = judge_warm_up(t_s, light)
+    found, ended_s = judge_warm_up(t_s, light), context.source.clock_ns() / NS_PER_S
     table, picture = context.session / "warm-up.csv", context.session / "warm-up.svg"
     write_csv(table, ("t_s", "light_dn"), zip(t_s.tolist(), light.tolist(), strict=True))
     with chart(picture, found.line) as (axes,):
@@ -150,6 +150,13 @@ def warm_up(context: StepContext) -> StepOutcome:
         label_ends(axes)
     figures: dict[str, Figure] = {name: value for name, value in asdict(found).items() if name != "is_stable"}
     figures |= {"readings": len(light), "stable": "yes" if found.is_stable else "no"}
+    if context.truth is not None:
+        virtual = context.truth.config.certify.virtual
+        tau_s, cold = 60 * virtual.warm_up_min, virtual.cold_percent / 100
+        slope = cold / tau_s * math.exp(-ended_s / tau_s) + virtual.drift_percent_per_h / 100 / S_PER_H
+        figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
+        stable_s = tau_s * math.log(max(abs(cold) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
+        figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)  # of its exponential alone
     per_h = StepNumber(found.drift_percent_per_h, found.drift_error_percent_per_h, "%/h", "drift of white at the last reading")
     return StepOutcome(
         "done" if found.is_stable else "failed",

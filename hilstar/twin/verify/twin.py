@@ -149,7 +149,7 @@ class Twin(Closing):
         # All channels together, as everything here is.
         mono = structs.replace(self.config.tracker, detector=structs.replace(tracker.detector, bayer=None))
         summed = structs.replace(self.config, tracker=mono)
-        self._background = TrackerBackground(summed, file.folder, self.camera, refuse=False)
+        self._background = TrackerBackground(summed, file.folder, self.camera, refuse=False, moving=self.bench.moving)
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
         """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -102,10 +102,9 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
 
 def read_records(path: Path, record: type[Record]) -> list[Record]:
     """The rows of a table that `write_records` wrote, as dataclasses of texts, numbers and flags."""
-    kinds = {field.name: field.type for field in fields(record)}  # type: ignore[arg-type]
-    convert: dict[str, Any] = {"int": int, "float": float, "str": str, "bool": "True".__eq__}
+    convert = {name: "True".__eq__ if kind is bool else kind for name, kind in get_type_hints(record).items()}
     with path.open(encoding="utf-8", newline="") as file:
-        return [record(**{name: convert[str(kinds[name])](text) for name, text in row.items()}) for row in csv.DictReader(file)]
+        return [record(**{name: convert[name](text) for name, text in row.items()}) for row in csv.DictReader(file)]
 
 
 @contextmanager

@@ -1,7 +1,5 @@
 """A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and the bench's own errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The error budget of a tracker, from a run's telemetry or from independent cases, with its 95 % intervals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -16,8 +16,6 @@ are most likely. Bias and clock are the generalised least squares estimate (Aitk
 repeats with the place is not taken for a clock, and a clock not for such an error.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -22,8 +22,6 @@ waves of a coarse grid of directions, and their powers are added. Grid and stret
 run is one stretch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -180,7 +178,7 @@ def _waves(
     return waves, found
 
 
-def _best_of(tried: list[Phases], about: FloatArray, freedom: float) -> tuple[Projector | None, Component, Phases | None]:
+def _best_of(tried: "list[Phases]", about: FloatArray, freedom: float) -> "tuple[Projector | None, Component, Phases | None]":
     """Of the waves of one direction those that explain most of residuals (n, 3) beyond noise; None where none does."""
     power, waves, best = 0.0, None, None
     found = Component(NOTHING, np.zeros_like(about), 0.0)

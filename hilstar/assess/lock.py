@@ -1,7 +1,5 @@
 """Availability, acquisition and loss of lock: which of the answers that were due came."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

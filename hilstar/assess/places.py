@@ -6,8 +6,6 @@ so that the same attitude is the same place however the run got there. A smooth 
 (Wendland 1995), a `spacing` apart wherever the run has been.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

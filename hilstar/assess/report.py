@@ -1,7 +1,5 @@
 """An assessment for its readers: the JSON object, tables, lines on the terminal, and one page with charts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import astuple, fields
 from pathlib import Path

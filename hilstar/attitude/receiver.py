@@ -3,8 +3,6 @@
 `BackChannel` sends what a two-way link carries back: statuses, time requests, and replies to the sender's own time requests.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable

@@ -42,12 +42,14 @@ class Colours:
 
     `matrix` is that of a white of 1 electron per second, `of_white` (3,) each primary's share of that, and `by_primary`
     (channels, 3) each channel's share of the electrons of a primary. `places_px` (3, 2) is where a primary's light lies within
-    a pixel of the image. `mean_nm` (3,) is the primaries' mean wavelength of the photons that the tracker detects.
+    a pixel of the image. `density` (3, n) are the spectra of the photons that the tracker detects of each, of
+    sum 1, at `nm` (n,).
     """
 
     matrix: ChannelMatrix
     places_px: FloatArray
-    mean_nm: FloatArray
+    nm: FloatArray
+    density: FloatArray
     _gram: FloatArray
     _curves: tuple[Callable[..., FloatArray], ...]
     _kinds: FloatArray | None
@@ -57,6 +59,11 @@ class Colours:
     def of_white(self) -> FloatArray:
         """Each primary's share of white (3,), in electrons of all channels."""
         return np.asarray(self.matrix.e_per_s.sum(axis=0))
+
+    @property
+    def mean_nm(self) -> FloatArray:
+        """The mean wavelength (3,) of the photons that the tracker detects of each primary."""
+        return np.asarray(self.density @ self.nm)
 
     @property
     def by_primary(self) -> FloatArray:
@@ -217,10 +224,10 @@ def mixed_for(
     seen = optics.quantum_efficiency(nm) * optics.transmission(nm) * nm
     density = np.array([one(nm) for one in primaries]) * seen
     density /= density.sum(axis=1, keepdims=True)
-    mean_nm = density @ nm
+    places = np.asarray(places_px)
     if len(channels) > 1:
         by_primary = matrix.e_per_s / of_white
-        return Colours(matrix, np.asarray(places_px), mean_nm, by_primary.T @ by_primary, (), kinds, _scale(channels, True))
+        return Colours(matrix, places, nm, density, by_primary.T @ by_primary, (), kinds, _scale(channels, True))
     up_to = np.cumsum(density, axis=1)
     gram = up_to @ up_to.T * STEP_NM
     # The part of a cumulative spectrum above a wavelength: a photon there adds as much to a star's product with it.
@@ -231,7 +238,7 @@ def mixed_for(
     knots = np.unique(np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm]))
     weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, one) for one in above)]
     curves = tuple(rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * one))) for one in weights)
-    return Colours(matrix, np.asarray(places_px), mean_nm, gram, curves, kinds, _scale(channels, False))
+    return Colours(matrix, places, nm, density, gram, curves, kinds, _scale(channels, False))
 
 
 def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:

@@ -255,6 +255,7 @@ def write_preview_png(path: Path, codes: Codes) -> None:
     from PIL import Image
     from scipy.ndimage import gaussian_filter
 
+    codes = codes if codes.ndim == 2 else codes.max(axis=2)
     signal = codes.astype(np.float32) / np.float32(max(int(codes.max()), 1))
     smooth = gaussian_filter(_discs(signal) ** PREVIEW_POWER, PREVIEW_BLUR_PX)
     written(path, lambda file: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(file, "PNG"))

@@ -24,6 +24,7 @@ from hilstar.bench.cameras import bench_camera
 from hilstar.calibrate.attitude_pairs import Pairs, RotationFit, fit_rotation, pair_with_ledger, read_pairs, refuse_conventions
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, load_geometry, load_notes, write_geometry
+from hilstar.monitor.identity import MonitorIdentity
 from hilstar.rotation import conjugate, from_matrix, multiply, normalise, to_matrix, to_rotation_vector
 from hilstar.scene.camera import Camera
 from hilstar.units import ARCSEC_PER_RAD
@@ -227,7 +228,7 @@ def _f_limit(above: float, below: float) -> float:
     return float(fdtri(above, below, 1 - FALSE_ALARM))
 
 
-def write_alignment(path: Path, found: Aligned, file: BenchFile) -> None:
+def write_alignment(path: Path, found: Aligned, file: BenchFile, identity: MonitorIdentity | None = None) -> None:
     """Write the bench's present geometry with the alignment that was found. Raises InputError where it cannot be written."""
     name = file.config.collimator.geometry
     if name is None:
@@ -251,7 +252,7 @@ def write_alignment(path: Path, found: Aligned, file: BenchFile) -> None:
     rms = found.residual.rms
     error = replace(notes.error, alignment_cross_arcsec=rms.cross, alignment_roll_arcsec=rms.roll)
     sigma = notes.sigma | dict(zip(axes, found.sigma_arcsec, strict=True))
-    write_geometry(path, camera, found.q_cam_to_mon, Notes(sigma, error, made))
+    write_geometry(path, camera, found.q_cam_to_mon, Notes(sigma, error, made, identity or notes.identity))
 
 
 def summary_of(found: Aligned) -> dict[str, Any]:

@@ -39,6 +39,7 @@ from hilstar.calibrate.measurements import (
 from hilstar.charts import BLUE, GREEN, INK, MUTED, RED, chart, label_ends
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, write_calibration
+from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.response import srgb_light
 from hilstar.units import MAG_PER_RELATIVE
 
@@ -284,7 +285,11 @@ class Provenance:
 
 
 def calibrate_photometric(
-    measured: Path, output: Path, provenance: Provenance | None = None, bits: int | None = None
+    measured: Path,
+    output: Path,
+    provenance: Provenance | None = None,
+    bits: int | None = None,
+    identity: MonitorIdentity | None = None,
 ) -> dict[str, Any]:
     """Fit a response to MEASURED.csv, write MONITOR.toml with its CSV beside it, and return the figures by the keys of --json.
 
@@ -307,7 +312,7 @@ def calibrate_photometric(
     if stated["when"] == NOT_STATED:
         stated["when"] = datetime.date.today().isoformat()
     head = CalibrationHead(kind="photometric", bits=data.bits, response=output.with_suffix(".csv").name, **stated)
-    table = write_calibration(output, head, columns, noise, NotesTable(drift=drift_note, text=text))
+    table = write_calibration(output, head, columns, noise, NotesTable(drift=drift_note, text=text), identity=identity)
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
     additivity = None  # ratio of r + g + b to w at white, above black
     if len(fits) == len(CHANNELS):

@@ -1,7 +1,5 @@
 """What a campaign on the bench says beside its budget: cases without answers, wrong answers, and the drift of the bench."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

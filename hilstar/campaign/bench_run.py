@@ -10,8 +10,6 @@ One process and one frame loop, which never waits for the tracker. Laws:
 4. A tracker that falls silent within a case is waited for, up to `silent_s` after its last message. The case then begins again.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Iterator

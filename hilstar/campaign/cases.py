@@ -1,7 +1,5 @@
 """A case: its attitude and bench file, from its number and its point in the design; and its row, from its answers."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import math

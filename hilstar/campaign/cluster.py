@@ -3,8 +3,6 @@
 Each thread of a worker has a session, and a GL context, of its own.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

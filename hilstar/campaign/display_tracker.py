@@ -1,7 +1,5 @@
 """The virtual tracker before the display: each frame shown during an exposure, through the twin, to DN."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec
@@ -14,10 +12,10 @@ from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
 from hilstar.frame.layers import Sources, light_of, sky_layers
 from hilstar.frame.view import View
-from hilstar.monitor.quantise import shown_light
+from hilstar.monitor.quantise import primary_lights
 from hilstar.rotation import propagate
 from hilstar.tracker.detector import Detector
-from hilstar.twin.optics import TwinOptics
+from hilstar.twin.optics import TwinOptics, seen_primaries
 from hilstar.twin.shutter import RowBeat, rolled
 from hilstar.twin.simulator import Exposure, TrackerBackground, detector_canvas, exposure_truth
 from hilstar.twin.verify.twin import true_geometry, true_panel
@@ -66,7 +64,7 @@ class DisplayTracker:
         tracker = self.config.tracker
         self.camera, self.stars = tracker_camera(tracker, self.file.folder), self._bench.stars
         self.canvas = detector_canvas(self.file, self.camera)
-        self._panel = true_panel(self._bench)
+        self._panel, self._primaries = true_panel(self._bench), seen_primaries(self._bench)
         self._background = TrackerBackground(self.config, self.file.folder, self.camera)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
@@ -81,7 +79,8 @@ class DisplayTracker:
             shown, glow_e_per_s = self._rolling_e_per_s(view, rng)
         else:
             shown, glow_e_per_s = self._light_e_per_s(view), self._glow_e_per_s
-        mean_e = self._optics.image_e_per_s(shown) * exposure_s + glow_e_per_s * exposure_s + self._background.of_view_e(view)
+        shown_e_per_s = self._optics.images_e_per_s(shown, self._primaries).sum(axis=0)
+        mean_e = shown_e_per_s * exposure_s + glow_e_per_s * exposure_s + self._background.of_view_e(view)
         if rng is None:
             dn = self._detector.expose_noiseless(mean_e, exposure_s)
         else:
@@ -93,7 +92,7 @@ class DisplayTracker:
         return Exposure(view, dn, mean_e, truth)
 
     def _light_e_per_s(self, view: View) -> FloatArray:
-        """The mean light (H, W) of the display over the exposure."""
+        """The mean light (primaries, H, W) of the display over the exposure."""
         count, moving = max(1, round(view.exposure_s * self.config.monitor.refresh_hz)), self._bench.moving
         streaks = moving is not None and moving.satellites is not None
         if not streaks and not view.turn.rate_cam_rad_s.any():
@@ -105,12 +104,12 @@ class DisplayTracker:
             t_ns = view.t_ns
             if streaks and t_ns is not None:
                 t_ns += round(seconds * NS_PER_S)
-            light = shown_light(self._bench.draw(q, frame, t_ns=t_ns).levels, self._panel)
+            light = np.array(primary_lights(self._bench.draw(q, frame, t_ns=t_ns).levels, self._panel))
             total = light if total is None else total + light
-        return np.zeros((0, 0)) if total is None else total / count
+        return np.zeros((0, 0, 0)) if total is None else total / count
 
     def _rolling_e_per_s(self, view: View, rng: np.random.Generator | None) -> tuple[FloatArray, FloatArray]:
-        """The mean light (H, W) of the display over each place's own exposure, and that of the glow (h, w)."""
+        """The mean light (primaries, H, W) of the display over each place's own exposure, and that of the glow (h, w)."""
         config, screen, geometry = self.config, self._bench.scan, self._optics.geometry
         period_s, free = 1 / config.monitor.refresh_hz, config.tracker.trigger == "free" and rng is not None
         phase_s = rng.uniform(0, period_s) if free and rng is not None else -view.exposure_s / 2
@@ -119,7 +118,7 @@ class DisplayTracker:
         changes = bool(turn.rate_cam_rad_s.any()) or len(self._bench.quantiser.exposure(0, len(beat.frames))) > 1
         changes |= moving is not None and moving.satellites is not None
         compensated = config.render.motion == "on"
-        total, shown = np.zeros(sizes[0][::-1]), None
+        total, shown = np.zeros((len(self._primaries), *sizes[0][::-1])), None
         y, x = (part.ravel().astype(np.float64) for part in np.indices(sizes[1][::-1]))
         glow_late_s = np.nan_to_num(screen.late_s(*geometry.shown_at(*geometry.to_monitor(x, y)), sizes[0]))
         glow_rows_s, glow = view.scan.late_s(x, y, sizes[1]), np.zeros(x.shape)
@@ -129,12 +128,12 @@ class DisplayTracker:
                 q = propagate(view.q_icrs_to_cam, turn.rate_cam_rad_s, seconds)
                 t_ns = None if view.t_ns is None else view.t_ns + round(seconds * NS_PER_S)
                 rate = turn.rate_cam_rad_s if compensated else None
-                shown = shown_light(self._bench.draw(q, number, rate, t_ns=t_ns).levels, self._panel)
-                rows, columns = np.nonzero(shown)
+                shown = np.array(primary_lights(self._bench.draw(q, number, rate, t_ns=t_ns).levels, self._panel))
+                rows, columns = np.nonzero(shown.any(axis=0))
                 places = columns.astype(np.float64), rows.astype(np.float64)
                 screen_late_s = screen.late_s(*places, sizes[0])
                 row_late_s = np.nan_to_num(view.scan.late_s(*geometry.to_tracker(*places), sizes[1]))
-            total[rows, columns] += shown[rows, columns] * beat.shares(frame, screen_late_s, row_late_s)
+            total[:, rows, columns] += shown[:, rows, columns] * beat.shares(frame, screen_late_s, row_late_s)
             glow += beat.shares(frame, glow_late_s, glow_rows_s)
         return total, self._glow_e_per_s * glow.reshape(self._glow_e_per_s.shape)
 

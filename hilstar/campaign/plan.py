@@ -4,8 +4,6 @@ The file is TOML, read into checked and frozen tables. A parameter is a key of t
 case's own keys. The design gives each case a point of the unit cube, by the plan's sampling and seed alone.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import re

@@ -1,7 +1,5 @@
 """The backlog of missing cases, and the pool of processes that runs them on this machine."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -181,7 +179,7 @@ class Pool:
         if worker.task is not None:
             lost(worker.task, backlog.died(worker.task))
 
-    def __enter__(self) -> Pool:
+    def __enter__(self) -> "Pool":
         return self
 
     def __exit__(self, *raised: object) -> None:

@@ -12,8 +12,6 @@ is within it, **not met** where the lower one exceeds it, else **not shown**; a 
 - field-of-view and pixel error by the bootstrap. What the noise alone could hide is added to their upper limit.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable

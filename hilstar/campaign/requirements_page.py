@@ -1,7 +1,5 @@
 """The verdicts of a plan's requirements for their readers: requirements.csv, a chart, and one page that a person can sign."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

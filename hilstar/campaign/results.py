@@ -11,8 +11,6 @@ all, less what bins of that size have by chance. Attitude errors are taken about
 alignment, which no parameter costs.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -64,7 +62,7 @@ class Columns:
         """The names of the varied columns."""
         return [name for name in (*self.numbers, *self.texts) if name.startswith(VARY)]
 
-    def some(self, chosen: npt.NDArray[np.bool_]) -> Columns:
+    def some(self, chosen: npt.NDArray[np.bool_]) -> "Columns":
         """The chosen (n,) cases alone."""
         numbers = {name: column[chosen] for name, column in self.numbers.items()}
         texts = {

@@ -1,7 +1,5 @@
 """A campaign from its plan to its table. Finished cases stay finished, however the run ends."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -85,7 +83,7 @@ class Campaign:
         identity = msgspec.to_builtins(self.identity)
         return About(plan, self.file.sha256, self.job.files_sha256, self.job.solver, self.job.images, identity)
 
-    def run(self, directory: Directory, workers: Pool | Cluster, on_done: Callable[[int], None]) -> None:
+    def run(self, directory: Directory, workers: "Pool | Cluster", on_done: Callable[[int], None]) -> None:
         """Run the missing cases, and write the table once none is missing. `on_done` gets the number of finished cases.
 
         Raises InputError where nothing can be written, and the workers' errors. The same call goes on from there.
@@ -112,7 +110,7 @@ class Campaign:
         finally:
             journal.close()
 
-    def show(self, directory: Directory, display: Display, notices: Notices, on_done: Callable[[int], None]) -> bool:
+    def show(self, directory: Directory, display: "Display", notices: Notices, on_done: Callable[[int], None]) -> bool:
         """Show the missing cases on the bench, and write the tables once none is missing; False where a signal ended the run.
 
         Raises as `run` does. The same call goes on from there.

@@ -4,8 +4,6 @@ Rows are the same bit for bit on every worker that has the campaign's `Identity`
 changes with their bench files.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

@@ -10,8 +10,6 @@ The journal appends each row as one line with its checksum, to one file per bloc
 The table has one row per case, in their order. The same rows give the same bytes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os
@@ -50,7 +48,7 @@ def require_parquet() -> None:
         raise MachineError(f"a campaign's table needs pyarrow; {INSTALL}") from error
 
 
-def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> pa.Schema:
+def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> "pa.Schema":
     """The Arrow schema of columns (name -> kind), with the campaign's identity in its metadata."""
     import pyarrow as pa
 
@@ -58,7 +56,7 @@ def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> pa.Schema
     return pa.schema([pa.field(name, kinds[kind]) for name, kind in columns.items()], metadata=dict(about))
 
 
-def write_table(path: Path, schema: pa.Schema, blocks: Iterator[list[Row]]) -> None:
+def write_table(path: Path, schema: "pa.Schema", blocks: Iterator[list[Row]]) -> None:
     """Write blocks of rows, each as a row group, whole or not at all. Raises InputError where it cannot be written."""
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -1,7 +1,5 @@
 """hilstar answers: what a star tracker says, decoded and explained."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -84,13 +82,13 @@ def answers(
         say(f"{counts['answers']} answers, {counts['valid']} valid" + (f"; refused: {refused}" if refused else ""))
 
 
-def _explained(found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: FloatArray | None) -> list[str]:
+def _explained(found: "Answer | RefusedAnswer", decoder: "AnswerDecoder", shown: "FloatArray | None") -> list[str]:
     from hilstar.answers.explain import lines_of
 
     return lines_of(found, decoder, shown)
 
 
-def _shown_now(file: BenchFile) -> FloatArray | None:
+def _shown_now(file: "BenchFile") -> "FloatArray | None":
     """What a run's page on this machine shows, or what the sender of the attitude says now.
 
     None without a page, where that road has room for one listener only or nobody sends.
@@ -110,7 +108,7 @@ def _shown_now(file: BenchFile) -> FloatArray | None:
         return None
 
 
-def _shown_by_page() -> FloatArray | None:
+def _shown_by_page() -> "FloatArray | None":
     """The attitude of the newest frame of the run whose page is at the usual address; None where there is none."""
     import http.client
 
@@ -133,7 +131,7 @@ def _shown_by_page() -> FloatArray | None:
     return np.array(shown.q)
 
 
-def _live(plan: ReadPlan, seconds: float | None) -> tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]:
+def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]":
     """The answers of the live link, read here."""
     import threading
 
@@ -145,14 +143,14 @@ def _live(plan: ReadPlan, seconds: float | None) -> tuple[AnswerDecoder, Iterato
     decoder, stop = plan.decoder(link.messages), threading.Event()
     say(f"listening at {link.endpoint}; Ctrl-C ends it")
 
-    def found() -> Iterator[Answer | RefusedAnswer]:
+    def found() -> "Iterator[Answer | RefusedAnswer]":
         with link, stop_on_signal(stop):
             yield from live_answers(plan, link, decoder, math.inf if seconds is None else seconds, stop.is_set)
 
     return decoder, found()
 
 
-def _count(found: Answer | RefusedAnswer, counts: Counter[str]) -> None:
+def _count(found: "Answer | RefusedAnswer", counts: "Counter[str]") -> None:
     from hilstar.answers.formats import RefusedAnswer
 
     if isinstance(found, RefusedAnswer):
@@ -162,7 +160,7 @@ def _count(found: Answer | RefusedAnswer, counts: Counter[str]) -> None:
     counts["valid"] += found.valid
 
 
-def _row(found: Answer | RefusedAnswer) -> dict[str, Any]:
+def _row(found: "Answer | RefusedAnswer") -> dict[str, Any]:
     """For a program."""
     from hilstar.answers.formats import RefusedAnswer
 
@@ -181,7 +179,7 @@ def _row(found: Answer | RefusedAnswer) -> dict[str, Any]:
     }
 
 
-def _line(found: Answer | RefusedAnswer) -> str:
+def _line(found: "Answer | RefusedAnswer") -> str:
     """For a person."""
     from hilstar.answers.formats import RefusedAnswer
     from hilstar.rotation import to_radec_roll_deg

@@ -1,7 +1,5 @@
 """hilstar assess: a tracker's error budget, from a run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """hilstar attitude: where a log or a live stream points, in terms that a person can check."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -81,12 +79,12 @@ def attitude(
 class _Found(NamedTuple):
     """An attitude, its source's conventions, and whether it is held over a gap of the log."""
 
-    sample: AttitudeSample
-    conventions: Conventions
+    sample: "AttitudeSample"
+    conventions: "Conventions"
     held: bool = False
 
 
-def _live(file: BenchFile, at: str | None, patience_s: float) -> _Found:
+def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
     """The first attitude of the stream that a bench file names."""
     from hilstar.run.open_link import first_attitude, open_link
 
@@ -98,7 +96,7 @@ def _live(file: BenchFile, at: str | None, patience_s: float) -> _Found:
         return _Found(first_attitude(link, patience_s), link.conventions)
 
 
-def _of_log(path: Path, at: str | None, stated: Stated) -> _Found:
+def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
     """The attitude of a log at a time."""
     from hilstar.attitude.clock.timeline import Policy
     from hilstar.attitude.logs.entries import log_joins
@@ -118,7 +116,7 @@ def _of_log(path: Path, at: str | None, stated: Stated) -> _Found:
     return _Found(sample, log.conventions, held)
 
 
-def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
+def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
     """Where the camera looks, and what it sees."""
     import numpy as np
 

@@ -1,7 +1,5 @@
 """hilstar benchmark: how long a frame takes, beside other ways to the same image."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated

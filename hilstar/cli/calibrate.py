@@ -1,11 +1,9 @@
 """hilstar calibrate: a bench's geometry by dots or attitudes, its monitor by patches, its scale by stars."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +12,9 @@ from hilstar.cli.running import Windowed
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory
+
+if TYPE_CHECKING:
+    from hilstar.monitor.identity import MonitorIdentity
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 RESOLUTION_FORM = "--resolution W,H in pixels, such as 1920,1080"
@@ -84,7 +85,8 @@ def geometric(
     file = read_bench_file(bench_file)
     check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
     found = calibrate_files(file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal)
-    written = write_calibrated(output, found, plot)
+    monitor = file.config.monitor
+    written = write_calibrated(output, found, plot, _monitor_of(monitor.display, monitor.resolution_px))
     _report(output, as_json, lambda: summary_of(found, written), lambda: lines_of(found))
 
 
@@ -116,6 +118,18 @@ def psf(
         return
     typer.echo("\n".join(lines_of(found)))
     typer.echo(f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}")
+
+
+def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> MonitorIdentity | None:
+    """The identity of the display that was measured, where this machine has it, of those sides; None elsewhere."""
+    from hilstar.monitor.window.this_monitor import identity_here
+
+    identity = identity_here(display)
+    modes = () if sides_px is None else ("{}x{}@".format(*sides_px), "{1}x{0}@".format(*sides_px))
+    if identity is None or not identity.mode.startswith(modes or ""):
+        return None
+    say(f"measured on {identity.name()}")
+    return identity
 
 
 def _report(output: Path, as_json: bool, figures: Callable[[], dict[str, Any]], lines: Callable[[], list[str]]) -> None:
@@ -163,7 +177,8 @@ def alignment(
     file = read_bench_file(bench_file)
     check_files([pairs, ledger], [output], file)
     found = align_files(file, pairs, ledger, offset_s or 0.0)
-    write_alignment(output, found, file)
+    monitor = file.config.monitor
+    write_alignment(output, found, file, _monitor_of(monitor.display, monitor.resolution_px))
     _report(output, as_json, lambda: summary_of(found) | {"written": [str(output)]}, lambda: lines_of(found))
 
 
@@ -224,6 +239,9 @@ def photometric(
     instrument: Annotated[str, typer.Option(help="Instrument used.")] = "",
     unit: Annotated[str, typer.Option(help="Unit of the values, such as cd/m2 or DN.")] = "",
     plot: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The response and its residuals.")] = None,
+    display: Annotated[
+        str, typer.Option(metavar="INDEX|NAME", help="The display that was measured, where this machine has one.")
+    ] = "0",
     as_json: Json = False,
 ) -> None:
     """Fit the monitor's response to measured patches."""
@@ -232,7 +250,8 @@ def photometric(
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
-    found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits)
+    identity = _monitor_of(int(display) if display.isdecimal() else display)
+    found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits, identity)
     if plot is not None:
         draw_calibration(measured, plot, bits)
         found["written"].append(str(plot))

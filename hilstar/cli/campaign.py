@@ -1,7 +1,5 @@
 """hilstar campaign: many cases of a bench, over every core and machine."""
 
-from __future__ import annotations
-
 import math
 import os
 import sys
@@ -153,7 +151,7 @@ class Showing:
     console_name: list[str] | None
 
 
-def show_cases(this: Campaign, directory: Directory, asked: Showing) -> None:
+def show_cases(this: "Campaign", directory: "Directory", asked: Showing) -> None:
     """Show the missing cases to the real tracker, with progress on the terminal and on the page."""
     from hilstar.campaign.bench_run import OpenDisplay
     from hilstar.console.publisher import PageParts, RunDescription
@@ -181,13 +179,14 @@ def show_cases(this: Campaign, directory: Directory, asked: Showing) -> None:
                 notices.tell("campaign", f"{count} of {this.cases} cases, {left_s:.0f} s left")
 
         @contextmanager
-        def display(file: BenchFile) -> Iterator[OpenDisplay]:
+        def display(file: "BenchFile") -> Iterator[OpenDisplay]:
             with (
                 running.shown_bench(file, asked.headless, asked.windowed, asked.force, timed=True) as (bench, screen),
                 running.optional_frames(asked.frames, bench, screen) as feed,
             ):
                 ledger = LedgerSwitch()
-                told = RunSource(where, bench.renderer.gl_renderer, bench.config.monitor.refresh_hz, math.inf)
+                renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
+                told = RunSource(where, renderer, refresh_hz, math.inf, running.forced_on(screen))
                 parts = PageParts(bench, notices, ledger, lambda path: Ledger(path, bench, notices), screen)
                 page, status = RunDescription("campaign", "campaign", where), RunStatus(told, ledger)
                 with running.followed(listener, False, page, parts, status, frames=feed) as (sink, follower, _):
@@ -199,7 +198,7 @@ def show_cases(this: Campaign, directory: Directory, asked: Showing) -> None:
 
 
 def run_cases(
-    this: Campaign, directory: Directory, scheduler: Scheduler | None, workers: int, memory_bytes: int | None
+    this: "Campaign", directory: "Directory", scheduler: "Scheduler | None", workers: int, memory_bytes: int | None
 ) -> None:
     """Run the missing cases on a cluster or on this machine's cores."""
     from hilstar.campaign.pool import Pool

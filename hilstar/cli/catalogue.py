@@ -1,7 +1,5 @@
 """hilstar catalogue: the stars of a bench as its tracker sees them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

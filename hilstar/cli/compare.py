@@ -1,7 +1,5 @@
 """hilstar compare: two frames, star by star."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

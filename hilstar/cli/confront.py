@@ -1,7 +1,5 @@
 """hilstar confront: photographs of the sky against the simulator, and the camera that took them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """hilstar convert: an attitude log in another form."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

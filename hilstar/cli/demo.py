@@ -1,7 +1,5 @@
 """hilstar demo: the main job in one command."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -82,7 +80,7 @@ def demo(
         progress("serving", seconds * HZ) as advance,
     ):
 
-        def watching(bench: Bench, endpoint: str) -> AbstractContextManager[tuple[FrameSink, Outlet]]:
+        def watching(bench: "Bench", endpoint: str) -> "AbstractContextManager[tuple[FrameSink, Outlet]]":
             return _watching(bench, endpoint, listener, control, lambda shown: advance(shown.number + 1), tracker)
 
         shows = Shows(demo_file, samples) if tracker is None else Shows(tracker.bench_file, samples, tracker.watches)
@@ -115,13 +113,13 @@ def demo(
 
 @contextmanager
 def _watching(
-    bench: Bench,
+    bench: "Bench",
     endpoint: str,
-    listener: PageListener | None,
+    listener: "PageListener | None",
     control: bool,
-    advance: FrameSink,
-    tracker: TrackerBeside | None,
-) -> Iterator[tuple[FrameSink, Outlet]]:
+    advance: "FrameSink",
+    tracker: "TrackerBeside | None",
+) -> "Iterator[tuple[FrameSink, Outlet]]":
     """Follow the demo with a progress bar, its page and, if there is one, its tracker."""
     from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.record.ledger import NO_SPLIT, Ledger
@@ -143,7 +141,7 @@ def _watching(
 
 
 @contextmanager
-def tracker_beside(folder: Path, demo_file: Path, seconds: float, seed: int) -> Iterator[TrackerBeside]:
+def tracker_beside(folder: Path, demo_file: Path, seconds: float, seed: int) -> "Iterator[TrackerBeside]":
     """The demo's tracker, whose answers come by a socket of its own; the bench file that names it is in `folder`."""
     make_directory(folder)
     with temporary_folder("loop") as place:
@@ -163,7 +161,7 @@ class TrackerBeside:
         self._process: subprocess.Popen[str] | None = None
 
     @contextmanager
-    def before(self, frames: FrameFeed) -> Iterator[None]:
+    def before(self, frames: "FrameFeed") -> Iterator[None]:
         """Run it before the frames of a feed; it ends by itself, or with this."""
         self._feed = frames
         command = [sys.executable, "-m", "hilstar", "tracker", str(self.bench_file), "--watch", frames.endpoint]

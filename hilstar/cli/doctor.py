@@ -1,8 +1,7 @@
 """hilstar doctor: what this machine has and lacks, and whether a bench file is plausible."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -35,22 +34,22 @@ def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = 
         else:
             typer.echo(table(cells))
         return
-    benches = {} if bench_file is None else examine_bench(bench_file)
+    benches = examine_bench(bench_file, datetime.now(UTC).date())
     result = examine()
-    for fields in benches.values():
-        say_units(fields)
+    for bench in benches.values():
+        say_units(bench.fields)
     if as_json:
-        named = {"benches": {name: fields.keys() for name, fields in benches.items()}} if benches else {}
+        named = {"benches": {name: bench.keys() for name, bench in benches.items()}} if benches else {}
         print_json(asdict(result) | named)
     else:
         for check in result.checks:
             mark = "ok" if check.ok else "MISSING" if check.required else "none"
             typer.echo(f"{mark:8}{check.name:12}{check.detail}")
         for output in result.outputs:
-            typer.echo(f"{'check' if output.faults else 'ok':8}{'output':12}{output.line}")
-            for fault in output.faults:
-                typer.echo(f"{'':20}{fault}")
-        for name, fields in benches.items():
-            typer.echo(f"{'ok' if fields.warning is None else 'check':8}{name:12}{fields.line()}")
+            typer.echo("\n".join(output.lines()))
+        for name, bench in benches.items():
+            typer.echo("\n".join(bench.lines(name)))
     if not result.ok:
         raise typer.Exit(3)
+    for bench in benches.values():
+        bench.monitor.refuse(force=False)

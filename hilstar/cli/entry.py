@@ -1,7 +1,5 @@
 """The entry point of the command line: runs a command, and turns each refusal into one line and an exit code."""
 
-from __future__ import annotations
-
 import io
 import logging
 import os

@@ -1,9 +1,8 @@
 """hilstar first-light: the first day on a bench, step by step; it resumes where it stopped."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +10,7 @@ import msgspec
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files, parse_diode
-from hilstar.cli.running import Console, ConsoleName, Control, Token, page_listener
+from hilstar.cli.running import Console, ConsoleName, Control, Force, Token, page_listener
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError, did_you_mean
 from hilstar.files import check_directory, make_directory
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from hilstar.calibrate.first_light.image_sources import ImageSource, Pattern
     from hilstar.console.listener import PageListener
 
-PATCHES = 96
+PATCHES, FORCED = 96, "forced"
 EXAMPLE_TRUTH = "truth-example.toml"  # in configs
 
 
@@ -64,6 +63,7 @@ def first_light(
     ] = None,
     again: Annotated[list[str] | None, typer.Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
     seed: Annotated[int, typer.Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
+    force: Force = False,
     console: Console = None,
     control: Control = False,
     token: Token = None,
@@ -95,6 +95,9 @@ def first_light(
         alone_in(make_directory(output)),
         _shown(listener, control, file) as (tell, watch),
     ):
+        source.find_monitor(file, datetime.now(UTC).date(), force=force)
+        for line in source.forced:
+            tell(f"{FORCED:12} {line}")
         session = FirstLightSession(output, file, source, readings, watch)
         code = session.run(frozenset(again or []), tell)
         beats = beat_line(session.beat())
@@ -113,8 +116,8 @@ def first_light(
 
 @contextmanager
 def _shown(
-    listener: PageListener | None, control: bool, file: files.BenchFile
-) -> Iterator[tuple[Callable[[str], None], Callable[[Pattern], object]]]:
+    listener: "PageListener | None", control: bool, file: "files.BenchFile"
+) -> "Iterator[tuple[Callable[[str], None], Callable[[Pattern], object]]]":
     """The audience of a session's lines and patterns: the terminal and, if there is one, the page."""
     if listener is None:
         yield say, lambda pattern: None
@@ -131,8 +134,8 @@ def _shown(
 
 
 def _image_source(
-    file: files.BenchFile, grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
-) -> ImageSource:
+    file: "files.BenchFile", grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
+) -> "ImageSource":
     """The source of images. Raises InputError for options that exclude each other."""
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode, VirtualBench

@@ -1,7 +1,5 @@
 """hilstar fmu: a co-simulation FMU (FMI 2.0) that drives a bench over UDP, by PythonFMU."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """hilstar frame: one frame into files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """hilstar keys: CURVE keys for ZeroMQ beyond loopback."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """hilstar latency: from swap to light, by a photodiode."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """hilstar optics: the file of a tracker's glass, from a prescription, a map of images, or a pupil's aberrations."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -118,7 +116,7 @@ def lens(
         )
 
 
-def _tell(output: Path, glass: Glass, as_json: bool, more: dict[str, float] | None = None) -> None:
+def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, float] | None = None) -> None:
     """Write a glass and say what it holds."""
     import numpy as np
 

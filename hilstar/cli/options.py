@@ -3,8 +3,6 @@
 A parser takes a text and returns a value. Each refusal shows the form to write.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable
@@ -101,7 +99,7 @@ USUAL_ADDRESSES = {"--console": "127.0.0.1:8765", "--scpi": "127.0.0.1:5025"}
 def check_files(
     inputs: Iterable[Path | None],
     outputs: Iterable[Path | None],
-    file: bench_file.BenchFile | None = None,
+    file: "bench_file.BenchFile | None" = None,
     kept: Path | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -145,7 +143,7 @@ def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> A
     return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
 
 
-def parse_at(command: str, at_s: float | None, config: BenchConfig, timed: bool = False) -> int | None:
+def parse_at(command: str, at_s: float | None, config: "BenchConfig", timed: bool = False) -> int | None:
     """The moment of a frame, ns after `epoch_utc`, None for that one. Raises InputError where nothing changes with time."""
     from hilstar.bench.config.bench_config import has_observer
 
@@ -183,7 +181,7 @@ def parse_radec(text: str) -> tuple[float, float, float]:
     return ra_deg, dec_deg, roll_deg
 
 
-def parse_spin(text: str) -> FloatArray:
+def parse_spin(text: str) -> "FloatArray":
     """The rate in rad/s, cam components (3,), of "AXIS,DEG_PER_S"."""
     import numpy as np
 
@@ -209,7 +207,7 @@ def parse_place(text: str | None) -> tuple[float, float, float] | None:
     return latitude_deg, longitude_deg, height_m
 
 
-def parse_mounting(text: str | None) -> Mounting:
+def parse_mounting(text: str | None) -> "Mounting":
     """The mounting of `--mounting`. Raises InputError."""
     from hilstar.attitude.wire.protocol import NORM_TOLERANCE
     from hilstar.attitude.wire.source import Mounting
@@ -255,7 +253,7 @@ def parse_speed(text: str) -> float:
     return factor
 
 
-def parse_split(text: str | None) -> SplitLimits:
+def parse_split(text: str | None) -> "SplitLimits":
     """The split of "1GB" or "1h". Raises InputError."""
     from hilstar.run.record.ledger import NO_SPLIT, SplitLimits
 
@@ -276,7 +274,7 @@ def parse_memory(text: str) -> int:
     return round(float(match[1]) * SPLIT_UNITS[match[2]])
 
 
-def parse_reading(text: str) -> StarReading:
+def parse_reading(text: str) -> "StarReading":
     """A reading from "HIP,DN". Raises InputError."""
     from hilstar.calibrate.scale import StarReading
 

@@ -1,7 +1,5 @@
 """hilstar replay: an attitude log on the monitor."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -83,7 +81,8 @@ def replay(
         if explain:
             running.explain_bench(bench, of_source=play.conventions.lines(mounting))
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
-        status = RunStatus(RunSource(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)
+        told = RunSource(f"replaying {log}", renderer, refresh_hz, play.frame_count, running.forced_on(screen))
+        status = RunStatus(told, kept)
         page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
         schedule = getattr(wrong, "schedule", None)  # nobody starts a fault in a run that is replayed
         parts = PageParts(

@@ -1,7 +1,5 @@
 """Parts of the commands that run a bench: its screen, its ledger, its page, what is said of it, and the end of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -14,7 +12,7 @@ import typer
 from hilstar.console.run_status import RunStatus
 from hilstar.console.terminal import report, say
 from hilstar.errors import InputError, MachineError
-from hilstar.notices import Notices
+from hilstar.notices import Notice, Notices
 from hilstar.process.programs import Service
 from hilstar.units import NS_PER_S
 
@@ -38,7 +36,12 @@ if TYPE_CHECKING:
 UTC_MARK = "{utc}"  # stands for the time in a ledger's name
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
-    bool, typer.Option("--force", help="Show on a display that the start-up checks refuse; the refusal is logged.")
+    bool,
+    typer.Option(
+        "--force",
+        help="Show on a display that the start-up checks refuse, or on a monitor that the bench's files were not measured on;"
+        " status, page and ledger go on saying so.",
+    ),
 ]
 LedgerFile = Annotated[
     Path | None,
@@ -108,7 +111,7 @@ def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] 
 
 
 @contextmanager
-def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool, *, timed: bool) -> Iterator[tuple[Any, Any]]:
+def shown_bench(file: "BenchFile", headless: bool, windowed: bool, force: bool, *, timed: bool) -> Iterator[tuple[Any, Any]]:
     """The bench and its screen; None when headless. `timed` as in `open_bench`."""
     if headless:
         from hilstar.bench.build import open_bench
@@ -119,8 +122,13 @@ def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool, *,
         return
     from hilstar.run.screen.gate import open_screen
 
-    with open_screen(file, windowed=windowed, force=force, timed=timed) as screen:
+    with open_screen(file, datetime.now(UTC).date(), windowed=windowed, force=force, timed=timed) as screen:
         yield screen.bench, screen
+
+
+def forced_on(screen: Any) -> str:
+    """What is wrong with a screen that is shown by --force; "" for nothing, and headless."""
+    return "" if screen is None else "; ".join(screen.forced)
 
 
 def say_of_light(bench: Any) -> None:
@@ -132,13 +140,13 @@ def say_of_light(bench: Any) -> None:
             say(line)
 
 
-def say_units(fields: FieldsOfView) -> None:
+def say_units(fields: "FieldsOfView") -> None:
     """Warn of a length in the bench file that is probably in another unit than its key."""
     if fields.warning is not None:
         say(f"check the units: {fields.warning}")
 
 
-def say_beat(bench: Any, screen: Any) -> BeatSummary:
+def say_beat(bench: Any, screen: Any) -> "BeatSummary":
     """The beat between the tracker's exposures and the screen's refresh, with a line where it matters."""
     from hilstar.run.sync import beat_line, beat_of
 
@@ -151,7 +159,7 @@ def say_beat(bench: Any, screen: Any) -> BeatSummary:
 
 
 @contextmanager
-def optional_pulse(file: BenchFile, notices: Notices) -> Iterator[FramePulse | None]:
+def optional_pulse(file: "BenchFile", notices: Notices) -> "Iterator[FramePulse | None]":
     """The bench file's pulse at each frame; None without one. Raises InputError where its port cannot be opened."""
     from hilstar.run.frame_pulse import FramePulse
 
@@ -164,7 +172,7 @@ def optional_pulse(file: BenchFile, notices: Notices) -> Iterator[FramePulse | N
 
 
 @contextmanager
-def optional_answers(bench: Any, notices: Notices, ledger: LedgerSwitch, screen: Any) -> Iterator[LiveAnswers | None]:
+def optional_answers(bench: Any, notices: Notices, ledger: "LedgerSwitch", screen: Any) -> "Iterator[LiveAnswers | None]":
     """The tracker's answers while this is open; None where the bench file names none. Raises InputError."""
     if bench.config.answers is None:
         yield None
@@ -181,7 +189,7 @@ def optional_answers(bench: Any, notices: Notices, ledger: LedgerSwitch, screen:
 
 
 @contextmanager
-def optional_frames(endpoint: str | None, bench: Any, screen: Any) -> Iterator[FrameFeed | None]:
+def optional_frames(endpoint: str | None, bench: Any, screen: Any) -> "Iterator[FrameFeed | None]":
     """The feed of the run's frames to watchers; None without an endpoint. Raises InputError where it cannot be bound."""
     if endpoint is None:
         yield None
@@ -202,17 +210,20 @@ def dated_ledger(path: Path | None) -> Path | None:
 
 
 @contextmanager
-def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> Iterator[LedgerSwitch]:
+def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> "Iterator[LedgerSwitch]":
     """The run's ledger, which also keeps its events; without a path it starts switched off."""
+    from hilstar.bench.measured_on import SHOWN_ANYWAY
     from hilstar.run.record.ledger import Ledger, LedgerSwitch
 
     ledger = LedgerSwitch(None if path is None else Ledger(path, bench, notices, overwrite, split))
     notices.listen(ledger.notice)
+    for line in bench.output.get("forced", ()):
+        ledger.notice(Notice.now("forced", f"{line}: {SHOWN_ANYWAY}"))
     with ledger:
         yield ledger
 
 
-def optional_scenario(path: Path | None) -> Scenario | None:
+def optional_scenario(path: Path | None) -> "Scenario | None":
     """The scenario of `--scenario`, None without one. Raises InputError."""
     from hilstar.bench.scenario import read_scenario
 
@@ -221,8 +232,8 @@ def optional_scenario(path: Path | None) -> Scenario | None:
 
 @contextmanager
 def run_with_faults(
-    bench: Any, scenario: Scenario | None, notices: Notices, ledger: LedgerSwitch, recording: Recording | None = None
-) -> Iterator[AnyFaults | None]:
+    bench: Any, scenario: "Scenario | None", notices: Notices, ledger: "LedgerSwitch", recording: "Recording | None" = None
+) -> "Iterator[AnyFaults | None]":
     """The faults of a run, from its scenario and stream or from the run that is replayed; None for none."""
     from hilstar.bench.scenario import NO_SCENARIO
     from hilstar.run.faults import ReplayedFaults, RunFaults
@@ -245,7 +256,7 @@ def run_with_faults(
         yield faults
 
 
-def end_of_run(summary: RunSummary, screen: Any, ledger: LedgerSwitch, notices: Notices, as_json: bool) -> None:
+def end_of_run(summary: "RunSummary", screen: Any, ledger: "LedgerSwitch", notices: Notices, as_json: bool) -> None:
     """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed.
 
     Raises MachineError where the window went away or the GPU was lost.
@@ -271,7 +282,7 @@ def refuse_lost_gpu(notices: Notices) -> None:
 @contextmanager
 def page_listener(
     console: str | None, control: bool, token: str | None, names: list[str] | None
-) -> Iterator[PageListener | None]:
+) -> "Iterator[PageListener | None]":
     """The page's listening socket; None without --console. Raises InputError."""
     from hilstar.console.listener import PageListener, parse_address
 
@@ -288,8 +299,8 @@ def page_listener(
 
 @contextmanager
 def scpi_listener(
-    file: BenchFile, scpi: str | None, page: PageListener | None, token: str | None
-) -> Iterator[PageListener | None]:
+    file: "BenchFile", scpi: str | None, page: "PageListener | None", token: str | None
+) -> "Iterator[PageListener | None]":
     """SCPI's listening socket, with the page's token if that has one; None without --scpi. Raises InputError."""
     from hilstar.console.listener import PageListener, parse_address
 
@@ -307,15 +318,15 @@ def scpi_listener(
 
 @contextmanager
 def followed(
-    listener: PageListener | None,
+    listener: "PageListener | None",
     control: bool,
-    description: RunDescription,
-    parts: PageParts,
+    description: "RunDescription",
+    parts: "PageParts",
     status: RunStatus,
-    record: FrameSink | None = None,
-    frames: FrameFeed | None = None,
-    scpi: PageListener | None = None,
-) -> Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]:
+    record: "FrameSink | None" = None,
+    frames: "FrameFeed | None" = None,
+    scpi: "PageListener | None" = None,
+) -> "Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]":
     """Connect a run to the terminal, `record`, systemd, `frames`, page and SCPI: its sink, its follower, their requests."""
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
     if frames is not None:
@@ -329,18 +340,18 @@ def followed(
 
         with opened_page(Listeners(listener, scpi), control, description, parts) as (feed, requests):
 
-            def follow(running: Running) -> None:
+            def follow(running: "Running") -> None:
                 status.follow(running)
                 feed.follow(running)
 
             yield _all_of([*sinks, feed.see]), follow, requests
 
 
-def _all_of(sinks: list[FrameSink]) -> FrameSink:
+def _all_of(sinks: "list[FrameSink]") -> "FrameSink":
     if len(sinks) == 1:
         return sinks[0]
 
-    def sink(shown: Shown) -> None:
+    def sink(shown: "Shown") -> None:
         for one in sinks:
             one(shown)
 

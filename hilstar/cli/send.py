@@ -1,7 +1,5 @@
 """hilstar send: a log or a spin, sent as a simulator sends it."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """hilstar sensor: a tracker's sensor from its EMVA 1288 data sheet, or from its own frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,7 +44,7 @@ def measure(
     _tell(output, measure_sensor(flats, darks), "By hilstar sensor measure; errors are one sigma", as_json)
 
 
-def _tell(output: Path, sensor: SensorFile, source: str, as_json: bool) -> None:
+def _tell(output: Path, sensor: "SensorFile", source: str, as_json: bool) -> None:
     from hilstar.calibrate.sensor import write_sensor
 
     files = write_sensor(output, sensor, source)

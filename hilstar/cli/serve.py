@@ -1,7 +1,5 @@
 """hilstar serve: the live attitude stream on the monitor; of a file with `heads`, one process per head beside one source."""
 
-from __future__ import annotations
-
 import math
 from contextlib import ExitStack
 from dataclasses import replace
@@ -37,7 +35,7 @@ HeadOf = Annotated[Path | None, typer.Option("--head-of", hidden=True)]
 FedBy = Annotated[str | None, typer.Option("--fed-by", hidden=True)]
 
 
-def serve_heads(asked: HeadsRun, console: str | None, overwrite: bool, as_json: bool) -> None:
+def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json: bool) -> None:
     """Serve every head until its end, and print what each reported; exit code 4 if none ever had an attitude.
 
     The page of head k is at the port of `console` plus k.
@@ -91,7 +89,7 @@ def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, 
     return tuple(f"{host}:{address.port}" for address in addresses)
 
 
-def fed_link(file: ReadFile, fed_by: str, notices: Notices) -> ZmqReceiver:
+def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
     """A head's link to the process that has the source, with which it ends; `fed_by` is that one's endpoint and process id."""
     from hilstar.attitude.wire.source import PACKETS, Mounting
     from hilstar.attitude.wire.zmq_links import FedDecoder, ZmqReceiver
@@ -181,7 +179,7 @@ def serve(
         running.say_units(fields)
         running.say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
-        told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest)
+        told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest, running.forced_on(screen))
         status = RunStatus(told, kept)
         parts = PageParts(
             bench,
@@ -219,7 +217,7 @@ def frames_of(asked: list[str] | None, *, heads: bool) -> tuple[int | None, str 
     return int(counts[0]) if counts else None, endpoints[0] if endpoints else None
 
 
-def _described(file: ReadFile, link: AnyLink) -> RunDescription:
+def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
     """The run as its page says it; where SCPI steers, with the port of the link to which it sends."""
     from hilstar.console.publisher import RunDescription
 
@@ -228,7 +226,7 @@ def _described(file: ReadFile, link: AnyLink) -> RunDescription:
     return RunDescription("serve", source.source, link.endpoint, "asked" if source.lockstep else "clock", steer_port)
 
 
-def _source(file: ReadFile, fed_by: str | None, notices: Notices) -> AnyLink:
+def _source(file: "ReadFile", fed_by: str | None, notices: Notices) -> "AnyLink":
     """The link to the bench's own source or, for a head, to the process that has it."""
     from hilstar.run.open_link import open_link
 
@@ -237,7 +235,7 @@ def _source(file: ReadFile, fed_by: str | None, notices: Notices) -> AnyLink:
     return open_link(file.config, file.folder, notices, apart=True)
 
 
-def tracker_pictures(link: AnyLink, bench: Bench, faults: Any = None) -> Pictures | None:
+def tracker_pictures(link: "AnyLink", bench: "Bench", faults: Any = None) -> "Pictures | None":
     """The virtual tracker's pictures for a link whose other side asks for them."""
     from hilstar.twin.pictures import TrackerPictures
 

@@ -1,7 +1,5 @@
 """hilstar service: a systemd unit of this user that serves a bench, watched and restarted."""
 
-from __future__ import annotations
-
 import getpass
 import os
 import re
@@ -153,7 +151,7 @@ def _systemctl(*words: str) -> bool:
     return done.returncode == 0
 
 
-def _checked(bench_file: Path, options: list[str]) -> tuple[list[str], ListenAddress | None]:
+def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAddress | None]":
     """The options, checked by `hilstar serve`, and the address of its page. Raises InputError."""
     from hilstar.console.listener import parse_address
 

@@ -1,7 +1,5 @@
 """hilstar simulate: the virtual tracker's image of the sky."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -97,7 +95,7 @@ def simulate(
 
 
 def simulate_log(
-    bench_file: Path, log: Path, frames: int | None, noise: FrameNoise, output: Path, scenario: Path | None
+    bench_file: Path, log: Path, frames: int | None, noise: "FrameNoise", output: Path, scenario: Path | None
 ) -> None:
     """The virtual tracker along a log."""
     from hilstar.attitude.logs.entries import Stated, log_joins

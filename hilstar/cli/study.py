@@ -1,7 +1,5 @@
 """hilstar study: charts of what each choice costs, and of where methods fail."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from importlib import import_module

@@ -1,7 +1,5 @@
 """hilstar tracker: the virtual tracker as a process of its own, before a display that runs."""
 
-from __future__ import annotations
-
 import os
 import re
 import threading
@@ -130,7 +128,7 @@ def tracker(
         say(f"{frames.verb.replace('a sender', 'frames')} {watch}; answers {rate_hz:g} Hz, {form}, to {link.endpoint}")
         process = TrackerProcess(live, frames, planted, rate_hz, errors)
 
-        def send(said: Answer) -> None:
+        def send(said: "Answer") -> None:
             link.send(said)
             row(said)
 
@@ -192,7 +190,7 @@ def checked_rate(rate_hz: float | None, exposure_s: float) -> float:
     return rate_hz
 
 
-def solver_of(text: str | None, live: LiveTracker) -> Solve | None:
+def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
     """Who finds attitudes lost in space; None: the true one is taken. Raises InputError."""
     import numpy as np
 
@@ -214,7 +212,7 @@ def solver_of(text: str | None, live: LiveTracker) -> Solve | None:
     return by_image(text or "", live)
 
 
-def by_image(text: str, live: LiveTracker) -> Solve:
+def by_image(text: str, live: "LiveTracker") -> "Solve":
     """A campaign's solver of images: a command, or a function. Raises InputError."""
     import numpy as np
 
@@ -249,7 +247,7 @@ def recorded(path: Path | None) -> Iterator[Any]:
     with path.open("w", encoding="ascii") as file:
         file.write("t_s,qw,qx,qy,qz,valid\n")
 
-        def row(said: Answer) -> None:
+        def row(said: "Answer") -> None:
             q = said.q_icrs_to_cam
             numbers = ",,," if q is None else ",".join(repr(float(value)) for value in q)
             file.write(f"{(said.t_ns or 0) / 1e9:.9f},{numbers},{int(q is not None)}\n")

@@ -1,7 +1,5 @@
 """hilstar verify: the digital twin of a bench."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -69,7 +67,7 @@ def verify(
         raise typer.Exit(1)
 
 
-def _verify_heads(heads: HeadsFile, fields: int, seed: int, as_json: bool) -> None:
+def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> None:
     """Print the angles between the heads of a file with `heads`, solved from what their trackers would see."""
     import numpy as np
 
@@ -92,7 +90,7 @@ def _verify_heads(heads: HeadsFile, fields: int, seed: int, as_json: bool) -> No
         typer.echo(f"{f'{first} to {second}':20}{told}")
 
 
-def _proposed(file: Bench, verdict: Verdict, seed: int, write: bool, as_json: bool) -> dict[str, Any]:
+def _proposed(file: "Bench", verdict: "Verdict", seed: int, write: bool, as_json: bool) -> dict[str, Any]:
     """The keys of --propose and --write in the JSON object; the lines are printed unless that is wanted."""
     from hilstar.twin.verify.proposals import proposal_lines, propose, write_proposal
 

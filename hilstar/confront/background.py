@@ -8,9 +8,9 @@ import numpy as np
 from scipy import ndimage
 
 from hilstar.arrays import BoolArray, FloatArray
-from hilstar.tracker.centroids import EIGHT_NEIGHBOURS
 from hilstar.units import MAD_TO_SIGMA
 
+EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 MIN_BLOCKS = 12  # along the shorter side; a block is 64 px or less
 BLOCK_PX = 64
 MIN_BLOCK_PX = 16

@@ -14,14 +14,13 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.confront.background import source_mask
+from hilstar.confront.background import EIGHT_NEIGHBOURS, source_mask
 from hilstar.confront.light import BRIGHT_V_MAG
 from hilstar.confront.session import MATCH_PX, Session, Shot
 from hilstar.confront.sky import planets_seen
 from hilstar.frame.view import STILL
 from hilstar.rotation import to_matrix
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
-from hilstar.tracker.centroids import EIGHT_NEIGHBOURS
 from hilstar.twin.simulator import Simulator
 from hilstar.units import MAD_TO_SIGMA as MAD
 

@@ -1,7 +1,5 @@
 """The page's address, the socket that listens there, and the token that admits a browser."""
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import re

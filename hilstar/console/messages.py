@@ -5,8 +5,6 @@ written, the number that is complete (a seqlock) and a CRC, so that a reader not
 overwritten. Each ring has one writer. The memory has no name (memfd): it is gone with the last process that has it open.
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import os
@@ -89,6 +87,7 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     hidden: str = ""
     display_lost: str = ""
     gamma: str = ""
+    forced: str = ""
     ledger: LedgerState | None = None
     note: str = ""
     faults: list[str] = []
@@ -286,7 +285,7 @@ class SharedMemory:
         self.frames, self.states, self.events, self.answers, self.pictures = rings
 
     @classmethod
-    def make(cls, picture_bytes: int) -> SharedMemory:
+    def make(cls, picture_bytes: int) -> "SharedMemory":
         """New memory for pictures of at most `picture_bytes`."""
         return cls(os.memfd_create("hilstar-console"), picture_bytes)
 

@@ -1,7 +1,5 @@
 """What the page draws over a picture: stars, outline and grid, from the bench's stars and its two cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -181,7 +179,7 @@ class Overlay:
         return self.marks.truth(frame, stars, q_icrs_to_cam, grid=True)
 
 
-def overlay_of(bench: Bench) -> Overlay:
+def overlay_of(bench: "Bench") -> Overlay:
     """The overlay of an assembled bench."""
     return Overlay(CameraMarks(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder)), bench.shown_stars)
 

@@ -3,8 +3,6 @@
 One thread does this ten times a second; the frame loop takes no part in it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -4,8 +4,6 @@
 (NaN, infinity) are sent as null.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import msgspec

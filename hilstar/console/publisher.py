@@ -1,7 +1,5 @@
 """What a run or a first-light session publishes to its page: frames, pictures, its state; and what operators order."""
 
-from __future__ import annotations
-
 import contextlib
 import pickle
 import threading
@@ -87,13 +85,13 @@ class FramePublisher:
         self._memory = memory
         self._picture_due_ns = 0
 
-    def follow(self, running: Running) -> None:
+    def follow(self, running: "Running") -> None:
         """Follow a run, whose counters go on changing."""
         self.running = running
         if running.answers is not None:
             running.answers.heard = self._hear
 
-    def _hear(self, answers: LiveAnswers) -> None:
+    def _hear(self, answers: "LiveAnswers") -> None:
         """Publish a new answer of the tracker. Called by the thread that takes answers."""
         newest = answers.newest
         lit = None if newest is None or newest.lit is None else tuple(newest.lit.q.tolist())
@@ -101,7 +99,7 @@ class FramePublisher:
         places = [(round(star.x_px, 2), round(star.y_px, 2)) for star in stars]
         self._memory.answers.put(msgspec.json.encode(NewAnswer(answers.figures, lit, places)))
 
-    def see(self, shown: Shown) -> None:
+    def see(self, shown: "Shown") -> None:
         """Publish a frame. Called by the frame loop."""
         self.shown = shown
         self.count += 1
@@ -133,9 +131,10 @@ class FramePublisher:
             with contextlib.suppress(ValueError):  # levels of another size than the bench's: no picture, and the run goes on
                 self._copy(shown)
 
-    def _copy(self, shown: Shown) -> None:
+    def _copy(self, shown: "Shown") -> None:
         """Copy a picture: levels, attitude, and the places of its stars."""
-        levels, sprites = shown.drawn.levels, shown.drawn.sprites
+        drawn, sprites = shown.drawn.levels, shown.drawn.sprites
+        levels = drawn if drawn.ndim == 2 else drawn.max(axis=2)  # the page's picture is grey
         height, width = levels.shape
         places: list[np.ndarray] = []
         if sprites is not None:
@@ -162,12 +161,12 @@ class PageParts:
     """The parts of a run; `make_ledger` begins a ledger at a path, `answers` are the tracker's."""
 
     bench: Bench
-    notices: Notices
-    ledger: LedgerSwitch
-    make_ledger: Callable[[Path], Ledger]
-    screen: Screen | None = None
-    faults: FaultSchedule | None = None
-    answers: LiveAnswers | None = None
+    notices: "Notices"
+    ledger: "LedgerSwitch"
+    make_ledger: "Callable[[Path], Ledger]"
+    screen: "Screen | None" = None
+    faults: "FaultSchedule | None" = None
+    answers: "LiveAnswers | None" = None
 
 
 class WatchedRun:
@@ -222,6 +221,7 @@ class WatchedRun:
             hidden="" if shown is None else shown.on_screen.hidden,
             display_lost="" if screen is None else screen.window.gone or "",
             gamma=self._notices.lasting.get(GAMMA, ""),
+            forced="" if screen is None else printable("; ".join(screen.forced)),
             ledger=self._ledger(),
             faults=[] if faults is None else faults.on(),
             rates=self._notices.lasting.get(WRONG, ""),
@@ -236,7 +236,7 @@ class WatchedRun:
         return LedgerState(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
 
 
-def _attitude(shown: Shown | None) -> ShownAttitude | None:
+def _attitude(shown: "Shown | None") -> ShownAttitude | None:
     attitude = None if shown is None else shown.attitude
     if attitude is None:
         return None
@@ -253,7 +253,7 @@ def _attitude(shown: Shown | None) -> ShownAttitude | None:
     )
 
 
-def _clock(running: Running) -> ShownClock | None:
+def _clock(running: "Running") -> ShownClock | None:
     clock = None if running.clock is None else running.clock()
     if clock is None or clock.mode == "none":
         return None
@@ -378,7 +378,7 @@ class RunDescription:
     steer_port: int = 0
 
 
-def setup_for(listeners: Listeners, control: bool, description: RunDescription, file: BenchFile, picture_bytes: int) -> Setup:
+def setup_for(listeners: Listeners, control: bool, description: RunDescription, file: "BenchFile", picture_bytes: int) -> Setup:
     """The setup of a page and of SCPI for a bench file; a run adds to `hello`."""
     monitor, page, scpi = file.config.monitor, listeners.page, listeners.scpi
     hello = Hello(
@@ -448,7 +448,7 @@ def opened_page(
 
 
 CODE_BYTES = 2
-FAILED = "failed:"  # as `first-light` says of a step
+FAILED, FORCED = "failed:", "forced"  # as `first-light` says of a step, and of a monitor
 
 
 class SessionPublisher:
@@ -460,7 +460,7 @@ class SessionPublisher:
         self._failed: dict[str, str] = {}
         self._patterns = 0
 
-    def show(self, pattern: Pattern) -> None:
+    def show(self, pattern: "Pattern") -> None:
         """Publish the pattern now shown; of a coloured one the brightest channel."""
         codes = pattern.codes if pattern.codes.ndim == 2 else pattern.codes.max(axis=2)
         height, width = codes.shape
@@ -475,7 +475,7 @@ class SessionPublisher:
     def say(self, line: str) -> None:
         """Publish a line of the session: a step begins or ends."""
         step, _, words = line.partition(" ")
-        if words.strip().startswith(FAILED):
+        if step == FORCED or words.strip().startswith(FAILED):
             self._failed[step] = f"{step} {words.strip()}"
         else:
             self._failed.pop(step, None)
@@ -506,7 +506,7 @@ class SessionPublisher:
 
 
 @contextmanager
-def session_page(listener: PageListener, control: bool, file: BenchFile) -> Iterator[SessionPublisher]:
+def session_page(listener: PageListener, control: bool, file: "BenchFile") -> Iterator[SessionPublisher]:
     """The page of a session while this is open."""
     monitor = file.config.monitor
     width, height = monitor.resolution_px

@@ -1,7 +1,5 @@
 """A run's report: the operator's page as one file with the whole run in it, and its figures as JSON."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import math
@@ -160,7 +158,8 @@ def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> 
 
 def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
     """One frame: its packed levels and its truth."""
-    levels = shown.drawn.levels
+    shown_levels = shown.drawn.levels
+    levels = shown_levels if shown_levels.ndim == 2 else shown_levels.max(axis=2)
     attitude = shown.attitude
     truth = None if attitude is None else overlay.truth(shown.number, attitude.q_icrs_to_cam, shown.drawn.clipped_hip)
     wide = levels.dtype.itemsize == 2

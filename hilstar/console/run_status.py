@@ -3,8 +3,6 @@
 The frame loop only leaves its newest frame here; a thread of the status words it, so that no terminal delays a frame.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import sys
@@ -34,12 +32,14 @@ ALIVE_NS, ALIVE_PERIODS = NS_PER_S, 3.0
 
 @dataclass(frozen=True, slots=True)
 class RunSource:
-    """What a run shows: where its attitudes come from, on what it is drawn, and how many frames there will be."""
+    """What a run shows: where its attitudes come from, on what it is drawn, how many frames there will be, and what is wrong
+    with the screen that --force shows it on."""
 
     attitudes: str
     renderer: str
     refresh_hz: float
     frames: float = math.inf
+    forced: str = ""
 
 
 class StatusLine(NamedTuple):
@@ -53,7 +53,7 @@ class StatusLine(NamedTuple):
 class RunStatus:
     """What a run is doing, from the newest frame that `see` was given."""
 
-    def __init__(self, source: RunSource, ledger: LedgerSwitch | None = None) -> None:
+    def __init__(self, source: RunSource, ledger: "LedgerSwitch | None" = None) -> None:
         self._source = source
         self._ledger = ledger
         self._begun_ns = time.monotonic_ns()
@@ -61,11 +61,11 @@ class RunStatus:
         self._running: Running | None = None
         self._before = (self._begun_ns, 0, 0)  # when the lines were last made: host time, frames, packets
 
-    def follow(self, running: Running) -> None:
+    def follow(self, running: "Running") -> None:
         """Take the run, which goes on counting."""
         self._running = running
 
-    def see(self, shown: Shown) -> None:
+    def see(self, shown: "Shown") -> None:
         """Take the newest frame; costs the frame loop one assignment."""
         self._shown = shown
 
@@ -86,7 +86,7 @@ class RunStatus:
             return "no frame yet"
         attitude, tally, packets = _attitude_line(shown), running.loop.tally, running.packets
         told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
-        return f"attitude {attitude.text}; {told}"
+        return f"attitude {attitude.text}; {told}" + ("; shown by --force" if self._source.forced else "")
 
     def lines(self, now_ns: int) -> list[StatusLine]:
         """The status at a host time; rates are since it was last asked for."""
@@ -119,11 +119,13 @@ class RunStatus:
             failed = f"; failed: {ledger.failure}" if ledger.failure else ""
             text = printable(f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}")
             yield StatusLine("ledger", text, ledger.failure is None)
+        if self._source.forced:
+            yield StatusLine("forced", printable(self._source.forced), False)
         yield StatusLine("source", self._source.attitudes)
         yield StatusLine("display", f"{self._source.refresh_hz:g} Hz, {self._source.renderer}")
 
 
-def _attitude_line(shown: Shown) -> StatusLine:
+def _attitude_line(shown: "Shown") -> StatusLine:
     attitude = shown.attitude
     if attitude is None:
         return StatusLine("attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False)
@@ -138,7 +140,7 @@ def _attitude_line(shown: Shown) -> StatusLine:
     return StatusLine("attitude", text + (": STALE" if shown.stale else ""), not shown.stale)
 
 
-def _tracker_line(found: TrackerFigures) -> StatusLine:
+def _tracker_line(found: "TrackerFigures") -> StatusLine:
     def three(values: list[float] | None) -> str:
         return "-" if values is None else ", ".join(f"{value:.1f}" for value in values)
 
@@ -183,7 +185,7 @@ def _live(status: RunStatus, stop: threading.Event) -> None:
             stop.wait(LIVE_EACH_S)
 
 
-def _table(lines: list[StatusLine]) -> Table:
+def _table(lines: list[StatusLine]) -> "Table":
     from rich.table import Table
     from rich.text import Text
 

@@ -7,8 +7,6 @@ Laws:
 3. Memory is bounded: a line by MAX_LINE_BYTES, the queue of errors by MAX_ERRORS, whose last then says that it is full.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

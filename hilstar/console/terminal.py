@@ -1,7 +1,5 @@
 """What the commands print: lines, one JSON object, a summary, a progress bar, a refusal."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys
@@ -20,7 +18,7 @@ if TYPE_CHECKING:
     from hilstar.run.summary import PacketSummary, RunSummary
     from hilstar.running_statistics import Percentiles
 
-INSTEAD: dict[Reason, str] = {
+INSTEAD: "dict[Reason, str]" = {
     "format": "send packets of 64 bytes, version 1, little-endian, or JSON with t_ns and q",
     "crc": "end each packet with the CRC-32 of zlib over the 60 bytes before it, and look at the cable",
     "nan": "send finite numbers",
@@ -53,7 +51,7 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
-def report(summary: RunSummary, as_json: bool) -> None:
+def report(summary: "RunSummary", as_json: bool) -> None:
     """The summary of a run, for a program or a person."""
     if as_json:
         print_json(summary)
@@ -62,7 +60,7 @@ def report(summary: RunSummary, as_json: bool) -> None:
     def figure(value: float | None, digits: int = 2) -> str:
         return "-" if value is None else f"{value:.{digits}f}"
 
-    def spread(times: Percentiles) -> str:
+    def spread(times: "Percentiles") -> str:
         return " / ".join(figure(value) for value in (times.p50, times.p99, times.max))
 
     packets, stars, clipped = summary.packets, summary.stars_drawn, summary.clipped
@@ -100,7 +98,7 @@ def report(summary: RunSummary, as_json: bool) -> None:
         typer.echo(f"{name:20}{line}")
 
 
-def without_attitude(endpoint: str, packets: PacketSummary) -> str:
+def without_attitude(endpoint: str, packets: "PacketSummary") -> str:
     """Why a run had no attitude, and what to change."""
     if not packets.received:
         return f"no attitude came from {endpoint}; start the sender, and check its address"
@@ -109,7 +107,7 @@ def without_attitude(endpoint: str, packets: PacketSummary) -> str:
     return f"all {packets.refused} packets from {endpoint} were refused, {told}"
 
 
-def clock_line(clock: ClockSummary) -> str:
+def clock_line(clock: "ClockSummary") -> str:
     """How the sender's clock stands to this machine's."""
     if clock.mode == "none":
         return "no attitude has arrived"

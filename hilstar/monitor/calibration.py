@@ -20,6 +20,7 @@ from msgspec import Meta
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import write_whole
+from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.response import (
     MAX_LEVELS,
     TRIPLES,
@@ -195,14 +196,16 @@ def primary_responses(source: str | Path, bits: int) -> tuple[Response, ...]:
     return tuple(tables[name] for name in ("rgb" if "r" in tables else "www"))
 
 
-def with_uniformity(source: str | Path, bits: int, path: Path, grid: FloatArray | None) -> tuple[Path, ...]:
+def with_uniformity(
+    source: str | Path, bits: int, path: Path, grid: FloatArray | None, identity: MonitorIdentity | None = None, when: str = ""
+) -> tuple[Path, ...]:
     """Write a calibration's light with another grid of relative light (rows, columns), or with none; the files, TOML first.
 
-    `source` is a built-in name or a file, as for `load_calibration`. Raises InputError.
+    `source` is a built-in name or a file, as for `load_calibration`; `when` dates a built-in's. Raises InputError.
     """
     response, weights, noise, notes = f"{path.stem}.csv", None, 0.0, NotesTable()
     if str(source) in FORMULAS:
-        head = CalibrationHead("photometric", "", "", f"none: the formula {source}", "relative", bits, response)
+        head = CalibrationHead("photometric", "", when, f"none: the formula {source}", "relative", bits, response)
         columns, weights = {"w": _formula(str(source), bits).light}, WeightsTable(*REC709_WEIGHTS)
     else:
         origin = _path_of(source)
@@ -210,7 +213,8 @@ def with_uniformity(source: str | Path, bits: int, path: Path, grid: FloatArray 
         columns = read_response(beside(origin, file.calibration.response, "[calibration] response"), bits)
         head = msgspec.structs.replace(file.calibration, response=response)
         weights, noise, notes = file.weights, file.noise.relative if file.noise else 0.0, file.notes
-    table = write_calibration(path, head, columns, noise, notes, weights)
+        identity = identity or file.monitor_identity
+    table = write_calibration(path, head, columns, noise, notes, weights, identity=identity)
     return (path, table) if grid is None else (path, table, add_uniformity(path, grid))
 
 
@@ -283,6 +287,7 @@ class CalibrationFile(Table, frozen=True):
     uniformity: UniformityTable | None = None
     noise: NoiseTable | None = None
     notes: NotesTable = msgspec.field(default_factory=NotesTable)
+    monitor_identity: MonitorIdentity | None = None
 
 
 KIND = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
@@ -403,6 +408,8 @@ def write_calibration(
     noise: float,
     notes: NotesTable,
     weights: WeightsTable | None = None,
+    *,
+    identity: MonitorIdentity | None = None,
 ) -> Path:
     """Write the TOML and, beside it, the response it names; the CSV's path. Raises InputError where they cannot be written."""
     table = path.parent / head.response
@@ -415,6 +422,8 @@ def write_calibration(
     if weights is not None:
         lines += ["[weights]", *(f"{name} = {share!r}" for name, share in msgspec.structs.asdict(weights).items()), ""]
     lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
+    if identity is not None:
+        lines += ["", identity.toml()]
     write_whole(table, comment + ",".join(["code", *columns]) + "\n" + rows)
     write_whole(path, "\n".join(lines) + "\n")
     return table

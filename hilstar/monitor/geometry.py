@@ -15,6 +15,7 @@ from msgspec import Meta
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
+from hilstar.monitor.identity import TABLE, MonitorIdentity
 from hilstar.reading import parse_toml, read_text
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera, Lens, ResidualField
@@ -80,11 +81,12 @@ class MadeTable(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """Notes of a geometry file: one sigma of each parameter, how well it is known, and how it was made."""
+    """Notes of a geometry file: one sigma of each parameter, how well it is known, how it was made, and on which monitor."""
 
     sigma: dict[str, float]
     error: ErrorTable
     made: MadeTable
+    identity: MonitorIdentity | None = None
 
 
 class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -104,6 +106,7 @@ class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     sigma: dict[str, float] = {}
     error: ErrorTable | None = None
     made: MadeTable | None = None
+    monitor_identity: MonitorIdentity | None = None
 
 
 KIND = "hilstar geometry 1"
@@ -140,7 +143,7 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
 def load_notes(path: Path) -> Notes:
     """The notes of a geometry file. Raises InputError."""
     found: GeometryFile = _read(path, GeometryFile, ADVICE)
-    return Notes(found.sigma, found.error or ErrorTable(), found.made or MadeTable())
+    return Notes(found.sigma, found.error or ErrorTable(), found.made or MadeTable(), found.monitor_identity)
 
 
 def _read(path: Path, form: type[LensTable], advice: str) -> Any:
@@ -192,7 +195,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         made=notes.made,
     )
     # Plain values and lists, tables after them; what is None or an empty table is left unsaid.
-    table = msgspec.to_builtins(found)
+    table = msgspec.to_builtins(found) | {TABLE: None if notes.identity is None else notes.identity.known()}
     plain = [f"{key} = {_value(value)}" for key, value in table.items() if not isinstance(value, dict) and value is not None]
     parts = ["\n".join(plain)]
     for key, value in table.items():

@@ -1,7 +1,5 @@
 """A base for what has to be closed: a `with` around it does so at its end."""
 
-from __future__ import annotations
-
 from typing import Self
 
 

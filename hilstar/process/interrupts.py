@@ -8,8 +8,6 @@ the usual exit code, and a process, which does it where a call in C keeps Python
 Writing to stderr never waits: if nobody reads it, neither a frame nor the end of the process is delayed.
 """
 
-from __future__ import annotations
-
 import _thread
 import atexit
 import contextlib

@@ -3,8 +3,6 @@
 The owner decides how many workers there are, what each does next, and what follows from a death.
 """
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os
@@ -31,7 +29,7 @@ Work = Callable[..., Any]
 class WorkerProcess:
     """A worker, and the task that it has, as the owner names it. `ready` from the first message on."""
 
-    process: SpawnProcess
+    process: "SpawnProcess"
     link: Connection
     ready: bool = False
     task: Any = None

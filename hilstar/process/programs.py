@@ -5,8 +5,6 @@ datagrams that the service is ready and alive, and its status in a line. The wat
 says that the service does its work, so that a service whose work hangs is restarted, whatever its other threads do.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -8,8 +8,6 @@ ms, of 10 000 stars 9 ms in place of 6.5 (two cores, nothing else running); besi
 same time. So each thread is kept on a core of its own.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc
@@ -108,7 +106,7 @@ class HostClock:
         if seconds > 0:
             time.sleep(seconds)
 
-    def within(self, seconds: float) -> Deadline:
+    def within(self, seconds: float) -> "Deadline":
         """The moment that is so many seconds from now."""
         return Deadline(self, self.now_ns() + round(seconds * 1e9))
 

@@ -1,7 +1,5 @@
 """The demo: a sender process streams a slew, and this process shows it."""
 
-from __future__ import annotations
-
 import math
 import shlex
 import subprocess

@@ -7,6 +7,7 @@ path and no serial number. Of a monitor's EDID only its maker, model, size and y
 from __future__ import annotations
 
 import contextlib
+import datetime
 import os
 import platform
 import re
@@ -16,6 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from hilstar.attitude.wire.serial_link import adapters, serial_ports
 from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
@@ -23,9 +25,12 @@ from hilstar.attitude.wire.zmq_socket import zmq_version
 from hilstar.bench.bench_file import BenchFile, read_bench_or_heads
 from hilstar.bench.build import bench_calibration, bench_optics
 from hilstar.bench.cameras import FieldsOfView, fields_of_view
+from hilstar.bench.measured_on import MonitorCheck, check_monitor
 from hilstar.errors import HilstarError, MachineError
+from hilstar.monitor.identity import TABLE, edid_identity
 from hilstar.monitor.window.output_settings import findings
 from hilstar.monitor.window.randr import lit_outputs
+from hilstar.monitor.window.this_monitor import identity_here
 from hilstar.monitor.window.window import displays, window_renderer
 from hilstar.monitor.window.x11 import server_of
 from hilstar.notices import Notices
@@ -39,8 +44,6 @@ COLUMNS = ("hilstar", "machine", "OpenGL", "display server", "monitors", "links"
 TO_FILL = "(write it here)"
 NOT_THERE = "none"
 SYS, PROC = Path("/sys"), Path("/proc")
-EDID_HEADER = bytes.fromhex("00ffffffffffff00")
-EDID_BYTES, DESCRIPTORS, DESCRIPTOR_BYTES, NAME_TAG = 128, (54, 72, 90, 108), 18, 0xFC
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,10 @@ class OutputReport:
     line: str
     faults: list[str]
     state: dict[str, object]
+
+    def lines(self) -> list[str]:
+        """For a person."""
+        return [f"{'check' if self.faults else 'ok':8}{'output':12}{self.line}", *(f"{'':20}{fault}" for fault in self.faults)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,17 +95,45 @@ def examine() -> Examination:
     return Examination(all(check.ok for check in checks if check.required), checks, outputs)
 
 
-def examine_bench(path: Path) -> dict[str, FieldsOfView]:
-    """What the screen and the tracker of a bench file see, or of each of its heads, by the file's name.
+@dataclass(frozen=True, slots=True)
+class BenchReport:
+    """What a bench's screen and tracker see, and its monitor against its files."""
+
+    fields: FieldsOfView
+    monitor: MonitorCheck
+
+    def keys(self) -> dict[str, Any]:
+        """By the keys of `doctor --json`."""
+        now, told = self.monitor.now, {"fault": self.monitor.fault, "notice": self.monitor.notice}
+        return {**self.fields.keys(), **({} if now is None else {"monitor": {TABLE: now.known(), **told}})}
+
+    def lines(self, name: str) -> Iterator[str]:
+        """For a person, by the bench file's name."""
+        yield f"{'ok' if self.fields.warning is None else 'check':8}{name:12}{self.fields.line()}"
+        if self.monitor.now is not None:
+            yield f"{'CHANGED' if self.monitor.fault else 'ok':8}{'monitor':12}{self.monitor.now.name()}"
+            yield from [f"{'':20}{self.monitor.notice}"] * bool(self.monitor.notice)
+
+
+def examine_bench(path: Path | None, today: datetime.date) -> dict[str, BenchReport]:
+    """The report on a bench file, or on each of its heads, by the file's name; none on no file.
 
     Raises InputError where the file, or one that it names, is wrong.
     """
+    if path is None:
+        return {}
     file = read_bench_or_heads(path)
     files = (file,) if isinstance(file, BenchFile) else file.files
     for one in files:
         bench_calibration(one.config, one.folder)
         bench_optics(one.config.tracker, one.folder)
-    return {one.path.name: fields_of_view(one.config, one.folder) for one in files}
+    return {one.path.name: _report_on(one, today) for one in files}
+
+
+def _report_on(file: BenchFile, today: datetime.date) -> BenchReport:
+    now = identity_here(file.config.monitor.display)
+    check = MonitorCheck(None) if now is None else check_monitor(file, now, today)
+    return BenchReport(fields_of_view(file.config, file.folder), check)
 
 
 def _check(name: str, look: Callable[[], str]) -> Check:
@@ -166,33 +201,6 @@ LOOKS: dict[str, Callable[[], str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Edid:
-    """What a monitor says of itself (VESA E-EDID 1.4, section 3): three letters of its maker, its model, year and size."""
-
-    maker: str
-    product: int
-    name: str
-    year: int
-    size_cm: tuple[int, int]
-
-    def line(self) -> str:
-        """The monitor for a person."""
-        width_cm, height_cm = self.size_cm
-        return f"{self.maker} {self.name or f'{self.product:04x}'} ({self.year}, {width_cm} x {height_cm} cm)"
-
-
-def read_edid(data: bytes) -> Edid | None:
-    """An EDID's first block read; None where it is none. Its serial number (bytes 12 to 15, and a text) is left out."""
-    if len(data) < EDID_BYTES or data[:8] != EDID_HEADER or sum(data[:EDID_BYTES]) % 256:
-        return None
-    code = int.from_bytes(data[8:10], "big")
-    maker = "".join(chr(64 + (code >> shift & 31)) for shift in (10, 5, 0))
-    texts = [data[at + 5 : at + DESCRIPTOR_BYTES] for at in DESCRIPTORS if data[at : at + 5] == bytes((0, 0, 0, NAME_TAG, 0))]
-    name = texts[0].split(b"\n")[0].decode("cp437").strip() if texts else ""
-    return Edid(maker, int.from_bytes(data[10:12], "little"), name, 1990 + data[17], (data[21], data[22]))
-
-
 def row() -> dict[str, str]:
     """This machine's cells by their columns; the last is for who measured."""
     packages = ", ".join(f"{name} {version(name)}" for name in ("moderngl", "glfw"))
@@ -258,8 +266,8 @@ def _monitors() -> str:
         shown += [re.sub(r"^\d+: ", "", display.line()) for display in displays()]
     for path in sorted((SYS / "class/drm").glob("card*-*/edid")):
         with contextlib.suppress(OSError):
-            if (edid := read_edid(path.read_bytes())) is not None:
-                shown.append(f"EDID {edid.line()}")
+            if (found := edid_identity(edid := path.read_bytes())).maker:
+                shown.append(f"EDID {found.maker} {found.model} ({found.year}, {edid[21]} x {edid[22]} cm)")
     return "; ".join(shown) or NOT_THERE
 
 

@@ -4,8 +4,6 @@
 refused and counted; nothing of it is kept.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -4,8 +4,6 @@ This file is copied into the FMU. There it has the standard library and PythonFM
 has: it imports nothing of hilstar. The packets are those of firmware_protocol/protocol.toml, to which a test holds them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

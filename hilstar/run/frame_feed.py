@@ -4,8 +4,6 @@ The loop copies a frame's levels into one of few buffers: 0.1 ms at 1080p, and n
 lit pixels and sends them. Where it has not done so with all buffers, the frame is not handed on.
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Callable
@@ -78,7 +76,7 @@ class FrameFeed(Closing):
             height=levels.shape[0],
             bits=monitor.bits,
             q=self._attitude(shown),
-            channels=1 if self._rgb is None else 3,
+            channels=1 if self._rgb is None and levels.ndim == 2 else 3,
             bench_sha256=self._bench.file.sha256,
         )
         self._full.put(copied)
@@ -106,6 +104,9 @@ class FrameFeed(Closing):
             self._free.put(copied)
 
     def _frame(self, head: FrameHead, levels: npt.NDArray[np.unsignedinteger[Any]]) -> ShownFrame:
+        if levels.ndim == 3:
+            lit = np.flatnonzero(levels.any(axis=2))
+            return ShownFrame(head, lit.astype(np.uint32), levels.reshape(-1, levels.shape[2])[lit])
         lit = lit_pixels(levels)
         found = levels.ravel()[lit]
         codes = found if self._rgb is None else self._rgb[found].astype(code_dtype(head.bits))

@@ -1,7 +1,5 @@
 """A trigger pulse for the tracker at each frame, from a separate thread, because a line may be slow."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -3,8 +3,6 @@
 A head reports as a systemd service does (sd_notify): ready once it draws, then a sign of life each second while frames go on.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -4,8 +4,6 @@ The frame loop only leaves each frame here. One thread takes what the reader's p
 most MAX_JUDGED_HZ answers a second; those beyond that are counted.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable, Iterator

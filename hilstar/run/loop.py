@@ -4,8 +4,6 @@ It knows neither screens nor links: a pacer says when frames are due and shows t
 the attitudes. `FaultyFrames` says which frames a fault drops, freezes or blanks; a fault of light is a layer of the frame.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

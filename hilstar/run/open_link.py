@@ -1,7 +1,5 @@
 """The link that a bench file names, and the first attitude that comes over it."""
 
-from __future__ import annotations
-
 import math
 import time
 from pathlib import Path

@@ -3,8 +3,6 @@
 The frame loop turns switches and counts the frames that they change. Other threads ask through a queue of `SwitchRequest`.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace

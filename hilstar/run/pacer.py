@@ -4,8 +4,6 @@ A pacer hands the frame loop one moment after another. `Pacer` keeps a grid of t
 `DisplayPacer` (`screen/screen.py`) follows a display's refresh.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext

@@ -1,7 +1,5 @@
 """The replay of a log or of a ledger: which part of it, how fast, the run itself, and its frames as files."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -67,7 +65,7 @@ class DrawnBy:
         """As a person reads it."""
         return f"{self.gl_renderer}, OpenGL {self.gl_version}, by {self.path}"
 
-    def other_codes(self, other: DrawnBy, quantisation: Quantisation) -> float:
+    def other_codes(self, other: "DrawnBy", quantisation: Quantisation) -> float:
         """The largest share of lit pixels whose codes the two may draw one off; 0: the same bit for bit."""
         if self == other:
             return 0.0

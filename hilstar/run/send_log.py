@@ -1,7 +1,5 @@
 """The test sender: a log or a spin at a steady rate, with the faults of a bad cable, reproducible by a seed."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,6 +1,6 @@
 """The sending end of every road to hilstar (ZeroMQ, serial line, UDP), and `Sender`, a simulator in Python over any of them."""
 
-from __future__ import annotations
+from __future__ import annotations  # docs/python-api.md shows annotations as they are written
 
 import re
 import threading

@@ -1,7 +1,5 @@
 """A live run over a link: a free-running stream, or a simulation in lockstep, which waits for a frame of each attitude."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The summary of a run: the figures of `serve` and `replay`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

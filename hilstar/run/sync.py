@@ -4,8 +4,6 @@ An exposure of n + f refreshes (f under 1) sees about n whole frames and a part 
 the middle of its own light. A frame seen only in part still counts at its own middle.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

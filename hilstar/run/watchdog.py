@@ -1,7 +1,5 @@
 """What a run watches: whether an attitude is there, how long each stage of a frame takes, and whether the GPU is well."""
 
-from __future__ import annotations
-
 import threading
 from typing import Self
 

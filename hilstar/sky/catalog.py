@@ -3,8 +3,6 @@
 What people call bright stars: Bayer's letters, Flamsteed's numbers and proper names, by HIP number.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from dataclasses import dataclass, fields, replace
@@ -94,11 +92,11 @@ class Catalog:
     def __len__(self) -> int:
         return len(self.hip)
 
-    def taken(self, rows: IntArray | npt.NDArray[np.bool_]) -> Catalog:
+    def taken(self, rows: IntArray | npt.NDArray[np.bool_]) -> "Catalog":
         """The stars at `rows`: places, or a mask (n,)."""
         return replace(self, **{name: getattr(self, name)[rows] for name in column_names()})
 
-    def at_phase(self, jd: float) -> Catalog:
+    def at_phase(self, jd: float) -> "Catalog":
         """The stars with their V at a Julian date: a sinusoid of magnitudes about V, of those that have a `maximum_jd`."""
         known = np.flatnonzero(np.isfinite(self.maximum_jd))
         turns = (jd - self.maximum_jd[known]) / self.period_d[known]
@@ -108,7 +106,7 @@ class Catalog:
         note = f"{len(known)} variable stars have their light of JD {jd:.4f}; {count} without an epoch of phase have their mean"
         return replace(self, v_mag=v_mag, notes=(*self.notes, note))
 
-    def brighter_than(self, faintest_v_mag: float) -> Catalog:
+    def brighter_than(self, faintest_v_mag: float) -> "Catalog":
         """The stars with v_mag <= `faintest_v_mag` (inclusive)."""
         kept = self.v_mag <= faintest_v_mag
         return self if kept.all() else self.taken(kept)

@@ -4,8 +4,6 @@ Each WCS image of a file becomes a tangent (gnomonic) image of its own resolutio
 middle, or a HEALPix map, becomes the six faces of a cube. Between pixels all are bilinear.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import math
@@ -56,7 +54,7 @@ class TangentImage:
         middle = (self.image.shape[0] - 1) / 2
         return x * scale + middle, y * scale + middle
 
-    def seen_by(self, px_rad: float, sigma_px: float) -> TangentImage:
+    def seen_by(self, px_rad: float, sigma_px: float) -> "TangentImage":
         """The same for a camera whose finest pixels have `px_rad`: with pixels nearly as large, and spread by a Gaussian."""
         from scipy.ndimage import gaussian_filter
 
@@ -68,7 +66,7 @@ class TangentImage:
         padded = whole.image if is_of_cube else np.pad(whole.image, math.ceil(4 * sigma))
         return replace(whole, image=gaussian_filter(padded, sigma, mode="nearest" if is_of_cube else "constant"))
 
-    def _binned(self, count: int) -> TangentImage:
+    def _binned(self, count: int) -> "TangentImage":
         if count < 2:
             return self
         half = -self.image.shape[0] % (2 * count) // 2  # sides are even: the middle stays

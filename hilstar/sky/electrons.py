@@ -10,8 +10,6 @@ logarithm of a V = 0 star's electron rate is a smooth curve over V-I, with a ter
 fitted to the library once per bench. tests/authority/test_pickles.py holds the errors of held-out stars.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache

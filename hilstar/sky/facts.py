@@ -3,8 +3,6 @@
 Hipparcos' facts are a file of their own, read when somebody first asks. Errors of place and motion are carried to an epoch.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple

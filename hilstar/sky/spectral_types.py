@@ -4,8 +4,6 @@ A giant and a dwarf of one V-I differ, and no colour that Hipparcos has tells an
 V = 0 star's rate is interpolated over subclass, luminosity class and V-I between the library's spectra, bare and behind dust.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 from functools import cache

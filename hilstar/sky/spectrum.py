@@ -1,7 +1,5 @@
 """Spectra: black bodies, colour temperatures, passbands and curves over wavelength."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable

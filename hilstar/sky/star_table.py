@@ -10,8 +10,6 @@ process that writes the same file, a table is read again.
 The catalogue of a bench: the packaged one, a `hip_main.dat`, or a user's table, alone or added to Hipparcos.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -5,8 +5,6 @@ A spatial index over directions: which stars can lie within an angle of an axis.
 Where a star is seen: proper motion and aberration, on unit vectors in float64 (ICRS).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -55,7 +53,7 @@ class Stars:
     bv_mag: FloatArray
     temperature_k: FloatArray
     electrons_per_s: FloatArray
-    grid: CellGrid
+    grid: "CellGrid"
     catalog: Catalog
     row: IntArray
     velocity_km_s: FloatArray | None = None
@@ -86,7 +84,7 @@ class Stars:
         vectors = vectors.T.take(which, axis=1).T if vectors.flags.f_contiguous else vectors[which]
         return vectors if self.velocity_km_s is None else aberrate(vectors, self.velocity_km_s)
 
-    def seen_at(self, velocity_km_s: FloatArray | None) -> Stars:
+    def seen_at(self, velocity_km_s: FloatArray | None) -> "Stars":
         """The same stars for such an observer; None: for the one who sees `vectors`."""
         return self if velocity_km_s is None else replace(self, velocity_km_s=velocity_km_s)
 

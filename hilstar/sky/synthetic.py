@@ -1,7 +1,5 @@
 """Synthetic magnitudes: a star's spectrum through UBVRI, Gaia's G and all wavelengths, and a tracker's own zero points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Literal
 

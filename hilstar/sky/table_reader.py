@@ -5,8 +5,6 @@ Which column of a table is which: the names of Gaia, Tycho-2, Hipparcos and this
 Tables of stars as files: FITS, VOTable, ECSV and CSV through Astropy, only the columns that are used.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence

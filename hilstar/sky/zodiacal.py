@@ -7,8 +7,6 @@ The spectrum is sunlight times the ratio of table 19 to it, straight in logarith
 of 90 degrees from the Sun, and redder nearer to it by the paper's equation 22.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -110,7 +108,7 @@ class ZodiacalLight:
     far_e_per_s_sr: float
 
     @classmethod
-    def through(cls, optics: Optics) -> ZodiacalLight:
+    def through(cls, optics: Optics) -> "ZodiacalLight":
         """The light that a tracker detects (thesis eq. 4.9 to 4.11, for another spectrum)."""
         wavelength_nm, response = electron_response(optics)
         near, far = (

@@ -4,8 +4,6 @@ Each body is alone on its bench; its cost is the difference from the same frame 
 traced in float64 and with a point in its place. An approaching body is judged by frame time and by finite light.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager

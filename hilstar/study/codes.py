@@ -1,7 +1,5 @@
 """Ways from light to code values, and the error of each by every centroider: of one frame, and over an exposure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

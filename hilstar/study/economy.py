@@ -1,7 +1,5 @@
 """The gain of `effort = "auto"`: five scenes at full effort and at the effort that they need, with their times and errors."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path

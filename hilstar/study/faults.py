@@ -1,7 +1,5 @@
 """The cost of each fault on request in a frame, and the error of stars in the codes under stray light."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory

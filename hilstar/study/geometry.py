@@ -6,8 +6,6 @@ and SF5, radii 62.8, -45.7 and -128.2 mm, 4.0 and 2.5 mm thick), scaled to the f
 and sees the whole screen; 5 % of the dots are lost and as many are false.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ point and passband weighting; the cost of each choice over B-V and for Hipparcos
 The thesis's other figures are in `hilstar/study/thesis.py`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,11 +1,8 @@
 """The thesis's three published outputs (chapter 5): centroids, magnitudes, temperatures, and images without and with noise."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,9 +13,6 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.tracker.settings import DetectorSettings
 from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
-
-if TYPE_CHECKING:
-    pass
 
 SEED = 1
 ZOOM_PX = 160

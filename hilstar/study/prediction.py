@@ -7,8 +7,6 @@ Then the prediction of a vibration beside a steady turn, against its frequency: 
 the newest attitude alone.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from bisect import bisect_right

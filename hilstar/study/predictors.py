@@ -1,7 +1,5 @@
 """A slew shaken on each axis, and the predictors that carry its samples on to the moment of light."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The methods from light to levels: flux and centroid errors against magnitude, and against time."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path

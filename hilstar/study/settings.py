@@ -1,7 +1,5 @@
 """Shared by studies: their benches, the optics of the brightness studies, and stars that stand alone in an image."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ The virtual tracker stands before the display at rest, without noise. The black 
 `run.sync`'s at each row's own phase.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory

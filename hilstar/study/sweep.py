@@ -4,8 +4,6 @@ Works are timed in rounds, so that other load on the machine is in the times of 
 which method is faster, so a study also notes the load by others.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import resource

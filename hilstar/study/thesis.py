@@ -3,8 +3,6 @@
 Called by the study of models, whose tables and findings these join.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ written again. Its image is compared with that of the sky in the same exposure, 
 the stars of one exposure see the whole beat. The beat is compared with the prediction of `run.sync`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack

@@ -1,6 +1,6 @@
 """For your own tests: two skies compared star by star, so that a golden frame holds on another driver."""
 
-from __future__ import annotations
+from __future__ import annotations  # docs/python-api.md shows annotations as they are written
 
 from pathlib import Path
 from typing import Any

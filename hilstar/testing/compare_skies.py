@@ -4,8 +4,6 @@ Stars are found in the golden image and fitted in both (see star_fit). Where rou
 fit, that star's limits are wider.
 """
 
-from __future__ import annotations
-
 import csv
 import gzip
 import io
@@ -124,7 +122,7 @@ class _SkyFit:
         self.model = self.templates.image(fitted)
         self.residual = image - self.model
 
-    def follow(self, frame: FloatArray) -> _SkyFit:
+    def follow(self, frame: FloatArray) -> "_SkyFit":
         """The same stars in another image: the same templates, except for those that moved."""
         start = self.templates.places_px
         fit = _SkyFit(frame, start, self.psf)

@@ -1,7 +1,5 @@
 """What `hilstar compare -o DIR` writes: a table of all stars, and a chart of errors against magnitude."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -87,7 +85,7 @@ class ChartPanel:
         common = count - drawn
         return f"{kind}: {count}" + (f"\n({common} by what is common)" if common else "")
 
-    def draw(self, axis: Axes) -> None:
+    def draw(self, axis: "Axes") -> None:
         """Draw the stars, the limits and the legend."""
         for kind, marker, colour in STYLES:
             mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
@@ -103,7 +101,7 @@ class ChartPanel:
         axis.set_ylim(MIN_ERROR / 2, 300 * self.row)
         axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
 
-    def name_stars(self, axis: Axes) -> list[Annotation]:
+    def name_stars(self, axis: "Axes") -> "list[Annotation]":
         """Names of the worst stars. Missing and extra ones are named in the panel of flux alone."""
         names = []
         for star in self.worst:

@@ -4,8 +4,6 @@ The common motion is a shift, with turn and scale, or a homography, fitted so th
 matched with extra ones first: after a shift by more than a star's width no star is in its place.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace

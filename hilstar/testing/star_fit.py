@@ -6,8 +6,6 @@ to first order in its shift. Light that no star explains stays in the residual. 
 found in the image; near ones are one blend.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -240,7 +238,7 @@ class Seeds:
         """How many stars there are, each of a blend counted."""
         return sum(max(len(hip), 1) for hip in self.hip)
 
-    def only(self, kept: npt.NDArray[np.bool_]) -> Seeds:
+    def only(self, kept: npt.NDArray[np.bool_]) -> "Seeds":
         """The seeds (n,) that are `kept`."""
         return Seeds(self.places_px[kept], [hip for hip, keep in zip(self.hip, kept, strict=True) if keep])
 

@@ -32,7 +32,7 @@ from hilstar.sky.stars import split_by_rate
 from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
-from hilstar.twin.optics import TwinOptics
+from hilstar.twin.optics import TwinOptics, seen_primaries
 from hilstar.twin.simulator import TrackerBackground, detector_canvas
 from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
@@ -50,7 +50,7 @@ STALE_S, TURN_S = 5.0, 1.0  # an attitude older than this predicts no other; two
 
 @dataclass(frozen=True, slots=True)
 class Exposed:
-    """What an exposure had of the display: lit pixels (n,), their mean light (n,), e-/s, and the mean attitude.
+    """What an exposure had of the display: lit pixels (n,), their mean light (n, primaries), e-/s, and the mean attitude.
 
     `span_ns` are its begin and end; `frames` it had, and the share of it in which the field was not blank.
     """
@@ -69,7 +69,7 @@ class Exposed:
 
 
 class WatchedFrames:
-    """The newest frames of a display, each lit until the next; `light_of` gives the light (n,) of a frame's pixels."""
+    """The newest frames of a display, each lit until the next; `light_of` gives a frame's pixels' light (n, primaries)."""
 
     def __init__(self, light_of: Callable[[ShownFrame], FloatArray]) -> None:
         self.received = self.missing = 0
@@ -111,7 +111,8 @@ class WatchedFrames:
             if (q := frame.q_icrs_to_cam) is not None:
                 turns.append((q, share))
         lit, first = np.unique(np.concatenate(places), return_inverse=True)
-        light = np.bincount(first, np.concatenate(lights), minlength=len(lit)).astype(np.float64)
+        columns = np.concatenate(lights).T
+        light = np.array([np.bincount(first, one, minlength=len(lit)) for one in columns], dtype=np.float64).T
         shown = sum((share for _, share in turns), 0.0)
         return Exposed((begin_ns, end_ns), lit.astype(np.intp), light, _mean(turns), len(places), shown)
 
@@ -160,7 +161,7 @@ class LiveTracker(Closing):
         with open_bench(file) as bench:
             self._size_px, self._bits = bench.camera.resolution_px, self.config.monitor.bits
             self._panel = true_panel(bench)
-            self._rgb = bench.calibration.response.rgb
+            self._rgb, self._primaries = bench.calibration.response.rgb, seen_primaries(bench)
             self._optics = TwinOptics(true_geometry(bench, self.camera), self.canvas.psf)
             glow_e_per_s = self._optics.glow_e_per_s(self._panel)
             noise_e2 = tracker.detector.noise(np.median(glow_e_per_s) * self.exposure_s, self.exposure_s).total_e2
@@ -176,16 +177,18 @@ class LiveTracker(Closing):
 
     def _light(self, frame: ShownFrame) -> FloatArray:
         levels = frame.codes if self._rgb is None else _levels_of(frame.codes, self._rgb)
-        light = self._panel.response.light[levels] * self._panel.flux_at_white_e_per_s
+        panels, columns = self._panel.primaries or (self._panel,), levels.reshape(len(levels), -1).T
+        lights = [one.response.light[k] * one.flux_at_white_e_per_s for one, k in zip(panels, columns, strict=True)]
+        light = np.stack(lights, axis=1)
         if self._panel.uniformity is not None:
-            light = light * self._panel.uniformity.ravel()[frame.lit]
+            light = light * self._panel.uniformity.ravel()[frame.lit, None]
         return np.asarray(light)
 
     def take(self, frame: ShownFrame) -> None:
         """Take a frame. Raises InputError for one of another display."""
         head = frame.head
         kind = head.width, head.height, head.bits, head.channels
-        mine = *self._size_px, self._bits, 1 if self._rgb is None else 3
+        mine = *self._size_px, self._bits, 1 if self._rgb is None and not self._panel.primaries else 3
         if kind != mine:
             shown, wanted = ("{} x {} pixels of {} bits in {} channels".format(*each) for each in (kind, mine))
             raise InputError(f"frames of {shown}, the bench file has {wanted}; give the bench file of serve")
@@ -194,8 +197,9 @@ class LiveTracker(Closing):
     def expose(self, exposed: Exposed) -> npt.NDArray[np.uint16]:
         """The DN of an exposure."""
         rows, columns = np.divmod(exposed.lit, self._size_px[0])
-        light = self._optics.lit_image_e_per_s(rows, columns, exposed.light_e_per_s)
-        light *= self.exposure_s
+        lights = zip(exposed.light_e_per_s.T, self._primaries, strict=True)
+        light = sum(self._optics.lit_image_e_per_s(rows, columns, one, primary) for one, primary in lights)
+        light = light * self.exposure_s
         light += self._under_e
         return self._detector.expose(light, self.exposure_s, self._rng)
 

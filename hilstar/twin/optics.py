@@ -8,14 +8,16 @@ density on the image.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.frame import Bench
 from hilstar.monitor.quantise import Panel
-from hilstar.optics.glass_psf import GlassPsf
+from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.process.closing import Closing
 from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
@@ -42,9 +44,13 @@ class BenchGeometry:
     tracker: Camera
     mirror: Mirror = "none"
 
-    def to_tracker(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Tracker pixels of monitor pixels, (n,) each; NaN behind the tracker."""
-        return self.tracker.project(self.monitor.rays(*self.shown_at(x_px, y_px)) @ self.tracker.cam_to_image.T)
+    def to_tracker(
+        self, x_px: FloatArray, y_px: FloatArray, place_px: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[FloatArray, FloatArray]:
+        """Tracker pixels of light at `place_px` from the middles of monitor pixels, (n,) each; NaN behind the tracker."""
+        x_px, y_px = self.shown_at(x_px, y_px)
+        rays = self.monitor.rays(x_px + place_px[0], y_px + place_px[1])
+        return self.tracker.project(rays @ self.tracker.cam_to_image.T)
 
     def to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Monitor pixels that tracker pixels see, (n,) each, without the mirror; NaN behind the monitor."""
@@ -65,6 +71,29 @@ class BenchGeometry:
                 return x_px, y_px
 
 
+class Primary(NamedTuple):
+    """A monitor's primary before the tracker's optics: where its light lies within a pixel, and its glass's spectrum.
+
+    That is each of the file's wavelengths' share (L,) of its electrons; None: as of light without a spectrum.
+    """
+
+    place_px: tuple[float, float] = (0.0, 0.0)
+    shares: FloatArray | None = None
+
+
+ALL_ALIKE = (Primary(),)
+
+
+def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
+    """The primaries of a bench before its tracker's optics: one for all where they are not driven apart."""
+    colours, psf = bench.colours, bench.tracker_psf
+    if colours is None:
+        return ALL_ALIKE
+    spectra = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm) if isinstance(psf, GlassPsf) else None
+    places = [(float(x), float(y)) for x, y in colours.places_px]
+    return tuple(Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places))
+
+
 class TwinOptics(Closing):
     """Images of a monitor on the tracker's detector. Free it with `close`, or use it as a context manager."""
 
@@ -74,30 +103,38 @@ class TwinOptics(Closing):
         self._psf = psf.blurred(side_px / math.sqrt(12))
         self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 
-    def image_e_per_s(self, light_e_per_s: FloatArray) -> FloatArray:
+    def images_e_per_s(self, lights_e_per_s: Sequence[FloatArray], primaries: Sequence[Primary]) -> FloatArray:
+        """Electrons per second of each tracker pixel by each primary's light (H, W): (primaries, h, w), float64."""
+        return np.array([self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)])
+
+    def image_e_per_s(self, light_e_per_s: FloatArray, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of each monitor pixel (H, W), float64."""
         rows, columns = np.nonzero(light_e_per_s)
-        return self.lit_image_e_per_s(rows, columns, light_e_per_s[rows, columns])
+        return self.lit_image_e_per_s(rows, columns, light_e_per_s[rows, columns], primary)
 
-    def lit_image_e_per_s(self, rows: IntArray, columns: IntArray, light_e_per_s: FloatArray) -> FloatArray:
+    def lit_image_e_per_s(
+        self, rows: IntArray, columns: IntArray, light_e_per_s: FloatArray, primary: Primary = ALL_ALIKE[0]
+    ) -> FloatArray:
         """The same from monitor pixels (n,) that are lit."""
         width, height = self.geometry.tracker.resolution_px
         total = np.zeros((height, width))
         at_once = max(1, POINTS_AT_ONCE // SUB**2)
         for begin in range(0, len(rows), at_once):
             part = slice(begin, begin + at_once)
-            total += self._points(columns[part], rows[part], light_e_per_s[part])
+            total += self._points(columns[part], rows[part], light_e_per_s[part], primary)
         return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total  # a measured PSF may be negative somewhere
 
-    def _points(self, columns: IntArray, rows: IntArray, light_e_per_s: FloatArray) -> FloatArray:
+    def _points(self, columns: IntArray, rows: IntArray, light_e_per_s: FloatArray, primary: Primary) -> FloatArray:
         steps = (np.arange(SUB) - (SUB - 1) / 2) / SUB
         dx, dy = (step.ravel() for step in np.meshgrid(steps, steps))
-        x_px, y_px = self.geometry.to_tracker((columns[:, None] + dx).ravel(), (rows[:, None] + dy).ravel())
+        places = (columns[:, None] + dx).ravel(), (rows[:, None] + dy).ravel()
+        x_px, y_px = self.geometry.to_tracker(*places, primary.place_px)
         light = np.repeat(light_e_per_s / SUB**2, SUB**2)
         star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
         sprites = pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px)
-        if isinstance(self._psf, GlassPsf):  # a monitor's light has no spectrum here
-            return self._psf.image(sprites, self._psf.mean_shares, size_px).astype(np.float64)
+        if isinstance(self._psf, GlassPsf):  # grey light has no spectrum here
+            shares = self._psf.mean_shares if primary.shares is None else primary.shares
+            return self._psf.image(sprites, shares, size_px).astype(np.float64)
         self._renderer.draw(sprites)
         return self._renderer.linear().astype(np.float64)
 

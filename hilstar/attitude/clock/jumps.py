@@ -11,8 +11,6 @@ Laws:
 A sender that stamps with hilstar's own clock, or with Unix time, needs none of this (`KnownClockFilter`).
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 from typing import NamedTuple

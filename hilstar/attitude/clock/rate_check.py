@@ -8,8 +8,6 @@ Laws:
 4. Stretches of several lengths are compared: a short one finds a fast turn in half a second, a long one a slow turn in noise.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import deque

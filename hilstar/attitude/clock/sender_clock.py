@@ -10,8 +10,6 @@ An offset is host time minus sender time, ns, as a line over host time. Three mo
   clock of Unix time, its uncertainty what the kernel states of that. The error of the sender's clock comes on top.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass, replace

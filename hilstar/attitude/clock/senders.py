@@ -12,8 +12,6 @@ Laws:
 3. A sender that comes back on the course that it had before a stranger took its place was not that stranger.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -140,7 +138,7 @@ class _KnownSender:
     q: list[float] = field(default_factory=list)
 
     @classmethod
-    def of(cls, arrival: SampleArrival) -> _KnownSender:
+    def of(cls, arrival: SampleArrival) -> "_KnownSender":
         sample = arrival.event
         made = cls(sample, arrival.host_ns, arrival.waited_ns, since_ns=arrival.host_ns, count=sample.sequence)
         made.count_t_ns, made.q, made.turning_rad_s = sample.t_ns, sample.q_icrs_to_cam.tolist(), _rate_of(sample)

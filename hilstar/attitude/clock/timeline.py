@@ -8,8 +8,6 @@ sin(x) / x of its rate, noise keeps nothing. The share to keep is the regression
 samples as far apart as frames predict. A constant rate has no jitter and passes unchanged to the last bit.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from bisect import bisect_right

@@ -22,8 +22,6 @@ Writing: version 1.0, which every AEM reader reads and which states the quaterni
 quaternion derivatives: some readers take QUATERNION/RATE as an angular velocity, others as Euler rates.
 """
 
-from __future__ import annotations
-
 import re
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence

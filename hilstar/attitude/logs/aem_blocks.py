@@ -7,8 +7,6 @@ XML goes through Python's expat parser, element by element. A DOCTYPE is refused
 nothing outside the text is read. Depth and element size are bounded, and of each state only the numbers are kept.
 """
 
-from __future__ import annotations
-
 import difflib
 import io
 import re
@@ -273,13 +271,13 @@ class _Element:
     name: str
     line: int
     attributes: dict[str, str]
-    children: list[_Element] = field(default_factory=list)
+    children: "list[_Element]" = field(default_factory=list)
     text: str = ""
 
     def unlike(self, detail: str) -> AemFaultError:
         return AemFaultError(f":{self.line}", f"is not an AEM in XML ({detail})")
 
-    def parts(self, *names: str) -> list[_Element]:
+    def parts(self, *names: str) -> "list[_Element]":
         """Its children, where all have one of these names and no text stands between them. Raises AemFaultError."""
         for child in self.children:
             if child.name not in names:

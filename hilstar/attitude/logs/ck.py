@@ -11,8 +11,6 @@ Rules:
 SPICE runs in a process of its own (`ck_spice`).
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

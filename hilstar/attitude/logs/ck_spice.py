@@ -12,8 +12,6 @@ A request is one JSON object on stdin: `path`, `kernels` and `body`. The answer 
 5. There is a break between two pieces of coverage, unless they touch and their attitudes agree.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -14,8 +14,6 @@ TEME is the true equator of 1980 with the mean equinox: TOD of 1980 turned back 
 A reference frame named `icrs` or `gcrf` says what its axes are; `map`, `world` or `odom` does not, and is never guessed.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import replace

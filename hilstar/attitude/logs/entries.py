@@ -12,8 +12,6 @@ A log's own usual interval says what a gap is, never the stale limit of a live s
 4. But an interval of more than GAP_INTERVALS usual ones is a gap: the attitude within it is unknown, and is held.
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 from collections.abc import Iterable, Iterator, Sequence

@@ -4,8 +4,6 @@ CSV and JSON lines are read and written here. CSV columns, in any order: `t_s,qw
 `sequence` and `discontinuity`. A JSON line is the wire's JSON form of an attitude. The other formats have a module each.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import importlib.util

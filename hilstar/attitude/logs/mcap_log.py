@@ -11,8 +11,6 @@ Writing uses small chunks, for a run that may be killed and a disk that may be f
 The library's writer obeys neither 1 nor 2, and its index grows by a megabyte in ten minutes of such chunks.
 """
 
-from __future__ import annotations
-
 import bz2
 import contextlib
 import io

@@ -13,8 +13,6 @@ pass and bounded memory. pyulog reads that copy: of a whole file it would read a
 any size, and it searches a damaged file in quadratic time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import math
@@ -217,7 +215,7 @@ class _Series(NamedTuple):
             return None
         return np.stack([np.asarray(self.columns[each], dtype=np.float64) for each in names], axis=1)
 
-    def where(self, good: npt.NDArray[np.bool_]) -> _Series:
+    def where(self, good: npt.NDArray[np.bool_]) -> "_Series":
         return _Series(self.t_us[good], {name: column[good] for name, column in self.columns.items()})
 
 

@@ -17,8 +17,6 @@ one with the most samples, and the others are interpolated to those (SLERP, as i
 Type definitions in the bag are compared with those of rosbags and never registered: that would turn them into Python code.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -77,7 +75,7 @@ ORDER_ADVICE = "the bag has two attitudes of one time, or its clock was set back
 
 
 @lru_cache(maxsize=2)
-def typestore(encoding: Encoding) -> Typestore:
+def typestore(encoding: Encoding) -> "Typestore":
     """ROS's own types: of Noetic for ROS 1, of rosbags's latest ROS 2 (these have not changed since the first)."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -165,9 +163,9 @@ class _Edge:
 
     parent: str
     child: str
-    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
-    received_ns: array[int] = field(default_factory=lambda: array("q"))
-    numbers: array[float] = field(default_factory=lambda: array("d"))
+    stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    received_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    numbers: "array[float]" = field(default_factory=lambda: array("d"))
     moves: bool = False
 
     def add(self, turn: _RosTurn, received_ns: int) -> None:
@@ -212,7 +210,7 @@ class _FrameChain(NamedTuple):
     edges: tuple[_Edge, ...]
     timed: _Edge
 
-    def heard(self, told: list[tuple[str, str]]) -> Iterator[_Heard]:
+    def heard(self, told: list[tuple[str, str]]) -> "Iterator[_Heard]":
         """The orientation of the whole chain at each transform of the timed part.
 
         Other parts are unit; the timed one keeps its norm, for its check.
@@ -242,7 +240,7 @@ class _FrameChain(NamedTuple):
 class _Tree:
     """The transforms of a bag."""
 
-    def __init__(self, path: Path, transforms: Iterable[_Heard]) -> None:
+    def __init__(self, path: Path, transforms: "Iterable[_Heard]") -> None:
         self._path = path
         self._up: dict[str, dict[str, _Edge]] = {}
         count = 0

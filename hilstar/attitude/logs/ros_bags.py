@@ -9,8 +9,6 @@
 A bag states the unpacked sizes of its chunks, which may be false: nothing is unpacked beyond the limits below.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,7 +1,5 @@
 """A tracker's telemetry: CSV with every row that it has, valid or not, or a log of attitudes (AEM, MCAP, JSON lines)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -9,8 +9,6 @@ The contract:
 4. It ends with this process, however this one ends.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

@@ -3,8 +3,6 @@
 It hears no signals: the process that shows stars does, and ends this one.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

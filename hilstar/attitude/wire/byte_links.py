@@ -3,8 +3,6 @@
 For the process that reads a tracker's answers (see `hilstar.answers.reader`). What comes is not looked at here.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -11,8 +11,6 @@ ipc://FILE deletes that file.
 UDP takes numeric addresses only, so that no name can lead elsewhere.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import os

@@ -4,8 +4,6 @@ The side that binds is the CURVE server, with an allow-list of its clients' publ
 server's public key. Key files are pyzmq certificates.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

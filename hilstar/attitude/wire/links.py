@@ -3,8 +3,6 @@
 A packet has two names on its way in: what arrived (`RawMessage`, once decoded `Arrival`), and the `AttitudeSample` in it.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
@@ -47,10 +45,10 @@ class LinkCounts:
         """The counts by name."""
         return asdict(self)
 
-    def __add__(self, other: LinkCounts) -> LinkCounts:
+    def __add__(self, other: "LinkCounts") -> "LinkCounts":
         return LinkCounts(*map(add, astuple(self), astuple(other)))
 
-    def __sub__(self, other: LinkCounts) -> LinkCounts:
+    def __sub__(self, other: "LinkCounts") -> "LinkCounts":
         return LinkCounts(*map(sub, astuple(self), astuple(other)))
 
 
@@ -63,7 +61,7 @@ class FloodGate:
         self._seen_ns = clock.now_ns()
         self._dropped_ns = self._seen_ns - OVER_NS - 1
 
-    def newest(self, waiting: list[RawMessage], declares_discontinuity: Callable[[bytes], bool]) -> list[RawMessage]:
+    def newest(self, waiting: "list[RawMessage]", declares_discontinuity: Callable[[bytes], bool]) -> "list[RawMessage]":
         """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses where others are passed over.
 
         The newest passed-over message whose last part declares a discontinuity is taken too: no attitude is interpolated across

@@ -12,8 +12,6 @@ Laws:
 hilstar connects, and retries until 42 is there, or listens where 42 is the client.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import select

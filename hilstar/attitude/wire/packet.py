@@ -18,7 +18,7 @@ Laws of the byte stream, whose frames are each followed by 0x00:
 The layout is that of firmware_protocol/protocol.toml.
 """
 
-from __future__ import annotations
+from __future__ import annotations  # docs/python-api.md shows annotations as they are written
 
 import math
 import struct

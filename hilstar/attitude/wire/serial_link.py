@@ -1,7 +1,5 @@
 """Serial ports: the link of COBS frames on a device that may be unplugged and come back, lines of text, and the RTS output."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -11,8 +11,6 @@ A frame is lit until the next one is. The sender keeps few frames for a watcher:
 `frame` says so.
 """
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import dataclass
 from typing import Any

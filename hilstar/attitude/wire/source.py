@@ -1,7 +1,5 @@
 """What a source of attitudes means by its numbers, and how the attitude of a body becomes that of the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -9,8 +9,6 @@ Laws:
 The kernel stamps the arrival (SO_TIMESTAMPNS), however late a datagram is read; `KernelStamps` does the same for TCP.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno
@@ -114,7 +112,7 @@ class Datagrams:
         self._stamps = KernelStamps(made, clock)
 
     @classmethod
-    def bound(cls, place: UdpPlace, clock: HostClock = HOST_CLOCK) -> Datagrams:
+    def bound(cls, place: UdpPlace, clock: HostClock = HOST_CLOCK) -> "Datagrams":
         """Bound to a place. Raises InputError where it cannot be."""
         made = socket.socket(socket.AF_INET6 if place.host.version == 6 else socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -129,7 +127,7 @@ class Datagrams:
         return cls(made, clock)
 
     @classmethod
-    def connected(cls, host: str, port: int) -> Datagrams:
+    def connected(cls, host: str, port: int) -> "Datagrams":
         """Connected to a peer: only its datagrams arrive. Raises OSError where the host is unknown."""
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
         made = socket.socket(found[0][0], socket.SOCK_DGRAM)

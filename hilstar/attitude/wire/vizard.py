@@ -11,8 +11,6 @@ stops where a SIM_UPDATE is not answered with OK.
 Broadcast: Basilisk's PUB socket binds, and hilstar's SUB socket connects.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterable

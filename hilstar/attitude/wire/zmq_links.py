@@ -1,7 +1,5 @@
 """Links over ZeroMQ: a free-running stream (SUB in, XPUB out), lockstep (REP), and the feed from one source to its heads."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import struct

@@ -6,8 +6,6 @@ closes a peer that does not finish its handshake within HANDSHAKE_MS. `_MemoryWa
 that never ends.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno
@@ -268,9 +266,9 @@ class ZmqSocket(Link):
         self._poller = zmq.Poller()
         try:
             if allowed is not None:
-                from zmq.auth.thread import ThreadAuthenticator  # brings asyncio
+                from zmq.auth import thread  # brings asyncio
 
-                self._authenticator = ThreadAuthenticator(self._context)
+                self._authenticator = thread.ThreadAuthenticator(self._context)
                 self._authenticator.start()
                 self._authenticator.configure_curve_callback("*", allowed)
             if bind:

@@ -292,7 +292,9 @@ class Monitor(Table, frozen=True):
     The window opens for `serve` and `replay` unless `--headless` is given; `--windowed` keeps it on the desktop. At the start
     120 frames are measured. A display is refused (exit code 3), unless `--force` is given, when its size or refresh rate
     differs from the bench file, when it has fewer bits, when it is scaled, composited or mirrored by another display, when it
-    drops frames, or when it does not wait for its refresh. A display that is unplugged is filled again when it returns.
+    drops frames, or when it does not wait for its refresh. So is a monitor that is not the one, or not as it was, when the
+    files of `calibration` and `[collimator] geometry` were measured ([which monitor](first-day.md#which-monitor-this-is)). A
+    display that is unplugged is filled again when it returns.
 
     Keys in the window: q quit, b blank, space pause, c crosshair, g grid, t next test pattern, h help. Frames whose sky was
     changed with these keys are counted as `operator`; frames while the window was minimised, covered, moved off its display,
@@ -320,6 +322,15 @@ class Monitor(Table, frozen=True):
             "[CALIBRATION.md](../configs/CALIBRATION.md))."
         ),
     ] = "srgb"
+    calibration_valid_days: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=36500,
+            description="How long the files of `calibration` and `[collimator] geometry` hold: with older ones a screen is "
+            "refused.",
+        ),
+    ] = 180
     display: Annotated[
         int | str,
         Meta(description="Which display the window fills: its index, or a part of its name. `hilstar doctor` lists them."),

@@ -395,7 +395,7 @@ def geometry(context: StepContext) -> StepOutcome:
     ideal = context.file.config.tracker.distortion is None
     found = calibrate_files(context.file, paths, context.folder / "plan.csv", dark, tracker_is_ideal=ideal)
     output, picture = context.session / "geometry.toml", context.session / "geometry.png"
-    write_calibrated(output, found, picture)
+    write_calibrated(output, found, picture, context.source.monitor)
     chosen, error = found.chosen, found.uncertainty
     figures: dict[str, Figure] = {
         "model": chosen.name,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import logging
 import shlex
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -24,10 +25,13 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_optics, open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.frame_files import write_codes_png
+from hilstar.bench.measured_on import check_monitor
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.files import written
 from hilstar.monitor.calibration import BUILT_IN, primary_lights
+from hilstar.monitor.identity import MonitorIdentity
+from hilstar.monitor.window.this_monitor import identity_here
 from hilstar.process.closing import Closing
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.render.backend import ScreenView
@@ -96,11 +100,17 @@ class ImageSource:
     """Shows patterns to the tracker and returns its images; by default without a display, a dark image or a photodiode.
 
     `identity` is a text that changes when the source does; `sets_exposure` says whether `look` may ask for another exposure
-    than the bench file's.
+    than the bench file's. `monitor` is the display's before its window was on it, None where this program has no display, and
+    `forced` what is wrong with it and was shown by --force.
     """
 
     identity: str
     sets_exposure: bool
+    monitor: MonitorIdentity | None = None
+    forced: Sequence[str] = ()
+
+    def find_monitor(self, file: BenchFile, today: datetime.date, *, force: bool) -> None:
+        """Compare the display's monitor with the one of the bench's files. Raises InputError, MachineError unless `force`."""
 
     def gate(self, file: BenchFile) -> Timing | None:
         """The display's timing, None where this program has no display. Raises MachineError."""
@@ -163,6 +173,7 @@ class SerialDiode:
 
 POLL_S = 0.02
 SETTLE_S = 0.25  # for a panel that is slow to change
+log = logging.getLogger(__name__)
 SHOW_YOURSELF = "or show the patterns yourself: name {pattern} in --grab"
 
 
@@ -198,6 +209,8 @@ class PatternDisplay(Closing):
     def __init__(self) -> None:
         self._window: Window | None = None
         self._screen_px = (0, 0)
+        self.force = False
+        self.forced: list[str] = []
 
     def gate(self, file: BenchFile) -> Timing:
         """Measure the display as `serve` does. Raises MachineError where it is not as the bench file has it."""
@@ -205,7 +218,10 @@ class PatternDisplay(Closing):
         try:
             window = self._window_for(file)
             with open_bench(file, window_context()) as bench:
-                return pass_gate(Screen(window, bench), force=False)
+                screen = Screen(window, bench)
+                timing = pass_gate(screen, self.force)
+                self.forced += screen.forced
+                return timing
         except MachineError as error:
             raise MachineError(f"{str(error).removesuffix('; or add --force')}; {SHOW_YOURSELF}") from error
 
@@ -246,7 +262,7 @@ class PatternDisplay(Closing):
         light: list[int] = []
         with open_bench(file, window_context()) as bench:
             screen = Screen(window, bench)
-            pass_gate(screen, force=False)
+            pass_gate(screen, self.force)
             bench.draw(None)
             due_s, done = time.monotonic(), begin()
             while not done():
@@ -284,12 +300,25 @@ GRAB_TIMEOUT_S = 120.0
 class _ShownHere(ImageSource):
     """An image source before this program's own display; `dark` is the tracker's image with the monitor switched off."""
 
+    _shows = False  # whether a command shows the patterns
+
     def __init__(self, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
         self._display, self._dark, self._diode = PatternDisplay(), dark, diode
+        self.forced = self._display.forced
+
+    def find_monitor(self, file: BenchFile, today: datetime.date, *, force: bool) -> None:
+        """Compare the display's monitor with the one of the bench's files; nothing where a command shows the patterns."""
+        if self._shows:
+            return
+        self._display.force = force
+        found = check_monitor(file, identity_here(file.config.monitor.display), today)
+        found.refuse(force)
+        self.monitor = found.now
+        self._display.forced += found.told(log)
 
     def gate(self, file: BenchFile) -> Timing | None:
         """The display's timing."""
-        return self._display.gate(file)
+        return None if self._shows else self._display.gate(file)
 
     def unlit(self, stem: Path) -> Path | None:
         """The image that the user gave, if any."""
@@ -322,10 +351,6 @@ class GrabCommand(_ShownHere):
         self.sets_exposure = any("{exposure_s}" in word for word in self._words)
         self.identity = f"grab: {command}"
         super().__init__(dark, None if self._shows else diode)
-
-    def gate(self, file: BenchFile) -> Timing | None:
-        """The display's timing, None where the command shows the patterns."""
-        return None if self._shows else super().gate(file)
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Run the command while the pattern is shown. Raises NoImage with the last line of its stderr where it fails."""
@@ -381,7 +406,6 @@ def _wait(done: Callable[[], bool]) -> None:
 
 
 STILL_S = 0.5  # a file that has not grown for so long is complete
-log = logging.getLogger(__name__)
 
 
 class ByHand(_ShownHere):
@@ -524,6 +548,9 @@ class VirtualBench(ImageSource):
 
     @cached_property
     def _primaries(self) -> FloatArray:
+        if self._panel.primaries:
+            white = self._panel.flux_at_white_e_per_s
+            return np.array([one.response.light * (one.flux_at_white_e_per_s / white) for one in self._panel.primaries])
         monitor = self.truth.config.monitor
         source = monitor.calibration if monitor.calibration in BUILT_IN else self.truth.folder / monitor.calibration
         return primary_lights(source, monitor.bits)

@@ -306,7 +306,9 @@ def photometry(context: StepContext) -> StepOutcome:
     measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
     readings.write(measured)
     instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
-    found = calibrate_photometric(measured, output, Provenance("", "", instrument, "DN/s"), monitor.bits)
+    found = calibrate_photometric(
+        measured, output, Provenance("", "", instrument, "DN/s"), monitor.bits, context.source.monitor
+    )
     files = [output, output.with_suffix(".csv"), measured, picture, before, *readings.images]
     if assumed.uniformity is not None:
         files.append(add_uniformity(output, assumed.uniformity))

@@ -78,7 +78,7 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     """session.json: the bench, where its patterns are seen, and the steps in their order.
 
     `unfinished` has the state of each interrupted step: while it is the same, the images taken are used again. `beat` is that
-    of the tracker's exposures with the display's refresh, measured where it could be.
+    of the tracker's exposures with the display's refresh, measured where it could be; `forced` what --force shows it on.
     """
 
     kind: str
@@ -90,6 +90,7 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     steps: list[StepRecord]
     unfinished: dict[str, str] = {}
     beat: BeatSummary | None = None
+    forced: list[str] = []
 
 
 def read_session(folder: Path) -> SessionFile | None:
@@ -154,6 +155,7 @@ def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
     overview = [(Markup(f"<a href='#{each.name}'>{each.name}</a>"), _badge(each), each.line) for each in session.steps]
     body = [
         f'<p class="small">hilstar {escaped(session.hilstar)}; images: {escaped(session.seen_by)}</p>',
+        *(f'<p class="verdict" style="background:{COLOURS["failed"]}">Forced: {escaped(each)}</p>' for each in session.forced),
         table_of(overview),
         *([f"<p>{escaped(beats)}</p>"] if beats else []),
         *(part for record in session.steps for part in _step(folder, record)),

@@ -109,7 +109,8 @@ def display(context: StepContext) -> StepOutcome:
     if timing.modes_hz:
         figures["modes_hz"] = " ".join(map(str, timing.modes_hz))
     paced = "" if timing.paced_by_screen else "; the display has no refresh of its own, frames are paced by software"
-    return StepOutcome("done", f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}", figures)
+    forced = "".join(f"; forced: {each}" for each in context.source.forced)
+    return StepOutcome("done", f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}{forced}", figures)
 
 
 BEFORE_FILE = "bench-before.toml"
@@ -328,7 +329,9 @@ class FirstLightSession:
             for table in tables or step.tables
         }
         named = {text: sha256_of(self.file.folder / text) for text in _texts(kept) if _is_file(self.file.folder / text)}
-        seen_by = self.source.identity if step.tables else platform.python_version()
+        monitor = self.source.monitor
+        shown_on = f" on {monitor.name()}" if monitor is not None and monitor.edid_sha256 else ""
+        seen_by = self.source.identity + shown_on if step.tables else platform.python_version()
         return hashlib.sha256(msgspec.json.encode([__version__, seen_by, kept, named], order="sorted")).hexdigest()
 
     def as_file(self, running: str | None = None) -> SessionFile:
@@ -343,6 +346,7 @@ class FirstLightSession:
             steps=[self.records[name] for name in NAMES if name in self.records],
             unfinished=self.unfinished,
             beat=self.beat(),
+            forced=list(self.source.forced),
         )
 
     def beat(self) -> BeatSummary:

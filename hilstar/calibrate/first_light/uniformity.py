@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,8 @@ def uniformity(context: StepContext) -> StepOutcome:
         line += "; the bench file has it so" if known is not None else "; nothing was written"
     else:
         source, path = calibration_source(context.file), context.session / FILE
-        files += with_uniformity(source, context.file.config.monitor.bits, path, None if found.is_even else found.grid)
+        grid, today = None if found.is_even else found.grid, datetime.datetime.now(datetime.UTC).date().isoformat()
+        files += with_uniformity(source, context.file.config.monitor.bits, path, grid, context.source.monitor, today)
         changes = context.names("monitor", "calibration", path)
         line += "; what the tracker's own lens darkens is part of it"
     noisy = found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG)

@@ -41,6 +41,7 @@ from hilstar.calibrate.geometric.observed import Observed, measure_images, read_
 from hilstar.charts import BLUE, SMALL_PT, chart
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, write_geometry
+from hilstar.monitor.identity import MonitorIdentity
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Lens
 from hilstar.units import ARCSEC_PER_RAD
@@ -306,8 +307,8 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
     return {name: FittedParameter(float(value), float(s)) for name, (value, s) in values.items()}
 
 
-def write_calibrated(path: Path, found: Calibrated, plot: Path | None) -> list[str]:
-    """Write the geometry file with its errors, and its chart if `plot`; their names. Raises InputError."""
+def write_calibrated(path: Path, found: Calibrated, plot: Path | None, identity: MonitorIdentity | None = None) -> list[str]:
+    """Write the geometry file with its errors and its monitor, and its chart if `plot`; their names. Raises InputError."""
     geometry, chosen, uncertainty = found.fit.geometry, found.chosen, found.uncertainty
     error = ErrorTable(
         model=chosen.name,
@@ -321,7 +322,7 @@ def write_calibrated(path: Path, found: Calibrated, plot: Path | None) -> list[s
     sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
     when = datetime.datetime.now(datetime.UTC).date().isoformat()
     made = MadeTable(by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses))
-    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, Notes(sigma, error, made))
+    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, Notes(sigma, error, made, identity))
     if plot is not None:
         draw_geometry(plot, found)
     return [str(each) for each in (path, plot) if each is not None]

@@ -4,8 +4,6 @@ listeners of the page and of SCPI, of which one may be missing (-1).
 It ends with the run, when the other end of the channel is closed for whatever reason.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import ctypes

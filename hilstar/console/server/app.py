@@ -1,7 +1,5 @@
 """The page's addresses, what each answers, and who may ask. The protocol of the WebSocket is in docs/console-server.md."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac

@@ -1,7 +1,5 @@
 """Connections to pages: HTTP and WebSockets with bounds; every open page gets messages at its own speed."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import time
@@ -27,7 +25,7 @@ MAX_UNSENT_BYTES = 65_536  # in the kernel
 MAX_PONGS_BYTES = 200_000  # that wait for a peer that sends pings and reads nothing
 LINE = "hilstar.line"  # in a WebSocket's scope: its `ReadingWebSocket`
 
-_connections: OrderedDict[BoundedHttp, None] = OrderedDict()
+_connections: "OrderedDict[BoundedHttp, None]" = OrderedDict()
 
 
 class BoundedHttp(H11Protocol):

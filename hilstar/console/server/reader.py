@@ -1,7 +1,5 @@
 """A run's shared memory, read ten times a second and worded for the page: state, health, chart points, events, pictures."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import struct
@@ -106,6 +104,8 @@ def _of_rest(seen: RunState, lately: RecentFrames) -> Iterator[str]:
         yield f"the window is {seen.hidden}"
     if seen.gamma:
         yield seen.gamma
+    if seen.forced:
+        yield f"shown by --force: {seen.forced}"
     if seen.operator_text:
         yield f"changed by the operator: {seen.operator_text}"
     if seen.rates:

@@ -5,8 +5,6 @@ source = "scpi"` an attitude packet goes to the run's own UDP port on loopback S
 frame waits for any of it. Every connection has registers and a queue of errors of its own. docs/scpi.md has the commands.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac
@@ -373,7 +371,7 @@ def _numbers(values: tuple[float, ...] | list[float] | None, places: int) -> str
     return ",".join([NOT_A_NUMBER] * places if values is None else [f"{value:.12E}" for value in values])
 
 
-def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> Command:
+def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> "Command":
     """A command that sets a mask."""
 
     async def command(connection: Connection, unit: Unit) -> None:
@@ -382,7 +380,7 @@ def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> Com
     return command
 
 
-def _bare(what: Callable[[InstrumentStatus], None]) -> Command:
+def _bare(what: Callable[[InstrumentStatus], None]) -> "Command":
     """A command without parameters."""
 
     async def command(connection: Connection, unit: Unit) -> None:

@@ -26,11 +26,13 @@ WRONG, DOUBTFUL, RIGHT = "wrong", "doubtful", "right"
 
 @dataclass(frozen=True, slots=True)
 class OutputState:
-    """An output as RandR describes it: its mode and the preferred ones (px), its transform (rows of a 3 x 3 matrix),
-    rotation, properties and EDID (b"" for none); the other outputs that are lit, and the screen's providers (GPUs)."""
+    """An output as RandR describes it: its mode and the preferred ones (px), its refresh (0 where that is not known), its
+    transform (rows of a 3 x 3 matrix), rotation, properties and EDID (b"" for none); the other outputs that are lit, and the
+    screen's providers (GPUs)."""
 
     name: str
     mode_px: Pair
+    refresh_hz: float = 0.0
     preferred_px: tuple[Pair, ...] = ()
     transform: tuple[float, ...] = IDENTITY
     rotated: bool = False

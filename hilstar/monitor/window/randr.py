@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any, Self
 
 from hilstar.monitor.window.output_settings import IDENTITY, NVIDIA, NVIDIA_ATTRIBUTES, OutputState, Pair, Value, property_value
-from hilstar.monitor.window.x11 import INT, TEXT, X11_LIBRARY, Survival, has_extension, load_library
+from hilstar.monitor.window.x11 import INT, TEXT, X11_LIBRARY, Survival, has_extension, is_composited, load_library
 
 XRANDR_LIBRARY = "libXrandr.so.2"
 ROTATE_0 = 1  # randr.h
@@ -31,7 +31,7 @@ class _Mode(ctypes.Structure):  # XRRModeInfo
         ("width", ctypes.c_uint),
         ("height", ctypes.c_uint),
         ("dot_clock", ctypes.c_ulong),
-        ("sync", ctypes.c_uint * 7),
+        ("sync", ctypes.c_uint * 7),  # third: a line's pixels; last: a frame's lines
         ("name", _Pointer),
         ("name_length", ctypes.c_uint),
         ("flags", ctypes.c_ulong),
@@ -170,7 +170,7 @@ class Randr:
         with self._resources() as resources:
             if resources is None:
                 return []
-            modes = {mode.id: (mode.width, mode.height) for mode in resources.modes[: resources.nmode]}
+            modes = {mode.id: mode for mode in resources.modes[: resources.nmode]}
             for number in resources.outputs[: resources.noutput]:
                 with self._output(resources, number) as output:
                     state = None if output is None or not output.crtc else self._state(resources, number, output, modes)
@@ -194,19 +194,25 @@ class Randr:
                     return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in parts)
         return b""
 
-    def _state(self, resources: Any, number: int, output: Any, modes: dict[int, Pair]) -> OutputState | None:
+    def additions(self) -> dict[str, bool]:
+        """What may stand between X and the displays, and whether it does."""
+        return {"XWayland": has_extension(self._display, b"XWAYLAND"), "a compositing manager": is_composited(self._display)}
+
+    def _state(self, resources: Any, number: int, output: Any, modes: dict[int, _Mode]) -> OutputState | None:
         crtc = self._xrandr.XRRGetCrtcInfo(self._display, ctypes.byref(resources), output.crtc)
         with self._got(_Crtc, self._xrandr.XRRFreeCrtcInfo, crtc) as now:
             if now is None or now.mode not in modes:
                 return None
-            mode_px, rotated = modes[now.mode], now.rotation != ROTATE_0
+            mode, rotated = modes[now.mode], now.rotation != ROTATE_0
+            pixels = mode.sync[2] * mode.sync[6]
         properties = dict(self._properties(number))
         edid = properties.pop("EDID", b"")
         name = _name(output)
         return OutputState(
             name=name,
-            mode_px=mode_px,
-            preferred_px=tuple(dict.fromkeys(modes[k] for k in output.modes[: output.npreferred] if k in modes)),
+            mode_px=_size_px(mode),
+            refresh_hz=mode.dot_clock / pixels if pixels else 0.0,
+            preferred_px=tuple(dict.fromkeys(_size_px(modes[k]) for k in output.modes[: output.npreferred] if k in modes)),
             transform=self._transform(output.crtc),
             rotated=rotated,
             properties={key: value for key, value in properties.items() if not isinstance(value, bytes)}
@@ -322,6 +328,10 @@ def lit_outputs() -> list[OutputState]:
             return randr.outputs()
     except OSError:
         return []
+
+
+def _size_px(mode: _Mode) -> Pair:
+    return mode.width, mode.height
 
 
 def _name(info: Any) -> str:

@@ -38,7 +38,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Display:
-    """A monitor of this machine as the system describes it; `refresh_hz` is 0 where it does not say (Xvfb)."""
+    """A monitor of this machine as the system describes it; `refresh_hz` is 0 where it does not say (Xvfb).
+
+    `bits` per colour are those of its mode: the minimum of the three.
+    """
 
     index: int
     name: str
@@ -47,6 +50,11 @@ class Display:
     position_px: tuple[int, int]
     size_mm: tuple[int, int]
     scale: float
+    bits: int
+
+    def is_named(self, wanted: int | str) -> bool:
+        """Whether `[monitor] display` means it: its index, or a part of its name."""
+        return wanted == self.index or (isinstance(wanted, str) and wanted.lower() in self.name.lower())
 
     def line(self) -> str:
         """The display for a person."""
@@ -114,6 +122,7 @@ def _describe(index: int, monitor: Any) -> Display:
         position_px=_pair(glfw.get_monitor_pos(monitor)),
         size_mm=_pair(glfw.get_monitor_physical_size(monitor)),
         scale=float(glfw.get_monitor_content_scale(monitor)[0]),
+        bits=int(min(mode.bits.red, mode.bits.green, mode.bits.blue)),
     )
 
 
@@ -290,8 +299,7 @@ class Window:
     def screen_bits(self) -> int:
         """Bits per colour of the screen's mode: the minimum of the three."""
         monitor = glfw.get_window_monitor(self._window) or glfw.get_primary_monitor()
-        bits = glfw.get_video_mode(monitor).bits
-        return int(min(bits.red, bits.green, bits.blue))
+        return _describe(0, monitor).bits
 
     @property
     def scaled(self) -> bool:
@@ -427,7 +435,7 @@ def _area_of(monitor: Any) -> ScreenArea:
 def _find(wanted: int | str) -> tuple[Display, Any]:
     described = _displays()
     for display, monitor in zip(described, glfw.get_monitors(), strict=True):
-        if wanted == display.index or (isinstance(wanted, str) and wanted.lower() in display.name.lower()):
+        if display.is_named(wanted):
             return display, monitor
     known = "; ".join(display.line() for display in described)
     meant = did_you_mean(wanted, (display.name for display in described))

@@ -3,8 +3,6 @@
 Answers are placed by the middle of their exposure. Memory does not grow with the run, except by up to MAX_FAULTS faults.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass, field

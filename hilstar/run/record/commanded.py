@@ -1,7 +1,5 @@
 """The attitudes that a run commanded: read from its ledger, and interpolated between its frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

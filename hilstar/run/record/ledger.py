@@ -6,8 +6,6 @@ last. A disk that fails is tried again and never ends the display. Where somebod
 event says so and the ledger continues in another file, because the rest of the first could not be read.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

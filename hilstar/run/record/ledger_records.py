@@ -3,8 +3,6 @@
 There is a record for each frame, each event, each second of the process, and for what was only counted.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

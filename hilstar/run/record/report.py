@@ -1,7 +1,5 @@
 """The figures of a run's report, from its ledger: added record by record, in memory that does not grow with the run."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass, field

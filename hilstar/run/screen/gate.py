@@ -1,7 +1,6 @@
 """A bench on its display, past the start-up gate: swaps are timed, and a display whose timing cannot be trusted is refused."""
 
-from __future__ import annotations
-
+import datetime
 import logging
 import threading
 from collections.abc import Iterator
@@ -14,8 +13,11 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench, orientation_of
 from hilstar.bench.config import Monitor
+from hilstar.bench.measured_on import SHOWN_ANYWAY, check_monitor
 from hilstar.errors import MachineError
+from hilstar.monitor.identity import TABLE
 from hilstar.monitor.window.output_settings import findings
+from hilstar.monitor.window.this_monitor import identity_here
 from hilstar.monitor.window.window import Window, WindowSettings
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.render.driver import sleep_in_waits
@@ -61,9 +63,14 @@ class Timing:
 
 
 @contextmanager
-def open_screen(file: BenchFile, *, windowed: bool, force: bool, timed: bool) -> Iterator[Screen]:
-    """The bench of a file on its display, past the gate; `timed` as in `open_bench`. Raises InputError or MachineError."""
+def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force: bool, timed: bool) -> Iterator[Screen]:
+    """The bench of a file on its display, past the gate; `timed` as in `open_bench`. Raises InputError or MachineError.
+
+    The monitor has to be the one that the bench's files were measured on, not too long before `today`.
+    """
     monitor = file.config.monitor
+    found = check_monitor(file, identity_here(monitor.display), today)
+    found.refuse(force)
     display = None if windowed else monitor.display
     size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
     sleep_in_waits()
@@ -73,9 +80,11 @@ def open_screen(file: BenchFile, *, windowed: bool, force: bool, timed: bool) ->
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
             log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)
         screen = Screen(window, bench)
+        screen.forced += found.told(log)
         bench.warm_up()
         pass_gate(screen, force)
         bench.output.update({} if screen.output is None else screen.output.fields())
+        bench.output.update({TABLE: {} if found.now is None else found.now.known(), "forced": screen.forced})
         yield screen
 
 
@@ -107,7 +116,7 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
 
 
 def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
-    """Log what may be wrong with a display, and refuse (MachineError) one that is; with `force` that is only logged, too."""
+    """Log what may be wrong with a display, and refuse (MachineError) one that is; with `force` that is logged and kept."""
     window, monitor = screen.window, screen.bench.config.monitor
     changed = screen.bench.renderer.changed_codes()
     if changed:
@@ -123,7 +132,8 @@ def _look_for_faults(screen: Screen, timing: Timing, force: bool) -> None:
     for fault in (*wrong, *faults(window, monitor, timing), *[changed] * bool(changed)):
         if not force:
             raise MachineError(f"{fault}; or add --force")
-        log.warning("%s: shown anyway (--force)", fault)
+        screen.forced.append(fault)
+        log.warning("%s: %s", fault, SHOWN_ANYWAY)
 
 
 def burst_periods(screen: Screen, clock: HostClock) -> float:

@@ -1,7 +1,5 @@
 """The monitor's window: frames on it, their pacing by its refresh, the square that a photodiode watches, and its keys."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time
@@ -137,7 +135,8 @@ class Screen:
 
     `clock` predicts its swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns` is the time from a swap to
     the middle row's first light: half of the scan-out, the panel's own delay, and the frames `queued` in the driver. `output`
-    is how the display's output was set when the gate was passed, None where that is not known.
+    is how the display's output was set when the gate was passed, None where that is not known; `forced` has what was wrong with
+    the display or its monitor, and was shown by --force.
     """
 
     def __init__(self, window: Window, bench: Bench) -> None:
@@ -145,6 +144,7 @@ class Screen:
         self.window = window
         self.bench = bench
         self.output: OutputState | None = None
+        self.forced: list[str] = []
         self.aids = Aids()
         self.swap_to_light_ns = round((bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS)
         self.keep_time(1000.0 / monitor.refresh_hz, False, time.monotonic_ns())
@@ -295,4 +295,5 @@ class DisplayPacer(Pacer):
         named["gamma"] = {"frames": self._gamma_frames, "s": self._gamma_ns / NS_PER_S}
         shown = self._screen.window.presented
         output = self._screen.output
-        return named | {"presented": presented_as(shown), "presented_frames": shown, "output": output and output.fields()}
+        named |= {"presented": presented_as(shown), "presented_frames": shown, "forced": self._screen.forced}
+        return named | {"output": output and output.fields()}

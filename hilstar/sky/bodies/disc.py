@@ -19,8 +19,6 @@ clouds, seas, city lights, moonlight or airglow.
 Sizes, flattening, poles and laws of the light of Sun, Moon, Earth and planets.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -141,7 +139,7 @@ class Disc:
         seen = ring @ np.linalg.inv(self.to_sphere).T
         return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
 
-    def of_rate(self, electrons_per_s: float) -> Disc:
+    def of_rate(self, electrons_per_s: float) -> "Disc":
         """The same disc with this flux in all; black where nothing of it is lit."""
         whole_sr = self.law_integral_sr()
         return replace(self, normal_e_per_s_sr=electrons_per_s / whole_sr if whole_sr > 0 else 0.0)

@@ -3,8 +3,6 @@
 Where the sky is seen from near the Earth: parallax, light bent by the Sun, aberration.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import warnings
 from dataclasses import dataclass
@@ -55,7 +53,7 @@ class Tdb:
     whole: float
     part: float
 
-    def after(self, seconds: float) -> Tdb:
+    def after(self, seconds: float) -> "Tdb":
         """The moment some seconds later."""
         return Tdb(self.whole, self.part + seconds / DAY_S)
 

@@ -19,8 +19,6 @@ phase (Kieffer and Stone 2005, AJ 129, 2887, table 4); at 10 and 90 degrees its 
 between the bands, constant beyond them. Sunlight: G2V of the library.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 

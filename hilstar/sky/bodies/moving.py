@@ -5,8 +5,6 @@ magnitudes at steps of the observer's orbit, the places with straight lines betw
 so a replay draws the same light. For an observer whose place comes with each frame it is all computed with each frame.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ Its frame is ICRF, GCRF or EME2000 about the Earth; lines of a segment are joine
 epochs about a time, places and velocities, whatever the message recommends. Accelerations and covariances are not used.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import re

@@ -1,7 +1,5 @@
 """Satellites that can be in view at a moment: their directions and their light at any time about it."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -94,7 +92,7 @@ class Pass:
     def __len__(self) -> int:
         return len(self.index)
 
-    def only(self, which: IntArray) -> Pass:
+    def only(self, which: IntArray) -> "Pass":
         """Only the satellites at places `which` (k,)."""
         return replace(self, index=self.index[which], seen_km=self.seen_km[:, which], place_km=self.place_km[:, which])
 

@@ -16,8 +16,6 @@ of the list at a time, and between them places follow the cubic through both pla
 over three days. A cubic of exact velocities would be within 5 mm; SGP4's own are not quite the slopes of its places.
 """
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import math
@@ -86,7 +84,7 @@ class Satellite:
 
     name: str
     number: int
-    satrec: Satrec
+    satrec: "Satrec"
 
     def age_days(self, utc_ns: int) -> float:
         """How many days a UTC is after the elements' own date."""
@@ -375,7 +373,7 @@ def brightness_of(satellites: Sequence[Satellite], rows: dict[int, Row], default
 class Swarm:
     """Satellites by their elements; a moment's places depend on that moment alone."""
 
-    def __init__(self, satrecs: Sequence[Satrec]) -> None:
+    def __init__(self, satrecs: "Sequence[Satrec]") -> None:
         from sgp4.api import SatrecArray
 
         shares = [satrecs[k : k + SHARE] for k in range(0, len(satrecs), SHARE)]

@@ -6,8 +6,6 @@ share of each frame of a panel that lights row by row. Each quantisation, bit st
 all with the same stars.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ measured stars; the steps add up to the whole error, star by star. Cut sprites c
 dark: earlier it would be charged twice.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -4,8 +4,6 @@ A combination is on the front unless another of its scene has time and error no 
 equal in both are both on it. Figures are the table's, rounded as they stand there. `auto` is judged by the run's own noise.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -225,7 +223,7 @@ def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str)
         grid[-1].set_xlabel("median time of a frame [ms]")
 
 
-def _scatter(axes: Axes, rows: Sequence[CombinationRow]) -> None:
+def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
     floor = FLOOR_SHARE * min((row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0)
     at = [(row.time_ms, max(row.error_arcsec, floor)) for row in rows]
     front = [(row, place) for row, place in zip(rows, at, strict=True) if row.on_front == "true"]

@@ -5,8 +5,6 @@ of mass of the pixels around the path, extended so that a late attitude stays wi
 detector noise is not the display's.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

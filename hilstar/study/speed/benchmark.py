@@ -5,8 +5,6 @@ found: its time has no culling and no projecting, and it makes no codes. A cell 
 are the catalogue's and, where it has too few, random ones. Import and first frame are timed in fresh processes.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import platform

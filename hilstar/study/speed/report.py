@@ -1,7 +1,5 @@
 """The benchmark's result: the command's JSON object, lines for a person, a CSV and a chart."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

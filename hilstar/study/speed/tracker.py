@@ -4,8 +4,6 @@ Each exposure has 1024 x 1024 pixels and all noise. Peers are given hilstar's ex
 drawing: NumPy's and GalSim's noise beside the whole exposure, and the finders of photutils and sep on hilstar's own DN.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from importlib import import_module

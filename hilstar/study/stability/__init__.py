@@ -4,8 +4,6 @@ Cases that draw are measured by `hilstar study stability` where it runs (`image.
 tests/authority measures those cases with every commit, and the tables beside this file have their figures.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

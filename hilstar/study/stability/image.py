@@ -4,8 +4,6 @@ Each case draws, so that its figures are those of the machine that runs it. Popp
 while the camera turns slowly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Where methods fail: each case with the failing method, its error, hilstar's way and the reason; charts of curves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path

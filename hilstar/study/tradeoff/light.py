@@ -1,7 +1,5 @@
 """Trade-offs of light: brightness integral, spectrum from colours, PSF, quantisation, depth of the catalogue."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack

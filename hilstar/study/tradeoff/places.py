@@ -1,7 +1,5 @@
 """Trade-offs of place: culling, projection, smear along a turning star's path, prediction; on the demo's bench."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """For each step of the chain: every method against the exact one, error against time, on the machine at hand."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from contextlib import ExitStack

@@ -118,7 +118,8 @@ class FaultyFields:
         frame = twin.bench.frame(q, first_frame, faults=effects)
         lights = exposure_lights(twin.bench, frame, first_frame, [twin.true_panel], effects)
         asked = twin.sky_optics.image_e_per_s(frame.linear.astype(np.float64)) * exposure_s
-        return _Shot(asked, twin.true_optics.image_e_per_s(lights[0]) * exposure_s, frame)
+        shown = twin.true_optics.images_e_per_s(lights[0], twin.primaries).sum(axis=0) * exposure_s
+        return _Shot(asked, shown, frame)
 
     def _attitude(self, fault: Fault) -> FloatArray:
         """An attitude at which a fault falls on the image; any one where that does not matter."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import open_bench
+from hilstar.bench.build import open_bench, primary_panels
 from hilstar.bench.cameras import ideal_monitor, real_monitor, tracker_camera
 from hilstar.bench.config import Verify
 from hilstar.bench.frame import Bench, Frame
@@ -24,13 +24,13 @@ from hilstar.errors import InputError
 from hilstar.frame.faults import FaultLayer
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.monitor.quantise import Panel, shown_light
+from hilstar.monitor.quantise import Panel, primary_lights
 from hilstar.monitor.response import Response, table_response
 from hilstar.process.closing import Closing
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.tracker.detector import Detector
-from hilstar.twin.optics import BenchGeometry, TwinOptics
+from hilstar.twin.optics import BenchGeometry, TwinOptics, seen_primaries
 from hilstar.twin.simulator import TrackerBackground
 
 PHASES = 4  # frames of a sequence with which an exposure may begin
@@ -39,13 +39,15 @@ PHASES = 4  # frames of a sequence with which an exposure may begin
 def exposure_lights(
     bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel], faults: FaultLayer | None = None
 ) -> list[FloatArray]:
-    """The mean light (H, W), electrons per second, of each panel over an exposure that begins with frame `first_frame`.
+    """The mean light (primaries, H, W), electrons per second, of each panel over an exposure from frame `first_frame` on.
+
+    There is one light of all primaries where they are not driven apart.
 
     With `temporal` that is one of the first PHASES frames of a sequence, which `frame` is the first of.
     """
     count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
     exposed = bench.quantiser.exposure(first_frame % PHASES, count)
-    lights = [np.zeros(frame.levels.shape) for _ in panels]
+    lights = [np.zeros((len(panel.primaries) or 1, *frame.levels.shape[:2])) for panel in panels]
     for number in range(exposed.stop):
         levels = frame.levels
         if number:
@@ -53,7 +55,8 @@ def exposure_lights(
             levels = bench.draw_sprites(sprites, first_frame + number).levels
         if number in exposed:
             for light, panel in zip(lights, panels, strict=True):
-                light += shown_light(levels, panel)
+                for whole, part in zip(light, primary_lights(levels, panel), strict=True):
+                    whole += part
     for light in lights:
         light /= len(exposed)
     return lights
@@ -64,10 +67,14 @@ def true_panel(bench: Bench) -> Panel:
     verify = bench.config.verify
     white = verify.true_flux_at_white_e_per_s or bench.flux_at_white_e_per_s
     if verify.true_calibration is None:
-        return Panel(bench.calibration.response, white, bench.uniformity)
+        scale = white / bench.flux_at_white_e_per_s
+        parts = tuple(replace(one, flux_at_white_e_per_s=scale * one.flux_at_white_e_per_s) for one in bench.panel.primaries)
+        return Panel(bench.calibration.response, white, bench.uniformity, parts)
     true = true_calibration(bench, verify.true_calibration, bit_stealing=bench.config.render.bit_stealing)
     response = levels_of(bench.calibration.response, true.response)
-    return Panel(response, white, true.uniformity_map(bench.config.monitor.resolution_px))
+    uniformity, colours = true.uniformity_map(bench.config.monitor.resolution_px), bench.colours
+    parts = () if colours is None else primary_panels(bench.file, colours, white, uniformity, verify.true_calibration)
+    return Panel(response, white, uniformity, parts)
 
 
 def true_calibration(bench: Bench, name: str, *, bit_stealing: bool = False) -> Calibration:
@@ -137,6 +144,7 @@ class Twin(Closing):
         self.true_optics = TwinOptics(true, self.bench.tracker_psf)
         self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
         self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
+        self.primaries = seen_primaries(self.bench)
         self._background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
@@ -146,8 +154,10 @@ class Twin(Closing):
         sky = self.sky_optics.image_e_per_s(frame.linear.astype(np.float64)) * exposure_s
         panels = [self.true_panel, self.bench.panel] if self.differs else [self.true_panel]
         lights = exposure_lights(self.bench, frame, first_frame, panels)
-        shown = self.true_optics.image_e_per_s(lights[0]) * exposure_s
-        assumed = self.sky_optics.image_e_per_s(lights[1]) * exposure_s if self.differs else shown
+        by_primary = self.true_optics.images_e_per_s(lights[0], self.primaries) * exposure_s
+        shown = assumed = by_primary.sum(axis=0)
+        if self.differs:
+            assumed = self.sky_optics.images_e_per_s(lights[1], self.primaries).sum(axis=0) * exposure_s
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
         discs, under_e = self.bench.discs(view), self.glow_e_per_s * exposure_s + self._background.of_view_e(view)

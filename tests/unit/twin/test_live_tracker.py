@@ -25,7 +25,7 @@ def frame(number, lit, light, q=IDENTITY, lit_ns=None):
 
 
 def watched(*frames):
-    kept = WatchedFrames(lambda frame: frame.codes.astype(np.float64))
+    kept = WatchedFrames(lambda frame: frame.codes.astype(np.float64)[:, None])
     for each in frames:
         kept.add(each)
     return kept
@@ -36,7 +36,7 @@ def test_an_exposure_has_of_each_frame_the_time_that_it_was_lit():
     kept = watched(frame(1, [3], [8]), frame(2, [3, 5], [4, 40], turned), frame(4, [], [], None))
     exposed = kept.exposed(150, 550)  # half of frame 1, all of frame 2 and, as 3 never came, of its time too; and of 4
     assert exposed.lit.tolist() == [3, 5]
-    assert exposed.light_e_per_s == pytest.approx([8 / 8 + 4 / 2, 40 / 2])
+    assert exposed.light_e_per_s[:, 0] == pytest.approx([8 / 8 + 4 / 2, 40 / 2])
     assert (exposed.frames, exposed.shown_share) == (3, pytest.approx(5 / 8))
     assert to_rotation_vector(exposed.q_icrs_to_cam)[2] == pytest.approx(0.01 * 4 / 5)
     assert kept.missing == 1

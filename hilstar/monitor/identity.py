@@ -1,0 +1,123 @@
+"""Which monitor, in which mode and with which settings: what calibration files carry, and how two of them differ."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+
+from hilstar.errors import printable
+from hilstar.toml_tables import Table
+
+TABLE = "monitor_identity"  # of a calibration or geometry file
+STRAIGHT = "straight"
+NO_SERIALS = frozenset({0, 1, 0x01010101, 0xFFFFFFFF})  # what makers write who number nothing
+MAX_WEEK = 54  # 0: not stated; 255: the year is the model's (VESA E-EDID 1.4, 3.4.4)
+SHOWN_DIGITS = 12  # of a SHA-256 in a line
+
+
+class MonitorIdentity(Table, frozen=True):
+    """The monitor of a calibration: what it says of itself, how it is connected and driven, and its own settings.
+
+    Empty, or None, is what is not known. `gamma_ramp` is "straight" or the SHA-256 of the ramp that the window system has set
+    (hilstar's own full-screen window sets a straight one for its time). `brightness`, `contrast`, `colour_preset` and `hours`
+    are by DDC/CI; hours are not compared. `window_system` has what stands between a frame and the panel, as the start-up gate
+    words it.
+    """
+
+    maker: str = ""
+    model: str = ""
+    serial: str = ""
+    week: int | None = None
+    year: int | None = None
+    edid_sha256: str = ""
+    connector: str = ""
+    mode: str = ""  # "1920x1080@59.95", px and Hz
+    bits: int | None = None
+    gamma_ramp: str = ""
+    brightness: int | None = None
+    contrast: int | None = None
+    colour_preset: int | None = None
+    hours: int | None = None
+    window_system: tuple[str, ...] = ()
+
+    def name(self) -> str:
+        """The monitor and its connection for a person."""
+        own = " ".join(part for part in (self.maker, self.model) if part) or "a monitor that does not say what it is"
+        own += f", serial {self.serial}" if self.serial else ""
+        return f"{own}, on {self.connector or 'a connector not known'} at {self.mode or 'a mode not known'}"
+
+    @property
+    def doubt(self) -> str:
+        """Why another monitor could pass for this one; "" where its EDID has a serial number."""
+        if self.serial:
+            return ""
+        if self.maker:
+            return f"{self.maker} {self.model} has no serial number: another one of its kind on {self.connector} passes for it"
+        why = "EDID unreadable" if self.edid_sha256 else "no EDID"
+        return f"{why}: the monitor is told apart by connector and mode alone"
+
+    def known(self) -> dict[str, Any]:
+        """What is known, by its keys."""
+        return {key: value for key, value in msgspec.to_builtins(self).items() if value not in ("", None, ())}
+
+    def toml(self) -> str:
+        """The table of a calibration file."""
+        return f"[{TABLE}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in self.known().items())
+
+
+def edid_identity(edid: bytes) -> MonitorIdentity:
+    """What an EDID says (VESA E-EDID 1.4, section 3), with its SHA-256; that alone where it is damaged, nothing for none."""
+    from pyedid import parse_edid  # 0.1 s, with the HTTP library that it imports
+
+    known = MonitorIdentity(edid_sha256=sha256_of(edid))
+    try:
+        found = parse_edid(edid)
+    except (ValueError, struct.error):
+        return known
+    # pyedid 1.0.3 reads these two numbers the wrong way round.
+    product, number = (int.from_bytes(edid[a:b], "little") for a, b in ((10, 12), (12, 16)))
+    serial = _plain(found.serial) if isinstance(found.serial, str) else ""
+    return msgspec.structs.replace(
+        known,
+        maker=found.manufacturer_pnp_id,
+        model=_plain(found.name or "") or f"{product:04x}",
+        serial=serial if serial.strip("0 ") else "" if number in NO_SERIALS else str(number),
+        week=found.week if 0 < found.week <= MAX_WEEK else None,
+        year=found.year,
+    )
+
+
+def _plain(text: str) -> str:
+    return printable(" ".join(text.replace("\0", "").split()))
+
+
+def sha256_of(data: bytes) -> str:
+    """The SHA-256 of what was read; "" for nothing."""
+    return hashlib.sha256(data).hexdigest() if data else ""
+
+
+def differences(was: MonitorIdentity, now: MonitorIdentity) -> Iterator[str]:
+    """How the present monitor differs from the one of a file, in words that give both.
+
+    A setting that one of them does not know is passed over; but a monitor that said what it was, and says nothing now, differs.
+    """
+    if was.edid_sha256 != now.edid_sha256:
+        same = was.serial and (was.maker, was.model, was.serial) == (now.maker, now.model, now.serial)
+        yield "the same monitor with another EDID (another input, or a setting of its menu)" if same else "another monitor"
+    for key in ("connector", "mode", "bits", "gamma_ramp", "brightness", "contrast", "colour_preset"):
+        before, after = getattr(was, key), getattr(now, key)
+        if before not in ("", None) and after not in ("", None) and before != after:
+            yield f"{key.replace('_', ' ')} {_short(before)}, now {_short(after)}"
+    if was.window_system != now.window_system:
+        before, after = (", ".join(one.window_system) or "nothing" for one in (was, now))
+        yield f"the window system added {before}, and adds {after} now"
+
+
+def _short(value: str | int) -> str:
+    text = str(value)
+    return text[:SHOWN_DIGITS] if len(text) == 64 else text

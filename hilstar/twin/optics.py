@@ -8,14 +8,16 @@ density on the image.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.build import bench_primaries, named_channels
 from hilstar.bench.frame import Bench
+from hilstar.monitor.primaries import channel_matrix
 from hilstar.monitor.quantise import Panel
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.process.closing import Closing
@@ -24,6 +26,7 @@ from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import pack_sprites
+from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
 # Squares along a pixel's side. Against twelve, a star's centroid is off by 1e-5 px and its flux by 2e-6 mag on the demo's
@@ -94,6 +97,43 @@ def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
     return tuple(Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places))
 
 
+@dataclass(frozen=True, slots=True)
+class DisplayColours:
+    """A display's light in the pixels of a tracker with a mosaic; all of it in those of a tracker without.
+
+    `by_primary` (channels, primaries) are the channels' shares of a primary's electrons, `white` (channels,) of black's.
+    """
+
+    bayer: str | None
+    by_primary: FloatArray
+    white: FloatArray
+
+    @classmethod
+    def of(cls, bench: Bench) -> DisplayColours:
+        """Those of a bench. Where a mosaic's panel has no known primaries, white has the mean colour of the stars."""
+        config, colours, stars, folder = bench.config, bench.colours, bench.stars, bench.file.folder
+        bayer, primaries = config.tracker.detector.bayer, bench_primaries(config.monitor, folder)
+        if bayer is None or stars.colours is None:
+            return cls(None, np.ones((1, 1)), np.ones(1))
+        if colours is not None:
+            return cls(bayer, colours.by_primary, colours.matrix.e_per_s.sum(axis=1))
+        rates = stars.rates_e_per_s
+        white = rates @ stars.colours[: len(rates)] / rates.sum()
+        if primaries is not None:
+            white = channel_matrix(primaries, named_channels(config.tracker, folder), 1.0).e_per_s.sum(axis=1)
+        return cls(bayer, white[:, None], white)
+
+    def shown(self, images: FloatArray) -> FloatArray:
+        """Light of each primary (primaries, h, w) in the detector's pixels (h, w)."""
+        if self.bayer is None:
+            return np.asarray(images.sum(axis=0))
+        return in_pixels(np.tensordot(self.by_primary, images, 1), self.bayer)
+
+    def grey(self, image: FloatArray) -> FloatArray:
+        """The black level's light (h, w) in the detector's pixels."""
+        return image if self.bayer is None else in_pixels(np.multiply.outer(self.white, image), self.bayer)
+
+
 class TwinOptics(Closing):
     """Images of a monitor on the tracker's detector. Free it with `close`, or use it as a context manager."""
 
@@ -103,7 +143,7 @@ class TwinOptics(Closing):
         self._psf = psf.blurred(side_px / math.sqrt(12))
         self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 
-    def images_e_per_s(self, lights_e_per_s: Sequence[FloatArray], primaries: Sequence[Primary]) -> FloatArray:
+    def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray], primaries: Sequence[Primary]) -> FloatArray:
         """Electrons per second of each tracker pixel by each primary's light (H, W): (primaries, h, w), float64."""
         return np.array([self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)])
 

@@ -120,7 +120,7 @@ def psf(
     typer.echo(f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}")
 
 
-def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> MonitorIdentity | None:
+def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> "MonitorIdentity | None":
     """The identity of the display that was measured, where this machine has it, of those sides; None elsewhere."""
     from hilstar.monitor.window.this_monitor import identity_here
 

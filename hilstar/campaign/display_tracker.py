@@ -15,7 +15,7 @@ from hilstar.frame.view import View
 from hilstar.monitor.quantise import primary_lights
 from hilstar.rotation import propagate
 from hilstar.tracker.detector import Detector
-from hilstar.twin.optics import TwinOptics, on_pixels, seen_primaries
+from hilstar.twin.optics import DisplayColours, TwinOptics, seen_primaries
 from hilstar.twin.shutter import RowBeat, rolled
 from hilstar.twin.simulator import Exposure, TrackerBackground, detector_canvas, exposure_truth
 from hilstar.twin.verify.twin import true_geometry, true_panel
@@ -65,6 +65,7 @@ class DisplayTracker:
         self.camera, self.stars = tracker_camera(tracker, self.file.folder), self._bench.stars
         self.canvas = detector_canvas(self.file, self.camera)
         self._panel, self._primaries = true_panel(self._bench), seen_primaries(self._bench)
+        self._colours = DisplayColours.of(self._bench)
         self._background = TrackerBackground(self.config, self.file.folder, self.camera, moving=self._bench.moving)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
@@ -79,8 +80,9 @@ class DisplayTracker:
             shown, glow_e_per_s = self._rolling_e_per_s(view, rng)
         else:
             shown, glow_e_per_s = self._light_e_per_s(view), self._glow_e_per_s
-        by_primary_e = self._optics.images_e_per_s(shown, self._primaries) * exposure_s
-        mean_e = on_pixels(self._bench, by_primary_e, glow_e_per_s * exposure_s) + self._background.of_view_e(view)
+        shown_e_per_s = self._colours.shown(self._optics.images_e_per_s(shown, self._primaries))
+        glow_e = self._colours.grey(glow_e_per_s) * exposure_s
+        mean_e = shown_e_per_s * exposure_s + glow_e + self._background.of_view_e(view)
         if rng is None:
             dn = self._detector.expose_noiseless(mean_e, exposure_s)
         else:

@@ -26,6 +26,7 @@ Study = Literal[
     "bodies",
     "faults",
     "chain",
+    "colour",
 ]
 
 ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file

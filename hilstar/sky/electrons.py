@@ -62,7 +62,6 @@ MAX_BV_TERM_MAG = 0.3
 # rates are wrong, and those of the K giants, fifty times as many to V = 7.5, are right.
 BV_KNOT_COUNT = 5
 MAX_BV_FIT_VI_MAG = 2.0
-CLASSES = "OBAFGKM"
 BLOCK_STARS = 20_000  # evaluated at once: their splines' terms stay within a processor's cache
 
 
@@ -315,19 +314,6 @@ def library_electrons_per_s(library: Library, optics: Optics, photometry: Photom
     if not (rate > 0).all():
         raise InputError('tracker: a star of the Pickles library gives no electron; write spectrum = "blackbody"')
     return np.asarray(rate)
-
-
-def class_shares(optics: Optics, from_nm: float) -> dict[str, float]:
-    """The share of a star's electrons that is light from a wavelength on, by spectral class: the mean of the library's stars.
-
-    Light beyond the library's 250 to 1600 nm counts for nothing.
-    """
-    library = load_library()
-    nm = library.wavelength_nm
-    detected = library.flux * nm * optics.quantum_efficiency(nm) * optics.transmission(nm)
-    shares = detected[:, nm >= from_nm].sum(axis=1) / np.maximum(detected.sum(axis=1), np.finfo(np.float64).tiny)
-    classes = np.array([kind[0] for kind in library.spectral_type])
-    return {one: float(shares[classes == one].mean()) for one in CLASSES}
 
 
 def band_mean(library: Library, passband: Curve, weighting: Weighting = "energy") -> FloatArray:

@@ -193,3 +193,16 @@ def fit_spectra(kind: FloatArray, library: Library, rate: FloatArray) -> TypeTab
 def tabulate_types(optics: Optics, photometry: Photometry) -> TypeTable:
     """The rate table of a bench. Raises InputError as `tabulate_pickles` does."""
     return fit_types(library_electrons_per_s(bare_and_dusty(), optics, photometry))
+
+
+def class_shares(optics: Optics, from_nm: float) -> dict[str, float]:
+    """The share of a star's electrons that is light from a wavelength on, by spectral class: the mean of the library's stars.
+
+    Light beyond the library's 250 to 1600 nm counts for nothing.
+    """
+    library = load_library()
+    nm = library.wavelength_nm
+    detected = library.flux * nm * optics.quantum_efficiency(nm) * optics.transmission(nm)
+    shares = detected[:, nm >= from_nm].sum(axis=1) / np.maximum(detected.sum(axis=1), np.finfo(np.float64).tiny)
+    classes = np.array([kind[0] for kind in library.spectral_type])
+    return {one: float(shares[classes == one].mean()) for one in LETTERS}

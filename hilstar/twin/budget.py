@@ -20,7 +20,8 @@ from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, reddest_nm
 from hilstar.monitor.quantise import Panel
-from hilstar.sky.electrons import Optics, all_channels, class_shares
+from hilstar.sky.electrons import Optics, all_channels
+from hilstar.sky.spectral_types import class_shares
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude

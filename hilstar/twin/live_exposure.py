@@ -32,7 +32,8 @@ from hilstar.sky.stars import split_by_rate
 from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
-from hilstar.twin.optics import TwinOptics, on_pixels, seen_primaries
+from hilstar.tracker.mosaic import software_image, software_psf_px
+from hilstar.twin.optics import DisplayColours, TwinOptics, seen_primaries
 from hilstar.twin.simulator import TrackerBackground, detector_canvas
 from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
@@ -163,14 +164,15 @@ class LiveTracker(Closing):
             self._size_px, self._bits = bench.camera.resolution_px, self.config.monitor.bits
             self._panel = true_panel(bench)
             self._rgb, self._primaries = bench.calibration.response.rgb, seen_primaries(bench)
+            self._colours = DisplayColours.of(bench)
             self._optics = TwinOptics(true_geometry(bench, self.camera), self.canvas.psf)
             glow_e_per_s = self._optics.glow_e_per_s(self._panel)
             noise_e2 = tracker.detector.noise(np.median(glow_e_per_s) * self.exposure_s, self.exposure_s).total_e2
             faintest = SEEN_SIGMAS * float(np.sqrt(noise_e2)) / self.canvas.psf.peak_share / self.exposure_s
             self.stars, _ = split_by_rate(bench.stars, max(faintest, bench.faintest_shown_e_per_s))
         background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
-        self._glow_e = glow_e_per_s * self.exposure_s
-        self._background_e = background.of_view_e(View(np.array([1.0, 0, 0, 0])))
+        glow_e = self._colours.grey(glow_e_per_s) * self.exposure_s
+        self._under_e = glow_e + background.of_view_e(View(np.array([1.0, 0, 0, 0])))
         self._radius_rad = self.camera.field_radius_rad(0.0)
         self._before: tuple[int, FloatArray] | None = None
         self._last: tuple[int, FloatArray] | None = None
@@ -200,8 +202,9 @@ class LiveTracker(Closing):
         """The DN of an exposure."""
         rows, columns = np.divmod(exposed.lit, self._size_px[0])
         lights = zip(exposed.light_e_per_s.T, self._primaries, strict=True)
-        by_primary = np.array([self._optics.lit_image_e_per_s(rows, columns, *one) for one in lights]) * self.exposure_s
-        light = on_pixels(self._bench, by_primary, self._glow_e) + self._background_e
+        images = np.array([self._optics.lit_image_e_per_s(rows, columns, *each) for each in lights])
+        light = self._colours.shown(images) * self.exposure_s
+        light += self._under_e
         return self._detector.expose(light, self.exposure_s, self._rng)
 
     def solve(self, exposed: Exposed) -> Solved:
@@ -244,11 +247,12 @@ class LiveTracker(Closing):
         return rate_between_rad_s(before[1], last[1], (last[0] - before[0]) / NS_PER_S)
 
     def _found(self, dn: npt.NDArray[np.uint16], exposed: Exposed, expected: FloatArray | None) -> FoundStars:
-        psf_px = self.canvas.psf.width_px
+        psf_px = software_psf_px(self.canvas.psf.width_px, self.config.tracker.detector)
         streak_px = float(np.linalg.norm(self.rate_cam_rad_s()[:2])) * self.exposure_s * self.camera.focal_length_px
         window_px = max(1.0, *psf_px, min(streak_px / np.sqrt(12), MAX_WINDOW_PX) if streak_px > STREAK_PX else 0.0)
         still = streak_px <= STREAK_PX
-        seen = find_stars(dn, CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_px if still else None))
+        image = software_image(dn, self.config.tracker.detector)
+        seen = find_stars(image, CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_px if still else None))
         good = ~seen.at_edge
         x_px, y_px = seen.x_px[good], seen.y_px[good]
         flux_e = seen.flux[good] * self.config.tracker.detector.gain_e_per_dn

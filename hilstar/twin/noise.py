@@ -25,6 +25,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_stars, star_rates
 from hilstar.bench.cameras import tracker_camera, tracker_psf
+from hilstar.bench.glass import say_once
 from hilstar.charts import BLUE, ORANGE, chart, label_ends, two_digits, write_csv
 from hilstar.errors import InputError
 from hilstar.frame.truth import truth_table
@@ -241,9 +242,11 @@ def noise_budget(
     Magnitudes are those of stars of the Sun's colour; simulated stars and fields come from `rng`. Raises InputError.
     """
     config, tracker = file.config, file.config.tracker
+    if tracker.detector.bayer is not None:
+        say_once("--noise is of a pixel that adds up all channels; a mosaic's has its own alone", "[tracker.detector] bayer")
     camera, stars = tracker_camera(tracker, file.folder), bench_stars(config, file.folder)
     star = NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s)
-    background = TrackerBackground(config, file.folder, camera)
+    background = TrackerBackground(config, file.folder, camera, mosaic=False)
     sights, levels_e = [], []
     for q in rng.standard_normal((SKY_FIELDS, 4)) if q_icrs_to_cam is None else q_icrs_to_cam[None]:
         try:
@@ -298,7 +301,7 @@ def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatA
     tracker = file.config.tracker
     camera, stars = tracker_camera(tracker, file.folder), bench_stars(file.config, file.folder)
     star = NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s)
-    background = TrackerBackground(file.config, file.folder, camera, refuse=True)
+    background = TrackerBackground(file.config, file.folder, camera, mosaic=False)
     found = np.full((len(q_icrs_to_cam), 2), np.inf)
     for k, q in enumerate(q_icrs_to_cam):
         field = field_stars(stars, camera, q)

@@ -15,7 +15,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.build import bench_primaries, named_channels
 from hilstar.bench.frame import Bench
+from hilstar.monitor.primaries import channel_matrix
 from hilstar.monitor.quantise import Panel
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.process.closing import Closing
@@ -23,7 +25,7 @@ from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import mean_colour, pack_sprites
+from hilstar.scene.sprites import pack_sprites
 from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
@@ -95,18 +97,41 @@ def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
     return tuple(Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places))
 
 
-def on_pixels(bench: Bench, by_primary: FloatArray, glow: FloatArray) -> FloatArray:
-    """What the detector's pixels (h, w) have of each primary's light (primaries, h, w) and of a glow of white's colour (h, w).
+@dataclass(frozen=True, slots=True)
+class DisplayColours:
+    """A display's light in the pixels of a tracker with a mosaic; all of it in those of a tracker without.
 
-    Those of a mosaic have their own channel's. Grey light has the mean colour of the stars there, for its own is not known.
+    `by_primary` (channels, primaries) are the channels' shares of a primary's electrons, `white` (channels,) of black's.
     """
-    bayer, colours = bench.config.tracker.detector.bayer, bench.colours
-    if bayer is None:
-        return np.asarray(by_primary.sum(axis=0) + glow)
-    shares = mean_colour(bench.stars)[:, None] if colours is None else colours.by_primary
-    of_glow = shares @ (np.ones(1) if colours is None else colours.of_white)
-    channels = zip(shares, of_glow, strict=True)
-    return in_pixels((np.tensordot(share, by_primary, 1) + part * glow for share, part in channels), bayer)
+
+    bayer: str | None
+    by_primary: FloatArray
+    white: FloatArray
+
+    @classmethod
+    def of(cls, bench: Bench) -> DisplayColours:
+        """Those of a bench. Where a mosaic's panel has no known primaries, white has the mean colour of the stars."""
+        config, colours, stars, folder = bench.config, bench.colours, bench.stars, bench.file.folder
+        bayer, primaries = config.tracker.detector.bayer, bench_primaries(config.monitor, folder)
+        if bayer is None or stars.colours is None:
+            return cls(None, np.ones((1, 1)), np.ones(1))
+        if colours is not None:
+            return cls(bayer, colours.by_primary, colours.matrix.e_per_s.sum(axis=1))
+        rates = stars.rates_e_per_s
+        white = rates @ stars.colours[: len(rates)] / rates.sum()
+        if primaries is not None:
+            white = channel_matrix(primaries, named_channels(config.tracker, folder), 1.0).e_per_s.sum(axis=1)
+        return cls(bayer, white[:, None], white)
+
+    def shown(self, images: FloatArray) -> FloatArray:
+        """Light of each primary (primaries, h, w) in the detector's pixels (h, w)."""
+        if self.bayer is None:
+            return np.asarray(images.sum(axis=0))
+        return in_pixels(np.tensordot(self.by_primary, images, 1), self.bayer)
+
+    def grey(self, image: FloatArray) -> FloatArray:
+        """The black level's light (h, w) in the detector's pixels."""
+        return image if self.bayer is None else in_pixels(np.multiply.outer(self.white, image), self.bayer)
 
 
 class TwinOptics(Closing):

@@ -438,15 +438,23 @@ def _tracker_keys(config: BenchConfig) -> tuple[object, ...]:
 class TrackerBackground:
     """Light between the stars on a bench's detector: what is the same in every view, zodiacal light by direction, sky glow.
 
-    Both are computed at LATTICE places along each side of the detector, each with its pixel's solid angle. Where its
-    table is blank, near the Sun, a field is refused (InputError); without `refuse` the nearest tabled light is drawn, and
+    Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all channels.
+    Zodiacal light and glow are computed at LATTICE places along each side of the detector, each with its pixel's solid
+    angle. Where the table is blank, near the Sun, a field is refused (InputError); without `refuse` the nearest tabled light is drawn, and
     a warning says so once until the field has left that part of the sky.
     """
 
     def __init__(
-        self, config: BenchConfig, folder: Path, camera: Camera, *, refuse: bool = True, moving: "MovingSky | None" = None
+        self,
+        config: BenchConfig,
+        folder: Path,
+        camera: Camera,
+        *,
+        refuse: bool = True,
+        mosaic: bool = True,
+        moving: MovingSky | None = None,
     ) -> None:
-        self._bayer, tracker = config.tracker.detector.bayer, config.tracker
+        self._bayer, tracker = config.tracker.detector.bayer if mosaic else None, config.tracker
         channels = (bench_optics(tracker, folder),) if self._bayer is None else bench_channels(tracker, folder)
         self.steady_e = in_pixels((background_e(config, optics) for optics in channels), self._bayer)
         self._config, self._refuse, self._beyond = config, refuse, False

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from msgspec import structs
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
@@ -146,10 +145,9 @@ class Twin(Closing):
         self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
         self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
         self.primaries = seen_primaries(self.bench)
-        # All channels together, as everything here is.
-        mono = structs.replace(self.config.tracker, detector=structs.replace(tracker.detector, bayer=None))
-        summed = structs.replace(self.config, tracker=mono)
-        self._background = TrackerBackground(summed, file.folder, self.camera, refuse=False, moving=self.bench.moving)
+        self._background = TrackerBackground(
+            self.config, file.folder, self.camera, refuse=False, mosaic=False, moving=self.bench.moving
+        )
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
         """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""

@@ -15,6 +15,7 @@ from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.answers import AnswersSettings, check_answers
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
+from hilstar.bench.config.certify import CertifySettings
 from hilstar.bench.config.hardware import (
     Collimator,
     Monitor,
@@ -57,6 +58,7 @@ class BenchConfig(Table, frozen=True):
     verify: Verify = msgspec.field(default_factory=Verify)
     sync: SyncSettings = msgspec.field(default_factory=SyncSettings)
     faults: FaultSettings = msgspec.field(default_factory=FaultSettings)
+    certify: CertifySettings = msgspec.field(default_factory=CertifySettings)
     answers: AnswersSettings | None = None
 
     @property

@@ -462,7 +462,7 @@ def _saved(stem: Path) -> Path | None:
     return None
 
 
-SWAP_JITTER_NS, DIODE_JITTER_NS = 20_000, 100_000
+SWAP_JITTER_NS = 20_000
 MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 
 
@@ -475,7 +475,7 @@ class VirtualBench(ImageSource):
     def __init__(self, bench: BenchFile, truth: BenchFile, seed: int) -> None:
         self.truth, self._seed, self.sets_exposure = truth, seed, True
         self.identity = f"virtual: sha256 {truth.sha256}, seed {seed}"
-        _refuse_other_bench(bench, truth)
+        refuse_other_bench(bench, truth)
         config = truth.config
         with open_bench(truth) as real:
             self._panel, camera = real.panel, real.camera
@@ -505,15 +505,7 @@ class VirtualBench(ImageSource):
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
         """A simulated photodiode: the true panel's delay and scan-out, with a little jitter."""
-        rng = np.random.default_rng((self._seed, zlib.crc32(b"diode")))
-        frames = int(seconds * file.config.monitor.refresh_hz)
-        period_ns = NS_PER_S / file.config.monitor.refresh_hz
-        swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(np.int64)
-        shown = edges_of(swap_ns, np.array([marker_light(number, KIND) for number in range(frames)]))
-        monitor = replace(self.truth.config.monitor, photodiode_px=file.config.monitor.photodiode_px)
-        delay_ns = (monitor.panel_delay_ms + swap_to_square_ms(monitor)) * NS_PER_MS
-        late_ns = delay_ns + rng.normal(0, DIODE_JITTER_NS, len(shown.host_ns))
-        return DiodeRecording(shown, Edges(shown.host_ns + np.rint(late_ns).astype(np.int64), shown.level))
+        return virtual_diode(file, self.truth, seconds, np.random.default_rng((self._seed, zlib.crc32(b"diode"))))
 
     def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
         from PIL import Image
@@ -560,7 +552,19 @@ class VirtualBench(ImageSource):
         self._optics.close()
 
 
-def _refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
+def virtual_diode(file: BenchFile, truth: BenchFile, seconds: float, rng: np.random.Generator) -> DiodeRecording:
+    """Edges of a true panel's delay and scan-out, with the jitter of swaps and of the truth's `[certify.virtual]`."""
+    frames = int(seconds * file.config.monitor.refresh_hz)
+    period_ns = NS_PER_S / file.config.monitor.refresh_hz
+    swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(np.int64)
+    shown = edges_of(swap_ns, np.array([marker_light(number, KIND) for number in range(frames)]))
+    monitor = replace(truth.config.monitor, photodiode_px=file.config.monitor.photodiode_px)
+    delay_ms = monitor.panel_delay_ms + swap_to_square_ms(monitor)
+    late_ms = delay_ms + rng.normal(0, truth.config.certify.virtual.delay_noise_ms, len(shown.host_ns))
+    return DiodeRecording(shown, Edges(shown.host_ns + np.rint(late_ms * NS_PER_MS).astype(np.int64), shown.level))
+
+
+def refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
     """Refuse (InputError) a truth whose screen or tracker does not match the bench file's."""
     mine, its = bench.config, truth.config
     screens = [orientation_of(c.monitor).screen_px(c.monitor.resolution_px) for c in (mine, its)]

@@ -150,8 +150,8 @@ def surface(
             break
         for _ in range(3):
             terms = field_terms(x_px, y_px, resolution_px, degree)
-            inverse = np.linalg.pinv(terms[kept])
-            found = inverse @ values[kept]
+            q, r = np.linalg.qr(terms[kept])
+            found = np.linalg.solve(r, q.T @ values[kept])
             left = np.abs(values - terms @ found)
             spread = MAD_TO_SIGMA * np.median(left[kept], axis=0)
             within = kept & (left < WILD_SIGMAS * np.maximum(spread, 1e-12)).all(axis=1)
@@ -165,8 +165,8 @@ def surface(
             if more <= 0 or fdtrc(more, dof, max(best_squares - squares, 0.0) / more / max(squares / dof, 1e-30)) > BETTER_P:
                 break
         noise = math.sqrt(squares / dof)
-        root = np.asarray(np.linalg.qr(inverse.T, mode="r")).T  # root root' = inverse inverse'
-        best, best_squares = Surface(degree, resolution_px, found, noise * root, float(dof), noise), squares
+        # r'r is the normal matrix, so its inverse's root is that of r.
+        best, best_squares = Surface(degree, resolution_px, found, noise * np.linalg.inv(r), float(dof), noise), squares
     if best is None:
         needed = DOTS_A_TERM * (degrees[0] + 1) * (degrees[0] + 2) // 2
         raise InputError(f"{int(kept.sum())} dots are seen and {needed} are needed; look at focus, exposure and [collimator]")

@@ -141,7 +141,7 @@ def delays_of(recording: DiodeRecording | None, file: BenchFile) -> FloatArray:
 
 
 class VirtualReader:
-    """Readings of a virtual bench by its truth file, without an image; each `turn` has noise of its own. Raises InputError."""
+    """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own noise. Raises InputError."""
 
     def __init__(self, file: BenchFile, truth: BenchFile, seed: int, turn: int = 0) -> None:
         refuse_other_bench(file, truth)

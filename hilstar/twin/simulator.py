@@ -438,10 +438,10 @@ def _tracker_keys(config: BenchConfig) -> tuple[object, ...]:
 class TrackerBackground:
     """Light between the stars on a bench's detector: what is the same in every view, zodiacal light by direction, sky glow.
 
-    Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all channels.
-    Zodiacal light and glow are computed at LATTICE places along each side of the detector, each with its pixel's solid
-    angle. Where the table is blank, near the Sun, a field is refused (InputError); without `refuse` the nearest tabled light is drawn, and
-    a warning says so once until the field has left that part of the sky.
+    Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all channels. Zodiacal light
+    and glow are computed at LATTICE places along each side of the detector, each with its pixel's solid angle. Where the
+    table of zodiacal light is blank, near the Sun, a field is refused (InputError); without `refuse` the nearest tabled
+    light is drawn, and a warning says so once until the field has left that part of the sky.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ from hilstar.calibrate.first_light.geometry import (
     see_figure,
     sharpness,
 )
-from hilstar.calibrate.first_light.image_sources import GrabCommand, NoImage, Pattern, black, off_screen, on_screen
+from hilstar.calibrate.first_light.image_sources import GrabCommand, ImageSource, NoImage, Pattern, black, off_screen, on_screen
 from hilstar.calibrate.first_light.records import KeyChange, StepOutcome, rewrite
 from hilstar.calibrate.first_light.session import FirstLightSession, SessionStep
 from hilstar.errors import InputError
@@ -172,7 +172,7 @@ def test_a_command_that_fails_says_why(tmp_path, command, words):
         grabbed(tmp_path, command)
 
 
-class Blind:
+class Blind(ImageSource):
     """Eyes for steps that take no image."""
 
     identity = "blind"

@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light.context import StepContext
-from hilstar.calibrate.first_light.image_sources import VirtualBench
+from hilstar.calibrate.first_light.image_sources import ImageSource, VirtualBench
 from hilstar.calibrate.first_light.photometry import (
     Assumed,
     Photometer,
@@ -62,7 +62,7 @@ def test_the_peak_of_a_lattice_is_that_of_its_light_drawn_pixel_by_pixel():
         assert share == pytest.approx(largest, rel=0.06)
 
 
-class Camera:
+class Camera(ImageSource):
     """A tracker whose image is uniform over the field: so much light for each lit pixel, by a response of its own."""
 
     identity = "camera"

@@ -17,7 +17,7 @@ TABLE = "monitor_identity"  # of a calibration or geometry file
 STRAIGHT = "straight"
 NO_SERIALS = frozenset({0, 1, 0x01010101, 0xFFFFFFFF})  # what makers write who number nothing
 MAX_WEEK = 54  # 0: not stated; 255: the year is the model's (VESA E-EDID 1.4, 3.4.4)
-SHOWN_DIGITS = 12  # of a SHA-256 in a line
+SHOWN_DIGITS = 20  # of a SHA-256 in a line; names and modes are shorter
 
 
 class MonitorIdentity(Table, frozen=True):
@@ -72,9 +72,11 @@ class MonitorIdentity(Table, frozen=True):
 
 def edid_identity(edid: bytes) -> MonitorIdentity:
     """What an EDID says (VESA E-EDID 1.4, section 3), with its SHA-256; that alone where it is damaged, nothing for none."""
+    known = MonitorIdentity(edid_sha256=sha256_of(edid))
+    if not edid:
+        return known
     from pyedid import parse_edid  # 0.1 s, with the HTTP library that it imports
 
-    known = MonitorIdentity(edid_sha256=sha256_of(edid))
     try:
         found = parse_edid(edid)
     except (ValueError, struct.error):
@@ -112,12 +114,7 @@ def differences(was: MonitorIdentity, now: MonitorIdentity) -> Iterator[str]:
     for key in ("connector", "mode", "bits", "gamma_ramp", "brightness", "contrast", "colour_preset"):
         before, after = getattr(was, key), getattr(now, key)
         if before not in ("", None) and after not in ("", None) and before != after:
-            yield f"{key.replace('_', ' ')} {_short(before)}, now {_short(after)}"
+            yield f"{key.replace('_', ' ')} {str(before)[:SHOWN_DIGITS]}, now {str(after)[:SHOWN_DIGITS]}"
     if was.window_system != now.window_system:
         before, after = (", ".join(one.window_system) or "nothing" for one in (was, now))
         yield f"the window system added {before}, and adds {after} now"
-
-
-def _short(value: str | int) -> str:
-    text = str(value)
-    return text[:SHOWN_DIGITS] if len(text) == 64 else text

@@ -86,7 +86,7 @@ def test_10_000_damaged_blocks_are_read_or_doubted_and_never_taken_for_the_whole
         ({"connector": "DP-2"}, ["connector DP-1, now DP-2"]),
         ({"mode": "1920x1200@30.00"}, ["mode 1920x1200@59.95, now 1920x1200@30.00"]),
         ({"bits": 10}, ["bits 8, now 10"]),
-        ({"gamma_ramp": "c" * 64}, ["gamma ramp straight, now cccccccccccc"]),
+        ({"gamma_ramp": "c" * 64}, [f"gamma ramp straight, now {'c' * 20}"]),
         ({"brightness": 41, "contrast": 70}, ["brightness 40, now 41", "contrast 75, now 70"]),
         ({"colour_preset": 11}, ["colour preset 5, now 11"]),
         (

@@ -20,7 +20,7 @@ from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
 from hilstar.scene.extended import shifted
-from hilstar.scene.sprites import Sprites, by_share
+from hilstar.scene.sprites import Sprites, by_share, with_mean
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
 from hilstar.sky.stars import Stars
@@ -29,6 +29,7 @@ STEP_NM = 0.25  # of the spectra of primaries
 KNOT_STEPS = 8
 MEAN_WEIGHT = 1e3  # per nm: a mean wavelength within reach is met to 1e-3 nm
 UNSEEN = 1e-6  # share of white
+TINY = 1e-30  # electrons per second
 WITHIN, WITHIN_NM = 1e-6, 0.1  # within the gamut: of a star's electrons, and of its mean wavelength
 SCALE_K = np.geomspace(1500.0, 60_000.0, 400)
 
@@ -136,8 +137,7 @@ class Colours:
         shares = self.on(stars).primaries
         if shares is None:
             raise AssertionError("made above")
-        mean = stars.rates_e_per_s @ shares[: len(stars.rates_e_per_s)] / (stars.rates_e_per_s.sum() or 1.0)
-        return np.vstack([shares, mean])[np.where(star < 0, -1, star)]
+        return with_mean(shares, stars)[np.where(star < 0, -1, star)]
 
     def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.
@@ -155,7 +155,7 @@ class Colours:
         else:
             for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
                 added |= {f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)}
-            added["off_gamut"] = off
+            added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
         known = [*(truth.dtype.names or ()), "in_gamut"]
         kinds = [*truth.dtype.descr, *((name, "f8") for name in added if name not in known), ("in_gamut", "?")]
         found = np.zeros(len(truth), dtype=kinds)
@@ -183,9 +183,10 @@ class Colours:
         return tuple(found)
 
 
-def lit_alone(sprites: Sprites) -> Sprites:
-    """Sprites without those that have no light of this primary."""
-    lit = np.flatnonzero(sprites.data["electrons_per_s"])
+def lit_alone(sprites: Sprites, faintest_e_per_s: float) -> Sprites:
+    """The sprites of a primary without those of stars that have less of its light than a pixel can show, or none."""
+    rates = np.ascontiguousarray(sprites.data["electrons_per_s"])
+    lit = np.flatnonzero(rates >= max(faintest_e_per_s / sprites.per_star, TINY))
     if len(lit) == len(sprites):
         return sprites
     x_px, y_px = sprites.x_px[lit], sprites.y_px[lit]

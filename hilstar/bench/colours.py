@@ -11,7 +11,8 @@ Both ask the same of a star: its electrons through some curves of wavelength, wh
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -55,6 +56,7 @@ class Colours:
     _curves: tuple[Callable[..., FloatArray], ...]
     _kinds: FloatArray | None
     _scale: FloatArray
+    _kept: list[Any] = field(default_factory=list)  # the last frame's extended light, and each primary's of it
 
     @property
     def of_white(self) -> FloatArray:
@@ -172,14 +174,20 @@ class Colours:
         if stars.primaries is None:
             raise AssertionError("the stars of a bench that drives its primaries apart have their shares")
         bias = 0.5 if sprites.footprint_px % 2 else 0.0  # as in pack_sprites
-        found = []
-        for light, (right, down) in zip(by_share(sprites, stars, stars.primaries), self.places_px.tolist(), strict=True):
+        found, places = [], self.places_px.tolist()
+        each = by_share(sprites, stars, stars.primaries)
+        extended: list[Any] = [()] * len(each)
+        if sprites.extended:
+            if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
+                moved = zip(each, places, strict=True)
+                self._kept[:] = [sprites.extended, [[shifted(one, -x, -y) for one in part.extended] for part, (x, y) in moved]]
+            extended = self._kept[1]
+        for light, (right, down), lights in zip(each, places, extended, strict=True):
             x_px, y_px = light.x_px - right, light.y_px - down
             for column, place_px in enumerate((x_px, y_px)) if right or down else ():
                 pixel = np.floor(place_px + bias)
                 light.data["pixel"][:, column], light.data["fraction_px"][:, column] = pixel, place_px - pixel
-            extended = tuple(shifted(one, -right, -down) for one in light.extended)
-            found.append(replace(light, x_px=x_px, y_px=y_px, extended=extended))
+            found.append(replace(light, x_px=x_px, y_px=y_px, extended=tuple(lights)))
         return tuple(found)
 
 

@@ -155,7 +155,7 @@ def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLi
             for one, most in ((light.image, np.inf), (light.cover, 1.0))
         )
         corner = light.corner_px[0] - 1, light.corner_px[1] - 1
-        return light if image is None else replace(light, image=image, cover=cover, corner_px=corner, lasting=False)
+        return light if image is None else replace(light, image=image, cover=cover, corner_px=corner)
     x_px, y_px = light.camera.principal_point_px
     return replace(light, camera=replace(light.camera, principal_point_px=(x_px + right_px, y_px + down_px)))
 

@@ -11,7 +11,8 @@ Both ask the same of a star: its electrons through some curves of wavelength, wh
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,7 @@ from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
 from hilstar.scene.extended import shifted
-from hilstar.scene.sprites import Sprites, by_share
+from hilstar.scene.sprites import Sprites, by_share, with_mean
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
 from hilstar.sky.stars import Stars
@@ -29,6 +30,7 @@ STEP_NM = 0.25  # of the spectra of primaries
 KNOT_STEPS = 8
 MEAN_WEIGHT = 1e3  # per nm: a mean wavelength within reach is met to 1e-3 nm
 UNSEEN = 1e-6  # share of white
+TINY = 1e-30  # electrons per second
 WITHIN, WITHIN_NM = 1e-6, 0.1  # within the gamut: of a star's electrons, and of its mean wavelength
 SCALE_K = np.geomspace(1500.0, 60_000.0, 400)
 
@@ -54,6 +56,7 @@ class Colours:
     _curves: tuple[Callable[..., FloatArray], ...]
     _kinds: FloatArray | None
     _scale: FloatArray
+    _kept: list[Any] = field(default_factory=list)  # the last frame's extended light, and each primary's of it
 
     @property
     def of_white(self) -> FloatArray:
@@ -136,8 +139,7 @@ class Colours:
         shares = self.on(stars).primaries
         if shares is None:
             raise AssertionError("made above")
-        mean = stars.rates_e_per_s @ shares[: len(stars.rates_e_per_s)] / (stars.rates_e_per_s.sum() or 1.0)
-        return np.vstack([shares, mean])[np.where(star < 0, -1, star)]
+        return with_mean(shares, stars)[np.where(star < 0, -1, star)]
 
     def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.
@@ -155,7 +157,7 @@ class Colours:
         else:
             for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
                 added |= {f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)}
-            added["off_gamut"] = off
+            added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
         known = [*(truth.dtype.names or ()), "in_gamut"]
         kinds = [*truth.dtype.descr, *((name, "f8") for name in added if name not in known), ("in_gamut", "?")]
         found = np.zeros(len(truth), dtype=kinds)
@@ -172,20 +174,27 @@ class Colours:
         if stars.primaries is None:
             raise AssertionError("the stars of a bench that drives its primaries apart have their shares")
         bias = 0.5 if sprites.footprint_px % 2 else 0.0  # as in pack_sprites
-        found = []
-        for light, (right, down) in zip(by_share(sprites, stars, stars.primaries), self.places_px.tolist(), strict=True):
+        found, places = [], self.places_px.tolist()
+        each = by_share(sprites, stars, stars.primaries)
+        extended: list[Any] = [()] * len(each)
+        if sprites.extended:
+            if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
+                moved = zip(each, places, strict=True)
+                self._kept[:] = [sprites.extended, [[shifted(one, -x, -y) for one in part.extended] for part, (x, y) in moved]]
+            extended = self._kept[1]
+        for light, (right, down), lights in zip(each, places, extended, strict=True):
             x_px, y_px = light.x_px - right, light.y_px - down
             for column, place_px in enumerate((x_px, y_px)) if right or down else ():
                 pixel = np.floor(place_px + bias)
                 light.data["pixel"][:, column], light.data["fraction_px"][:, column] = pixel, place_px - pixel
-            extended = tuple(shifted(one, -right, -down) for one in light.extended)
-            found.append(replace(light, x_px=x_px, y_px=y_px, extended=extended))
+            found.append(replace(light, x_px=x_px, y_px=y_px, extended=tuple(lights)))
         return tuple(found)
 
 
-def lit_alone(sprites: Sprites) -> Sprites:
-    """Sprites without those that have no light of this primary."""
-    lit = np.flatnonzero(sprites.data["electrons_per_s"])
+def lit_alone(sprites: Sprites, faintest_e_per_s: float) -> Sprites:
+    """The sprites of a primary without those of stars that have less of its light than a pixel can show, or none."""
+    rates = np.ascontiguousarray(sprites.data["electrons_per_s"])
+    lit = np.flatnonzero(rates >= max(faintest_e_per_s / sprites.per_star, TINY))
     if len(lit) == len(sprites):
         return sprites
     x_px, y_px = sprites.x_px[lit], sprites.y_px[lit]

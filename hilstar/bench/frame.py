@@ -259,8 +259,14 @@ class Bench:
         """Sprites with those of each primary, where those are driven apart."""
         if sprites is None or self.colours is None:
             return sprites
-        parts = self.colours.parts(sprites, self.shown_stars)
-        return replace(sprites, primaries=tuple(lit_alone(part) for part in parts))
+        parts = zip(self.colours.parts(sprites, self.shown_stars), self._faintest_e_per_s, strict=True)
+        return replace(sprites, primaries=tuple(lit_alone(*part) for part in parts))
+
+    @cached_property
+    def _faintest_e_per_s(self) -> list[float]:
+        """What a star needs of each primary's light to light a pixel of it, where the screen is darkest."""
+        panels = (replace(one, flux_at_white_e_per_s=one.flux_at_white_e_per_s * self.darkest) for one in self.panel.primaries)
+        return [self.quantiser.faintest_e_per_s(one, self.psf) for one in panels]
 
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
         """How many stars in view at an attitude are too faint for the monitor."""

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from hilstar.arrays import Float32Array
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import Backend, ScreenView, Target
 from hilstar.scene.sprites import Sprites
 
 
+def _by_first(name: str) -> Callable[..., Any]:
+    return lambda self, *given, **named: getattr(self._each[0], name)(*given, **named)
+
+
+def _by_all(name: str) -> Callable[..., Any]:
+    return lambda self: [getattr(one, name)() for one in self._each]
+
+
 class PrimariesBackend(Backend):
-    """Draws each primary of a Target by its own backend; all of them have one context, or none."""
+    """Draws each primary of a Target by its own backend; all of them have one context, or none. See `Backend`."""
 
     def __init__(self, target: Target, drawn_by: Sequence[Backend]) -> None:
         first = drawn_by[0]
@@ -25,76 +32,31 @@ class PrimariesBackend(Backend):
             first.gl_version,
             first.path,
         )
-        self._planes: np.ndarray[Any, np.dtype[np.unsignedinteger[Any]]] | None = None
+        self._planes: np.ndarray[Any, np.dtype[np.unsignedinteger[Any]]] = np.empty((0, 0, 0), np.uint8)
+
+    draw_linear, linear, finish, close = map(_by_first, ("draw_linear", "linear", "finish", "close"))
+    present, take_back_buffer = map(_by_first, ("present", "take_back_buffer"))
+    changed_codes, fault = map(_by_first, ("changed_codes", "fault"))
+    remember_tables, forget_images, begin_anew = map(_by_all, ("remember_tables", "forget_images", "begin_anew"))
 
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """See `Backend.draw`."""
         for one, light in zip(self._each, (None,) * len(self._each) if sprites is None else sprites.primaries, strict=True):
             one.draw(light, frame)
 
-    def draw_linear(self, sprites: Sprites) -> None:
-        """See `Backend.draw_linear`."""
-        self._each[0].draw_linear(sprites)
-
-    def linear(self) -> Float32Array:
-        """The image of the last `draw_linear`."""
-        return self._each[0].linear()
-
     def levels(self) -> Levels:
         """See `Backend.levels`."""
-        planes = self._planes
         for k, one in enumerate(self._each):
             levels = one.levels()
-            if planes is None or planes.dtype != levels.dtype:
-                planes = self._planes = np.empty((len(self._each), *levels.shape), levels.dtype)
-            np.copyto(planes[k], levels)
-        if planes is None:
-            raise AssertionError("a target has primaries")
-        return Levels(np.moveaxis(planes, 0, -1))
+            if not self._planes.size:
+                self._planes = np.empty((len(self._each), *levels.shape), levels.dtype)
+            np.copyto(self._planes[k], levels)
+        return Levels(np.moveaxis(self._planes, 0, -1))
 
     def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
         """See `Backend.show_on`."""
         self._each[0].show_on(view, self._each[1:])
 
-    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
-        """See `Backend.present`."""
-        self._each[0].present(overlay, patch_code, marker)
-
-    def take_back_buffer(self) -> None:
-        """See `Backend.take_back_buffer`."""
-        self._each[0].take_back_buffer()
-
-    def changed_codes(self) -> str:
-        """See `Backend.changed_codes`."""
-        return self._each[0].changed_codes()
-
-    def fault(self) -> str:
-        """See `Backend.fault`."""
-        return self._each[0].fault()
-
-    def remember_tables(self) -> None:
-        """See `Backend.remember_tables`."""
-        for one in self._each:
-            one.remember_tables()
-
     def changed_tables(self) -> int:
         """See `Backend.changed_tables`."""
         return sum(one.changed_tables() for one in self._each)
-
-    def forget_images(self) -> None:
-        """See `Backend.forget_images`."""
-        for one in self._each:
-            one.forget_images()
-
-    def begin_anew(self) -> None:
-        """See `Backend.begin_anew`."""
-        for one in self._each:
-            one.begin_anew()
-
-    def finish(self) -> None:
-        """See `Backend.finish`."""
-        self._each[0].finish()
-
-    def close(self) -> None:
-        """Free the GL context and everything in it."""
-        self._each[0].close()

@@ -151,11 +151,11 @@ def shifted(light: ExtendedLight, right_px: float, down_px: float) -> ExtendedLi
         from scipy.ndimage import shift
 
         image, cover = (
-            None if one is None else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, one.max())
-            for one in (light.image, light.cover)
+            None if one is None else shift(np.pad(one, 1), (down_px, right_px), output=np.float32).clip(0.0, most)
+            for one, most in ((light.image, np.inf), (light.cover, 1.0))
         )
         corner = light.corner_px[0] - 1, light.corner_px[1] - 1
-        return light if image is None else replace(light, image=image, cover=cover, corner_px=corner, lasting=False)
+        return light if image is None else replace(light, image=image, cover=cover, corner_px=corner)
     x_px, y_px = light.camera.principal_point_px
     return replace(light, camera=replace(light.camera, principal_point_px=(x_px + right_px, y_px + down_px)))
 

@@ -235,13 +235,18 @@ def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
     return [sprites] if stars.colours is None else by_share(sprites, stars, stars.colours)
 
 
+def with_mean(shares: FloatArray, stars: Stars) -> FloatArray:
+    """Shares (n, columns) of stars, and in one more row those of all stars' light together, without bodies'."""
+    rates = stars.rates_e_per_s
+    return np.vstack([shares, rates @ shares[: len(rates)] / (rates.sum() or 1.0)])
+
+
 def by_share(sprites: Sprites, stars: Stars, shares: FloatArray) -> list[Sprites]:
     """The sprites once for each column of `shares` (stars, columns): every light times its star's or body's share.
 
     Light that is neither a star's nor a body's, as a fault's, has the mean share of the stars.
     """
-    alone = len(stars.rates_e_per_s)
-    shares = np.vstack([shares, stars.rates_e_per_s @ shares[:alone] / (stars.rates_e_per_s.sum() or 1.0)])
+    alone, shares = len(stars.rates_e_per_s), with_mean(shares, stars)
     bodies = {name: alone + k for k, name in enumerate(stars.bodies)}
     of_sprites = np.where(sprites.star < 0, -1, sprites.star)
     of_extended = [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended]

@@ -215,7 +215,8 @@ class MatchTally:
     `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` are the stars that the display
     really shows, however far off. `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a
     screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the detector's noise.
-    `off_px` has how far off each kind of centroider finds each of `stars`.
+    `off_px` has how far off each kind of centroider finds each of `stars`, `channels_mag` how much too faint each channel is of
+    those whose colour the primaries have; there are `out_of_gamut` others.
     """
 
     stars: list[Star] = field(default_factory=list)
@@ -230,6 +231,8 @@ class MatchTally:
     mirrored: Counter[Mirror] = field(default_factory=Counter)
     noisy_mag: list[float] = field(default_factory=list)
     noisy_px: list[float] = field(default_factory=list)
+    channels_mag: list[list[float]] = field(default_factory=list)
+    out_of_gamut: int = 0
     off_px: dict[Centroider, list[float]] = field(default_factory=lambda: {kind: [] for kind in FAMILY})
 
 
@@ -360,10 +363,22 @@ class Comparison:
             tally.off_px.setdefault(kind, []).extend(
                 math.hypot(*here.against(there, int(k))[1:]) for k in np.flatnonzero(found)
             )
+        if seen.by_channel:
+            tally.out_of_gamut += int((found & ~seen.truth["in_gamut"]).sum())
+            self._compare_channels(seen, np.flatnonzero(found & seen.truth["in_gamut"]))
         tally.vanished += len(sky.found) - len(shown.found)
         self._follow(seen, shown.found, wanted)
         self._count_mirrored(seen, shown.found, wanted)
         self._measure_noisy(seen, self.twin.detected_e(seen, rng), wanted)
+
+    def _compare_channels(self, seen: TwinField, stars: IntArray) -> None:
+        """The light of each channel in squares about stars, shown against sky."""
+        self.tally.channels_mag = self.tally.channels_mag or [[] for _ in seen.by_channel]
+        reach = math.ceil(self.finder.settings.radius_px)
+        for x, y in np.rint([seen.x_px[stars], seen.y_px[stars]]).T.astype(int).tolist():
+            part = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+            for off, (there, sky) in zip(self.tally.channels_mag, seen.by_channel, strict=True):
+                off.append(abs(magnitude(float(there[part].sum() / sky[part].sum()))))
 
     def measured(self) -> Measured:
         """All that was measured so far, with what a verdict has to know of the bench. Raises InputError (see `true_panel`)."""

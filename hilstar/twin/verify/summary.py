@@ -75,6 +75,11 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
         "passed": verdict.passed,
         "reasons": verdict.reasons,
         **{name: getattr(tally, name) for name in ("blended", "clipped", "not_shown", "at_edge", "summed")},
+        "channels_mag": {
+            key: error_spread(np.array(off))
+            for key, off in zip(measured.config.tracker.quantum_efficiencies, tally.channels_mag, strict=False)
+        },
+        "out_of_gamut": tally.out_of_gamut,
         "zero_point_mag": _finite(errors.zero_point_mag),
         "scale_error": None if fit is None else fit.scale_error,
         "rotation_arcsec": None if fit is None else fit.rotation_rad * ARCSEC_PER_RAD,
@@ -132,6 +137,8 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)",
         f"{'centroid error':20}{centroid}, by {summary['centroider']}",
         f"{'by each centroider':20}{each} px rms",
+        *(f"{key:21}{three(errors)} mag" for key, errors in summary["channels_mag"].items()),
+        *([f"{'out of gamut':20}{summary['out_of_gamut']} stars, which are not in these"] if summary["channels_mag"] else []),
         f"{'with detector noise':20}{three(noisy['flux_mag'])} mag, {three(noisy['centroid_px'])} px",
         *(
             f"{'V {v_from} to {v_to}'.format(**row):>17}   {row['flux_error_mag'].rms:.4f} mag rms,"

@@ -100,8 +100,9 @@ class TwinField:
     """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
 
     `shown_e` is what the monitor as it is makes, `assumed_e` what it would make if everything were as assumed (the same
-    array where nothing differs), and `sky_e` what the stars themselves make. `under_e` lies under them all. `truth` has the
-    rows of TRUTH_DTYPE of stars and points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more
+    array where nothing differs), and `sky_e` what the stars themselves make. `by_channel` has shown and sky of each channel,
+    where primaries are driven apart for several. `under_e` lies under them all. `truth` has the rows of TRUTH_DTYPE of stars
+    and points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more
     than points.
     """
 
@@ -113,6 +114,7 @@ class TwinField:
     y_px: FloatArray
     discs: tuple[tuple[FloatArray, float], ...] = ()
     under_e: FloatArray | float = 0.0
+    by_channel: tuple[tuple[FloatArray, FloatArray], ...] = ()
 
     def near_disc(self, camera: Camera, margin_px: float) -> npt.NDArray[np.bool_]:
         """True for stars (n,) within `margin_px` of a disc's limb, or before it."""
@@ -160,13 +162,17 @@ class Twin(Closing):
         shown = assumed = by_primary.sum(axis=0)
         if self.differs:
             assumed = self.sky_optics.images_e_per_s(lights[1], self.primaries).sum(axis=0) * exposure_s
+        by_channel: tuple[tuple[FloatArray, FloatArray], ...] = ()
+        if (colours := self.bench.colours) is not None and not colours.mono:
+            skies = (self.sky_optics.image_e_per_s(light.astype(np.float64)) * exposure_s for light in frame.light)
+            by_channel = tuple(zip(np.tensordot(colours.by_primary, by_primary, 1), skies, strict=True))
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
         discs, under_e = self.bench.discs(view), self.glow_e_per_s * exposure_s + self._background.of_view_e(view)
         points = ~np.isin(frame.truth["name"], [disc.name for disc in discs])
         x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
         found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
-        return TwinField(shown, assumed, sky, frame.truth[points], x_px, y_px, found, under_e)
+        return TwinField(shown, assumed, sky, frame.truth[points], x_px, y_px, found, under_e, by_channel)
 
     def detected_e(self, seen: TwinField, rng: np.random.Generator) -> FloatArray:
         """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted."""

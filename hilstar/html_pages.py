@@ -41,12 +41,14 @@ img { max-width: 100%; height: auto; border-radius: 8px; vertical-align: top }
 .number { font-size: 28px; line-height: 1.2; font-weight: 600; font-variant-numeric: tabular-nums; margin: 10px 0 }
 .number small { display: block; font-size: 13.5px; font-weight: 400; color: var(--muted); margin-top: 2px }
 details { margin: 8px 0 } summary { cursor: pointer; color: var(--accent) }
-@media screen and (min-width: 900px) { .card.pictured { grid-template-columns: minmax(0, 2fr) minmax(0, 3fr) }
+@media screen and (min-width: 900px), print { .card.pictured { grid-template-columns: minmax(0, 2fr) minmax(0, 3fr) }
   .card > header, .card > details { grid-column: 1 / -1 } .card figure { margin: 0 } }
 @media (max-width: 600px) { body { font-size: 14px; padding: 12px 10px 30px } .card { padding: 12px }
   td, th { padding-right: 10px } }
-@media print { @page { size: A4; margin: 14mm } body { font-size: 12px; padding: 0; max-width: none } a { color: inherit }
-  * { print-color-adjust: exact } .wide-table { overflow: visible } table { font-size: 11px } td, th { padding-right: 8px }
+@media print { @page { size: A4; margin: 14mm } a { color: inherit }
+  body { font-size: 12px; padding: 0; max-width: none; background: none } * { print-color-adjust: exact }
+  details:not([open]) { display: none } .number { font-size: 20px } .card { padding: 10px 12px }
+  .wide-table { overflow: visible } table { font-size: 11px } td, th { padding-right: 8px }
   img, figure, tr, .note, .health { break-inside: avoid } img { max-height: 235mm } h1, h2 { break-after: avoid } }
 """
 
@@ -94,8 +96,8 @@ def measured(value: float, error: float | None, unit: str = "") -> str:
     if error is None or not math.isfinite(error) or error <= 0:
         return f"{value:.4g} {unit}".rstrip()
     digits = 1 - math.floor(math.log10(error))
-    places = max(digits, 0)
-    return f"{round(value, digits):.{places}f} \N{PLUS-MINUS SIGN} {round(error, digits):.{places}f} {unit}".rstrip()
+    both = " \N{PLUS-MINUS SIGN} ".join(f"{round(each, digits):,.{max(digits, 0)}f}" for each in (value, error))
+    return f"{both.replace(',', chr(0x202F))} {unit}".rstrip()
 
 
 def table_of(rows: Iterable[Sequence[object]], header: Sequence[str] = (), digits: int = DIGITS) -> str:

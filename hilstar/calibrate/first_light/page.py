@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hilstar.calibrate.first_light.records import SessionFile, StepRecord
 from hilstar.calibrate.first_light.session import STEPS, SessionStep
+from hilstar.charts import capital
 from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.html_pages import Markup, banner_of, escaped, measured, page_of, picture_of, table_of
@@ -87,7 +88,7 @@ def _words(step: SessionStep, record: StepRecord, session: SessionFile) -> Itera
     else:
         value = measured(number.value, number.error, number.unit)
         yield f'<p class="number">{escaped(value)}<small>{escaped(number.of)}</small></p>'
-    yield f"<p>{escaped(record.line[:1].upper() + record.line[1:])}.</p>"
+    yield f"<p>{escaped(capital(record.line))}.</p>"
     if record.verdict == "failed":
         again = f"hilstar first-light {Path(session.bench).name} -o SESSION --again {record.name}"
         yield f'<p class="note"><b>What to do:</b> {escaped(step.cure)} Then, as before: <code>{escaped(again)}</code></p>'

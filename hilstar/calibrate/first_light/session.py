@@ -78,8 +78,9 @@ def latency(context: StepContext) -> StepOutcome:
     if context.truth is not None:
         figures["truth_panel_delay_ms"] = context.truth.config.monitor.panel_delay_ms
     line = (
-        f"panel_delay_ms {delay_ms:g} +- {error_ms:.3f}, the bench file has {monitor.panel_delay_ms:g}; a swap is light at the"
-        f" square after {found['latency_ms']['p50']:.2f} ms, jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
+        f"the panel's delay is {delay_ms:g} +- {error_ms:.3f} ms, the bench file has {monitor.panel_delay_ms:g};"
+        f" a swap is light at the square after {found['latency_ms']['p50']:.2f} ms,"
+        f" jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
     )
     agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
     change = KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms)
@@ -97,9 +98,9 @@ def machine(context: StepContext) -> StepOutcome:
     if missing:
         raise MachineError("; ".join(f"{check.name}: {check.detail}" for check in missing))
     figures = {check.name: check.detail for check in found.checks}
-    passed = sum(check.ok for check in found.checks)
-    number = StepNumber(passed, None, f"of {len(found.checks)}", "checks passed")
-    return StepOutcome("done", figures["opengl"], figures, number=number)
+    passed = sum(check.required for check in found.checks)  # all of them
+    number = StepNumber(passed, None, f"of {passed}", "checks passed of what hilstar needs")
+    return StepOutcome("done", f"OpenGL by {figures['opengl']}", figures, number=number)
 
 
 def display(context: StepContext) -> StepOutcome:

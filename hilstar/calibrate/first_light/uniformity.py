@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.calibrate.first_light.context import HOT_FILL, DarkSubtracted, StepContext
@@ -40,7 +41,7 @@ JOINED = 1e-3  # relative to a dot's weight: smooths fields that have few dots
 WORTH_MAG = 0.002  # rms over the field: less is within the error of a star's light
 FAR_SIGMAS, FAR_MAG = 3.0, 0.01  # beyond both, noise does not explain how dots differ
 FILE = "light.toml"
-LIT_SIGMAS = 5.0
+LIT_SIGMAS, RING_PX = 5.0, 3  # a dot in the tracker's image, and the ring about it that tells the glow
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +124,10 @@ def warm_up(context: StepContext) -> StepOutcome:
     code, (_, period, _) = dot_code(context), _spacing(context)
     codes = _shown([period // 2, period // 2], period, code, context.resolution_px)
     dark, file, lit, number = context.read(context.dark()), context.file, np.zeros(0, dtype=np.bool_), 0
+    cold, beside = dark < HOT_FILL * context.full_dn, lit
 
     def read() -> float:
-        nonlocal lit, number
+        nonlocal lit, beside, number
         pattern, number = Pattern(f"white_{number:03}", codes), number + 1
         context.watch(pattern)
         path = context.source.look(file, pattern, context.folder / pattern.name, context.exposure_s)
@@ -133,8 +135,12 @@ def warm_up(context: StepContext) -> StepOutcome:
         path.unlink()  # hundreds are taken, and an interrupted watch begins anew
         _check_brightness(context, looked, code)
         if not lit.size:
-            lit = (looked.image > LIT_SIGMAS * noisiest_background(looked.image).noise) & (dark < HOT_FILL * context.full_dn)
-        return float(looked.image[lit].sum())
+            lit = (looked.image > LIT_SIGMAS * noisiest_background(looked.image).noise) & cold
+            if not lit.any():
+                raise InputError(f"no dot of code {code} is seen; look at the focus, and whether the screen is on")
+            beside = binary_dilation(lit, iterations=RING_PX) & cold & ~lit
+        # What black pixels glow more than in the dark frame is no light of the dots.
+        return float(looked.image[lit].sum() - looked.image[beside].mean() * lit.sum())
 
     hold = Pattern("white", codes)
     t_s, light = watch_white(
@@ -152,10 +158,10 @@ def warm_up(context: StepContext) -> StepOutcome:
     figures |= {"readings": len(light), "stable": "yes" if found.is_stable else "no"}
     if context.truth is not None:
         virtual = context.truth.config.certify.virtual
-        tau_s, cold = 60 * virtual.warm_up_min, virtual.cold_percent / 100
-        slope = cold / tau_s * math.exp(-ended_s / tau_s) + virtual.drift_percent_per_h / 100 / S_PER_H
+        tau_s, change = 60 * virtual.warm_up_min, virtual.cold_percent / 100
+        slope = change / tau_s * math.exp(-ended_s / tau_s) + virtual.drift_percent_per_h / 100 / S_PER_H
         figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
-        stable_s = tau_s * math.log(max(abs(cold) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
+        stable_s = tau_s * math.log(max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
         figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)  # of its exponential alone
     per_h = StepNumber(found.drift_percent_per_h, found.drift_error_percent_per_h, "%/h", "drift of white at the last reading")
     return StepOutcome(

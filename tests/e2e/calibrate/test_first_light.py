@@ -32,7 +32,19 @@ from tests.support.waiting import PATIENCE_S
 
 GAMMA_22 = {"monitor": {"calibration": "gamma2.2", "photodiode_px": 40}}
 NOTES = Notes({}, ErrorTable(), MadeTable(by="planted", when="2026-11-21", poses=1))
-STEPS = ["machine", "display", "orientation", "focus", "geometry", "uniformity", "photometry", "scale", "latency", "verify"]
+STEPS = [
+    "machine",
+    "display",
+    "orientation",
+    "focus",
+    "warm-up",
+    "geometry",
+    "uniformity",
+    "photometry",
+    "scale",
+    "latency",
+    "verify",
+]
 FEW = ["--patches", 30]  # 12 levels
 NONE = ["--patches", 0]
 GAMMA, BLACK, WHITE_E_PER_S = 2.35, 1 / 800, 2.5e6
@@ -140,6 +152,7 @@ def test_a_whole_virtual_session_finds_mirror_and_lens(whole):
         "machine",
         "orientation",
         "focus",
+        "warm-up",
         "geometry",
         "uniformity",
         "photometry",
@@ -159,9 +172,10 @@ def test_the_page_needs_nothing_beside_it(whole):
     folder, found, _ = whole
     page = (folder / "s" / "first-light.html").read_text()
     assert not re.search(r"(src|href)=['\"](?!data:|#)", page)
-    assert page.count("data:image/png;base64,") == 11
+    assert page.count("data:image/svg+xml;base64,") == 12
     for step in found["steps"]:
         assert f'id="{step["name"]}"' in page
+        assert (step["number"] is not None) == (step["verdict"] == "done")
     assert found["bench_sha256"] in page
     assert "+flip_x = true" in page
 
@@ -204,14 +218,16 @@ def test_a_session_killed_half_way_goes_on_where_it_was(tmp_path):
         taken = ended_at(process, folder, "geometry-1/frame_005", signal.SIGKILL)
     session = json.loads((folder / "s" / "session.json").read_text())
     assert session["running"] == "geometry"
-    assert [step["name"] for step in session["steps"]] == STEPS[:4]
+    assert [step["name"] for step in session["steps"]] == STEPS[:5]
     with started(folder, *FEW) as process:
         readings = ended_at(process, folder, "photometry-1/patch_010", signal.SIGKILL)
     assert untouched(taken) == len(taken) - 1 > 4
     resumed = virtually(folder, *FEW)
     assert resumed.returncode == 0, resumed.stderr
     assert untouched(readings) == len(readings) - 1 > 10
-    names = [f"{name}-1" for name in ("focus", "geometry", "orientation", "photometry", "scale", "uniformity", "verify")]
+    names = [
+        f"{name}-1" for name in ("focus", "geometry", "orientation", "photometry", "scale", "uniformity", "verify", "warm-up")
+    ]
     assert sorted(path.name for path in (folder / "s" / "images").iterdir()) == names
     assert not list((folder / "s").rglob("*.part*"))
     light = steps_of(resumed)["photometry"]["figures"]

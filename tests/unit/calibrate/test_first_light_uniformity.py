@@ -58,7 +58,7 @@ def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp
     assert found.verdict == "done", found.line
     assert found.figures["truth_rms_mag"] < MAP_MAG
     assert found.figures["change_rms_mag"] == pytest.approx(seen, rel=0.5)
-    assert (folder / "uniformity.png") in found.pictures
+    assert (folder / "uniformity.svg") in found.pictures
     assert load_calibration(folder / "light.toml", 10).uniformity is not None
     assert did(folder, scale).verdict == "done"
     after = did(folder, verify)

@@ -75,6 +75,7 @@ def _run(words: list[str]) -> int:
 def usage_line(error: Any, words: list[str]) -> str:
     """The line for a wrong command line: typer's `error`, and what to write instead."""
     said = str(error.format_message()).replace("Value error, ", "").rstrip(".")
+    said = re.sub(r"a valid (float|int)\w*( range)?", lambda m: "a number" if m[1] == "float" else "a whole number", said)
     at = getattr(error, "ctx", None)
     see = f"(see {'hilstar' if at is None else at.command_path} --help)"
     if (spaced := _spaced_numbers(words)) is not None:

@@ -298,8 +298,7 @@ def site_air(config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArr
     v, bv, vi = (np.append(c, one) for c, one in zip((catalog.v_mag, catalog.bv_mag, catalog.vi_mag), SUNLIGHT, strict=True))
     kinds = None if kind is None else np.vstack([kind, np.full((1, 2), np.nan)])
     dimming = [
-        dimmed_mag(lambda through: channel_rates(config.sky, through)(v, bv, vi, kinds), one, extinction)
-        for one in channels
+        dimmed_mag(lambda through: channel_rates(config.sky, through)(v, bv, vi, kinds), one, extinction) for one in channels
     ]
     return SiteAir(
         up_at=Ground(config.site).up,

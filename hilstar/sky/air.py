@@ -100,8 +100,8 @@ def with_knots(curve: Curve, other: Curve, range_nm: tuple[float, float]) -> Cur
 class SiteAir:
     """The air of a place: `up_at` a UTC, ns, the constants of refraction, rad, and how it dims, glows and twinkles.
 
-    `dimming_mag` (channels, masses, n + 1) has each star of the catalogue by row, and last sunlight; `glow_e_per_s_sr` (channels,) is that
-    at the zenith, and `v_extinction_mag` that of V by air mass.
+    `dimming_mag` (channels, masses, n + 1) has each star of the catalogue by row, and last sunlight; `glow_e_per_s_sr`
+    (channels,) is that at the zenith, and `v_extinction_mag` that of V by air mass.
     """
 
     up_at: Callable[[int], FloatArray]
@@ -145,7 +145,7 @@ class SiteAir:
         return replace(stars, electrons_per_s=stars.electrons_per_s * factor)
 
     def glow_at(self, directions: FloatArray, utc_ns: int) -> FloatArray:
-        """Electrons per second and steradian (channels, n) of the sky's glow in apparent directions (n, 3); none below ground."""
+        """Electrons per second and steradian (channels, n) of the glow in apparent directions (n, 3); none below the horizon."""
         sine = directions @ self.above(utc_ns).up
         masses = 1 / np.sqrt(1 - VAN_RHIJN * (1 - np.maximum(sine, 0.0) ** 2))
         relative = masses * flux_ratio(self.v_extinction_mag * (masses - 1)) * (sine > 0)

@@ -444,7 +444,7 @@ class TrackerBackground:
     """
 
     def __init__(
-        self, config: BenchConfig, folder: Path, camera: Camera, *, refuse: bool = True, moving: "MovingSky | None" = None
+        self, config: BenchConfig, folder: Path, camera: Camera, *, refuse: bool = True, moving: MovingSky | None = None
     ) -> None:
         self._bayer, tracker = config.tracker.detector.bayer, config.tracker
         channels = (bench_optics(tracker, folder),) if self._bayer is None else bench_channels(tracker, folder)

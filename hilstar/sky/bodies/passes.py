@@ -97,7 +97,7 @@ class Pass:
         """Only the satellites at places `which` (k,)."""
         return replace(self, index=self.index[which], seen_km=self.seen_km[:, which], place_km=self.place_km[:, which])
 
-    def through(self, air: SiteAir, utc_ns: int) -> Pass:
+    def through(self, air: SiteAir, utc_ns: int) -> "Pass":
         """The same through the air at a UTC: bent, and with the light that comes through, none below the horizon."""
         range_km = np.linalg.norm(self.seen_km[0], axis=1)[:, None]
         towards, above, seen_km = self.seen_km[0] / range_km, air.above(utc_ns), self.seen_km.copy()

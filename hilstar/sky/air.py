@@ -145,7 +145,7 @@ class SiteAir:
         return replace(stars, electrons_per_s=stars.electrons_per_s * factor)
 
     def glow_at(self, directions: FloatArray, utc_ns: int) -> FloatArray:
-        """Electrons per second and steradian (channels, n) of the glow in apparent directions (n, 3); none below the horizon."""
+        """Electrons per second and steradian (channels, n) of the glow in apparent directions (n, 3), none below ground."""
         sine = directions @ self.above(utc_ns).up
         masses = 1 / np.sqrt(1 - VAN_RHIJN * (1 - np.maximum(sine, 0.0) ** 2))
         relative = masses * flux_ratio(self.v_extinction_mag * (masses - 1)) * (sine > 0)

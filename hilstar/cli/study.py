@@ -27,6 +27,7 @@ Study = Literal[
     "faults",
     "chain",
     "colour",
+    "confront",
 ]
 
 ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file
@@ -40,6 +41,10 @@ def study(
         Path | None, typer.Argument(metavar="[BENCH.toml]", help="The bench file of `chain`.", show_default=False)
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer rounds, where a full study takes minutes.")] = False,
+    images: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Photographs for `confront`: a folder for each camera, with its guess.toml."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Draw charts and tables of what each choice costs in accuracy and in time, and of where methods fail."""
@@ -48,8 +53,22 @@ def study(
         raise InputError("study chain: is of a bench; write hilstar study chain BENCH.toml -o DIR")
     if what != "chain" and bench is not None:
         raise InputError(f"study {what}: has benches of its own; leave out {bench}")
+    if (what == "confront") != (images is not None):
+        raise InputError(
+            "study confront: is of photographs; add --images DIR"
+            if images is None
+            else f"study {what}: has no photographs; leave out --images"
+        )
     with progress(f"study {what}", math.inf if bench is None else CHAIN_SCENES) as advance:
-        lines, right = study_lines(what, output, quick) if bench is None else chain_lines(bench, output, quick, advance)
+        if images is not None:
+            from hilstar.study.confront import run as confront_set
+
+            make_directory(output)
+            lines, right = confront_set(output, images, quick), None
+        elif bench is None:
+            lines, right = study_lines(what, output, quick)
+        else:
+            lines, right = chain_lines(bench, output, quick, advance)
     if as_json:
         print_json({"study": what, "right": right, "findings": lines, "directory": str(output)})
     else:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,14 @@ class Photograph:
     def size_px(self) -> tuple[int, int]:
         """Width and height."""
         return self.dn.shape[1], self.dn.shape[0]
+
+
+def paged(array: FloatArray) -> FloatArray:
+    """The array in a file without a name, of which the system keeps in memory what is used."""
+    with TemporaryFile() as file:
+        array.tofile(file)
+        file.flush()
+        return np.memmap(file, dtype=array.dtype, mode="r", shape=array.shape)
 
 
 def read_photographs(path: Path, resolution_px: tuple[int, int] | None, at_ns: int | None = None) -> list[Photograph]:

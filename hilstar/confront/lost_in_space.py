@@ -33,6 +33,10 @@ NEAR = 0.006  # of the image's diagonal: within it a star and a source are one
 MAX_CHANCE = 1e-9
 MAX_CANDIDATES = 20_000  # of a hypothesis
 MIN_MATCHED = 5
+# The triangles of one sky serve others of about its date: an arcminute changes a ratio by less than a tenth of its tolerance.
+KEPT_STARS, KEPT_RAD = 1000, 3e-4
+Triangles = tuple[IntArray, FloatArray, FloatArray]
+_KEPT: dict[float, tuple[FloatArray, Triangles]] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +82,12 @@ def solve_lost(field: Field, focal_length_px: float, vectors: FloatArray, near: 
         rows = np.flatnonzero(vectors @ near > math.cos(min(reach, math.pi)))
         found = _solved(field, focal_length_px, vectors[rows], _triangles_of_sky(vectors[rows], smaller_rad, near, reach))
         return None if found is None else replace(found, star=rows[found.star])
-    return _solved(field, focal_length_px, vectors, _triangles_of_sky(vectors, smaller_rad))
+    kept = _KEPT.get(smaller_rad)
+    if kept is None or kept[0].shape != vectors.shape or np.abs(kept[0][:KEPT_STARS] - vectors[:KEPT_STARS]).max() > KEPT_RAD:
+        kept = vectors, _triangles_of_sky(vectors, smaller_rad)
+        _KEPT.clear()
+        _KEPT[smaller_rad] = kept
+    return _solved(field, focal_length_px, vectors, kept[1])
 
 
 def _solved(

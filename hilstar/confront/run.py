@@ -16,7 +16,7 @@ from hilstar.bench.cameras import tracker_camera
 from hilstar.charts import write_csv
 from hilstar.confront.excess import split_excess
 from hilstar.confront.files import NAMES, fixed_camera, read_tracker_file, write_tracker
-from hilstar.confront.images import Photograph, read_photographs
+from hilstar.confront.images import Photograph, paged, read_photographs
 from hilstar.confront.judge import Judge, Verdict
 from hilstar.confront.page import page_pictures, write_page
 from hilstar.confront.report import Confronted, failures_of, lines_of, words_of
@@ -26,6 +26,7 @@ from hilstar.files import make_directory
 from hilstar.scene.camera import Camera
 
 OUTPUTS = ("index.html", "stars.csv", "sources.csv", *NAMES)
+MEMORY_PX = 20_000_000  # of photographs in memory, with their backgrounds 0.5 GB; those beyond lie in files
 STAR_COLUMNS = (
     "image",
     "hip",
@@ -53,7 +54,12 @@ def confront(
 ) -> Confronted:
     """Confront photographs with a bench's tracker and write DIR's files. Raises InputError: what is wrong, and what to do."""
     file, has_screen = read_tracker_file(bench)
-    photos = [one for path in images for one in read_photographs(path, file.config.tracker.resolution_px, at_ns)]
+    photos: list[Photograph] = []
+    for path in images:
+        read = read_photographs(path, file.config.tracker.resolution_px, at_ns)
+        if sum(one.dn.size for one in (*photos, *read)) > MEMORY_PX:
+            read = [replace(one, dn=paged(one.dn)) for one in read]
+        photos += read
     full = max(photo.full_dn for photo in photos)
     photos = [replace(photo, full_dn=full) for photo in photos]
     names = [photo.name for photo in photos]

@@ -17,7 +17,7 @@ from hilstar.bench.config.sky import SiteSettings
 from hilstar.bench.site import site_glow_e_per_s_sr
 from hilstar.confront.background import SkyLevel, Sources, find_sources, sky_level, source_mask
 from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera
-from hilstar.confront.images import Photograph
+from hilstar.confront.images import Photograph, paged
 from hilstar.confront.light import (
     LINEAR_OFF,
     LINEAR_SIGMAS,
@@ -128,7 +128,7 @@ class Session:
 
 def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArray | None) -> Shot:
     """A photograph with its attitude. Raises InputError where it has none: what is seen, and what to do."""
-    level = sky_level(photo.dn, photo.step_dn)
+    level = _level(photo, photo.step_dn)
     sources = find_sources(level.above(photo.dn))
     sky = dated_sky(file, photo.t_ns)
     points = ~sources.single & ~sources.trail
@@ -252,9 +252,16 @@ def _linear(shot: Shot, photo: Photograph, power: float) -> Shot:
     dn = full * (np.maximum(photo.dn, 0) / full) ** (1 / power)
     middle = float(np.median(photo.dn)) / full
     step = photo.step_dn / power * max(middle, photo.step_dn / full) ** (1 / power - 1)
-    linear = replace(photo, dn=dn, step_dn=step)
-    level = sky_level(dn, step)
-    return replace(shot, photo=linear, level=level)
+    linear = replace(photo, dn=paged(dn) if isinstance(photo.dn, np.memmap) else dn, step_dn=step)
+    return replace(shot, photo=linear, level=_level(linear, step))
+
+
+def _level(photo: Photograph, step_dn: float) -> SkyLevel:
+    """The background, in a file where the photograph is in one."""
+    level = sky_level(photo.dn, step_dn)
+    if isinstance(photo.dn, np.memmap):
+        level = replace(level, level=paged(level.level), noise=paged(level.noise))
+    return level
 
 
 @dataclass(frozen=True, slots=True)

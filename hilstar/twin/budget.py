@@ -8,16 +8,16 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from hilstar.bench.build import bench_channels
+from hilstar.bench.build import bench_primaries, named_channels
 from hilstar.bench.frame import Bench, clipping_hip, named
 from hilstar.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
-from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, read_primaries, reddest_nm
+from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, reddest_nm
 from hilstar.monitor.quantise import Panel
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectral_types import class_shares
@@ -66,15 +66,6 @@ class NotDrawn:
 
 
 @dataclass(frozen=True, slots=True)
-class RedShare:
-    """The share of a star's electrons that is light from `from_nm` on, by spectral class, in a channel or in "all" of them."""
-
-    channel: str
-    from_nm: float
-    by_class: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True)
 class LightBudget:
     """The range of stars that a bench can show; its fields are the keys of the JSON object of `hilstar budget`.
 
@@ -99,7 +90,7 @@ class LightBudget:
     centroider: By
     centroid_rms_px: dict[str, float | None]
     primaries: ChannelMatrix | None
-    near_infrared: list[RedShare]
+    near_infrared: list[dict[str, Any]]
 
 
 def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
@@ -118,13 +109,10 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     nothing = zero_mag + magnitude(dark)
     half = np.array([-0.5, 0.5])
     corner_share = float(bench.psf.shares(half, half[:, None]).max())  # a star on the corner of four pixels
-    file, tracker = bench.config.monitor.primaries.file, bench.config.tracker
-    channels = dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, bench.file.folder), strict=True))
-    primaries, ends_nm = None, [RED_NM]
-    if file is not None:
-        spectra = read_primaries(bench.file.folder / file)
-        primaries = channel_matrix(spectra, channels, white)
-        ends_nm.append(reddest_nm(spectra))
+    channels = named_channels(bench.config.tracker, bench.file.folder)
+    spectra = bench_primaries(bench.config.monitor, bench.file.folder)
+    primaries = None if spectra is None else channel_matrix(spectra, channels, white)
+    ends_nm = [RED_NM] if spectra is None else [RED_NM, reddest_nm(spectra)]
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return LightBudget(
         method=render.quantisation + (" with bit stealing" if render.bit_stealing else ""),
@@ -145,11 +133,12 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     )
 
 
-def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[RedShare]:
-    """What a tracker of these channels has of light from each wavelength on: all together, and each of several channels."""
-    each = channels if len(channels) > 1 else {}
-    every = {"all": all_channels(list(channels.values())), **each}
-    return [RedShare(name, nm, class_shares(one, nm)) for nm in ends_nm for name, one in every.items()]
+def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[str, Any]]:
+    """The shares of light `from_nm` on `by_class` of spectra, in "all" channels together, and in each `channel` of several."""
+    every = {"all": all_channels(list(channels.values())), **(channels if len(channels) > 1 else {})}
+    return [
+        {"channel": name, "from_nm": nm, "by_class": class_shares(one, nm)} for nm in ends_nm for name, one in every.items()
+    ]
 
 
 def zero_point_mag(bench: Bench) -> float:
@@ -288,9 +277,9 @@ def budget_lines(found: LightBudget) -> list[str]:
             shares = (f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True))
             lines.append(f"{channel:22}{', '.join(shares)}")
     for red in found.near_infrared:
-        by_class = " ".join(f"{kind} {100 * share:.1f}" for kind, share in red.by_class.items())
-        channel = "" if red.channel == "all" else f"  {red.channel}"
-        lines.append(f"{f'from {red.from_nm:.0f} nm, % of e-':22}{by_class}{channel}")
+        by_class = " ".join(f"{kind} {100 * share:.1f}" for kind, share in red["by_class"].items())
+        name = f"from {red['from_nm']:.0f} nm, % of e-"
+        lines.append(f"{name:22}{by_class}" + ("" if red["channel"] == "all" else f"  {red['channel']}"))
     every = found.centroider == "all"
     kinds = f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}" if every else f"{'centroid rms':>14}"
     lines += ["", f"{'V':>6}{'flux rms':>12}{'max mag':>10}{kinds}{'max px':>9}" + ("" if every else f"{'max arcsec':>12}")]

@@ -1,33 +1,54 @@
-"""Pages that need no other file: one style, light and dark, with tables and pictures."""
+"""Pages that need no other file: the operator's page's colours, light, dark and on paper, with cards, tables and pictures."""
 
 from __future__ import annotations
 
 import base64
 import html
+import math
+import re
 from collections.abc import Iterable, Sequence
-
-from hilstar.charts import DARK, GRID, INK, PAPER
+from pathlib import Path
 
 DIGITS = 4
-PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-:root {{ color-scheme: light dark; --ink: {ink}; --paper: {paper}; --rule: {rule}; --note: #fff6df }}
-@media (prefers-color-scheme: dark) {{ :root {{
-  --ink: {dark_ink}; --paper: {dark_paper}; --rule: {dark_rule}; --note: #3d3520 }} }}
-body {{ font: 15px/1.45 sans-serif; max-width: 1020px; margin: 2em auto; padding: 0 1em;
-  color: var(--ink); background: var(--paper) }}
-table {{ border-collapse: collapse; margin: 1em 0 }}
-td, th {{ padding: 3px 14px 3px 0; border-bottom: 1px solid var(--rule); vertical-align: top; text-align: left }}
-td.n {{ text-align: right; font-variant-numeric: tabular-nums }}
-code, pre {{ font: 13px/1.45 ui-monospace, monospace; overflow-wrap: anywhere; white-space: pre-wrap }}
-img {{ max-width: 100% }}
-.note, pre {{ background: var(--note); padding: .4em .8em; margin: .4em 0 }}
-.verdict {{ color: #fff; border-radius: .3rem; padding: .1rem .5rem }}
-.small {{ font-size: .9em; opacity: .75 }}
-</style></head><body><h1>{title}</h1>{body}</body></html>
+COLOURS = Path(__file__).resolve().parent / "console" / "page" / "page.css"  # their one place
+STYLE = """
+* { box-sizing: border-box }
+body { font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "DejaVu Sans", sans-serif; max-width: 1180px;
+  margin: 0 auto; padding: 20px 16px 40px; color: var(--text); background: var(--ground); overflow-wrap: break-word }
+h1 { font-size: 22px; line-height: 1.25; margin: 4px 0 12px } h2 { font-size: 18px; line-height: 1.3; margin: 28px 0 8px }
+p { margin: 8px 0 } figure { margin: 10px 0 } a { color: var(--accent) }
+.wide-table { overflow-x: auto; margin: 10px 0 } table { border-collapse: collapse }
+td, th { padding: 4px 16px 4px 0; border-bottom: 1px solid var(--line); vertical-align: top; text-align: left }
+th { color: var(--muted); font-weight: 500 } td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
+code, pre { font: 13px/1.45 ui-monospace, Menlo, monospace; overflow-wrap: anywhere; white-space: pre-wrap }
+img { max-width: 100%; height: auto; border-radius: 8px; vertical-align: top }
+.note, pre { background: var(--raised); border: 1px solid var(--line); border-radius: 8px; padding: 8px 12px; margin: 8px 0 }
+.small { font-size: 13px; color: var(--muted) } .verdict { color: #fff; border-radius: 6px; padding: 1px 8px }
+.health { display: flex; gap: 14px; align-items: center; margin: 12px 0; padding: 12px 18px; border-radius: var(--radius);
+  color: var(--ok); background: var(--ok-ground); border: 1px solid var(--ok-edge) }
+.health strong { display: block; font-size: 20px; line-height: 1.25 } .health span { color: var(--text) }
+.health[data-state="bad"], .health[data-state="bad"] span { color: var(--bad-text) }
+.health[data-state="bad"] { background: var(--bad-ground); border-color: var(--bad-ground) }
+.health[data-state="warn"] { color: var(--warn); background: var(--panel); border-color: var(--warn) }
+.chip { font-size: 13px; font-weight: 650; border-radius: 999px; padding: 2px 11px; border: 1px solid; white-space: nowrap }
+[data-state="ok"] > .chip { color: var(--ok) } [data-state="warn"] > .chip { color: var(--warn) }
+[data-state="bad"] > .chip { color: var(--bad-text); background: var(--bad-ground); border-color: var(--bad-ground) }
+.steps { display: flex; flex-wrap: wrap; gap: 8px; margin: 12px 0 } .steps a { text-decoration: none }
+.card { background: var(--panel); border: 1px solid var(--line); border-radius: var(--radius); padding: 14px 18px;
+  margin: 14px 0; display: grid; gap: 4px 24px; grid-template-columns: minmax(0, 1fr); break-inside: avoid }
+.card > header { display: flex; flex-wrap: wrap; gap: 4px 12px; align-items: center; justify-content: space-between }
+.card h2 { margin: 0 } .card > .words > :first-child { margin-top: 0 }
+.number { font-size: 28px; line-height: 1.2; font-weight: 600; font-variant-numeric: tabular-nums; margin: 10px 0 }
+.number small { display: block; font-size: 13.5px; font-weight: 400; color: var(--muted); margin-top: 2px }
+details { margin: 8px 0 } summary { cursor: pointer; color: var(--accent) }
+@media screen and (min-width: 900px) { .card.pictured { grid-template-columns: minmax(0, 2fr) minmax(0, 3fr) }
+  .card > header, .card > details { grid-column: 1 / -1 } .card figure { margin: 0 } }
+@media (max-width: 600px) { body { font-size: 14px; padding: 12px 10px 30px } .card { padding: 12px }
+  td, th { padding-right: 10px } }
+@media print { @page { size: A4; margin: 14mm } body { font-size: 12px; padding: 0; max-width: none } a { color: inherit }
+  * { print-color-adjust: exact } .wide-table { overflow: visible } table { font-size: 11px } td, th { padding-right: 8px }
+  img, figure, tr, .note, .health { break-inside: avoid } img { max-height: 235mm } h1, h2 { break-after: avoid } }
 """
-COLOURS = {"ink": INK, "paper": PAPER, "rule": GRID}
-COLOURS |= {f"dark_{name}": DARK[colour] for name, colour in COLOURS.items()}
 
 
 class Markup(str):
@@ -38,7 +59,23 @@ class Markup(str):
 
 def page_of(title: str, body: Iterable[str]) -> bytes:
     """A whole page."""
-    return PAGE.format(title=escaped(title), body="\n".join(body), **COLOURS).encode(errors="replace")
+    dark, light = (
+        found.group(1) for found in re.finditer(r"^:root[^{]*\{(.*?)\}", COLOURS.read_text(), re.MULTILINE | re.DOTALL)
+    )
+    style = f":root {{ color-scheme: light dark; {_plain(dark)} {_plain(light)} }}"  # light lacks what both themes share
+    style += f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {_plain(dark)} }} }}{STYLE}"
+    head = (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escaped(title)}</title><style>{style}</style></head>"
+    )
+    text = "\n".join((f"{head}<body><h1>{escaped(title)}</h1>", *body, "</body></html>\n"))
+    return text.encode(errors="replace")
+
+
+def _plain(block: str) -> str:
+    """The colours of a theme, without its scheme and font."""
+    return " ".join(re.findall(r"--[\w-]+: [^;]+;", block))
 
 
 def escaped(value: object) -> str:
@@ -46,11 +83,26 @@ def escaped(value: object) -> str:
     return value if isinstance(value, Markup) else html.escape(str(value))
 
 
+def banner_of(state: str, headline: str, words: object = "") -> str:
+    """The verdict of a page; its state is ok, warn or bad."""
+    more = f"<span>{escaped(words)}</span>" if words else ""
+    return f'<div class="health" data-state="{state}"><div><strong>{escaped(headline)}</strong>{more}</div></div>'
+
+
+def measured(value: float, error: float | None, unit: str = "") -> str:
+    """A value with its standard error to two digits of that."""
+    if error is None or not math.isfinite(error) or error <= 0:
+        return f"{value:.4g} {unit}".rstrip()
+    digits = 1 - math.floor(math.log10(error))
+    places = max(digits, 0)
+    return f"{round(value, digits):.{places}f} \N{PLUS-MINUS SIGN} {round(error, digits):.{places}f} {unit}".rstrip()
+
+
 def table_of(rows: Iterable[Sequence[object]], header: Sequence[str] = (), digits: int = DIGITS) -> str:
     """A table; None is a dash, and numbers stand at the right."""
     head = "".join(f"<th>{escaped(name)}</th>" for name in header)
     body = "".join(f"<tr>{''.join(_cell(value, digits) for value in row)}</tr>" for row in rows)
-    return f"<table>{f'<tr>{head}</tr>' if header else ''}{body}</table>"
+    return f'<div class="wide-table"><table>{f"<tr>{head}</tr>" if header else ""}{body}</table></div>'
 
 
 def _cell(value: object, digits: int) -> str:
@@ -61,4 +113,4 @@ def _cell(value: object, digits: int) -> str:
 
 def picture_of(data: bytes, kind: str, alt: str) -> str:
     """A picture of a media type (image/KIND) within the page."""
-    return f'<p><img alt="{escaped(alt)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}"></p>'
+    return f'<figure><img alt="{escaped(alt)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}"></figure>'

@@ -39,6 +39,7 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Orientation, Scan
 from hilstar.scene.psf import Psf
+from hilstar.sky.air import SiteAir, dimmed_mag
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Optics, Photometry, all_channels, star_temperatures_k, tabulate, tabulate_pickles
 from hilstar.sky.spectral_types import star_types, tabulate_types
@@ -56,6 +57,7 @@ S_PER_MS = 1e-3
 # each field counts.
 TIMED_FIELDS = [from_radec_roll_deg(*place, 0.0) for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
 TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])
+SUNLIGHT, V_NM = (0.0, 0.65, 0.70), 545.0  # V, B-V and V-I; the wavelength of V
 TIMED_EXACT_S, TIMED_ROUND_S, MAX_TIMED = 0.1, 0.05, 10
 
 
@@ -280,7 +282,33 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
         note = f"{unread} of {len(catalog)} stars have no MK type of O to M, and their spectra by colour alone"
         catalog = dataclasses.replace(catalog, notes=(*catalog.notes, note))
     flux = star_flux(config, folder)(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind)
+    if config.site is not None and moving is not None:  # the air takes of each star by its own spectrum
+        moving.air = site_air(config, folder, catalog, kind)
     return make_stars(catalog, vectors, temperature_k, flux)
+
+
+def site_air(config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArray | None = None) -> SiteAir:
+    """The air over `[site]` for stars of a catalogue. Raises InputError."""
+    from hilstar.bench.site import Ground, site_extinction, site_glow_e_per_s_sr, site_refraction  # ERFA takes 30 ms
+
+    if config.site is None:
+        raise AssertionError("the file has a site")
+    extinction, optics = site_extinction(config.site, folder), bench_optics(config.tracker, folder)
+    channels = bench_channels(config.tracker, folder)
+    v, bv, vi = (np.append(c, one) for c, one in zip((catalog.v_mag, catalog.bv_mag, catalog.vi_mag), SUNLIGHT, strict=True))
+    kinds = None if kind is None else np.vstack([kind, np.full((1, 2), np.nan)])
+    dimming = [
+        dimmed_mag(lambda through: channel_rates(config.sky, through)(v, bv, vi, kinds), one, extinction) for one in channels
+    ]
+    return SiteAir(
+        up_at=Ground(config.site).up,
+        refraction_rad=site_refraction(config.site, optics),
+        height_m=config.site.height_m,
+        aperture_mm=config.tracker.aperture_mm,
+        dimming_mag=np.array(dimming, dtype=np.float32),
+        v_extinction_mag=float(extinction(np.array([V_NM]))[0]),
+        glow_e_per_s_sr=np.array([site_glow_e_per_s_sr(config, folder, one) for one in channels]),
+    )
 
 
 def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:

@@ -143,6 +143,13 @@ class Bench:
         """The bodies, the satellites and the observer; None where the sky stands still."""
         return self.sources.moving
 
+    @cached_property
+    def drive(self) -> FloatArray | float:
+        """How much of white each of `stars` asks for by its colour, relative to a white star as bright; 1 for all in grey."""
+        return (
+            1.0 if self.colours is None else self.colours.drive(self.colours.shares_of(self.stars, np.arange(len(self.stars))))
+        )
+
     @property
     def quantiser(self) -> type[Quantiser]:
         """The quantisation of its levels."""
@@ -373,7 +380,7 @@ def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
 
 def clipping_hip(bench: Bench) -> list[int | str]:
     """Stars and bodies that clip when centred on the darkest pixel, brightest first: HIP numbers, and names of bodies."""
-    peak_e_per_s = bench.stars.electrons_per_s * bench.psf.peak_share
+    peak_e_per_s = bench.stars.electrons_per_s * bench.psf.peak_share * bench.drive
     order = np.argsort(-peak_e_per_s, kind="stable")
     clips = peak_e_per_s[order] > bench.flux_at_white_e_per_s * bench.darkest * (1 + CLIP_TOLERANCE)
     return bench.stars.designations(order[clips])
@@ -411,4 +418,14 @@ def shares_line(bench: Bench) -> str | None:
     return (
         f'[render] bit_stealing with calibration = "{calibration.name}" assumes that the tracker sees white as {shares} of red,'
         " green and blue, as a photometer does; measure it (hilstar first-light), or write a calibration file with [weights]"
+    )
+
+
+def colour_line(bench: Bench) -> str | None:
+    """One line where the primaries' spectra are guessed from their chromaticities; otherwise None."""
+    if bench.colours is None or bench.config.monitor.primaries.xy_r is None:
+        return None
+    return (
+        "[monitor.primaries] xy_r, xy_g and xy_b: the primaries' spectra are Gaussians of about those chromaticities, so all"
+        " colours are approximate; measure the spectra, and write file"
     )

@@ -10,6 +10,7 @@ import numpy as np
 
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
 from hilstar.bench.config.bench_config import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
+from hilstar.bench.site import Ground
 from hilstar.frame.bodies import POINT_PX
 from hilstar.reading import read_text
 from hilstar.scene.camera import Camera
@@ -44,7 +45,11 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
     if unix:
         start_ns = round(start_ns / DAY_NS) * DAY_NS  # a Julian year is right to a millisecond
     orbit = config.spacecraft.orbit or GEOCENTRE
-    observer = Geocentre() if orbit in {GEOCENTRE, SOURCE} else orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
+    observer: Orbit = Geocentre()
+    if config.site is not None:
+        observer = Ground(config.site)
+    elif orbit not in {GEOCENTRE, SOURCE}:
+        observer = orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
     sky, shown = config.sky, config.sky.bodies
     asked = (("Sun", shown.sun), (EARTH, shown.earth), ("Moon", shown.moon), *((planet, shown.planets) for planet in PLANETS))
     names = tuple(name for name, wanted in asked if wanted)

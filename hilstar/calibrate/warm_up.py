@@ -74,6 +74,13 @@ class WarmUp:
             return f"white is not yet stable to {limit}: by its exponential it is after {after}; {drift}"
         return f"white is not shown to be stable to {limit}: {drift}"
 
+    @property
+    def cure(self) -> str:
+        """What to do where white is not stable."""
+        if self.law == "exponential" and math.isfinite(self.stable_after_s):
+            return "wait until then, and watch it again"
+        return "watch it for longer (--warm-up), and look at dynamic contrast, local dimming and stray light"
+
 
 @dataclass(frozen=True, slots=True)
 class _Law:

@@ -66,7 +66,7 @@ class DisplayTracker:
         self.canvas = detector_canvas(self.file, self.camera)
         self._panel, self._primaries = true_panel(self._bench), seen_primaries(self._bench)
         self._colours = DisplayColours.of(self._bench)
-        self._background = TrackerBackground(self.config, self.file.folder, self.camera)
+        self._background = TrackerBackground(self.config, self.file.folder, self.camera, moving=self._bench.moving)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
     def _load_optics(self) -> None:

@@ -19,6 +19,7 @@ from hilstar.cli.budget import budget
 from hilstar.cli.calibrate import alignment, dots, geometric, photometric, plan, psf, scale
 from hilstar.cli.campaign import campaign
 from hilstar.cli.catalogue import catalogue
+from hilstar.cli.certify import certify
 from hilstar.cli.compare import compare
 from hilstar.cli.confront import confront
 from hilstar.cli.convert import convert
@@ -47,7 +48,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Attitude streams": (send, attitude, convert, answers, fmu, keys),
     "Check what is shown": (simulate, verify, compare, budget, catalogue, report),
     "Test the tracker": (assess, campaign, tracker, confront),
-    "Calibrate": (first_light, latency),
+    "Calibrate": (first_light, latency, certify),
     "Study": (study, benchmark),
     "This machine": (doctor,),
 }

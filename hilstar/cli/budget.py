@@ -34,7 +34,7 @@ def budget(
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
     from hilstar.bench.build import load
-    from hilstar.bench.frame import shares_line
+    from hilstar.bench.frame import colour_line, shares_line
     from hilstar.tracker.centroiders import FAMILY
     from hilstar.twin.budget import By, budget_lines, write_report
     from hilstar.twin.budget import budget as find_budget
@@ -53,7 +53,7 @@ def budget(
         meant = did_you_mean(centroider, choices)
         raise InputError(f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}")
     with load(bench_file) as bench:
-        found, assumed = find_budget(bench, by), shares_line(bench)
+        found, assumed = find_budget(bench, by), shares_line(bench) or colour_line(bench)
     if output is not None:
         write_report(make_directory(output), found)
     if as_json:

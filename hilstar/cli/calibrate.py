@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -12,9 +12,6 @@ from hilstar.cli.running import Windowed
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory
-
-if TYPE_CHECKING:
-    from hilstar.monitor.identity import MonitorIdentity
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 RESOLUTION_FORM = "--resolution W,H in pixels, such as 1920,1080"
@@ -120,7 +117,7 @@ def psf(
     typer.echo(f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}")
 
 
-def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> "MonitorIdentity | None":
+def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> Any:
     """The identity of the display that was measured, where this machine has it, of those sides; None elsewhere."""
     from hilstar.monitor.window.this_monitor import identity_here
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hilstar.calibrate.first_light.image_sources import ImageSource, Pattern
     from hilstar.console.listener import PageListener
 
-PATCHES, FORCED = 96, "forced"
+PATCHES, FORCED, WARM_UP_MIN, SECONDS = 96, "forced", 30.0, 60.0
 EXAMPLE_TRUTH = "truth-example.toml"  # in configs
 
 
@@ -61,6 +61,15 @@ def first_light(
             metavar="N", help="At most so many readings of the monitor's response, 0 for none. [96; by hand 0]", min=0
         ),
     ] = None,
+    warm_up: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MINUTES",
+            help="At most so long is white watched until it is stable to 0.2 %, 0 for not at all. [with --virtual 30, else 0]",
+            min=0,
+            max=1440,
+        ),
+    ] = None,
     again: Annotated[list[str] | None, typer.Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
     seed: Annotated[int, typer.Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
     force: Force = False,
@@ -70,12 +79,12 @@ def first_light(
     console_name: ConsoleName = None,
     as_json: Json = False,
 ) -> None:
-    """Bring up a bench: mounting, focus, geometry, response, full scale, delay and verification, with a page at the end.
+    """Bring up a bench: mounting, focus, warm-up, geometry, light, full scale, delay and verification, with a page at the end.
 
     Sets the bench file's keys; SESSION keeps the file as it was, the calibration files, session.json and first-light.html.
     """
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.records import write_page
+    from hilstar.calibrate.first_light.page import write_page
     from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
     from hilstar.run.sync import beat_line
 
@@ -89,6 +98,9 @@ def first_light(
     check_files([virtual, dark], [], file)
     by_hand = grab is None and virtual is None
     readings = (0 if by_hand else PATCHES) if patches is None else patches
+    if by_hand and warm_up:
+        raise InputError("--warm-up: a person cannot save an image every ten seconds; give --grab CMD, or leave it out")
+    watched_s = SECONDS * ((0.0 if virtual is None else WARM_UP_MIN) if warm_up is None else warm_up)
     with (
         page_listener(console, control, token, console_name) as listener,
         closing(_image_source(file, grab, virtual, dark, diode, seed)) as source,
@@ -98,7 +110,7 @@ def first_light(
         source.find_monitor(file, datetime.now(UTC).date(), force=force)
         for line in source.forced:
             tell(f"{FORCED:12} {line}")
-        session = FirstLightSession(output, file, source, readings, watch)
+        session = FirstLightSession(output, file, source, readings, watch, watched_s)
         code = session.run(frozenset(again or []), tell)
         beats = beat_line(session.beat())
         if beats is not None:

@@ -15,6 +15,7 @@ import numpy as np
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.rotation import from_rotation_vector, multiply, to_matrix
 from hilstar.scene.camera import Camera, Lens
+from hilstar.sky.stars import AirAbove
 from hilstar.units import MAD_TO_SIGMA
 
 REFRACTION_RAD = 2.826e-4  # 58.3 arcsec times tan z, at 1010 hPa and 10 C (Astronomical Almanac)
@@ -59,18 +60,31 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class Pointing:
-    """Attitude of a photograph, and its zenith in cam as tangents (x, y) from the boresight; None where none is fitted."""
+    """Attitude of a photograph, and its zenith in cam as tangents (x, y) from the boresight; None where none is fitted.
+
+    With `air` zenith and refraction are known.
+    """
 
     q_icrs_to_cam: FloatArray
     zenith: tuple[float, float] | None = None
+    air: AirAbove | None = None
+
+    @property
+    def boresight(self) -> FloatArray:
+        """The direction of the boresight (3,), ICRS."""
+        return np.asarray(to_matrix(self.q_icrs_to_cam)[2])
 
     @property
     def altitude_deg(self) -> float | None:
-        """Height of the boresight over the horizon, where refraction told it."""
+        """Height of the boresight over the horizon, where the air or refraction told it."""
+        if self.air is not None:
+            return math.degrees(math.asin(float(np.clip(self.boresight @ self.air.up, -1, 1))))
         return None if self.zenith is None else 90 - math.degrees(math.atan(math.hypot(*self.zenith)))
 
     def seen(self, vectors: FloatArray) -> FloatArray:
         """Directions (n, 3), ICRS, as the air bends them."""
+        if self.air is not None:
+            return self.air.bent(vectors)
         if self.zenith is None:
             return vectors
         up = np.array([*self.zenith, 1.0]) / math.hypot(1.0, *self.zenith) @ to_matrix(self.q_icrs_to_cam)
@@ -164,7 +178,7 @@ class _Loss:
         for one, end, size in zip(self.pointings, self.ends, self.sizes, strict=True):
             own = numbers[end - size : end]
             q = multiply(from_rotation_vector(ATTITUDE_STEP_RAD * own[:3] + follow), one.q_icrs_to_cam)
-            found.append(Pointing(q, None if size == 3 else (float(own[3]), float(own[4]))))
+            found.append(replace(one, q_icrs_to_cam=q, zenith=None if size == 3 else (float(own[3]), float(own[4]))))
         return camera, found
 
     def residuals(self, numbers: FloatArray) -> FloatArray:
@@ -284,9 +298,9 @@ def fit_camera(
             best, chosen = held[name], name
     names = () if fixed else MODELS[chosen]
     camera, bare, floor = _settled(base, bare, photographs, names)
-    if refraction:
+    if refraction and any(one.air is None for one in bare):
         bent = tuple(
-            one if one.zenith else _with_zenith(camera, one, places, floor)
+            one if one.zenith or one.air else _with_zenith(camera, one, places, floor)
             for one, places in zip(bare, photographs, strict=True)
         )
         plain_px = _held_out(camera, bare, photographs, names, floor)

@@ -15,6 +15,7 @@ from hilstar.arrays import FloatArray
 from hilstar.confront.judge import StarRow, Verdict
 from hilstar.confront.session import Session
 from hilstar.confront.star_psf import field_terms
+from hilstar.sky.air import scintillation as young
 
 MIN_STARS = 12
 
@@ -111,14 +112,15 @@ def _light(
 
 
 def scintillation(session: Session) -> Part:
-    """Young's law (1967, AJ 72, 747) by aperture, exposure and the air mass that refraction told; at sea level."""
+    """Young's law (1967, AJ 72, 747) by aperture, exposure and the air mass; at sea level without a site."""
     tracker = session.file.config.tracker
-    altitudes = [one.altitude_deg for one in session.camera.pointings if one.altitude_deg is not None]
-    if not altitudes or tracker.exposure_s <= 0:
+    masses = [one for one in session.light.masses if one is not None]
+    if not masses or tracker.exposure_s <= 0:
         return Part("scintillation", math.nan, "not known: no air mass, as refraction was not fitted")
-    mass = float(np.mean([1 / math.sin(math.radians(one)) for one in altitudes]))
-    sigma = 0.09 * (tracker.aperture_mm / 10) ** (-2 / 3) * mass**1.75 / math.sqrt(2 * tracker.exposure_s)
-    how = f"Young's law at sea level: air mass {mass:.2f}, the bench's {tracker.aperture_mm:g} mm and {tracker.exposure_s:g} s"
+    mass, site = float(np.mean(masses)), session.file.config.site
+    height_m = 0.0 if site is None else site.height_m
+    sigma = float(young(tracker.aperture_mm, np.array([mass]), height_m, tracker.exposure_s)[0])
+    how = f"Young's law at {height_m:g} m: air mass {mass:.2f}, {tracker.aperture_mm:g} mm and {tracker.exposure_s:g} s"
     return Part("scintillation", sigma, f"{how}; not measured")
 
 

@@ -32,6 +32,7 @@ PER_PX, HALF_PX = 4, 6  # samples a pixel, and half of a PSF image's side
 MODEL = "confront: "  # before the PSF's own numbers in the file's history
 SCREEN_PX, SCREEN_PITCH_UM, FILLED = (1920, 1080), 265.5, 0.95  # of a bench whose file has no monitor: a 24 inch screen
 PLACEHOLDER = "[monitor]\nresolution_px = [1920, 1080]\npixel_pitch_um = 265.5\n[collimator]\nfocal_length_mm = 1000.0\n"
+UNDATED = '[sky]\nepoch_utc = "2000-01-01T00:00:00Z"\n'
 NAMES = ("tracker.toml", "tracker_distortion.toml", "tracker_qe.csv", "tracker_psf.fits")
 PATH_KEYS = {
     "calibration",
@@ -43,6 +44,7 @@ PATH_KEYS = {
     "orbit",
     "satellites",
     "satellite_magnitudes",
+    "extinction",
 }
 PATH_KEYS |= {"true_calibration", "true_geometry"}
 
@@ -52,6 +54,8 @@ def read_tracker_file(path: Path) -> tuple[BenchFile, bool]:
     text = read_text(path, "give the path of a bench file, or of one that has [tracker] alone", MAX_TOML_BYTES)
     tables = parse_toml(path, text)
     has_screen = "monitor" in tables or "collimator" in tables
+    if "site" in tables and "sky" not in tables:
+        text = f"{text.rstrip()}\n{UNDATED}"  # photographs have dates of their own
     return bench_file_of(path, text if has_screen else f"{text.rstrip()}\n{PLACEHOLDER}"), has_screen
 
 
@@ -97,8 +101,13 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     dated = session.shots[0].sky
     for key in ("epoch_utc", "epoch_jyear", "observer_velocity_km_s"):
         sky.pop(key, None)
-    sky["epoch_jyear"] = round(dated.epoch_jyear, 6)
-    if dated.velocity_km_s is not None and not sky.get("bodies"):
+    first_ns = session.shots[0].photo.t_ns
+    if session.air is not None and first_ns is not None:
+        sky["epoch_utc"] = f"{np.datetime64(first_ns, 'ns').astype('datetime64[ms]')}Z"
+        tables["site"] = {k: v for k, v in given_tables.get("site", {}).items() if not k.startswith("sky_")}
+    else:
+        sky["epoch_jyear"] = round(dated.epoch_jyear, 6)
+    if session.air is None and dated.velocity_km_s is not None and not sky.get("bodies"):
         sky["observer_velocity_km_s"] = [round(float(v), 4) for v in dated.velocity_km_s]
     sky.setdefault("faintest_v_mag", 10.0)
     tables["sky"] = sky

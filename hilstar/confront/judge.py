@@ -139,11 +139,18 @@ class Judge:
         self.session = session
         file = read_bench_file(tracker)
         config = file.config
-        sky = msgspec.structs.replace(config.sky, faintest_v_mag=ALL_STARS_MAG)
-        dark = type(config.background)()
-        self._simulator = Simulator(
-            replace(file, config=msgspec.structs.replace(config, sky=sky, background=dark)), refuse=False
+        dated = session.shots[0].sky  # each photograph's air is put before its stars below
+        velocity = (0.0, 0.0, 0.0) if dated.velocity_km_s is None else tuple(dated.velocity_km_s.tolist())
+        sky = msgspec.structs.replace(
+            config.sky,
+            faintest_v_mag=ALL_STARS_MAG,
+            epoch_utc=None,
+            epoch_jyear=dated.epoch_jyear,
+            observer_velocity_km_s=velocity,
+            bodies=type(config.sky.bodies)(),
         )
+        config = msgspec.structs.replace(config, sky=sky, background=type(config.background)(), site=None)
+        self._simulator = Simulator(replace(file, config=config), refuse=False)
         self._stars = self._simulator.stars
         tracker_keys = config.tracker
         self._own_mag = -2.5 * math.log10(max(tracker_keys.exposure_s, 1e-12) / tracker_keys.detector.gain_e_per_dn)
@@ -208,9 +215,12 @@ class Judge:
 
     def _light_dn(self, number: int) -> FloatArray:
         """The stars' light (height, width), DN, by `simulate`'s own code, behind the air of this photograph."""
-        session, stars, simulator = self.session, self._stars, self._simulator
+        session, stars, simulator, shot = self.session, self._stars, self._simulator, self.session.shots[number]
         pointing = session.camera.pointings[number]
-        columns = (pointing.seen(stars.vectors), stars.temperature_k, stars.electrons_per_s)
+        air, rate = shot.sky.air, stars.electrons_per_s
+        if air is not None and session.air is not None:
+            rate = rate * session.air.shares(stars.row, air.altitude_rad(stars.vectors))[0]
+        columns = (pointing.seen(stars.vectors), stars.temperature_k, rate)
         by_row = [np.empty_like(column) for column in columns]
         for ordered, column in zip(by_row, columns, strict=True):
             ordered[stars.row] = column

@@ -28,6 +28,7 @@ BRIGHT_V_MAG = 6.5  # to which rms errors are stated
 TRUSTED_SNR = 20.0
 CLIP, ROUNDS = 3.5, 8
 MIN_STARS = 8
+MIN_MASSES, CLOUD_MAG = 0.3, 0.01  # air masses that tell extinction, and by how much skies differ beside it
 BLOCK_PX = 32
 MIN_VARIANCE_DN2 = 1e-9
 SKY_CURVATURE = 0.03  # of the sky's light: by how much its shade differs from one photograph to another beyond a slope
@@ -75,7 +76,8 @@ class LightFit:
 
     `correction` is that of the quantum efficiency: tilt and bow. `zero_point_mag` and `colour_term` are
     about Johnson V: -2.5 log10(DN) = V + colour_term (B-V) - zero point. DN go as light to the power `linearity`. `sigma` has
-    one sigma of figures by name. `mag` (n,) is what each star should have, without the photograph's offset.
+    one sigma of figures by name. `mag` (n,) is what each star should have, without the photograph's offset. `masses` are each
+    photograph's air masses where known, and `extinction_mag` what offsets grow by with one, beyond the site's own table.
     """
 
     offsets_mag: FloatArray
@@ -86,6 +88,8 @@ class LightFit:
     linearity: float
     sigma: dict[str, float] = field(default_factory=dict)
     mag: FloatArray = field(default_factory=lambda: np.empty(0))
+    masses: tuple[float | None, ...] = ()
+    extinction_mag: float | None = None
 
     def illumination(self, radius2: FloatArray) -> FloatArray:
         """Light relative to the axis at squares of radii."""
@@ -129,6 +133,27 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
         sigma=sigma,
         mag=base + found.model - ones @ found.values[:images],
     )
+
+
+def with_extinction(light: LightFit, stars: StarLight, masses: Sequence[float | None], *, known: bool) -> LightFit:
+    """The light with the slope of the photographs' offsets over their air masses, where these span MIN_MASSES.
+
+    A photograph's offset counts by its stars' scatter and by CLOUD_MAG, by which skies differ. With a `known` extinction the
+    slope is what is left of it.
+    """
+    found = replace(light, masses=tuple(masses))
+    x = np.array([np.nan if one is None else one for one in masses])
+    if not np.isfinite(x).all() or len(x) < 3 or np.ptp(x) < MIN_MASSES:
+        return found
+    off = light.offsets_mag[stars.image] + light.mag - stars.instrument_mag
+    count = np.bincount(stars.image[stars.clean], minlength=len(x))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(off[stars.clean])))
+    sigma = np.hypot(spread / np.sqrt(np.maximum(count, 1)), CLOUD_MAG)
+    design = np.column_stack([x, np.ones(len(x))]) / sigma[:, None]
+    slope, _ = np.linalg.lstsq(design, light.offsets_mag / sigma, rcond=None)[0]
+    error = math.sqrt(float(np.linalg.inv(design.T @ design)[0, 0]))
+    name = "extinction_beyond_table" if known else "extinction"
+    return replace(found, extinction_mag=float(slope), sigma=light.sigma | {f"{name}_mag_per_air_mass": error})
 
 
 def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:

@@ -14,6 +14,7 @@ from hilstar.confront.excess import Excess
 from hilstar.confront.judge import Verdict
 from hilstar.confront.light import LINEAR_OFF, LINEAR_SIGMAS
 from hilstar.confront.session import Session
+from hilstar.units import ARCSEC_PER_RAD
 
 MAX_RMS_PX, MAX_RMS_MAG, CHI2 = 0.15, 0.2, (0.8, 1.25)  # with --strict, of each photograph
 MIN_STARS_JUDGED = 5
@@ -59,6 +60,7 @@ class Confronted:
                 "zero_point_mag": _number(light.zero_point_mag),
                 "colour_term": _number(light.colour_term),
                 "vignetting_mag": list(light.vignetting_mag),
+                "extinction_mag_per_air_mass": extinction_of(session),
                 "linearity_power": session.power * light.linearity if session.power != 1.0 else light.linearity,
                 "tone_curve": session.power != 1.0,
                 "hot_pixels": self.defects[0],
@@ -105,9 +107,29 @@ def _image_figures(session: Session, verdict: Verdict) -> dict[str, Any]:
         "dim": verdict.dim,
         "offset_mag": float(session.light.offsets_mag[verdict.number]),
         "altitude_deg": pointing.altitude_deg,
+        "air_mass": session.light.masses[verdict.number],
+        "sky_v_mag_arcsec2": sky_v_mag(session, verdict.number),
         "date_off_years": None if verdict.dated is None else verdict.dated.years,
         "date_sigma_years": None if verdict.dated is None else verdict.dated.sigma,
     }
+
+
+def extinction_of(session: Session) -> float | None:
+    """Extinction in the tracker's light, mag an air mass, where photographs told it: of sunlight, with a site."""
+    slope = session.light.extinction_mag
+    if slope is None or session.air is None:
+        return slope
+    return slope + float(session.air.dimming_mag[0, 1, -1])
+
+
+def sky_v_mag(session: Session, number: int) -> float | None:
+    """V of the sky between the stars, mag/arcsec^2, by the zero point of stars; None where it is not above the pedestal."""
+    pixels, camera = session.pixels, session.camera.camera
+    dn = float(np.median(session.shots[number].level.level)) - pixels.pedestal_dn
+    if dn <= 0:
+        return None
+    zero = session.sky_mag() + float(session.light.offsets_mag[number])
+    return -2.5 * math.log10(dn * (camera.focal_length_px / ARCSEC_PER_RAD) ** 2) - zero
 
 
 def _fwhms(session: Session) -> FloatArray:
@@ -145,6 +167,16 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
             + ", ".join(f"{v:+.2f}" for v in light.offsets_mag - light.offsets_mag.min())
             + " mag dimmer than the clearest"
         )
+    extinction = extinction_of(session)
+    if extinction is not None:
+        sigma = next(value for name, value in light.sigma.items() if name.startswith("extinction"))
+        masses = [one for one in light.masses if one is not None]
+        found.append(
+            f"extinction: {extinction:.3f} +- {sigma:.3f} mag an air mass, over {min(masses):.2f} to {max(masses):.2f} of them"
+        )
+    skies = [v for k in range(len(session.shots)) if (v := sky_v_mag(session, k)) is not None]
+    if skies:
+        found.append(f"sky: V {min(skies):.2f} to {max(skies):.2f} mag/arcsec2, if its spectrum is that of [site] sky_spectrum")
     if defects[0] or defects[1]:
         found.append(f"pixels: {defects[0]} hot and {defects[1]} dead, in most of the photographs")
     for verdict in verdicts:

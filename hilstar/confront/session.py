@@ -6,12 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_optics, channel_rates
+from hilstar.bench.build import bench_optics, channel_rates, site_air
+from hilstar.bench.config.sky import SiteSettings
+from hilstar.bench.site import site_glow_e_per_s_sr
 from hilstar.confront.background import SkyLevel, Sources, find_sources, sky_level, source_mask
 from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera
 from hilstar.confront.images import Photograph
@@ -28,6 +31,7 @@ from hilstar.confront.light import (
     fit_pedestal,
     fit_pixels,
     transfer_points,
+    with_extinction,
 )
 from hilstar.confront.lost_in_space import MIN_MATCHED, Field, Solved, solve_lost
 from hilstar.confront.sky import DatedSky, dated_sky
@@ -35,8 +39,9 @@ from hilstar.confront.star_psf import HALF, Measured, Stamps, StarPsf, cut_stamp
 from hilstar.errors import InputError
 from hilstar.rotation import conjugate, rotate
 from hilstar.scene.camera import Camera
+from hilstar.sky.air import SiteAir, air_mass
 from hilstar.sky.spectrum import Curve
-from hilstar.units import flux_ratio, magnitude
+from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 MATCH_PX = 2.5
 BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
@@ -100,12 +105,23 @@ class Session:
     pixels: PixelFit
     power: float
     fixed: bool
+    air: SiteAir | None = None
+
+    def sky_mag(self) -> float:
+        """What the sky's light of V = 0 has on the tracker, mag, as stars have theirs (see `LightFit.mag`)."""
+        config, folder = self.file.config, self.file.folder
+        optics = bench_optics(config.tracker, folder)
+        corrected_by = NO_CORRECTION if self.fixed else self.light.correction
+        optics = replace(optics, quantum_efficiency=corrected(optics.quantum_efficiency, corrected_by))
+        site = msgspec.structs.replace(config.site or SiteSettings(0.0, 0.0), sky_v_mag_arcsec2=0.0)
+        glow = site_glow_e_per_s_sr(msgspec.structs.replace(config, site=site), folder, optics)
+        return float(magnitude(np.array([glow / ARCSEC_PER_RAD**2]))[0])
 
     def predicted_dn(self, number: int, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """DN of stars (n,), rows of the sky of photograph `number`, at their places on it."""
         sky, light = self.shots[number].sky, self.light
-        columns = np.stack([sky.v_mag[star], sky.bv_mag[star], sky.vi_mag[star]])
-        mag = _Magnitudes(self.file, columns)(NO_CORRECTION if self.fixed else light.correction)
+        mag = _Magnitudes(self.file, _columns(sky, star))(NO_CORRECTION if self.fixed else light.correction)
+        mag = mag + extinct_mag(self.air, sky, star)
         shade = light.illumination(radius2_of(self.camera.camera, x_px, y_px))
         return np.asarray(10 ** (-0.4 * (mag + light.offsets_mag[number])) * shade)
 
@@ -131,7 +147,14 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     if wide_px > WIDE_PX:
         raise InputError(f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in focus")
     return Shot(
-        photo, level, sources, sky, Pointing(found.q_icrs_to_cam), found.focal_length_px, matched, np.empty(0, dtype=np.intp)
+        photo,
+        level,
+        sources,
+        sky,
+        Pointing(found.q_icrs_to_cam, air=sky.air),
+        found.focal_length_px,
+        matched,
+        np.empty(0, dtype=np.intp),
     )
 
 
@@ -188,7 +211,8 @@ def run_session(
     assumed = Assumed(*(getattr(file.config.tracker.detector, name) for name in ("offset_dn", "read_noise_e", "gain_e_per_dn")))
     focal = float(np.median([shot.focal_length_px for shot in shots]))
     base = replace(base, focal_length_px=focal) if fixed is None else fixed.camera
-    fit = _Fitting(file, base, assumed, fixed)
+    air = None if shots[0].sky.air is None else site_air(file.config, file.folder, shots[0].sky.catalog)
+    fit = _Fitting(file, base, assumed, fixed, air)
     session = fit.of(shots, 1.0)
     off = abs(session.light.linearity - 1)
     if (
@@ -241,6 +265,7 @@ class _Fitting:
     base: Camera
     assumed: Assumed
     fixed: FixedCamera | None
+    air: SiteAir | None
 
     def of(self, shots: Sequence[Shot], power: float, before: CameraFit | None = None) -> Session:
         """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
@@ -279,8 +304,33 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         for shot, pointing in zip(shots, camera.pointings, strict=True):
             shot.pointing = pointing
     stars = _star_light(shots, camera.camera)
-    light = fit_light(stars, len(shots), _magnitudes(start.file, shots), None if fixed is None else fixed.light)
-    return Session(start.file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None)
+    magnitudes = _Magnitudes(start.file, np.concatenate([_columns(s.sky, s.star) for s in shots], axis=1))
+    extinct = np.concatenate([extinct_mag(start.air, shot.sky, shot.star) for shot in shots])
+    light = fit_light(
+        stars, len(shots), lambda corrected: magnitudes(corrected) + extinct, None if fixed is None else fixed.light
+    )
+    masses = [_masses(shot.sky, pointing) for shot, pointing in zip(shots, camera.pointings, strict=True)]
+    light = with_extinction(light, stars, masses, known=start.air is not None)
+    return Session(start.file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, start.air)
+
+
+def _columns(sky: DatedSky, star: IntArray) -> FloatArray:
+    return np.stack([sky.v_mag[star], sky.bv_mag[star], sky.vi_mag[star]])
+
+
+def extinct_mag(air: SiteAir | None, sky: DatedSky, star: IntArray) -> FloatArray:
+    """What the air over `[site]` takes of stars (n,), mag; nothing without a site or a date."""
+    if air is None or sky.air is None:
+        return np.zeros(len(star))
+    return np.asarray(magnitude(air.shares(sky.order[star], sky.air.altitude_rad(sky.vectors[star]))[0]))
+
+
+def _masses(sky: DatedSky, pointing: Pointing) -> float | None:
+    """Air masses before the boresight, by the site or by a fitted zenith."""
+    if sky.air is not None:
+        return sky.masses(pointing.boresight)
+    altitude = pointing.altitude_deg
+    return None if altitude is None else float(air_mass(np.radians([altitude]))[0])
 
 
 def _pixels(shots: Sequence[Shot], assumed: Assumed) -> PixelFit:
@@ -409,11 +459,6 @@ class _Magnitudes:
             rates = channel_rates(self._file.config.sky, optics)
             self._kept[correction] = magnitude(rates(*self._columns))
         return self._kept[correction]
-
-
-def _magnitudes(file: BenchFile, shots: Sequence[Shot]) -> _Magnitudes:
-    rows = [np.stack([s.sky.v_mag[s.star], s.sky.bv_mag[s.star], s.sky.vi_mag[s.star]]) for s in shots]
-    return _Magnitudes(file, np.concatenate(rows, axis=1))
 
 
 PIVOT_NM = 550.0

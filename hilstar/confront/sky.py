@@ -12,11 +12,14 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_optics
 from hilstar.bench.config.bench_config import UNIX_JD, jyear
+from hilstar.bench.site import Ground, site_refraction
+from hilstar.sky.air import air_mass
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.facts import errors_of, sigma_v_mag
 from hilstar.sky.star_table import TableChoice, choose_catalog
-from hilstar.sky.stars import aberrate, unit_vectors_icrs
+from hilstar.sky.stars import AirAbove, aberrate, unit_vectors_icrs
 from hilstar.units import NS_PER_S
 
 AU_KM, DAY_S = 149_597_870.7, 86_400.0
@@ -38,6 +41,11 @@ class DatedSky:
     velocity_km_s: FloatArray | None
     vectors: FloatArray
     order: IntArray
+    air: AirAbove | None = None  # over `[site]` on that day
+
+    def masses(self, direction: FloatArray) -> float | None:
+        """Air masses before a direction outside the air (3,); None without a site or a date."""
+        return None if self.air is None else float(air_mass(self.air.altitude_rad(direction[None]))[0])
 
     @property
     def v_mag(self) -> FloatArray:
@@ -78,9 +86,14 @@ def dated_sky(file: BenchFile, t_ns: int | None) -> DatedSky:
     catalog = choose_catalog(TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
     epoch = sky.epoch_jyear if t_ns is None else jyear(t_ns)
     velocity = None if t_ns is None else earth_velocity_km_s(t_ns)
+    air = None
+    if file.config.site is not None and t_ns is not None:
+        ground = Ground(file.config.site)
+        velocity = earth_velocity_km_s(t_ns) + ground.state(t_ns)[1]
+        air = AirAbove(ground.up(t_ns), site_refraction(file.config.site, bench_optics(file.config.tracker, file.folder)))
     order = np.argsort(catalog.v_mag, kind="stable")
     vectors = unit_vectors_icrs(catalog, epoch)[order]
-    return DatedSky(catalog, epoch, velocity, vectors if velocity is None else aberrate(vectors, velocity), order)
+    return DatedSky(catalog, epoch, velocity, vectors if velocity is None else aberrate(vectors, velocity), order, air)
 
 
 @lru_cache(maxsize=64)

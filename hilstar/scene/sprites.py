@@ -59,7 +59,7 @@ class Candidates:
 
     def near(self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float) -> NearStars:
         """The stars within `margin_px` of the image, and some more. The caller must not change the arrays."""
-        keeps = not stars.bodies and stars.velocity_km_s is None
+        keeps = not stars.bodies and stars.velocity_km_s is None and stars.air is None
         if keeps and self._kept is not None:
             last, last_camera, last_margin_px, last_icrs_to_image, near = self._kept
             same = stars.vectors is last.vectors and stars.electrons_per_s is last.electrons_per_s and stars.grid is last.grid

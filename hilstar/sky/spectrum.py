@@ -95,8 +95,8 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR) -> Curve
     return read_curve_csv(path)
 
 
-def read_curve_csv(path: Path) -> Curve:
-    """Read `wavelength_nm,value` rows; '#' starts a comment. Raises InputError with the line number."""
+def read_curve_csv(path: Path, highest: float = 1.0) -> Curve:
+    """Read `wavelength_nm,value` rows, values 0 to `highest`; '#' starts a comment. Raises InputError with the line number."""
     wavelength_nm: list[float] = []
     value: list[float] = []
     text = read_text(path, "give a CSV of wavelength_nm,value", MAX_CURVE_BYTES)
@@ -115,11 +115,11 @@ def read_curve_csv(path: Path) -> Curve:
     except csv.Error as error:
         raise cannot_read(path, error, "write a CSV: wavelength_nm,value") from error
     curve = Curve(np.array(wavelength_nm), np.array(value))
-    _check_curve(curve, path)
+    _check_curve(curve, path, highest)
     return curve
 
 
-def _check_curve(curve: Curve, path: Path) -> None:
+def _check_curve(curve: Curve, path: Path, highest: float) -> None:
     wavelength_nm, value = curve.wavelength_nm, curve.value
     if len(wavelength_nm) < 2:
         raise InputError(f"{path}: {len(wavelength_nm)} rows; write at least two rows wavelength_nm,value")
@@ -132,8 +132,9 @@ def _check_curve(curve: Curve, path: Path) -> None:
     if wavelength_nm[0] < RANGE_NM[0] or wavelength_nm[-1] > RANGE_NM[1]:
         ends = f"{wavelength_nm[0]:g} to {wavelength_nm[-1]:g} nm"
         raise InputError(f"{path}: wavelengths from {ends}; write {RANGE_NM[0]:g} to {RANGE_NM[1]:g} nm")
-    if value.min() < 0 or value.max() > 1:
-        raise InputError(f"{path}: values from {value.min():g} to {value.max():g}; write fractions from 0 to 1")
+    if value.min() < 0 or value.max() > highest:
+        what = "fractions from 0 to 1" if highest == 1 else f"numbers from 0 to {highest:g}"
+        raise InputError(f"{path}: values from {value.min():g} to {value.max():g}; write {what}")
 
 
 def blackbody_exitance_w_m2_m(wavelength_nm: FloatArray, temperature_k: float | FloatArray) -> FloatArray:

@@ -2,11 +2,12 @@
 
 A spatial index over directions: which stars can lie within an angle of an axis.
 
-Where a star is seen: proper motion and aberration, on unit vectors in float64 (ICRS).
+Where a star is seen: proper motion, aberration and refraction, on unit vectors in float64 (ICRS).
 """
 
+import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.sky.catalog import Catalog
 from hilstar.units import LIGHT_KM_S
+
+log = logging.getLogger(__name__)
 
 MAX_SHIFT = 1.1  # largest aberration in units of v/c, for speeds up to 0.1 c
 
@@ -28,7 +31,64 @@ CELL_DEG = 4.0
 PARTS = 4
 # arccos near 1 is accurate to 1e-8 rad only; a cell is enlarged by this.
 RADIUS_MARGIN_RAD = 1e-6
+MIN_ACROSS, MIN_UP = 1e-6, 0.05  # ERFA's limits of refraction (atioq)
+MOST_BENT_RAD = 0.012  # by those, in 1100 hPa and -50 C; 0.69 degrees
+LOW_RAD, LESS_BENT_RAD = 0.35, 0.0015  # above 20 degrees light is bent by less than 5 arcmin
 RAD_PER_MAS = np.pi / (180 * 3600 * 1000)
+
+
+@dataclass(frozen=True, slots=True)
+class AirAbove:
+    """The air over a place at a moment: the zenith `up` (3,), ICRS, and the constants of refraction, rad.
+
+    Refraction is ERFA's: A tan z + B tan^3 z, z the observed zenith distance, with constants for pressure, temperature and
+    humidity (refco), one for all colours; below 3 degrees of altitude it stays what it is there. `told` are warnings given.
+    """
+
+    up: FloatArray
+    refraction_rad: tuple[float, float]
+    told: set[str] = field(default_factory=set)
+
+    def bent(self, vectors: FloatArray) -> FloatArray:
+        """Directions (n, 3), ICRS, as the air bends them towards the zenith."""
+        a, b = self.refraction_rad
+        z = vectors @ self.up
+        level = vectors - z[:, None] * self.up
+        across = np.sqrt(np.einsum("ij,ij->i", level, level))
+        r, up = np.maximum(across, MIN_ACROSS), np.maximum(z, MIN_UP)
+        tangent = r / up
+        w = b * tangent**2
+        by = (a + w) * tangent / (1 + (a + 3 * w) / up**2)
+        cosine = 1 - by**2 / 2
+        return np.asarray((cosine - by * z / r)[:, None] * level + (cosine * z + by * r)[:, None] * self.up)
+
+    def lowest_rad(self, axis: FloatArray, radius_rad: float) -> float:
+        """The lowest altitude within an angle of a direction (3,)."""
+        return float(np.arcsin(np.clip(axis @ self.up, -1.0, 1.0))) - radius_rad
+
+    def most_rad(self, axis: FloatArray, radius_rad: float) -> float:
+        """By how much light within an angle of a direction (3,) is bent at most."""
+        return MOST_BENT_RAD if self.lowest_rad(axis, radius_rad) < LOW_RAD else LESS_BENT_RAD
+
+    def risen(self, which: IntArray, vectors: FloatArray, lowest_rad: float) -> IntArray:
+        """Those of directions (n, 3) above the horizon, which a field that reaches down to `lowest_rad` may cut."""
+        if lowest_rad > MOST_BENT_RAD:
+            return which
+        up = self.altitude_rad(vectors[which]) > 0
+        if lowest_rad < 0 and not up.all():
+            tell(self.told, "horizon", "[site]: the field reaches below the horizon; the stars there are not shown")
+        return which[up]
+
+    def altitude_rad(self, vectors: FloatArray) -> FloatArray:
+        """Apparent altitudes (n,) of directions outside the air (n, 3)."""
+        return np.asarray(np.arcsin(np.clip(self.bent(vectors) @ self.up, -1.0, 1.0)))
+
+
+def tell(told: set[str], key: str, text: str, *values: object) -> None:
+    """A warning, once."""
+    if key not in told:
+        told.add(key)
+        log.warning(text, *values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +104,8 @@ class Stars:
 
     `colours` (n, channels) are the shares of `electrons_per_s` that each channel of the tracker has, which sum to 1; None where
     it has one channel. `primaries` (n, 3) are the light that each of a monitor's primaries gives of it, as shares of
-    `electrons_per_s`; None where they are not driven apart.
+    `electrons_per_s`; None where they are not driven apart. Through `air` directions are bent, and `near`
+    finds none below the horizon.
     """
 
     hip: npt.NDArray[np.int32]
@@ -60,6 +121,7 @@ class Stars:
     bodies: tuple[str, ...] = ()
     colours: FloatArray | None = None
     primaries: FloatArray | None = None
+    air: AirAbove | None = None
 
     def __len__(self) -> int:
         return len(self.hip)
@@ -76,13 +138,17 @@ class Stars:
         """
         if self.velocity_km_s is not None:
             reach_rad += MAX_SHIFT * float(np.linalg.norm(self.velocity_km_s)) / LIGHT_KM_S
-        return self.grid.near(axis, radius_rad, edges, reach_rad)
+        if self.air is None:
+            return self.grid.near(axis, radius_rad, edges, reach_rad)
+        found = self.grid.near(axis, radius_rad, edges, reach_rad + self.air.most_rad(axis, radius_rad + reach_rad))
+        return self.air.risen(found, self.vectors, self.air.lowest_rad(axis, radius_rad + reach_rad))
 
     def directions(self, which: IntArray) -> FloatArray:
         """Where stars are seen: ICRS unit vectors (n, 3)."""
         vectors = self.vectors
         vectors = vectors.T.take(which, axis=1).T if vectors.flags.f_contiguous else vectors[which]
-        return vectors if self.velocity_km_s is None else aberrate(vectors, self.velocity_km_s)
+        seen = vectors if self.velocity_km_s is None else aberrate(vectors, self.velocity_km_s)
+        return seen if self.air is None else self.air.bent(seen)
 
     def seen_at(self, velocity_km_s: FloatArray | None) -> "Stars":
         """The same stars for such an observer; None: for the one who sees `vectors`."""

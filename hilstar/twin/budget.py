@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hilstar.arrays import IntArray
 from hilstar.bench.build import bench_primaries, named_channels
 from hilstar.bench.frame import Bench, clipping_hip, named
 from hilstar.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
@@ -91,6 +92,7 @@ class LightBudget:
     centroid_rms_px: dict[str, float | None]
     primaries: ChannelMatrix | None
     near_infrared: list[dict[str, Any]]
+    out_of_gamut: float | None
 
 
 def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
@@ -103,19 +105,21 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     render, white = bench.config.render, bench.flux_at_white_e_per_s
     # A star of rate r has V = zero_mag + magnitude(r).
     zero_mag = zero_point_mag(bench)
+    white /= solar_drive(bench)
     clips = zero_mag + magnitude(white * bench.darkest / bench.psf.peak_share)
     # Below this a star lights no pixel, wherever it is; for dithers, it lights one in half of the frames.
-    dark = bench.faintest_shown_e_per_s or bench.calibration.response.half_step * white
+    dark = bench.faintest_shown_e_per_s / solar_drive(bench) or bench.calibration.response.half_step * white
     nothing = zero_mag + magnitude(dark)
     half = np.array([-0.5, 0.5])
     corner_share = float(bench.psf.shares(half, half[:, None]).max())  # a star on the corner of four pixels
     channels = named_channels(bench.config.tracker, bench.file.folder)
     spectra = bench_primaries(bench.config.monitor, bench.file.folder)
-    primaries = None if spectra is None else channel_matrix(spectra, channels, white)
+    primaries = None if spectra is None else channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
     ends_nm = [RED_NM] if spectra is None else [RED_NM, reddest_nm(spectra)]
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return LightBudget(
-        method=render.quantisation + (" with bit stealing" if render.bit_stealing else ""),
+        method=render.quantisation
+        + (" with bit stealing" if render.bit_stealing else ", each primary" if bench.colours else ""),
         bits=bench.config.monitor.bits,
         clips_v_mag=clips,
         clips_v_mag_at_best=zero_mag + magnitude(white / corner_share),
@@ -124,13 +128,24 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         within=_within(rows),
         clipped_hip=clipping_hip(bench),
         left_out=not_drawn(bench),
-        black_e_per_s_px=bench.calibration.response.black * white,
+        black_e_per_s_px=bench.calibration.response.black * bench.flux_at_white_e_per_s,
         rows=rows,
         centroider=by,
         centroid_rms_px=next((row.axis_rms_px for row in rows if row.below_white_mag == COMPARED_MAG), dict.fromkeys(FAMILY)),
         primaries=primaries,
         near_infrared=red_shares(channels, ends_nm),
+        out_of_gamut=out_of_gamut(bench),
     )
+
+
+def out_of_gamut(bench: Bench) -> float | None:
+    """The share of a bench's stars whose colour its primaries cannot show; None where they are not driven apart."""
+    colours, count = bench.colours, len(bench.stars.rates_e_per_s)
+    if colours is None:
+        return None
+    alone = np.arange(count)
+    off = colours.off(colours.wanted(bench.stars, alone), colours.shares_of(bench.stars, alone))
+    return float(1 - colours.in_gamut(off).mean())
 
 
 def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[str, Any]]:
@@ -146,18 +161,25 @@ def zero_point_mag(bench: Bench) -> float:
 
     Raises InputError where it has none.
     """
-    rates_e_per_s = bench.stars.rates_e_per_s
-    bv_mag, v_mag = (column[: len(rates_e_per_s)] for column in (bench.stars.bv_mag, bench.stars.v_mag))
-    # The stars of that colour, or else the nearest to it: where there are stars, none of these is far from it.
-    distance = np.abs(bv_mag - SOLAR_BV)
-    alike = distance <= max(LIKE_SOLAR_BV, float(distance.min()))
-    return float(np.median(v_mag[alike] - magnitude(rates_e_per_s[alike])))
+    rates_e_per_s, alike = bench.stars.rates_e_per_s, _like_the_sun(bench)
+    return float(np.median(bench.stars.v_mag[alike] - magnitude(rates_e_per_s[alike])))
+
+
+def _like_the_sun(bench: Bench) -> IntArray:
+    """The stars of its colour, or else the nearest to it: where there are stars, none of these is far from it."""
+    distance = np.abs(bench.stars.bv_mag[: len(bench.stars.rates_e_per_s)] - SOLAR_BV)
+    return np.flatnonzero(distance <= max(LIKE_SOLAR_BV, float(distance.min())))
+
+
+def solar_drive(bench: Bench) -> float:
+    """How much of white a star of the Sun's colour asks for, relative to a white star as bright."""
+    return float(np.median(np.broadcast_to(bench.drive, len(bench.stars))[_like_the_sun(bench)]))
 
 
 def not_drawn(bench: Bench) -> NotDrawn:
     """The bench's stars that are not drawn; bodies, whose light is that of all stars many times over, do not count."""
     rates = bench.stars.rates_e_per_s
-    missing = rates[rates < bench.faintest_shown_e_per_s]
+    missing = rates[(bench.stars.electrons_per_s * bench.drive)[: len(rates)] < bench.faintest_shown_e_per_s]
     return NotDrawn(len(missing), float(missing.sum() / rates.sum()))
 
 
@@ -273,6 +295,9 @@ def budget_lines(found: LightBudget) -> list[str]:
         one = found.primaries
         figure = _number(one.condition, ".2f")
         lines.append(f"{'condition number':22}{figure}, electrons of each channel by each primary at full light:")
+        if found.out_of_gamut is not None:
+            what = "electrons by channel" if len(one.channels) > 1 else "mean wavelength"
+            lines.insert(-1, f"{'out of gamut':22}{found.out_of_gamut:.2%} of stars, whose {what} the primaries cannot show")
         for channel, rates in zip(one.channels, one.e_per_s.tolist(), strict=True):
             shares = (f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True))
             lines.append(f"{channel:22}{', '.join(shares)}")

@@ -160,6 +160,7 @@ class LiveTracker(Closing):
         self.canvas = detector_canvas(file, self.camera)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         with open_bench(file) as bench:
+            self._bench = bench  # its light; its renderer is closed
             self._size_px, self._bits = bench.camera.resolution_px, self.config.monitor.bits
             self._panel = true_panel(bench)
             self._rgb, self._primaries = bench.calibration.response.rgb, seen_primaries(bench)

@@ -134,7 +134,9 @@ class Simulator(Closing):
         elif len(tracker.quantum_efficiencies) > 1:
             say_once(NO_MOSAIC, "[tracker]")
         self._bayer = bayer
-        self._background = TrackerBackground(self.config, self.file.folder, self.camera, refuse=self._refuse)
+        self._background = TrackerBackground(
+            self.config, self.file.folder, self.camera, refuse=self._refuse, moving=self.moving
+        )
         self.background_e = self._background.steady_e
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
@@ -148,7 +150,7 @@ class Simulator(Closing):
         before, self.file, self.config = self.config, file, file.config
         if self.moving is not None or _sky_keys(before) != _sky_keys(self.config):
             self._load_sky()
-        if (before.tracker, before.background, before.sky) != (self.config.tracker, self.config.background, self.config.sky):
+        if _tracker_keys(before) != _tracker_keys(self.config):
             self._load_tracker()
         self._layers = sky_layers(self.canvas, self.sources)
         target = Target(self.config.tracker.resolution_px, self.canvas.psf)
@@ -181,6 +183,8 @@ class Simulator(Closing):
         """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
         exposure_s, canvas, view = self.config.tracker.exposure_s, self.canvas, rolled(view, self.config.tracker)
         stars = seen_in(view, self.stars, self.moving)
+        if self.moving is not None and self.moving.air is not None and rng is not None:
+            stars = self.moving.air.twinkling(stars, self.moving.utc_ns(view.t_ns), exposure_s, rng)
         layers = self._layers
         if faults is None:
             light = light_of(canvas, layers, stars, view)
@@ -423,27 +427,43 @@ def _sky_keys(config: BenchConfig) -> tuple[object, ...]:
     """All by which the rates and directions of stars are made, where no body moves among them."""
     tracker = config.tracker
     gathers = tracker.aperture_mm, tracker.quantum_efficiencies, tracker.transmission, tracker.detector.fill_factor
-    return config.sky, config.spacecraft, gathers
+    return config.sky, config.spacecraft, config.site, gathers
+
+
+def _tracker_keys(config: BenchConfig) -> tuple[object, ...]:
+    """All by which a tracker and its background are made."""
+    return config.tracker, config.background, config.sky, config.site
 
 
 class TrackerBackground:
-    """Light between the stars on a bench's detector: what is the same in every view, and zodiacal light by direction.
+    """Light between the stars on a bench's detector: what is the same in every view, zodiacal light by direction, sky glow.
 
-    Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all channels.
-    Zodiacal light is computed at LATTICE places along each side of the detector, each with its pixel's solid angle. Where its
-    table is blank, near the Sun, a field is refused (InputError); without `refuse` the nearest tabled light is drawn, and
-    a warning says so once until the field has left that part of the sky.
+    Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all channels. Zodiacal light
+    and glow are computed at LATTICE places along each side of the detector, each with its pixel's solid angle. Where the
+    table of zodiacal light is blank, near the Sun, a field is refused (InputError); without `refuse` the nearest tabled
+    light is drawn, and a warning says so once until the field has left that part of the sky.
     """
 
-    def __init__(self, config: BenchConfig, folder: Path, camera: Camera, *, refuse: bool = True, mosaic: bool = True) -> None:
+    def __init__(
+        self,
+        config: BenchConfig,
+        folder: Path,
+        camera: Camera,
+        *,
+        refuse: bool = True,
+        mosaic: bool = True,
+        moving: MovingSky | None = None,
+    ) -> None:
         self._bayer, tracker = config.tracker.detector.bayer if mosaic else None, config.tracker
         channels = (bench_optics(tracker, folder),) if self._bayer is None else bench_channels(tracker, folder)
         self.steady_e = in_pixels((background_e(config, optics) for optics in channels), self._bayer)
         self._config, self._refuse, self._beyond = config, refuse, False
+        self._moving = None if moving is None or moving.air is None or not moving.air.glow_e_per_s_sr.any() else moving
         self._lights: list[ZodiacalLight] = []
-        if config.background.zodiacal is None:
+        if config.background.zodiacal is not None:
+            self._lights = [ZodiacalLight.through(optics) for optics in channels]
+        if not self._lights and self._moving is None:
             return
-        self._lights = [ZodiacalLight.through(optics) for optics in channels]
         places = camera.grid_px(LATTICE)
         rays = camera.rays(*places)
         self._rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -452,14 +472,21 @@ class TrackerBackground:
 
     def of_view_e(self, view: View) -> FloatArray:
         """Electrons per exposure (height, width) in a view. Raises InputError near the Sun."""
-        if not self._lights:
+        if not self._lights and self._moving is None:
             return self.steady_e
-        seen = sunward(self._rays @ to_matrix(view.q_icrs_to_cam), sky_jd(self._config, view.t_ns))
-        found = tabled_light(seen)
-        self._say(float(seen.elongation_deg.min()), beyond=not found.tabled.all())
+        directions = self._rays @ to_matrix(view.q_icrs_to_cam)
+        rates: list[FloatArray] = []
+        if self._lights:
+            seen = sunward(directions, sky_jd(self._config, view.t_ns))
+            found = tabled_light(seen)
+            self._say(float(seen.elongation_deg.min()), beyond=not found.tabled.all())
+            rates = [light.electrons_per_s_sr(seen, found) for light in self._lights]
+        if self._moving is not None and self._moving.air is not None:
+            glow = self._moving.air.glow_at(directions, self._moving.utc_ns(view.t_ns))
+            glow = glow if self._bayer is not None else glow.sum(axis=0, keepdims=True)
+            rates = list(glow) if not rates else [a + b for a, b in zip(rates, glow, strict=True)]
         by_place = self._sr * self._config.tracker.exposure_s
-        channels = [light.electrons_per_s_sr(seen, found) * by_place for light in self._lights]
-        images = (self._down @ e.reshape(LATTICE, LATTICE) @ self._across.T for e in channels)
+        images = (self._down @ (rate * by_place).reshape(LATTICE, LATTICE) @ self._across.T for rate in rates)
         return np.asarray(self.steady_e + in_pixels(images, self._bayer))
 
     def _say(self, nearest_deg: float, *, beyond: bool) -> None:

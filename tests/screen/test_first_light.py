@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import time
+import tomllib
 
 import numpy as np
 import pytest
@@ -38,6 +39,8 @@ def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path)
     assert steps["orientation"]["figures"]["seen"] == "mirrored top to bottom"
     assert steps["geometry"]["figures"]["focal_length_px"] == pytest.approx(120e3 / 57.65, rel=1e-4)
     assert steps["verify"]["figures"]["star_rms_px"] < 0.05
+    measured = tomllib.loads((tmp_path / "s/geometry.toml").read_text())
+    assert {"connector": "screen", "mode": "640x480@0.00", "bits": 8}.items() <= measured["monitor_identity"].items()
 
 
 def told_by(process, word):

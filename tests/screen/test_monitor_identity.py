@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import subprocess
+import tomllib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
@@ -13,15 +14,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.monitor.calibration import CalibrationHead, NotesTable, write_calibration
 from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, monitor_camera, write_geometry
 from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.response import gamma_response
-from hilstar.monitor.window.this_monitor import identity_here
+from hilstar.monitor.window.this_monitor import edid_of_drm, identity_here
 from hilstar.run.record.ledger_records import EventRecord, run_records
 from tests.screen.test_monitors import bench
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.forks import HILSTAR, Started
 from tests.support.ledgers import read_run
+from tests.support.pages import ADDRESS, PageAddress
+from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.xorg import Xorg, xorg
 from tests.unit.run.test_machine_row import edid
 
@@ -143,16 +148,66 @@ def test_each_command_with_a_screen_refuses_and_a_headless_one_says_nothing(here
 
 def test_what_is_forced_stays_on_status_page_and_ledger(here, tmp_path):
     path, ledger = measured_bench(tmp_path, first_identity(here)), tmp_path / "run.mcap"
-    with plugged(here, edid("DELL P2423D")):
-        told = played(path, "--force", "--ledger", str(ledger))
-    assert told.returncode == 0, told.stderr
-    assert "this is DEL DELL P2423D" in told.stderr and "shown anyway (--force)" in told.stderr
-    (line, _) = json.loads(told.stdout)["screen"]["forced"]  # the other one: swaps do not wait
+    options = ["--force", "--json", "--ledger", str(ledger), "--console", "127.0.0.1:0"]
+    command = [*HILSTAR, "replay", str(path), str(tmp_path / "still.csv"), *options]
+    with (
+        plugged(here, edid("DELL P2423D")),
+        Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=here.env) as process,
+    ):
+        try:
+            host, port, _ = next(found for line in process.stderr if (found := ADDRESS.search(line))).groups()
+            page, words = PageAddress(host, int(port), ""), "shown by --force: response.toml was measured on DEL"
+            wait_for(lambda: any(reason.startswith(words) for reason in page.json("/health")["reasons"]))
+            process.terminate()
+            out, told = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+    assert process.returncode == 0, told
+    assert "this is DEL DELL P2423D" in told and "shown anyway (--force)" in told
+    (line, _) = json.loads(out)["screen"]["forced"]  # the other one: swaps do not wait
     assert "another monitor" in line
     events = [one for one in run_records(ledger) if isinstance(one, EventRecord) and one.kind == "forced"]
     assert any("this is DEL DELL P2423D" in event.detail for event in events)
     output = json.loads(read_run(ledger).head["output"])
     assert output["monitor_identity"]["model"] == "DELL P2423D" and line in output["forced"]
+    status = RunStatus(RunSource("", "", 60.0, forced=line))
+    assert ("forced", line, False) in status.lines(0)
+
+
+def test_calibrate_writes_the_monitor_that_this_machine_has(here, tmp_path):
+    path = measured_bench(tmp_path, None)
+    light = "".join(f"{code},w,{0.01 + (code / 255) ** 2.2}\n" for code in [*range(0, 256, 15)] * 2)
+    (tmp_path / "measured.csv").write_text(f"code,channel,value\n{light}")
+    lines = "".join(f"{','.join(map(str, q))},{','.join(map(str, q))},1\n" for q in np.eye(4).tolist())
+    (tmp_path / "pairs.csv").write_text(f"qw,qx,qy,qz,tw,tx,ty,tz,valid\n{lines}")
+    photometric = ("photometric", tmp_path / "measured.csv", "-o", tmp_path / "light.toml")
+    alignment = ("alignment", path, tmp_path / "pairs.csv", "-o", tmp_path / "aligned.toml")
+    for command, written in ((photometric, "light.toml"), (alignment, "aligned.toml")):
+        with plugged(here):
+            made = run_hilstar_here("calibrate", *command)
+        assert made.returncode == 0, made.stderr
+        assert "measured on DEL DELL U2412M, serial CN0F00BAR123, on DUMMY0 at 640x480@59.94" in made.stderr
+        assert tomllib.loads((tmp_path / written).read_text())["monitor_identity"]["serial"] == "CN0F00BAR123"
+    path.write_text(path.read_text().replace("resolution_px = [640, 480]", "resolution_px = [320, 240]"))
+    assert "measured on" not in run_hilstar_here("calibrate", *alignment).stderr  # another display than the bench's
+
+
+def test_the_kernel_is_asked_where_x_gives_no_edid(tmp_path):
+    for name, block in (("card0-DP-1", b""), ("card0-HDMI-A-1", b"first"), ("card1-HDMI-A-2", b"second")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "edid").write_bytes(block)
+    found = {name: edid_of_drm(name, tmp_path) for name in ("DP-1", "HDMI-A-1", "HDMI-2", "VGA-1")}
+    assert found == {"DP-1": b"", "HDMI-A-1": b"first", "HDMI-2": b"second", "VGA-1": b""}
+
+
+def test_a_forced_first_light_says_so_in_its_session_and_on_its_page(here, tmp_path):
+    path, session = measured_bench(tmp_path, first_identity(here)), tmp_path / "s"
+    with plugged(here, edid("DELL P2423D")):
+        told = run_hilstar("first-light", path, "-o", session, "--grab", "false {output}", "--force", env=here.env)
+    assert "this is DEL DELL P2423D" in told.stderr and told.returncode == 1  # no image came
+    kept = json.loads((session / "session.json").read_text())
+    assert "another monitor" in kept["forced"][0] and kept["steps"][1]["verdict"] == "done"
+    assert "this is DEL DELL P2423D" in (session / "first-light.html").read_text()
 
 
 def test_old_files_are_refused_by_their_date_and_undated_or_built_in_ones_are_noticed(here, tmp_path):

@@ -12,7 +12,9 @@ import numpy as np
 from hilstar.monitor.response import bit_stealing_response, srgb_response
 from hilstar.monitor.window.window import Window, WindowSettings
 from hilstar.render.backend import ScreenView, Target
-from hilstar.render.numpy_backend import NumpyBackend
+from dataclasses import replace
+from hilstar.render.numpy_backend import NumpyBackend, open_backend
+from hilstar.render.primaries_backend import PrimariesBackend
 from hilstar.render.presenter import window_context
 from hilstar.render.renderer import Renderer
 from hilstar.scene.frame_motion import Orientation
@@ -45,6 +47,28 @@ with Window(WindowSettings(SIZE, 8)) as window:
                 assert shown.any() or overlay & 4
             gl.take_back_buffer()
         assert gl.changed_codes() == oracle.changed_codes() == ""
+    gl.fault()  # of what this test read above
+    # Primaries that are driven apart: three pictures of levels, each to its own colour.
+    each = tuple(Target(SIZE, PSF, GREY, WHITE * share) for share in (0.3, 0.5, 0.2))
+    apart = replace(sprites, primaries=tuple(sprites_at(rng.uniform(0, 1, (99, 2)) * SIZE, 10.0 ** rng.uniform(4, 6, 99),
+                                                       PSF.footprint_px) for _ in each))
+    gl = open_backend(Target(SIZE, PSF, GREY, WHITE, primaries=each), context)
+    parts = [NumpyBackend(one) for one in each]
+    oracle = PrimariesBackend(gl.target, parts)
+    gl.draw(apart)
+    levels = gl.levels()
+    assert levels.shape == (240, 320, 3) and (levels.max(axis=(0, 1)) > 0).all()
+    for k, part in enumerate(parts):
+        part._levels = levels[..., k]
+    for turned, (overlay, marker) in zip(TURNED, OVER, strict=True):
+        for backend in (gl, oracle):
+            backend.show_on(ScreenView(SIZE, window.size_px, 8, Orientation(*turned), (150.4, 99.6)))
+            backend.present(overlay, 30, marker)
+        read = context.screen.read(viewport=(0, 0, *window.size_px), components=3, dtype="f4")
+        shown = np.rint(np.frombuffer(read, np.float32).reshape(*window.size_px[::-1], 3)[::-1] * 255)
+        assert np.array_equal(shown, parts[0].back_buffer), (turned, overlay)
+        gl.take_back_buffer()
+    assert gl.fault() == ""
 print("presented")
 """
 

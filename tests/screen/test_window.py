@@ -163,7 +163,7 @@ def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
     """Two levels: black and white; the square of the first white one stays 5 s."""
     command = ["calibrate", "plan", "-o", str(tmp_path / "plan.csv"), "--levels", "2", "--repeats", "1", "--show"]
     with Started(
-        [sys.executable, "-m", "hilstar", *command, "--seconds", "3"], stderr=subprocess.PIPE, text=True, env=screen.env
+        [sys.executable, "-m", "hilstar", *command, "--seconds", "1"], stderr=subprocess.PIPE, text=True, env=screen.env
     ) as process:
         seen = set()
         end = time.monotonic() + PATIENCE_S

@@ -46,6 +46,8 @@ class Extras:
     sky_times: float = 1.0
     smear_px: float = 0.0
     stars: bool = True
+    zenith: tuple[float, ...] | None = None  # ICRS: 58.3 arcsec tan z of refraction, and k_mag sec z of extinction
+    k_mag: float = 0.0
     blur_px: float = 0.0
 
 
@@ -74,12 +76,19 @@ def photograph(
     dec = dec + np.radians(catalog.pm_dec_mas_yr[bright] / 3.6e6) * years
     ra = ra + np.radians(catalog.pm_ra_cosdec_mas_yr[bright] / 3.6e6) * years / np.cos(dec)
     stars = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    extinct_mag = np.zeros(len(stars))
+    if extras.zenith is not None:
+        up = np.array(extras.zenith)
+        cosine = np.maximum(stars @ up, 0.1)
+        stars = stars + np.radians(58.3 / 3600) * (up / cosine[:, None] - stars)
+        stars /= np.linalg.norm(stars, axis=1, keepdims=True)
+        extinct_mag = extras.k_mag / cosine
     x, y, z = (stars @ rotation_of(*pointing).T).T
     front = z > 0.5
     u, v = x[front] / z[front], y[front] / z[front]
     gain = 1 + camera.k1 * (u * u + v * v)
     px, py = camera.centre_px[0] + camera.focal_px * u * gain, camera.centre_px[1] + camera.focal_px * v * gain
-    mag = (catalog.v_mag[bright] + camera.colour * catalog.bv_mag[bright])[front]
+    mag = (catalog.v_mag[bright] + camera.colour * catalog.bv_mag[bright] + extinct_mag)[front]
     near = (px > -10) & (px < WIDTH + 10) & (py > -10) & (py < HEIGHT + 10)
     px, py, mag = px[near], py[near], mag[near]
     if not extras.stars:

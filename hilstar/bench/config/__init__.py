@@ -6,6 +6,7 @@ Each key's type, limits, default and meaning stand once, in the class of its tab
 from hilstar.bench.config.answers import AnswersSettings
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings
 from hilstar.bench.config.bench_config import BenchConfig, config_of, parse_config, read_config
+from hilstar.bench.config.certify import CertifySettings
 from hilstar.bench.config.hardware import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, Collimator, Monitor, SyncSettings, Tracker, Verify
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, RenderSettings
 from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, Bodies, SkySettings
@@ -22,6 +23,7 @@ __all__ = [
     "Background",
     "BenchConfig",
     "Bodies",
+    "CertifySettings",
     "Collimator",
     "FaultSettings",
     "Monitor",

@@ -15,6 +15,7 @@ from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.answers import AnswersSettings, check_answers
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
+from hilstar.bench.config.certify import CertifySettings
 from hilstar.bench.config.hardware import (
     Collimator,
     Monitor,
@@ -26,7 +27,7 @@ from hilstar.bench.config.hardware import (
     check_sync,
 )
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES, RenderSettings
-from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SkySettings, SpacecraftSettings
+from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SiteSettings, SkySettings, SpacecraftSettings
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, Table, explained
@@ -57,7 +58,9 @@ class BenchConfig(Table, frozen=True):
     verify: Verify = msgspec.field(default_factory=Verify)
     sync: SyncSettings = msgspec.field(default_factory=SyncSettings)
     faults: FaultSettings = msgspec.field(default_factory=FaultSettings)
+    certify: CertifySettings = msgspec.field(default_factory=CertifySettings)
     answers: AnswersSettings | None = None
+    site: SiteSettings | None = None
 
     @property
     def exposure_frames(self) -> int:
@@ -94,14 +97,14 @@ def has_observer(config: BenchConfig) -> bool:
     """Whether the sky is seen from a known place: a spacecraft's, or for its bodies the Earth's centre."""
     bodies = config.sky.bodies
     shown = bodies.planets or bodies.moon or bodies.sun or bodies.earth or bodies.satellites is not None
-    return shown or config.spacecraft.orbit is not None
+    return shown or config.spacecraft.orbit is not None or config.site is not None
 
 
 def drives_apart(config: BenchConfig) -> bool:
     """Whether the codes of the primaries are each its own, for the colours of stars."""
     if config.render.colour is not None or config.render.bit_stealing:
         return config.render.colour == "star"
-    return getattr(config.tracker.detector, "bayer", None) is not None
+    return config.tracker.detector.bayer is not None
 
 
 def from_source(config: BenchConfig) -> bool:
@@ -295,6 +298,7 @@ def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
         raise InputError('[sky.bodies] satellite_magnitudes is of no satellites; write satellites = "tles.txt" too')
     for needs, what in (
         (background.zodiacal is not None, "[background] zodiacal needs"),
+        (config.site is not None, "[site] needs"),
         (has_observer(config), "[sky.bodies] and [spacecraft] need"),
         (sky.variables == "phase", '[sky] variables = "phase" needs'),
     ):
@@ -302,10 +306,25 @@ def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
             raise InputError(f'{what} a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"')
     if has_observer(config) and any(sky.observer_velocity_km_s):
         raise InputError(
-            "[sky] observer_velocity_km_s: with [sky.bodies] or [spacecraft] the velocity follows from the ephemeris; leave it"
-            " out"
+            "[sky] observer_velocity_km_s: with [sky.bodies], [spacecraft] or [site] the velocity follows from the ephemeris;"
+            " leave it out"
         )
+    _check_site(config)
     _check_orbit(config)
+
+
+def _check_site(config: BenchConfig) -> None:
+    """Refuse (InputError) a place on the ground that is to be in orbit too."""
+    if config.site is None:
+        return
+    if config.spacecraft.orbit is not None or config.sky.bodies.earth:
+        other = "[sky.bodies] earth" if config.spacecraft.orbit is None else "[spacecraft] orbit"
+        raise InputError(f"[site] is a place on the ground, and {other} is seen from above it; leave one of them out")
+    if config.attitude.source == "vizard" and config.attitude.use_velocity:
+        raise InputError(
+            '[site] is a place on the ground, and [attitude] source = "vizard" sends a spacecraft\'s velocity; write'
+            " use_velocity = false"
+        )
 
 
 def _check_orbit(config: BenchConfig) -> None:

@@ -12,6 +12,7 @@ from hilstar.toml_tables import Table
 
 GEOCENTRE = "geocentre"
 SOURCE = "source"
+PressureHpa = Annotated[float, Meta(ge=0, le=1100)]
 
 
 class Bodies(Table, frozen=True):
@@ -194,6 +195,48 @@ class SpacecraftSettings(Table, frozen=True):
             extra={"default": 'none; `"geocentre"` with `[sky.bodies]`'},
         ),
     ] = None
+
+
+class SiteSettings(Table, frozen=True):
+    """A place on the Earth from which the sky is seen, through its air. It needs `[sky] epoch_utc` and `hilstar[bodies]`.
+
+    Stars and bodies are bent towards the zenith and dimmed by their own spectra, and none below the horizon is shown. In
+    `simulate` the sky glows, and stars twinkle by Young's law (1967) with `--noise full`. Zodiacal light and a diffuse map stay
+    as they are outside the air. The Earth's turn is UT1 by Astropy's table.
+    """
+
+    latitude_deg: Annotated[float, Meta(ge=-90, le=90, description="Geodetic latitude, north positive (WGS84).")]
+    longitude_deg: Annotated[float, Meta(ge=-180, le=360, description="Longitude, east positive.")]
+    height_m: Annotated[float, Meta(ge=-500, le=20_000, description="Height over the ellipsoid.")] = 0.0
+    pressure_hpa: Annotated[
+        PressureHpa | None,
+        Meta(description="Pressure; 0 bends nothing.", extra={"default": "the standard atmosphere's at `height_m`"}),
+    ] = None
+    temperature_c: Annotated[float, Meta(ge=-90, le=60, description="Temperature of the air, Celsius.")] = 10.0
+    humidity: Annotated[float, Meta(ge=0, le=1, description="Relative humidity.")] = 0.5
+    extinction: Annotated[
+        float | str,
+        Meta(
+            description='Extinction, mag an air mass: `"ctio"`, `"kpno"`, `"la-palma"`, `"lick"`, `"mauna-kea"` or'
+            ' `"paranal"`; the path of a CSV (`wavelength_nm,value`); or a number for all wavelengths. Lick is the lowest of'
+            " them, 1290 m; the air of a town takes more."
+        ),
+    ] = "lick"
+    sky_v_mag_arcsec2: Annotated[
+        Magnitude | None,
+        Meta(
+            description="Surface brightness of the sky at the zenith, V: 21.7 where it is dark, 18 in a town. It replaces no"
+            " `[background]`.",
+            extra={"default": "none"},
+        ),
+    ] = None
+    sky_spectrum: Annotated[
+        str,
+        Meta(
+            description='The shape of its spectrum: `"paranal"` (UVES, 340 to 1060 nm), or the path of a CSV'
+            " (`wavelength_nm,value`)."
+        ),
+    ] = "paranal"
 
 
 class Background(Table, frozen=True):

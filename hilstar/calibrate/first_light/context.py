@@ -44,7 +44,7 @@ class StepContext:
 
     Images go to `folder`, results to `session`. `kept` has the images of an interrupted attempt, which are not taken again.
     `known` has the figures of earlier steps; `patches` is the maximum number of readings of the response. `watch` is called
-    with each pattern before it is shown.
+    with each pattern before it is shown. White is watched for `watched_s` at most, 0 for not at all.
     """
 
     file: BenchFile
@@ -55,6 +55,7 @@ class StepContext:
     kept: Mapping[str, Path]
     patches: int
     watch: Callable[[Pattern], object] = lambda pattern: None
+    watched_s: float = 0.0
 
     @property
     def resolution_px(self) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from hilstar.arrays import FloatArray
 from hilstar.calibrate.effective_psf import dots_of_image, draw_effective, fit_effective
 from hilstar.calibrate.first_light.context import DarkSubtracted, StepContext
 from hilstar.calibrate.first_light.image_sources import Pattern, black
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, with_changes
+from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, with_changes
 from hilstar.calibrate.geometric.calibration import (
     calibrate_files,
     notes_for_a_person,
@@ -24,11 +24,12 @@ from hilstar.calibrate.geometric.calibration import (
     write_calibrated,
 )
 from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, dot_image, plan_dots, write_plan
-from hilstar.charts import DARK, INK, ORANGE, TEXT_PT, chart
+from hilstar.charts import DARK, ORANGE, TEXT_PT, chart
 from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.twin.optics import BenchGeometry
+from hilstar.units import ERROR_OF_MEDIAN
 
 FIGURE_REACH = 0.25  # half the figure's side, relative to the smaller side of what both screen and tracker have
 SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
@@ -92,11 +93,15 @@ NOT_SEEN = "show the monitor to the whole of the tracker's field, expose longer,
 
 @dataclass(frozen=True, slots=True)
 class SeenFigure:
-    """The figure in the tracker's image: its orientation (a 2 x 2 matrix, row by row), scale, remaining turn and squares."""
+    """The figure in the tracker's image: its orientation (a 2 x 2 matrix, row by row), scale, remaining turn and squares.
+
+    The turn's error is half of what the figure's two sides disagree by.
+    """
 
     way: tuple[int, int, int, int]
     scale: float
     turn_deg: float
+    turn_error_deg: float
     x_px: FloatArray
     y_px: FloatArray
 
@@ -129,7 +134,9 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     left = np.linalg.inv(ways[way]) @ seen / scale
     if np.linalg.norm(left - np.eye(2)) > MAX_MISFIT:
         raise InputError("the figure is turned by no right angle; turn the tracker or the screen to within 15 degrees")
-    return SeenFigure(way, scale, float(np.degrees(np.arctan2(left[1, 0] - left[0, 1], left[0, 0] + left[1, 1]))), x_px, y_px)
+    turn = float(np.degrees(np.arctan2(left[1, 0] - left[0, 1], left[0, 0] + left[1, 1])))
+    sides = np.degrees([np.arctan2(left[1, 0], left[0, 0]), np.arctan2(-left[0, 1], left[1, 1])])
+    return SeenFigure(way, scale, turn, abs(float(sides[0] - sides[1])) / 2, x_px, y_px)
 
 
 def keys_of_ways() -> dict[str, tuple[int, int, int, int]]:
@@ -274,11 +281,12 @@ def orientation(context: StepContext) -> StepOutcome:
         figures: dict[str, Figure] = {"seen": WAYS[first], "told_by": "a key"}
         return StepOutcome("done", f"{way}, as a person saw it", figures, changes=changes)
     found, looked = measured
-    picture = context.session / "orientation.png"
+    picture = context.session / "orientation.svg"
     draw_spots(picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}")
-    figures = {"seen": WAYS[first], "scale": found.scale, "turn_deg": found.turn_deg}
+    figures = {"seen": WAYS[first], "scale": found.scale, "turn_deg": found.turn_deg, "turn_error_deg": found.turn_error_deg}
     line = f"{way}, {found.scale:.4f} of the expected size, turned by {found.turn_deg:+.2f} deg"
-    return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes)
+    number = StepNumber(found.turn_deg, found.turn_error_deg, "deg", "turn of the figure that is left")
+    return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes, number)
 
 
 def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
@@ -307,7 +315,7 @@ def focus(context: StepContext) -> StepOutcome:
     """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises InputError."""
     code, found, looked = sharp_dots(context)
     wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
-    picture, sigma = context.session / "focus.png", found.psf_sigma_px
+    picture, sigma = context.session / "focus.svg", found.psf_sigma_px
     finding = f"PSF sigma {sigma:.3f} px (median of {len(found.x_px)} dots), [tracker] psf_sigma_px is {wanted:g}"
     with chart(picture, finding, height_inch=6.0) as (axes,):
         dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
@@ -316,6 +324,7 @@ def focus(context: StepContext) -> StepOutcome:
         axes.invert_yaxis()
     figures: dict[str, Figure] = {
         "psf_sigma_px": sigma,
+        "psf_sigma_error_px": ERROR_OF_MEDIAN * float(np.std(found.each_psf_sigma_px)) / math.sqrt(len(found.x_px)),
         "dot_sigma_px": float(np.median(found.sigma_px)),
         "dots": len(found.x_px),
         "dot_code": code,
@@ -328,15 +337,16 @@ def focus(context: StepContext) -> StepOutcome:
     except InputError:  # too few dots stand alone: the width alone is known
         pass
     else:
-        drawn = context.session / "psf.png"
+        drawn = context.session / "psf.svg"
         draw_effective(drawn, effective)
         files, pictures = (*files, drawn), (picture, drawn)
         figures["effective_psf_rms"] = effective.chosen.rms
         line += f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the field"
+    number = StepNumber(sigma, float(figures["psf_sigma_error_px"]), "px", f"PSF sigma; the bench file says {wanted:g}")
     if sigma > BLURRED * wanted + BLURRED_BY_PX:
         cure = "turn the focus until this figure is smallest (--again focus), or write [tracker] psf_sigma_px as it is"
-        return StepOutcome("failed", f"{line}: {cure}", figures, files, pictures)
-    return StepOutcome("done", line, figures, files, pictures)
+        return StepOutcome("failed", f"{line}: {cure}", figures, files, pictures, number=number)
+    return StepOutcome("done", line, figures, files, pictures, number=number)
 
 
 class SharpDots(NamedTuple):
@@ -370,7 +380,7 @@ def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray
         low, high = (float(value) for value in np.percentile(image, (5, 99.9)))
         axes.imshow(np.sqrt(np.clip(image - low, 0, None)), cmap="gray", vmax=np.sqrt(max(high - low, 1.0)))
         axes.scatter(x_px, y_px, s=260, facecolors="none", edgecolors=DARK[ORANGE], linewidths=1.8)
-        plate = {"facecolor": INK, "edgecolor": "none", "boxstyle": "round,pad=0.25"}  # readable over stars and on black
+        plate = {"facecolor": "black", "edgecolor": "none", "boxstyle": "round,pad=0.25"}  # readable over stars and on black
         for name, x, y in zip(SQUARE_NAMES, x_px[:3], y_px[:3], strict=False):
             side = "right" if x > image.shape[1] / 2 else "left"
             away = -14 if side == "right" else 14
@@ -394,7 +404,7 @@ def geometry(context: StepContext) -> StepOutcome:
     ]
     ideal = context.file.config.tracker.distortion is None
     found = calibrate_files(context.file, paths, context.folder / "plan.csv", dark, tracker_is_ideal=ideal)
-    output, picture = context.session / "geometry.toml", context.session / "geometry.png"
+    output, picture = context.session / "geometry.toml", context.session / "geometry.svg"
     write_calibrated(output, found, picture, context.source.monitor)
     chosen, error = found.chosen, found.uncertainty
     figures: dict[str, Figure] = {
@@ -416,4 +426,6 @@ def geometry(context: StepContext) -> StepOutcome:
         f" a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
     )
     files = (output, picture, context.folder / "plan.csv", dark, *paths)
-    return StepOutcome("done", line, figures, files, (picture,), context.names("collimator", "geometry", output))
+    rms, points = chosen.rms_arcsec, len(found.data)
+    number = StepNumber(rms, rms / math.sqrt(4 * points), "arcsec", "rms distance of held-out dots from where the fit has them")
+    return StepOutcome("done", line, figures, files, (picture,), context.names("collimator", "geometry", output), number)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import logging
+import math
 import shlex
 import time
 import zlib
@@ -127,6 +128,14 @@ class ImageSource:
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
         """Record the display's square by a photodiode; None where there is none. Raises InputError, MachineError."""
         return None
+
+    def clock_ns(self) -> int:
+        """The clock of a warm-up."""
+        return time.monotonic_ns()
+
+    def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
+        """Go on showing a pattern for `seconds`."""
+        time.sleep(seconds)
 
     def close(self) -> None:
         """Free the display."""
@@ -328,6 +337,14 @@ class _ShownHere(ImageSource):
         """Record the user's photodiode."""
         return None if self._diode is None else self._diode.watch(self._display, file, seconds)
 
+    def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
+        """Go on showing a pattern, or wait where a command shows it."""
+        if self._shows:
+            super().hold(file, pattern, seconds)
+        else:
+            end_s = time.monotonic() + seconds
+            self._display.show_until(file, pattern, lambda: time.monotonic() > end_s)
+
     def close(self) -> None:
         """Close the window."""
         self._display.close()
@@ -462,7 +479,7 @@ def _saved(stem: Path) -> Path | None:
     return None
 
 
-SWAP_JITTER_NS, DIODE_JITTER_NS = 20_000, 100_000
+SWAP_JITTER_NS = 20_000
 MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 
 
@@ -475,7 +492,7 @@ class VirtualBench(ImageSource):
     def __init__(self, bench: BenchFile, truth: BenchFile, seed: int) -> None:
         self.truth, self._seed, self.sets_exposure = truth, seed, True
         self.identity = f"virtual: sha256 {truth.sha256}, seed {seed}"
-        _refuse_other_bench(bench, truth)
+        refuse_other_bench(bench, truth)
         config = truth.config
         with open_bench(truth) as real:
             self._panel, camera = real.panel, real.camera
@@ -488,6 +505,7 @@ class VirtualBench(ImageSource):
         uniformity = 1.0 if self._panel.uniformity is None else self._panel.uniformity.astype(np.float64)
         self._white_e_per_s: FloatArray = np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
         self._units: dict[bytes, FloatArray] = {}
+        self._on_for_ns = 0
         if bench.config.render.bit_stealing:
             _ = self._primaries  # refused now where they are not known
 
@@ -497,23 +515,32 @@ class VirtualBench(ImageSource):
         frames = [np.ascontiguousarray(off_screen(on_screen(codes, mine), its)) for codes in pattern.frames]
         shown = max(1, round(exposure_s * file.config.monitor.refresh_hz))
         image = self._image_e_per_s([frames[number % len(frames)] for number in range(shown if len(frames) > 1 else 1)])
-        return self._exposed(image + self._glow_e_per_s, exposure_s, stem)
+        half_ns = round(NS_PER_S * max(exposure_s, self.truth.config.certify.virtual.seconds_a_reading) / 2)
+        light = (image + self._glow_e_per_s) * self._warmth((self._on_for_ns + half_ns) / NS_PER_S)
+        self._on_for_ns += 2 * half_ns
+        return self._exposed(light, exposure_s, stem)
 
     def unlit(self, stem: Path) -> Path | None:
         """The tracker's image of a monitor that is switched off."""
         return self._exposed(np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem)
 
+    def _warmth(self, on_for_s: float) -> float:
+        """Light relative to that of a warm monitor, by the truth's [certify.virtual]; the first pattern switches it on."""
+        virtual = self.truth.config.certify.virtual
+        cold = virtual.cold_percent / 100 * math.exp(-on_for_s / (60 * virtual.warm_up_min))
+        return 1 - cold + virtual.drift_percent_per_h / 100 * on_for_s / 3600
+
+    def clock_ns(self) -> int:
+        """Time since the monitor was switched on: each image takes the truth's `seconds_a_reading`."""
+        return self._on_for_ns
+
+    def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
+        """Let the clock go on."""
+        self._on_for_ns += round(NS_PER_S * seconds)
+
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
         """A simulated photodiode: the true panel's delay and scan-out, with a little jitter."""
-        rng = np.random.default_rng((self._seed, zlib.crc32(b"diode")))
-        frames = int(seconds * file.config.monitor.refresh_hz)
-        period_ns = NS_PER_S / file.config.monitor.refresh_hz
-        swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(np.int64)
-        shown = edges_of(swap_ns, np.array([marker_light(number, KIND) for number in range(frames)]))
-        monitor = replace(self.truth.config.monitor, photodiode_px=file.config.monitor.photodiode_px)
-        delay_ns = (monitor.panel_delay_ms + swap_to_square_ms(monitor)) * NS_PER_MS
-        late_ns = delay_ns + rng.normal(0, DIODE_JITTER_NS, len(shown.host_ns))
-        return DiodeRecording(shown, Edges(shown.host_ns + np.rint(late_ns).astype(np.int64), shown.level))
+        return virtual_diode(file, self.truth, seconds, np.random.default_rng((self._seed, zlib.crc32(b"diode"))))
 
     def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
         from PIL import Image
@@ -560,7 +587,19 @@ class VirtualBench(ImageSource):
         self._optics.close()
 
 
-def _refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
+def virtual_diode(file: BenchFile, truth: BenchFile, seconds: float, rng: np.random.Generator) -> DiodeRecording:
+    """Edges of a true panel's delay and scan-out, with the jitter of swaps and of the truth's `[certify.virtual]`."""
+    frames = int(seconds * file.config.monitor.refresh_hz)
+    period_ns = NS_PER_S / file.config.monitor.refresh_hz
+    swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(np.int64)
+    shown = edges_of(swap_ns, np.array([marker_light(number, KIND) for number in range(frames)]))
+    monitor = replace(truth.config.monitor, photodiode_px=file.config.monitor.photodiode_px)
+    delay_ms = monitor.panel_delay_ms + swap_to_square_ms(monitor)
+    late_ms = delay_ms + rng.normal(0, truth.config.certify.virtual.delay_noise_ms, len(shown.host_ns))
+    return DiodeRecording(shown, Edges(shown.host_ns + np.rint(late_ms * NS_PER_MS).astype(np.int64), shown.level))
+
+
+def refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
     """Refuse (InputError) a truth whose screen or tracker does not match the bench file's."""
     mine, its = bench.config, truth.config
     screens = [orientation_of(c.monitor).screen_px(c.monitor.resolution_px) for c in (mine, its)]

@@ -16,7 +16,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
-from hilstar.calibrate.first_light.records import Figure, StepOutcome
+from hilstar.calibrate.first_light.records import Figure, StepNumber, StepOutcome
 from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
 from hilstar.calibrate.plan import Patch, PlanSettings, in_channel, plan_patches
@@ -284,7 +284,7 @@ class Photometer:
 
 
 SEED = 0
-PHOTOMETRY_FILES = ("measured.csv", "response.toml", "response.png", "response-before.png")
+PHOTOMETRY_FILES = ("measured.csv", "response.toml", "response.svg", "response-before.svg")
 MIN_LEVELS = 10  # as `calibrate photometric` needs
 DIM_LIGHT = 1e-3  # relative to white: how far down responses are compared
 
@@ -397,15 +397,19 @@ def _judged(
         f" black {figures['black_level']:.2e} of white"
         f"{'' if figures['black_level_measured'] == 'yes' else ' as the bench file has it, not measured (--dark)'}"
     )
+    rms_mag = float(figures["held_out_rms_mag"])
+    error = rms_mag / math.sqrt(2 * float(figures["codes"]))
+    number = StepNumber(rms_mag, error, "mag", "rms distance of held-out levels from the response")
     if float(figures["links_max_mag"]) > limit_mag:
         why = "switch off dynamic contrast and local dimming, or is the tracker not linear?"
         line = f"dense and sparse dots of one code differ by {figures['links_max_mag']:.3f} mag: {why}"
-        return StepOutcome("failed", line, figures, files, pictures)
+        return StepOutcome("failed", line, figures, files, pictures, number=number)
     if float(figures["held_out_p95_mag"]) > limit_mag:
         why = "take more readings (--patches), look at stray light, and at whether the monitor was warm"
-        return StepOutcome("failed", f"{line}: the levels do not make one smooth response; {why}", figures, files, pictures)
+        line = f"{line}: the levels do not make one smooth response; {why}"
+        return StepOutcome("failed", line, figures, files, pictures, number=number)
     changes = context.names("monitor", "calibration", context.session / "response.toml")
-    return StepOutcome("done", line, figures, files, pictures, changes)
+    return StepOutcome("done", line, figures, files, pictures, changes, number)
 
 
 def response_error_mag(assumed: Response, true: Response) -> FloatArray:

@@ -1,10 +1,9 @@
-"""A session's records: session.json, the keys set in the bench file, and the page first-light.html."""
+"""A session's records: session.json, and the keys set in the bench file."""
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -15,9 +14,8 @@ from hilstar.bench.bench_file import BenchFile, read_bench_file, with_key
 from hilstar.bench.config import parse_config
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
-from hilstar.html_pages import Markup, escaped, page_of, picture_of, table_of
-from hilstar.reading import MAX_TOML_BYTES, NOT_JSON, exists, read_bytes, read_text
-from hilstar.run.sync import BeatSummary, beat_line
+from hilstar.reading import NOT_JSON, exists, read_bytes
+from hilstar.run.sync import BeatSummary
 
 Verdict = Literal["done", "skipped", "failed"]
 Figure = float | int | str
@@ -27,7 +25,6 @@ MAX_SESSION_BYTES = 20_000_000
 MAX_FILE_BYTES = 2_000_000_000
 KIND = "hilstar first light 1"
 SESSION_FILE = "session.json"
-PAGE_FILE = "first-light.html"
 ADVICE = "give the directory of a first-light session, or a new one"
 
 
@@ -46,9 +43,18 @@ class KeyChange(msgspec.Struct, frozen=True, kw_only=True):
         return f"[{self.table}] {self.key}: {before} -> {self.after}"
 
 
+class StepNumber(msgspec.Struct, frozen=True):
+    """The one figure of a step: value, standard error (None for a count or a figure without one), unit, and what it is."""
+
+    value: float
+    error: float | None
+    unit: str
+    of: str
+
+
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """The result of a step: one line, figures, files made, pictures for the page, and keys to set."""
+    """The result of a step: one line, figures, files made, pictures for the page, keys to set, and its one figure."""
 
     verdict: Verdict
     line: str
@@ -56,6 +62,7 @@ class StepOutcome:
     files: tuple[Path, ...] = ()
     pictures: tuple[Path, ...] = ()
     changes: tuple[KeyChange, ...] = ()
+    number: StepNumber | None = None
 
 
 class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,6 +79,7 @@ class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
     changes: list[KeyChange]
     ended: str
     seconds: float
+    number: StepNumber | None = None
 
 
 class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,56 +147,3 @@ def rewrite(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
         return file
     write_whole(file.path, with_changes(file, changes).text)
     return read_bench_file(file.path)
-
-
-MAX_PICTURE_BYTES = 50_000_000
-MAX_FILES_LISTED = 12  # per step; the others are counted here, and listed in session.json
-COLOURS = {"done": "#2e7d32", "skipped": "#8a6d00", "failed": "#c62828"}
-
-
-def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
-    """Write the page of a session, with its bench file as it was and as it is. Raises InputError where it cannot be written."""
-    bench = Path(session.bench)
-    old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, bench))
-    difference = "\n".join(difflib.unified_diff(old, new, "before", "now", lineterm=""))
-    beats = None if session.beat is None else beat_line(session.beat)
-    overview = [(Markup(f"<a href='#{each.name}'>{each.name}</a>"), _badge(each), each.line) for each in session.steps]
-    body = [
-        f'<p class="small">hilstar {escaped(session.hilstar)}; images: {escaped(session.seen_by)}</p>',
-        *(f'<p class="verdict" style="background:{COLOURS["failed"]}">Forced: {escaped(each)}</p>' for each in session.forced),
-        table_of(overview),
-        *([f"<p>{escaped(beats)}</p>"] if beats else []),
-        *(part for record in session.steps for part in _step(folder, record)),
-        "<h2>The bench file</h2>",
-        f"<p>{escaped(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",
-        f"<pre>{escaped(difference or 'nothing was changed')}</pre>",
-    ]
-    path = folder / PAGE_FILE
-    write_whole(path, page_of(f"First light of {bench.name}", body))
-    return path
-
-
-def _badge(record: StepRecord) -> Markup:
-    return Markup(f'<span class="verdict" style="background:{COLOURS[record.verdict]}">{record.verdict}</span>')
-
-
-def _step(folder: Path, record: StepRecord) -> Iterator[str]:
-    yield f'<h2 id="{record.name}">{record.name} {_badge(record)}</h2>'
-    yield f'<p>{escaped(record.line)}</p><p class="small">{escaped(record.ended)}, {record.seconds:.1f} s</p>'
-    if record.changes:
-        yield f"<p>In the bench file: {'; '.join(f'<code>{escaped(change.line)}</code>' for change in record.changes)}</p>"
-    yield from (_picture(folder / name) for name in record.pictures)
-    if record.figures:
-        yield table_of(record.figures.items(), digits=6)
-    if record.files:
-        listed = list(record.files.items())[:MAX_FILES_LISTED]
-        more = len(record.files) - len(listed)
-        yield table_of((name, Markup(f"<code>{digest}</code>")) for name, digest in listed)
-        yield f'<p class="small">and {more} files more, in session.json</p>' if more else ""
-
-
-def _picture(path: Path) -> str:
-    try:
-        return picture_of(read_bytes(path, "", MAX_PICTURE_BYTES), "png", path.stem)
-    except InputError as error:
-        return f"<p>{escaped(error)}</p>"

@@ -26,6 +26,7 @@ from hilstar.calibrate.first_light.records import (
     Figure,
     KeyChange,
     SessionFile,
+    StepNumber,
     StepOutcome,
     StepRecord,
     read_session,
@@ -34,7 +35,7 @@ from hilstar.calibrate.first_light.records import (
     write_session,
 )
 from hilstar.calibrate.first_light.stars import scale, verify
-from hilstar.calibrate.first_light.uniformity import uniformity
+from hilstar.calibrate.first_light.uniformity import uniformity, warm_up
 from hilstar.calibrate.latency import checked_delay_ms, draw_latency, pair, summarise
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import clear_parts, lock_alone, write_whole
@@ -58,7 +59,7 @@ def latency(context: StepContext) -> StepOutcome:
         return StepOutcome("skipped", f"not measured, the bench file's {monitor.panel_delay_ms:g} ms stays: give {how}")
     paired = pair(watched.seen, watched.shown, NS_PER_S / monitor.refresh_hz)
     found = summarise(paired, context.file.config)
-    picture = context.session / "latency.png"
+    picture = context.session / "latency.svg"
     draw_latency(picture, paired, found)
     delay_ms = checked_delay_ms(0.0 if -AGREE_MS < found["panel_delay_ms"] < 0 else found["panel_delay_ms"])
     error_ms = ERROR_OF_MEDIAN * found["jitter_ms"] / math.sqrt(found["edges"])
@@ -82,7 +83,8 @@ def latency(context: StepContext) -> StepOutcome:
     )
     agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
     change = KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms)
-    return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else (change,))
+    number = StepNumber(delay_ms, error_ms, "ms", "from the buffer swap to the light of the first row")
+    return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else (change,), number)
 
 
 MS_PER_S = 1000.0
@@ -95,7 +97,9 @@ def machine(context: StepContext) -> StepOutcome:
     if missing:
         raise MachineError("; ".join(f"{check.name}: {check.detail}" for check in missing))
     figures = {check.name: check.detail for check in found.checks}
-    return StepOutcome("done", figures["opengl"], figures)
+    passed = sum(check.ok for check in found.checks)
+    number = StepNumber(passed, None, f"of {len(found.checks)}", "checks passed")
+    return StepOutcome("done", figures["opengl"], figures, number=number)
 
 
 def display(context: StepContext) -> StepOutcome:
@@ -110,7 +114,9 @@ def display(context: StepContext) -> StepOutcome:
         figures["modes_hz"] = " ".join(map(str, timing.modes_hz))
     paced = "" if timing.paced_by_screen else "; the display has no refresh of its own, frames are paced by software"
     forced = "".join(f"; forced: {each}" for each in context.source.forced)
-    return StepOutcome("done", f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}{forced}", figures)
+    line = f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}{forced}"
+    number = StepNumber(timing.period_ms, timing.period_error_ms, "ms", "from one frame to the next")
+    return StepOutcome("done", line, figures, number=number)
 
 
 BEFORE_FILE = "bench-before.toml"
@@ -119,80 +125,128 @@ LOCK_FILE = ".lock"
 
 @dataclass(frozen=True, slots=True)
 class SessionStep:
-    """One step: what it shows, what it wants back, the steps it needs, and the tables of the bench file it depends on.
+    """One step: what it measures, and what to do where it fails; what it shows, what it wants back, the steps it needs.
 
-    `writes` has the keys of the bench file that it may set.
+    `tables` are those of the bench file that it depends on; `writes` has the keys that it may set.
     """
 
     name: str
-    shows: str
-    wants: str
+    measures: str
+    cure: str
     run: Callable[[StepContext], StepOutcome]
+    shows: str = ""
+    wants: str = ""
     needs: tuple[str, ...] = ()
     tables: tuple[str, ...] = ("monitor", "collimator", "tracker")
     writes: tuple[str, ...] = ()
 
 
 STEPS = (
-    SessionStep("machine", "", "OpenGL, links and files that work", machine, tables=()),
-    SessionStep("display", "120 black frames", "a display with the bench file's size and rate", display, tables=("monitor",)),
+    SessionStep(
+        "machine",
+        "What this machine has: OpenGL, links, files.",
+        "Install or free what is missing; `hilstar doctor` shows all checks.",
+        machine,
+        wants="OpenGL, links and files that work",
+        tables=(),
+    ),
+    SessionStep(
+        "display",
+        "Size and rate of the display, by 120 black frames.",
+        "Set the monitor's mode as the bench file has it, without a compositor, or mend [monitor].",
+        display,
+        "120 black frames",
+        "a display with the bench file's size and rate",
+        tables=("monitor",),
+    ),
     SessionStep(
         "orientation",
+        "Which way up the tracker sees the screen, by three squares.",
+        "Let the tracker see the whole screen in the dark, and look at the focal lengths and pitches in the bench file.",
+        orientation,
         "three squares: the largest at a corner, the next to its right, the smallest below it",
         "one image of the tracker",
-        orientation,
         needs=("machine", "display"),
         writes=("monitor.flip_x", "monitor.flip_y", "monitor.rotate_deg", "monitor.resolution_px"),
     ),
-    SessionStep("focus", "dots", "one image, and fainter ones while they saturate", focus, needs=("orientation",)),
+    SessionStep(
+        "focus",
+        "Width of the tracker's PSF, by dots that do not saturate it.",
+        "Turn the focus until the PSF is narrowest, or write [tracker] psf_sigma_px as it is.",
+        focus,
+        "dots",
+        "one image, and fainter ones while they saturate",
+        needs=("orientation",),
+    ),
+    SessionStep(
+        "warm-up",
+        "White against time, by the light of dots, until it changes by less than 0.2 % in ten minutes.",
+        "Leave the monitor on for as long as the line says.",
+        warm_up,
+        "dots",
+        "an image every ten seconds",
+        needs=("focus",),
+    ),
     SessionStep(
         "geometry",
+        "Where the tracker sees each pixel: lens, tilt and centre, by dots that blink their own codes.",
+        "Look at focus and stray light, and at whether the mount moved, and check the focal lengths in the bench file.",
+        geometry,
         "frames of dots, each of which blinks its own code",
         "an image of each frame",
-        geometry,
         needs=("orientation",),
         writes=("collimator.geometry",),
     ),
     SessionStep(
         "uniformity",
+        "Light against place on the screen, by dots on four lattices.",
+        "Look at the images: dust, stray light, or light that is not steady.",
+        uniformity,
         "dots on four lattices over the whole screen",
         "an image of each",
-        uniformity,
         needs=("geometry",),
         writes=("monitor.calibration",),
     ),
     SessionStep(
         "photometry",
+        "Light against code, with the tracker as a photometer.",
+        "Switch off dynamic contrast and local dimming, let the monitor warm up, and take more readings (--patches).",
+        photometry,
         "dots on lattices, in one code after the other",
         "an image of each",
-        photometry,
         needs=("geometry",),
         tables=("monitor", "tracker"),
         writes=("monitor.calibration",),
     ),
     SessionStep(
         "scale",
+        "How much light white is, by stars on the screen.",
+        "Measure the response first (photometry), and see that the background is dark.",
+        scale,
         "fields of stars",
         "an image of each",
-        scale,
         needs=("geometry",),
         tables=("monitor", "collimator", "tracker", "sky", "render"),
         writes=("render.flux_at_white_e_per_s", "render.brightest_v_mag"),
     ),
     SessionStep(
         "latency",
+        "Time from the buffer swap to light, by a photodiode.",
+        "Look at the photodiode's place over the square, and at [monitor] scanout_ms.",
+        latency,
         "the photodiode's square",
         "its edges",
-        latency,
         needs=("display",),
         tables=("monitor",),
         writes=("monitor.panel_delay_ms",),
     ),
     SessionStep(
         "verify",
+        "Stars on the screen against the sky: their places and their light, and those of the twin.",
+        "Repeat the step that the line names, then this one.",
+        verify,
         "fields of stars",
         "an image of each, and a twin that passes",
-        verify,
         needs=("geometry",),
         tables=("monitor", "collimator", "tracker", "sky", "render", "background", "verify"),
     ),
@@ -203,7 +257,7 @@ NAMES = tuple(step.name for step in STEPS)
 class FirstLightSession:
     """A session in a directory, with at most `patches` readings of the response; `watch` is called with each pattern.
 
-    Raises InputError for a directory with another bench's session.
+    White is watched for `watched_s` at most, 0 for not at all. Raises InputError for a directory with another bench's session.
     """
 
     def __init__(
@@ -213,8 +267,9 @@ class FirstLightSession:
         source: ImageSource,
         patches: int,
         watch: Callable[[Pattern], object] = lambda pattern: None,
+        watched_s: float = 0.0,
     ) -> None:
-        self._watch = watch
+        self._watch, self._watched_s = watch, watched_s
         self.folder, self.file, self.source, self.patches = folder, file, source, patches
         bench = str(file.path.resolve())
         found = read_session(folder)
@@ -286,6 +341,7 @@ class FirstLightSession:
             changes=list(outcome.changes),
             ended=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             seconds=round(time.monotonic() - start_s, 3),
+            number=outcome.number,
         )
 
     def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
@@ -315,9 +371,8 @@ class FirstLightSession:
         known: dict[str, Figure] = {
             f"{name}.{key}": value for name, record in self.records.items() for key, value in record.figures.items()
         }
-        return StepContext(
-            self.file, self.folder, folder, self.source, known, complete_images(folder), self.patches, self._watch
-        )
+        kept = complete_images(folder)
+        return StepContext(self.file, self.folder, folder, self.source, known, kept, self.patches, self._watch, self._watched_s)
 
     def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
         """The SHA-256 of what a step depends on: its tables without later steps' keys, files they name, the source."""

@@ -20,7 +20,7 @@ from hilstar.bench.config import Verify
 from hilstar.bench.frame import Bench, Frame
 from hilstar.calibrate.first_light.context import MAX_FILL, DarkSubtracted, StepContext
 from hilstar.calibrate.first_light.image_sources import Pattern
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, Verdict
+from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, Verdict
 from hilstar.calibrate.scale import UNSURE_MAG, MeasuredScale
 from hilstar.charts import BLUE, INK, MUTED, SMALL_PT, chart
 from hilstar.errors import InputError
@@ -278,7 +278,7 @@ def verify(context: StepContext) -> StepOutcome:
         "star_rms_arcsec": rms_px * ARCSEC_PER_RAD / context.geometry().tracker.focal_length_px,
     }
     reasons: list[str] = []
-    picture, light = context.session / "verify.png", context.session / "verify-light.png"
+    picture, light = context.session / "verify.svg", context.session / "verify-light.svg"
     rms = f"{figures['star_rms_px']:.3f} px ({figures['star_rms_arcsec']:.2f} arcsec) rms"
     width_px = context.file.config.tracker.resolution_px[0]
     draw_residuals(picture, seen.place_px, seen.residual_px, width_px, f"{len(seen.place_px)} stars are {rms} from the sky")
@@ -310,7 +310,10 @@ def verify(context: StepContext) -> StepOutcome:
         )
     line += f": {'; '.join(reasons)}" if reasons else ""
     verdict: Verdict = "failed" if reasons else "done"
-    return StepOutcome(verdict, line, figures, (*pictures, *seen.images), tuple(pictures))
+    rms_arcsec = float(figures["star_rms_arcsec"])
+    error = rms_arcsec / math.sqrt(4 * len(off_px))  # of an rms over two axes
+    number = StepNumber(rms_arcsec, error, "arcsec", f"rms distance of {len(off_px)} stars from where the sky has them")
+    return StepOutcome(verdict, line, figures, (*pictures, *seen.images), tuple(pictures), number=number)
 
 
 def _twin_file(context: StepContext) -> BenchFile:
@@ -432,21 +435,23 @@ def scale(context: StepContext) -> StepOutcome:
     figures["scatter_error_mag"] = scatter.error_mag
     brighter = f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than the bench file has it"
     line = f"white is worth {found.flux_at_white_e_per_s:.4g} e-/s, {brighter}, by {len(ratios)} stars"
-    picture = context.session / "scale.png"
+    picture = context.session / "scale.svg"
     draw_light(picture, wanted, magnitude(ratios), noise_mag, f"{line}; they agree to {found.scatter_mag:.3f} mag")
     files = (picture, *seen.images)
+    error_e_per_s = found.flux_at_white_e_per_s * error_mag / MAG_PER_RELATIVE
+    number = StepNumber(found.flux_at_white_e_per_s, error_e_per_s, "e-/s", "light of one pixel at white, in the tracker")
     wrong = [f"they disagree by {found.scatter_mag:.3f} mag"] if found.scatter_mag > UNSURE_MAG else []
     if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * trend_error_mag):
         wrong.append(f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +- {trend_error_mag:.3f} mag")
     if wrong:
         why = "the response is not as the bench file has it (photometry), or the background is not dark; nothing was changed"
-        return StepOutcome("failed", f"{line}, but {' and '.join(wrong)}: {why}", figures, files, (picture,))
+        return StepOutcome("failed", f"{line}, but {' and '.join(wrong)}: {why}", figures, files, (picture,), number=number)
     verdict: Verdict = "failed" if scatter.finding else "done"
     line += f", but {scatter.finding}" if scatter.finding else ""
     key, before = "flux_at_white_e_per_s", context.file.config.render.flux_at_white_e_per_s
     change = KeyChange(table="render", key=key, before=before, after=float(f"{found.flux_at_white_e_per_s:.6g}"))
     agrees = abs(by_mag) < AGREE_SIGMAS * error_mag
-    return StepOutcome(verdict, line, figures, files, (picture,), () if agrees else (change,))
+    return StepOutcome(verdict, line, figures, files, (picture,), () if agrees else (change,), number)
 
 
 def _white_e_per_s(file: BenchFile) -> float:

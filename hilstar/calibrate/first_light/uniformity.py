@@ -1,27 +1,28 @@
-"""The step of uniformity: light against place on the screen by dots, and the map that corrects it."""
+"""The steps of warm-up and uniformity: light of dots against time, and against place on the screen."""
 
 from __future__ import annotations
 
 import datetime
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.calibrate.first_light.context import HOT_FILL, StepContext
+from hilstar.calibrate.first_light.context import HOT_FILL, DarkSubtracted, StepContext
 from hilstar.calibrate.first_light.geometry import sharp_dots
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.calibrate.first_light.photometry import calibration_of, calibration_source
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome, Verdict
+from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, Verdict
 from hilstar.calibrate.geometric.dots import DOT_PX
-from hilstar.charts import chart
+from hilstar.calibrate.warm_up import AHEAD_S, S_PER_H, fitted_white, judge_warm_up, watch_white
+from hilstar.charts import BLUE, MUTED, chart, label_ends, write_csv
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import load_calibration, weights_of_grid, with_uniformity
 from hilstar.tracker.centroids import noisiest_background
-from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, magnitude
+from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, NS_PER_S, magnitude
 
 APART_TRACKER_PX, APART_SIGMAS = 10.0, 16.0  # from dot to dot
 # Radius of the circle about a dot whose light is summed. At most a quarter of a period, so that no two of the four lattices
@@ -39,6 +40,7 @@ JOINED = 1e-3  # relative to a dot's weight: smooths fields that have few dots
 WORTH_MAG = 0.002  # rms over the field: less is within the error of a star's light
 FAR_SIGMAS, FAR_MAG = 3.0, 0.01  # beyond both, noise does not explain how dots differ
 FILE = "light.toml"
+LIT_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,11 @@ class UniformityMap:
     left_mag: float
     used: BoolArray
 
+    def error_mag(self, noise_mag: float) -> float:
+        """The map's standard error at a dot: that of its fit, and what dots differ from it by beyond their noise."""
+        shape = math.sqrt(max(self.left_mag**2 - noise_mag**2, 0.0))
+        return math.hypot(self.left_mag * math.sqrt(self.grid.size / max(int(self.used.sum()), 1)), shape)
+
     @property
     def is_even(self) -> bool:
         """Whether the light is even to within a star's error."""
@@ -83,7 +90,7 @@ def uniformity(context: StepContext) -> StepOutcome:
     against = map_of(dots, dots.light / as_known, size_px)
     found = map_of(dots, dots.light, size_px)
     figures = _figures(context, dots, found, against)
-    picture = context.session / "uniformity.png"
+    picture = context.session / "uniformity.svg"
     line = f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by {found.left_mag:.4f} mag"
     line += f" (noise {dots.noise_mag:.4f})"
     draw_uniformity(picture, dots, found, line)
@@ -102,7 +109,91 @@ def uniformity(context: StepContext) -> StepOutcome:
         why = "dust, a panel uneven from pixel to pixel, or light that is not steady; look at the images"
         line = f"{line}: that is far above their noise: {why}"
     verdict: Verdict = "failed" if noisy else "done"
-    return StepOutcome(verdict, line, figures, tuple(files), (picture,), changes)
+    darkest = 100 * float(figures["darkest_of_brightest"])
+    error = darkest * math.sqrt(2) * float(figures["map_error_mag"]) / MAG_PER_RELATIVE
+    number = StepNumber(darkest, error, "%", "light at the darkest place of the screen, of that at the brightest")
+    return StepOutcome(verdict, line, figures, tuple(files), (picture,), changes, number)
+
+
+def warm_up(context: StepContext) -> StepOutcome:
+    """Watch the light of dots until it is stable. Raises InputError for dots that saturate the tracker."""
+    if not context.watched_s:
+        how = "give --warm-up MINUTES, 30 for most monitors, right after the monitor was switched on"
+        return StepOutcome("skipped", f"not measured, the monitor is taken to be warm: {how}")
+    code, (_, period, _) = dot_code(context), _spacing(context)
+    codes = _shown([period // 2, period // 2], period, code, context.resolution_px)
+    dark, file, lit, number = context.read(context.dark()), context.file, np.zeros(0, dtype=np.bool_), 0
+
+    def read() -> float:
+        nonlocal lit, number
+        pattern, number = Pattern(f"white_{number:03}", codes), number + 1
+        context.watch(pattern)
+        path = context.source.look(file, pattern, context.folder / pattern.name, context.exposure_s)
+        looked = context.looked(path, dark)
+        path.unlink()  # hundreds are taken, and an interrupted watch begins anew
+        _check_brightness(context, looked, code)
+        if not lit.size:
+            lit = (looked.image > LIT_SIGMAS * noisiest_background(looked.image).noise) & (dark < HOT_FILL * context.full_dn)
+        return float(looked.image[lit].sum())
+
+    hold = Pattern("white", codes)
+    t_s, light = watch_white(
+        read, context.source.clock_ns, lambda seconds: context.source.hold(file, hold, seconds), context.watched_s
+    )
+    found, ended_s = judge_warm_up(t_s, light), context.source.clock_ns() / NS_PER_S
+    table, picture = context.session / "warm-up.csv", context.session / "warm-up.svg"
+    write_csv(table, ("t_s", "light_dn"), zip(t_s.tolist(), light.tolist(), strict=True))
+    with chart(picture, found.line) as (axes,):
+        axes.plot(t_s / 60, 100 * light / light[-1], ".", color=MUTED, markersize=4)
+        axes.plot(t_s / 60, 100 * fitted_white(found, t_s, light) / light[-1], color=BLUE, label=found.law)
+        axes.set(xlabel="time [min]", ylabel="white over the last reading [%]")
+        label_ends(axes)
+    figures: dict[str, Figure] = {name: value for name, value in asdict(found).items() if name != "is_stable"}
+    figures |= {"readings": len(light), "stable": "yes" if found.is_stable else "no"}
+    if context.truth is not None:
+        virtual = context.truth.config.certify.virtual
+        tau_s, cold = 60 * virtual.warm_up_min, virtual.cold_percent / 100
+        slope = cold / tau_s * math.exp(-ended_s / tau_s) + virtual.drift_percent_per_h / 100 / S_PER_H
+        figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
+        stable_s = tau_s * math.log(max(abs(cold) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
+        figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)  # of its exponential alone
+    per_h = StepNumber(found.drift_percent_per_h, found.drift_error_percent_per_h, "%/h", "drift of white at the last reading")
+    return StepOutcome(
+        "done" if found.is_stable else "failed",
+        found.line if found.is_stable else f"{found.line}; {found.cure}",
+        figures,
+        (table, picture),
+        (picture,),
+        number=per_h if found.law != "none" else None,
+    )
+
+
+def dot_code(context: StepContext) -> int:
+    """The brightest code whose dots do not saturate the tracker. Raises InputError."""
+    return int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
+
+
+class DotSpacing(NamedTuple):
+    """The sigma of a dot in the tracker's image, tracker px; period and reach of a lattice of dots, monitor px."""
+
+    sigma_px: float
+    period: int
+    reach: float
+
+
+def _spacing(context: StepContext) -> DotSpacing:
+    geometry = context.real_geometry()
+    ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+    psf_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.tracker_psf.width_px)))
+    sigma_px = math.hypot(psf_px, DOT_PX * ratio / math.sqrt(12))
+    apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
+    period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(context.resolution_px) / MAX_DOTS / 2) * 2)
+    return DotSpacing(sigma_px, period, min(REACH * period, REACH_SIGMAS * sigma_px / ratio))
+
+
+def _check_brightness(context: StepContext, looked: DarkSubtracted, code: int) -> None:
+    if context.is_too_bright(looked):
+        raise InputError(f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step")
 
 
 def _said(found: UniformityMap, assumed: bool) -> str:
@@ -124,6 +215,7 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
         "off_bench_file_rms_mag": against.rms_mag,
         "left_rms_mag": found.left_mag,
         "dot_noise_mag": dots.noise_mag,
+        "map_error_mag": found.error_mag(dots.noise_mag),
     }
     if context.truth is not None:
         monitor = context.truth.config.monitor
@@ -136,13 +228,9 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
 
 def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     """Measure dots on lattices over the whole screen; their light, and the images. Raises InputError for too few whole dots."""
-    geometry, code = context.real_geometry(), int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
+    geometry, code = context.real_geometry(), dot_code(context)
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    psf_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.tracker_psf.width_px)))
-    sigma_px = math.hypot(psf_px, DOT_PX * ratio / math.sqrt(12))
-    apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
-    period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(context.resolution_px) / MAX_DOTS / 2) * 2)
-    reach = min(REACH * period, REACH_SIGMAS * sigma_px / ratio)
+    sigma_px, period, reach = _spacing(context)
     width, height = geometry.tracker.resolution_px
     y, x = np.mgrid[0:height, 0:width]
     seen = np.stack(geometry.to_monitor(x.ravel().astype(np.float64), y.ravel().astype(np.float64)))
@@ -155,8 +243,7 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
         firsts = [period // 2 + period // 2 * half for half in shift]
         looked = context.look(Pattern(f"lattice_{number:03}", _shown(firsts, period, code, context.resolution_px)), dark)
         paths.append(looked.path)
-        if context.is_too_bright(looked):
-            raise InputError(f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step")
+        _check_brightness(context, looked, code)
         noise_dn = noisiest_background(looked.image).noise
         size, first = np.array(context.resolution_px), np.array(firsts)
         parts.append(_sums(seen, looked.image, bad, firsts=first, period=period, reach=reach, size=size))
@@ -289,6 +376,7 @@ def draw_uniformity(path: Path, dots: DotLight, found: UniformityMap, finding: s
         for axes, (name, off_mag) in zip(both, panels.items(), strict=True):
             low, high = (float(value) for value in np.percentile(off_mag, (0.5, 99.5)))
             shown = axes.scatter(x, y, c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4))
+            shown.set_rasterized(True)  # thousands of dots
             axes.figure.colorbar(shown, ax=axes, label=name)
             axes.set(aspect="equal", ylabel="monitor y [px]")
             axes.invert_yaxis()

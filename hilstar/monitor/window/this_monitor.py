@@ -35,7 +35,7 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
         for state in randr.outputs():
             if state.name == display.name:
                 edid, refresh_hz, adds["a transform"] = state.edid, state.refresh_hz, state.transform != IDENTITY
-    edid = edid or _edid_of_drm(display.name)
+    edid = edid or edid_of_drm(display.name)
     width, height = display.resolution_px
     return msgspec.structs.replace(
         edid_identity(edid),
@@ -48,7 +48,7 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
     )
 
 
-def _edid_of_drm(connector: str, drm: Path = DRM) -> bytes:
+def edid_of_drm(connector: str, drm: Path = DRM) -> bytes:
     """The kernel's EDID of a connector, which X may call HDMI-1 where the kernel says HDMI-A-1; b"" for none."""
     for path in sorted(drm.glob("card*-*/edid")):
         with contextlib.suppress(OSError):

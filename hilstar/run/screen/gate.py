@@ -23,7 +23,7 @@ from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.render.driver import sleep_in_waits
 from hilstar.render.presenter import window_context
 from hilstar.run.screen.screen import DrawBudget, Screen
-from hilstar.units import NS_PER_MS
+from hilstar.units import ERROR_OF_MEDIAN, NS_PER_MS
 
 GATE_FRAMES = 120
 REFRESH_TOLERANCE = 0.01
@@ -50,6 +50,7 @@ class Timing:
     `paced_by_screen` is true where the screen itself keeps time, and `waits` false where it could, but swaps do not wait.
     `modes_hz` are the refresh rates that the display has. The driver holds `queued` finished frames back, a refresh each, and
     takes a frame for a swap up to `guard_ms` before it. With `variable` the display shows a frame when it comes.
+    `period_error_ms` is the standard error of the median.
     """
 
     period_ms: float
@@ -60,6 +61,7 @@ class Timing:
     queued: int = 0
     guard_ms: float = DrawBudget.GUARD_NS / NS_PER_MS
     variable: bool = False
+    period_error_ms: float = 0.0
 
 
 @contextmanager
@@ -200,7 +202,9 @@ def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timi
     # A display whose swaps come faster than any refresh does not wait for one: nothing keeps time but this program.
     on_time = abs(period_ms / wanted_ms - 1) < REFRESH_TOLERANCE
     by_screen = period_ms >= 1000.0 / known_hz * (1 - UNPACED) if known_hz else on_time
-    return Timing(period_ms, int((periods_ms > DROPPED * wanted_ms).sum()), by_screen, waits=by_screen or not known_hz)
+    dropped = periods_ms > DROPPED * wanted_ms
+    error_ms = ERROR_OF_MEDIAN * float(np.std(periods_ms[~dropped])) / len(periods_ms) ** 0.5 if not dropped.all() else 0.0
+    return Timing(period_ms, int(dropped.sum()), by_screen, waits=by_screen or not known_hz, period_error_ms=error_ms)
 
 
 def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:

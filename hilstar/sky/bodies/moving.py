@@ -14,6 +14,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
+from hilstar.sky.air import SiteAir
 from hilstar.sky.bodies.disc import (
     DARK_V_MAG,
     EARTH,
@@ -132,6 +133,7 @@ class MovingSky:
         self._face: Callable[[SkyMoment, int], Disc] = lru_cache(maxsize=len(names) + 1)(self._compute_face)
         self._circumstances: Callable[[int], Circumstances] = lru_cache(maxsize=2)(self._compute_circumstances)
         self.satellites: Satellites | None = None
+        self.air: SiteAir | None = None  # over an observer on the ground
         self._told = False
         self._fixed_km_s = self._seen_from(START).view.velocity_km_s
 
@@ -148,7 +150,7 @@ class MovingSky:
             colour = np.full(len(self.satellites), SUN_BV_MAG)
             stars = with_bodies(stars, self.satellites.names, colour, found=False, colours=self._bodies.sunlight)
         both = with_bodies(stars, self.names, self._bodies.bv_mag, colours=self._bodies.colours)
-        self.seen(both)
+        self.seen(both)  # which writes the bodies into the arrays
         return both
 
     def seen(
@@ -173,15 +175,25 @@ class MovingSky:
             stars.vectors[-count:] = vectors
             stars.grid.centre[-count:] = vectors
             stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(self._step(moment))
-        return stars.seen_at(velocity)
+        seen = stars.seen_at(velocity)
+        if self.air is None:
+            return seen
+        utc_ns = self._utc_ns + moment.since_ns
+        self.air.check_sun(self._circumstances(moment.since_ns // MINUTE_NS).sun_km, utc_ns)
+        return self.air.over(seen, utc_ns)
+
+    def utc_ns(self, t_ns: int | None) -> int:
+        """The UTC of a moment (None: the start), ns since 1970, held within the ephemeris."""
+        return self._utc_ns + self._within(t_ns)
 
     def passing(self, cone: Cone, t_ns: int | None = None, *velocity_and_place: FloatArray | None) -> Pass | None:
         """The satellites that can be in a cone at a moment; None for none; the observer's velocity and place as in `seen`."""
         if self.satellites is None:
             return None
         since_ns = self._within(t_ns)
-        now = partial(self._circumstances, since_ns // MINUTE_NS)
-        return self.satellites.near(cone, SkyAt(self._utc_ns + since_ns, now, self._fixed_km_s, *velocity_and_place))
+        now, utc_ns = partial(self._circumstances, since_ns // MINUTE_NS), self._utc_ns + since_ns
+        found = self.satellites.near(cone, SkyAt(utc_ns, now, self._fixed_km_s, *velocity_and_place))
+        return found if found is None or self.air is None else found.through(self.air, utc_ns)
 
     def satellites_placed(self, t_ns: int | None) -> int:
         """How many of the satellites have a place by their elements at a moment."""
@@ -223,6 +235,8 @@ class MovingSky:
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         step = self._step(moment)
         found = [_moved(self._face(step, i), directions[i], float(now[i, 3])) for i in np.flatnonzero(near).tolist()]
+        if self.air is not None:
+            found = _through(self.air, found, self._utc_ns + moment.since_ns)
         return sorted(found, key=lambda disc: disc.distance_km)
 
     def distances_km(
@@ -389,6 +403,17 @@ def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatAr
     if velocity_km_s is not None:
         return np.asarray(change + velocity_km_s)
     return None if change @ change < UNSEEN_KM_S**2 else change
+
+
+def _through(air: SiteAir, discs: list[Disc], utc_ns: int) -> list[Disc]:
+    """Discs as the air shows them, those below the horizon left out; how it flattens them is left out too."""
+    above, seen = air.above(utc_ns), []
+    for disc in discs:
+        altitude_rad = above.altitude_rad(disc.direction[None])
+        if altitude_rad[0] > -disc.radius_rad:
+            light = disc.normal_e_per_s_sr * float(air.shares(np.array([-1]), altitude_rad).mean())
+            seen.append(replace(disc, direction=above.bent(disc.direction[None])[0], normal_e_per_s_sr=light))
+    return seen
 
 
 def _moved(face: Disc, direction: FloatArray, distance_km: float) -> Disc:

@@ -3,10 +3,12 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.sky.air import SiteAir
 from hilstar.sky.bodies.kernel import NS_PER_DAY
 from hilstar.sky.bodies.orbit import Orbit, TleOrbit
 from hilstar.sky.bodies.satellites import (
@@ -95,6 +97,15 @@ class Pass:
     def only(self, which: IntArray) -> "Pass":
         """Only the satellites at places `which` (k,)."""
         return replace(self, index=self.index[which], seen_km=self.seen_km[:, which], place_km=self.place_km[:, which])
+
+    def through(self, air: SiteAir, utc_ns: int) -> Self:
+        """The same through the air at a UTC: bent, and with the light that comes through, none below the horizon."""
+        range_km = np.linalg.norm(self.seen_km[0], axis=1)[:, None]
+        towards, above, seen_km = self.seen_km[0] / range_km, air.above(utc_ns), self.seen_km.copy()
+        seen_km[0] = above.bent(towards) * range_km
+        altitude_rad, standard = above.altitude_rad(towards), self.brightness.standard_e_per_s.copy()
+        standard[self.index] *= air.shares(np.full(len(self), -1), altitude_rad).mean(axis=0) * (altitude_rad > 0)
+        return replace(self, seen_km=seen_km, brightness=replace(self.brightness, standard_e_per_s=standard))
 
     def directions(self, which: IntArray | slice, seconds: FloatArray, velocity_km_s: FloatArray | None = None) -> FloatArray:
         """Unit vectors (k, 3), ICRS, of satellites at places `which` (k,), aberrated as bodies are by `fixed_km_s`.

@@ -145,7 +145,9 @@ class Twin(Closing):
         self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
         self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
         self.primaries = seen_primaries(self.bench)
-        self._background = TrackerBackground(self.config, file.folder, self.camera, refuse=False, mosaic=False)
+        self._background = TrackerBackground(
+            self.config, file.folder, self.camera, refuse=False, mosaic=False, moving=self.bench.moving
+        )
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
         """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""

@@ -18,7 +18,7 @@ TRIALS, HELD = 60, 0.86  # share of trials within two stated errors: 0.95 is exp
 
 def planted(kind: str, noise: float, seed: int = 0, readings: int = READINGS) -> WarmUp:
     """A planted curve, with relative noise of each reading, judged."""
-    t_s = np.arange(readings) * EVERY_S
+    t_s: FloatArray = np.arange(readings, dtype=np.float64) * EVERY_S
     curves: dict[str, FloatArray] = {
         "exponential": 1 + CHANGE * np.exp(-t_s / TAU_S),
         "brightening": 1 - CHANGE * np.exp(-t_s / TAU_S),

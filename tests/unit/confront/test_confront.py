@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hilstar.attitude.logs.earth import q_icrs_to_enu
+from hilstar.rotation import conjugate, rotate
 from tests.support.commands import run_hilstar_here
-from tests.support.planted_sky import HEIGHT, NOTHING_WRONG, SKY, WIDTH, Extras, Planted, photograph, write_bench
+from tests.support.planted_sky import HEIGHT, NOTHING_WRONG, SKY, WIDTH, Extras, Planted, photograph, rotation_of, write_bench
 
 RAW = sorted((Path(__file__).parents[2] / "data" / "confront").glob("*.tiff"))
 RAW_BENCH = """[tracker]
@@ -127,6 +129,39 @@ def test_a_planted_camera_comes_back_within_its_errors_and_what_was_planted_is_n
     assert len(unexplained) == len(FALSE_STARS)
     for x, y, _ in FALSE_STARS:
         assert min(np.hypot(x - a, y - b) for a, b in unexplained) < NEAR_PX
+
+
+SITE = """[site]
+latitude_deg = 40.0
+longitude_deg = 10.0
+height_m = 0
+extinction = 0.15
+"""
+TIMES = ("20T20:00:00", "20T23:00:00", "21T01:00:00")  # of September 2020
+
+
+def test_a_site_tells_air_mass_and_extinction(tmp_path: Path) -> None:
+    camera, rng, paths, wanted = Planted(), np.random.default_rng(8), [], []
+    for time in TIMES:
+        t_ns = np.datetime64(f"2020-09-{time}", "ns").astype(np.int64)
+        up = rotate(conjugate(q_icrs_to_enu(np.array([t_ns]), 40.0, 10.0)[0]), np.array([[0.0, 0.0, 1.0]]))[0]
+        extras = Extras(zenith=tuple(up), k_mag=0.25)
+        wanted.append(1 / float(rotation_of(*SKY.pointings[2])[2] @ up))
+        paths.append(tmp_path / f"night_2020-09-{time.replace(':', '-')}.png")
+        Image.fromarray(photograph(camera, SKY.pointings[2], rng, extras)).save(paths[-1])
+    found = confronted(write_bench(tmp_path / "guess.toml", more=SITE), paths, tmp_path / "out")
+    figures = found["camera"]
+    sigma = figures["sigma"]["extinction_beyond_table_mag_per_air_mass"]
+    assert abs(figures["extinction_mag_per_air_mass"] - 0.25) < SIGMAS * sigma
+    assert sigma < 0.03
+    assert abs(figures["focal_length_px"] - camera.focal_px) < SIGMAS * figures["sigma"]["focal_length_px"] + 0.3  # aberration
+    masses = [image["air_mass"] for image in found["images"]]
+    assert masses == pytest.approx(wanted, abs=0.01)
+    assert all(image["rms_px"] < MAX_RMS_PX for image in found["images"])
+    # 600 e- in 68.75 arcsec squared, where 6e6 are V = 0; a night sky of that V has more red light than such a star
+    assert 19.18 < found["images"][0]["sky_v_mag_arcsec2"] < 19.6
+    done = run_hilstar_here("simulate", tmp_path / "out" / "tracker.toml", "--radec", "310,40,110", "-o", tmp_path / "a.fits")
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_gamma_of_1_8_is_found_and_undone(tmp_path: Path) -> None:

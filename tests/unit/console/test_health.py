@@ -46,6 +46,7 @@ def test_a_run_that_goes_well_has_no_reason():
         ({"faults": ["flash"]}, "a fault is on: flash"),
         ({"tracker": TrackerFigures(silent="the tracker has not answered for 2.0 s")}, "has not answered for 2.0 s"),
         ({"rates": "the packets' rates are wrong"}, "the packets' rates are wrong"),
+        ({"forced": "another monitor"}, "shown by --force: another monitor"),
     ],
 )
 def test_each_thing_that_is_wrong_is_a_reason(changes, words):

@@ -1,0 +1,255 @@
+"""From a bench, and its readings where there are some, to the inputs of its budget and the model that they go through."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import star_flux
+from hilstar.certify.budget import Input, Model
+from hilstar.certify.estimates import LightDeviation, Surface, evenness, light_deviation, places
+from hilstar.certify.model import Deviations, Figures, reference_stars
+from hilstar.certify.readings import Reader, dot_places, geometry_of
+from hilstar.units import MAG_PER_RELATIVE, magnitude
+
+SEED = 5  # of the order of readings
+DOT_IMAGES = 4
+READINGS_A_ROUND = 8  # between one black and white and the next
+LIBRARY_MAG = 0.013  # of stars' light by library spectra of their V-I: results/tradeoff.csv, 0.026 mag at 95 %
+SKY = (("star_flux", "mag"), ("star_place_along", "arcsec"), ("star_place_across", "arcsec"))
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """An input and its slopes: on relative light at the model's levels (size, levels) and at stars (size, stars), places (size,
+    stars, 2), delay and lateness (size,), ms, and on what the sky adds to each star (size, 3, stars).
+    """
+
+    input: Input
+    levels: FloatArray | None = None
+    even: FloatArray | None = None
+    place: FloatArray | None = None
+    delay: FloatArray | None = None
+    late: FloatArray | None = None
+    sky: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """A bench's readings, fitted; what could not be read is None."""
+
+    light: LightDeviation
+    even: Surface
+    place: Surface
+    delays_ms: FloatArray
+
+
+def read_bench(file: BenchFile, reader: Reader) -> Read:
+    """Read a bench for a certificate: its response, one pattern of dots, its delay. Raises InputError, MachineError."""
+    certify, rng = file.config.certify, np.random.default_rng(SEED)
+    codes = planned_codes(2**file.config.monitor.bits - 1, certify.levels, certify.repeats, rng)
+    light = light_deviation(file, reader.light(codes))
+    dots = reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
+    return Read(light, evenness(file, dots), places(file, dots), reader.delays_ms())
+
+
+def planned_codes(white: int, levels: int, repeats: int, rng: np.random.Generator) -> IntArray:
+    """Codes to read (n,), in even steps of their logarithm, the faintest all of them; black and white before every eight."""
+    count = min(levels, white)
+    wanted = next(found for n in itertools.count(count) if len(found := np.unique(np.rint(np.geomspace(1, white, n)))) >= count)
+    order = rng.permutation(np.repeat(wanted.astype(np.intp), repeats))
+    rounds = [np.concatenate([[0, white], order[k : k + READINGS_A_ROUND]]) for k in range(0, len(order), READINGS_A_ROUND)]
+    return np.asarray(np.concatenate([*rounds, [0, white]]), dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True)
+class Assembled:
+    """Inputs, the model of all figures, each figure's (quantity, star or field, unit), and what was not assessed."""
+
+    inputs: list[Input]
+    model: Model
+    names: list[tuple[str, int, str]]
+    figures: Figures
+    not_assessed: list[str]
+
+
+def assemble(file: BenchFile, read: Read | None, drift: tuple[float, str] | None = None) -> Assembled:
+    """The budget of a bench. `drift` is the relative change of light since the last check, and why. Raises InputError."""
+    figures = Figures(file, reference_stars(file))
+    count, lights = len(figures.stars), len(figures.log_light)
+    value = Deviations(
+        np.ones((1, lights)), np.zeros((1, count)), np.zeros((1, count, 2)),
+        np.array([file.config.monitor.panel_delay_ms]), np.zeros(1),
+    )  # fmt: skip
+    missing: list[str] = []
+    if read is None:
+        effects = list(_of_files(file, figures, missing))
+    else:
+        value, effects = _of_readings(file, figures, read, missing)
+    effects += [*_of_settings(file, figures, drift, missing), *_of_sky(file, figures, missing)]
+    names = [*figures.names, *((quantity, star, unit) for quantity, unit in SKY for star in range(count))]
+    quantised = np.array([star.quantised_mag for star in figures.stars])
+
+    def model(variables: list[FloatArray]) -> FloatArray:
+        def total(name: str) -> FloatArray | float:
+            parts = [(z, getattr(each, name)) for z, each in zip(variables, effects, strict=True)]
+            return sum((np.tensordot(z, slopes, axes=1) for z, slopes in parts if slopes is not None), start=0.0)
+
+        trials = len(variables[0])
+        off = Deviations(*(np.zeros((trials, *getattr(value, n).shape[1:])) + getattr(value, n) + total(m) for n, m in KINDS))
+        found = figures.of(off)
+        sky = np.zeros((trials, len(SKY), count)) + total("sky")
+        sky += found[:, : 3 * count].reshape(trials, 3, count)
+        sky[:, 0] += quantised
+        return np.concatenate([found, sky.reshape(trials, -1)], axis=1)
+
+    return Assembled([each.input for each in effects], model, names, figures, missing)
+
+
+KINDS = (("levels", "levels"), ("even", "even"), ("place_arcsec", "place"), ("delay_ms", "delay"), ("late_ms", "late"))
+
+
+def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[str]) -> tuple[Deviations, list[Effect]]:
+    light, size = read.light, file.config.monitor.resolution_px
+    join = light.weights(figures.log_light)
+    middle = read.even.terms(np.array([size[0] // 2]) * 1.0, np.array([size[1] // 2]) * 1.0)
+    even = read.even.terms(figures.x_px, figures.y_px) - middle
+    place = read.place.terms(figures.x_px, figures.y_px)
+    form = read.even.bowed(figures.x_px, figures.y_px) - read.even.bowed(*(np.array([side // 2]) * 1.0 for side in size))
+    half = np.abs(form) / 2 / math.sqrt(3)
+    late_ms = read.delays_ms
+    delay = float(late_ms.mean()) if len(late_ms) > 1 else file.config.monitor.panel_delay_ms
+    value = Deviations(
+        (join @ light.value)[None], (even @ read.even.value[:, 0] - form / 2)[None], (place @ read.place.value)[None],
+        np.array([delay]), np.zeros(1),
+    )  # fmt: skip
+    by_place = np.zeros((2, place.shape[1], len(figures.stars), 2))
+    for axis in (0, 1):
+        by_place[axis, :, :, axis] = (place @ read.place.factors).T
+    found = [
+        Effect(
+            Input("response", "Student t", "patches of light", light.factors.shape[1], light.noise, "relative", light.dof),
+            levels=(join @ light.factors).T,
+        ),
+        Effect(
+            Input("evenness", "Student t", "light of dots", even.shape[1], read.even.noise, "relative", read.even.dof),
+            even=(even @ read.even.factors).T,
+        ),
+        Effect(
+            Input(
+                "form of the light map", "rectangular", "smooth, or linear between a map's places", 1, _rms(half), "relative"
+            ),
+            even=half[None],
+        ),
+        Effect(
+            Input("geometry", "Student t", "places of dots", 2 * place.shape[1], read.place.noise, "arcsec", read.place.dof),
+            place=by_place.reshape(-1, len(figures.stars), 2),
+        ),
+    ]
+    if len(late_ms) > 1:
+        error = float(late_ms.std(ddof=1)) / math.sqrt(len(late_ms))
+        source = f"{len(late_ms)} edges of a photodiode"
+        found.append(Effect(Input("delay", "Student t", source, 1, error, "ms", len(late_ms) - 1.0), delay=np.array([error])))
+    else:
+        found += _stated_delay(file, missing)
+    return value, found
+
+
+def _of_files(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
+    """The effects of a bench's calibration files."""
+    yield from _stated_delay(file, missing)
+
+
+def _stated_delay(file: BenchFile, missing: list[str]) -> Iterator[Effect]:
+    known = file.config.certify.panel_delay_u_ms
+    if known is None:
+        missing.append("latency: no photodiode read it, and [certify] panel_delay_u_ms is not written")
+    else:
+        yield Effect(Input("delay", "normal", "[certify] panel_delay_u_ms", 1, known, "ms"), delay=np.array([known]))
+
+
+def _of_settings(file: BenchFile, figures: Figures, drift: tuple[float, str] | None, missing: list[str]) -> Iterator[Effect]:
+    """The instrument, temperature, drift, clock and prediction, as [certify] states them."""
+    certify, stars = file.config.certify, len(figures.stars)
+    one, instrument = np.ones((1, stars)), certify.instrument
+    if instrument.name:
+        scale = instrument.relative_expanded / instrument.k
+        source = f"certificate of {instrument.name}{f', {instrument.date}' if instrument.date else ''}, k = {instrument.k:g}"
+        yield Effect(Input("instrument", "normal", source, 1, scale, "relative"), even=scale * one)
+    else:
+        missing.append("absolute scale of the light: no [certify.instrument]; light is in the tracker's own electrons")
+    if certify.temperature_k and (certify.flux_mag_per_k or certify.place_arcsec_per_k):
+        kelvin = certify.temperature_k / math.sqrt(3)
+        flux, place = certify.flux_mag_per_k * kelvin / MAG_PER_RELATIVE, certify.place_arcsec_per_k * kelvin
+        moved = np.zeros((3, stars, 2))
+        moved[1, :, 0], moved[2, :, 1] = place, place
+        source = f"[certify] temperature_k = {certify.temperature_k:g}, half of a range"
+        light = np.stack([flux * one[0], 0 * one[0], 0 * one[0]])
+        yield Effect(Input("temperature", "rectangular", source, 3, kelvin, "K"), even=light, place=moved)
+    else:
+        missing.append("temperature: no range or no coefficient in [certify]")
+    if drift is not None:
+        size = abs(drift[0]) / math.sqrt(3)
+        yield Effect(Input("drift", "rectangular", drift[1], 1, size, "relative"), even=size * one)
+    else:
+        missing.append("drift since the certificate: no check has been made (hilstar certify --check)")
+    if certify.rate_deg_s:
+        for name, error, source in (
+            ("clock", certify.clock_ms, "[certify] clock_ms"),
+            ("prediction", certify.jitter_ms, "[certify] jitter_ms"),
+        ):
+            if error:
+                yield Effect(Input(name, "normal", source, 1, error, "ms"), late=np.array([error]))
+    else:
+        missing.append("motion: [certify] rate_deg_s is 0, so clock and prediction move no star")
+
+
+def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
+    """What the sky and the codes add to each star: catalogue, spectrum, quantisation; they are in the star_ figures alone."""
+    stars = figures.stars
+    count = len(stars)
+
+    def each(values: FloatArray, kind: int) -> FloatArray:
+        slopes = np.zeros((count, len(SKY), count))
+        slopes[np.arange(count), kind, np.arange(count)] = values
+        return slopes
+
+    mag, arcsec = np.array([star.sigma_mag for star in stars]), np.array([star.sigma_arcsec for star in stars])
+    source = "each star's errors in the catalogue"
+    rms = _rms(mag), _rms(arcsec)
+    yield Effect(Input("catalogue light", "normal", source, count, rms[0], "mag"), sky=each(mag, 0))
+    both = np.concatenate([each(arcsec / math.sqrt(2), 1), each(arcsec / math.sqrt(2), 2)])
+    yield Effect(Input("catalogue place", "normal", source, 2 * count, rms[1], "arcsec"), sky=both)
+    colour, source = spectrum_mag(file, np.array([star.b_v_mag for star in stars]))
+    yield Effect(
+        Input("spectrum", "normal", source, 1, _rms(colour), "mag"),
+        sky=np.stack([colour, np.zeros(count), np.zeros(count)])[None],
+    )
+    lost = np.array([star.quantised_mag for star in stars])
+    light = float(lost.std(ddof=1)) if count > 2 else 0.0
+    source = "scatter of what the codes of the reference stars lose"
+    yield Effect(Input("quantisation", "normal", source, count, light, "mag"), sky=each(np.full(count, light), 0))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def spectrum_mag(file: BenchFile, b_v_mag: FloatArray) -> tuple[FloatArray, str]:
+    """The standard uncertainty of stars' light by the way from colour to spectrum (n,), mag, and its source."""
+    if file.config.sky.spectrum != "blackbody" or file.config.sky.brightness != "dgs":
+        return np.full(len(b_v_mag), LIBRARY_MAG), "real stars of one colour (study tradeoff: 0.026 mag at 95 %)"
+    rates = []
+    known = np.nan_to_num(b_v_mag, nan=0.65)
+    for spectrum in ("pickles", "blackbody"):
+        sky = msgspec.structs.replace(file.config.sky, spectrum=spectrum)
+        flux = star_flux(msgspec.structs.replace(file.config, sky=sky), file.folder)
+        rates.append(np.asarray(flux(np.zeros(len(known)), known, np.full(len(known), np.nan), None)).sum(axis=1))
+    return np.abs(magnitude(rates[0] / rates[1])), "black bodies against library spectra of the same B-V"

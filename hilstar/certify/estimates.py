@@ -1,0 +1,198 @@
+"""Readings to a bench's deviations from its file, with their covariances: light by code and place, places, delay.
+
+All fits are linear least squares without a prior, so that their intervals hold by Student's t: a smoother curve would be
+nearer to the truth on the whole, and not hold it where its bias is larger than its scatter.
+
+    light      read / expected at each code read, above black, joined by a cubic spline in log light; a drift in time
+    evenness   log(light of a dot / expected) over the screen, Chebyshev polynomials, relative to the middle
+    place      direction of a dot by the tracker less that by the bench file, arcsec, Chebyshev polynomials
+
+A polynomial's degree rises from its first one as long as the next is better by an F test.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.special import fdtrc
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_calibration
+from hilstar.certify.readings import DotReadings, LightReadings, geometry_of, grey_response, white_of
+from hilstar.errors import InputError
+from hilstar.monitor.calibration import weights_of_grid
+from hilstar.scene.camera import field_terms
+from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+
+PLACE_DEGREES, EVEN_DEGREES = (7, 9, 11, 13), (4, 6, 8, 10)
+BETTER_P = 0.001  # of the F test by which a larger degree is taken
+WILD_SIGMAS = 6.0
+DOTS_A_TERM = 4
+MAP = (16, 9)  # fields of a usual map of light, columns and rows
+MIN_LEVELS = 4
+FAINT_SIGMAS = 5.0
+MIN_DOF = 2
+
+
+@dataclass(frozen=True, slots=True)
+class LightDeviation:
+    """True over expected light at the codes read: `value` (k,) over `log_light` (k,), log of light relative to white.
+
+    `factors` (k, m) times its transpose is the covariance. It holds for the first reading's moment; `drift_per_h` is relative,
+    with its standard uncertainty, nan where no time passed. `black` is relative to white, with its standard uncertainty.
+    """
+
+    log_light: FloatArray
+    value: FloatArray
+    factors: FloatArray
+    dof: float
+    noise: float
+    drift_per_h: float
+    drift_u_per_h: float
+    black: float
+    black_u: float
+
+    def weights(self, log_light: FloatArray) -> FloatArray:
+        """What each code's value adds to the deviation at lights (n,): (n, k). Beyond the codes read it is held."""
+        spline = CubicSpline(self.log_light, np.eye(len(self.log_light)), bc_type="natural")
+        return np.asarray(spline(np.clip(log_light, self.log_light[0], self.log_light[-1])))
+
+
+def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
+    """The deviation of a bench's light by readings. Raises InputError where they are too few, or have no light.
+
+    A reading is the light of its code and of black, times a drift; its noise goes with all light that it sees, and has a floor
+    where a black screen scatters by more than that.
+    """
+    codes, place, count = np.unique(read.code, return_inverse=True, return_counts=True)
+    hours, dark = (read.t_s - read.t_s[0]) / 3600, read.light[read.code == 0]
+    timed = float(np.ptp(hours)) > 0
+    dof = len(read.code) - len(codes) - timed
+    if len(codes) <= MIN_LEVELS or codes[0] != 0 or dof < MIN_DOF:
+        raise InputError(
+            f"{len(read.code)} readings of {len(codes)} codes; read black and {MIN_LEVELS} codes or more, some of them again"
+        )
+    mean = np.bincount(place, read.light) / count
+    spread = float(dark.std(ddof=1)) if len(dark) > 1 else 0.0
+    design = np.zeros((len(read.code), len(codes) + timed))
+    design[np.arange(len(read.code)), place] = 1.0
+    if timed:
+        design[:, -1] = hours * mean[place]
+    sigma, noise = np.maximum(mean[place], 1e-9 * mean[-1]), 1.0
+    for _ in range(2):
+        inverse = np.linalg.pinv(design / sigma[:, None])
+        found = inverse @ (read.light / sigma)
+        noise = math.sqrt(float((((read.light - design @ found) / sigma)[read.code > 0] ** 2).sum()) / dof)
+        floor = max(spread**2 - (noise * mean[0]) ** 2, 0.0)
+        sigma = np.sqrt(np.maximum(mean[place], 1e-9 * mean[-1]) ** 2 + floor / max(noise, 1e-12) ** 2)
+    noise = math.sqrt(float((((read.light - design @ found) / sigma) ** 2).sum()) / dof)
+    factors, light, size = noise * inverse, found[1 : len(codes)] - found[0], len(codes)
+    if not light[-1] > FAINT_SIGMAS * float(np.linalg.norm(factors[size - 1] - factors[0])):
+        raise InputError("white reads no light above black; look at what the screen shows, and expose longer")
+    grey, (width, height) = grey_response(file), file.config.monitor.resolution_px
+    even = bench_calibration(file.config, file.folder).uniformity_map((width, height))
+    here = 1.0 if even is None else float(even[height // 2, width // 2])
+    expected = white_of(file) * here * grey.light[codes[1:]]
+    return LightDeviation(
+        log_light=np.log(grey.light[codes[1:]]),
+        value=light / expected,
+        factors=(factors[1:size] - factors[0]) / expected[:, None],
+        dof=float(dof),
+        noise=noise,
+        drift_per_h=float(found[size]) if timed else math.nan,
+        drift_u_per_h=float(np.linalg.norm(factors[size])) if timed else math.nan,
+        black=float(found[0] / light[-1]),
+        black_u=float(np.linalg.norm(factors[0]) / light[-1]),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Polynomials over the screen: coefficients (terms, columns), factors (terms, terms) of each column, their freedom."""
+
+    degree: int
+    resolution_px: tuple[int, int]
+    value: FloatArray
+    factors: FloatArray
+    dof: float
+    noise: float
+
+    def terms(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """The polynomials (n, terms) at pixels (n,)."""
+        return field_terms(x_px, y_px, self.resolution_px, self.degree)
+
+    def bowed(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """How far the first column's surface and its own map of MAP fields, linear between them, are apart at pixels (n,)."""
+        wide, high = self.resolution_px
+        x, y = ((np.arange(n) + 0.5) * side / n - 0.5 for n, side in zip(MAP, self.resolution_px, strict=True))
+        grid = (self.terms(*(part.ravel() for part in np.meshgrid(x, y))) @ self.value[:, 0]).reshape(MAP[::-1])
+        rows, columns = (weights_of_grid(side, n) for side, n in zip((high, wide), MAP[::-1], strict=True))
+        at = np.rint(y_px).astype(np.intp), np.rint(x_px).astype(np.intp)
+        return np.asarray(
+            self.terms(x_px, y_px) @ self.value[:, 0] - np.einsum("nr,rc,nc->n", rows[at[0]], grid, columns[at[1]])
+        )
+
+
+def surface(
+    x_px: FloatArray, y_px: FloatArray, values: FloatArray, degrees: tuple[int, ...], resolution_px: tuple[int, int]
+) -> Surface:
+    """Fit a surface to values (n, columns) at pixels; wild ones do not count. Raises InputError for too few dots."""
+    kept = np.isfinite(values).all(axis=1)
+    best: Surface | None = None
+    best_squares = 0.0
+    for degree in degrees:
+        count = (degree + 1) * (degree + 2) // 2
+        if kept.sum() < DOTS_A_TERM * count:
+            break
+        for _ in range(3):
+            terms = field_terms(x_px, y_px, resolution_px, degree)
+            q, r = np.linalg.qr(terms[kept])
+            found = np.linalg.solve(r, q.T @ values[kept])
+            left = np.abs(values - terms @ found)
+            spread = MAD_TO_SIGMA * np.median(left[kept], axis=0)
+            within = kept & (left < WILD_SIGMAS * np.maximum(spread, 1e-12)).all(axis=1)
+            if within.sum() == kept.sum():
+                break
+            kept = within
+        dof = (int(kept.sum()) - count) * values.shape[1]
+        squares = float((left[kept] ** 2).sum())
+        if best is not None:
+            more = best.dof - dof
+            if more <= 0 or fdtrc(more, dof, max(best_squares - squares, 0.0) / more / max(squares / dof, 1e-30)) > BETTER_P:
+                break
+        noise = math.sqrt(squares / dof)
+        # r'r is the normal matrix, so its inverse's root is that of r.
+        best, best_squares = Surface(degree, resolution_px, found, noise * np.linalg.inv(r), float(dof), noise), squares
+    if best is None:
+        needed = DOTS_A_TERM * (degrees[0] + 1) * (degrees[0] + 2) // 2
+        raise InputError(f"{int(kept.sum())} dots are seen and {needed} are needed; look at focus, exposure and [collimator]")
+    return best
+
+
+def place_errors(file: BenchFile, read: DotReadings) -> FloatArray:
+    """Where each dot is seen less where the bench file shows it (n, 2), arcsec along the image's x and y."""
+    geometry = geometry_of(file)
+    seen = geometry.tracker.rays(read.seen_x_px, read.seen_y_px)
+    shown = geometry.monitor.rays(read.x_px, read.y_px)
+    return np.asarray((seen[:, :2] / seen[:, 2:] - shown[:, :2] / shown[:, 2:]) * ARCSEC_PER_RAD)
+
+
+def places(file: BenchFile, read: DotReadings) -> Surface:
+    """The errors of places over the screen, arcsec: columns along x and y. Raises InputError."""
+    size = file.config.monitor.resolution_px
+    return surface(read.x_px, read.y_px, place_errors(file, read), PLACE_DEGREES, size)
+
+
+def evenness(file: BenchFile, read: DotReadings) -> Surface:
+    """log(light of dots / expected) over the screen; only its differences mean anything. Raises InputError."""
+    size = file.config.monitor.resolution_px
+    known = bench_calibration(file.config, file.folder).uniformity_map(size)
+    at = np.rint(read.y_px).astype(np.intp), np.rint(read.x_px).astype(np.intp)
+    expected = np.ones(len(read.x_px)) if known is None else known[at].astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = np.log(read.light / expected)
+    return surface(read.x_px, read.y_px, off[:, None], EVEN_DEGREES, size)

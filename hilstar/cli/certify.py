@@ -1,0 +1,183 @@
+"""hilstar certify: how sure a bench is, stated and dated; and whether it has moved since."""
+
+from __future__ import annotations
+
+import datetime
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+
+from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
+from hilstar.console.terminal import print_json, say
+from hilstar.errors import InputError
+from hilstar.files import check_directory, make_directory, write_whole
+from hilstar.reading import exists
+
+if TYPE_CHECKING:
+    from hilstar.bench import bench_file as files
+    from hilstar.certify.readings import Reader
+
+CERTIFICATE, REFERENCE, PAGE = "certificate.json", "reference.json", "index.html"
+
+
+def certify(
+    bench_file: BenchFile,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory of the certificate and its checks.")],
+    check: Annotated[
+        bool, typer.Option("--check", help="Has the bench moved since its certificate? A minute's readings.")
+    ] = False,
+    again: Annotated[bool, typer.Option("--again", help="Certify anew, in place of the certificate in DIR.")] = False,
+    grab: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CMD", help="Command that takes the tracker's image, as that of first-light ({output}, {pattern})."
+        ),
+    ] = None,
+    virtual: Annotated[
+        Path | None,
+        typer.Option(metavar="TRUTH.toml", help="Without hardware: a bench file that says how the bench really is."),
+    ] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="With --virtual: draw every image of the tracker; else only figures are drawn.")
+    ] = False,
+    dark: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="With --grab: the tracker's image with the monitor switched off.")
+    ] = None,
+    diode: Annotated[
+        str | None, typer.Option(metavar="serial:/dev/ttyX@BAUD", help="With --grab: photodiode before the display's square.")
+    ] = None,
+    warm_up: Annotated[
+        float,
+        typer.Option("--warm-up", metavar="MIN", min=0, max=240, help="Watch white for up to so long, until it is stable."),
+    ] = 0.0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few trials: first order is enough where the model is linear.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="With --virtual: seed of the readings' noise.", min=0, max=MAX_SEED)] = 0,
+    as_json: Json = False,
+) -> None:
+    """State how sure a bench is: the light, places, attitude and latency of stars, with the uncertainty of each.
+
+    Without --grab and --virtual nothing is read, and the calibration files say it. DIR has index.html and certificate.json.
+    """
+    from hilstar.bench.bench_file import read_bench_file
+
+    check_directory("-o", output)
+    file = read_bench_file(bench_file)
+    check_files([virtual, dark], [], file)
+    for name, given in (("--grab", grab), ("--whole", whole or None), ("--dark", dark), ("--diode", diode)):
+        if given is not None and (virtual is not None) != (name == "--whole"):
+            raise InputError(
+                f"{name}: {'is for --virtual' if name == '--whole' else 'a virtual bench has its own'}; leave it out"
+            )
+    if (check or warm_up) and grab is None and virtual is None:
+        raise InputError("--check: reads the bench; write --grab CMD, or --virtual TRUTH.toml")
+    now = datetime.datetime.now(datetime.UTC)
+    with ExitStack() as ended:
+        reader = _reader(ended, file, make_directory(output), grab, virtual, whole, dark, diode, seed, check)
+        if check and reader is not None:
+            _check(file, reader, output, now, warm_up, as_json)
+        else:
+            _certify(file, reader, output, now, again, quick, as_json)
+
+
+def _certify(
+    file: files.BenchFile, reader: Reader | None, output: Path, now: datetime.datetime, again: bool, quick: bool, as_json: bool
+) -> None:
+    from hilstar.bench.certificate import read_certificate, sha256_of_bytes
+    from hilstar.certify.certificate import certify as certified
+    from hilstar.certify.check import largest_change
+    from hilstar.certify.page import text_lines, write_certificate_page
+
+    path, replaces = output / CERTIFICATE, None
+    if exists(path):
+        if not again:
+            raise InputError(f"{path}: exists; write --again to certify anew in its place, --check to check it, or another -o")
+        replaces = read_certificate(path).number
+    found, reference = certified(file, reader, now, quick=quick, drift=largest_change(output), replaces=replaces)
+    raw = msgspec.json.format(msgspec.json.encode(found))
+    digest = sha256_of_bytes(raw)
+    if reference is not None:
+        write_whole(output / REFERENCE, reference)
+    write_whole(path, raw)
+    write_certificate_page(output / PAGE, found, digest)
+    if as_json:
+        print_json({**msgspec.to_builtins(found), "sha256": digest, "page": str(output / PAGE)})
+        return
+    for name, text in text_lines(found, digest, output):
+        typer.echo(f"{name:24}{text}")
+
+
+def _check(file: files.BenchFile, reader: Reader, output: Path, now: datetime.datetime, warm_up: float, as_json: bool) -> None:
+    from dataclasses import asdict
+
+    from hilstar.bench.certificate import read_certificate
+    from hilstar.certify.check import by_bench_file, compare, read_reference, record, take_check, watch
+
+    reference, since = read_reference(output / REFERENCE), "the bench file"
+    if exists(output / CERTIFICATE):
+        since = read_certificate(output / CERTIFICATE).number
+    elif reference is None:
+        say(f"{output}: has no certificate; the check is against the bench file (hilstar certify {file.path.name} -o {output})")
+    warmed = watch(reader, 2**file.config.monitor.bits - 1, warm_up, output / "warm-up") if warm_up else None
+    figures = compare(file, reference or by_bench_file(file), take_check(file, reader))
+    rows = record(output, now, since, figures)
+    good = all(each.in_tolerance for each in figures)
+    if as_json:
+        found = {"certificate": since, "in_tolerance": good, "checks": len({row["made"] for row in rows})}
+        print_json(
+            {**found, "figures": [asdict(each) for each in figures], "warm_up": None if warmed is None else asdict(warmed)}
+        )
+    else:
+        for each in figures:
+            verdict = "in" if each.in_tolerance else "OUT OF"
+            u = f"{each.value:+.4g} +- {(each.upper - each.lower) / 2:.2g} {each.unit}"
+            typer.echo(f"{each.quantity:16}{u:28}{verdict} tolerance ({each.threshold:.2g})")
+        typer.echo(f"{'since':16}{since}")
+        if warmed is not None:
+            typer.echo(f"{'warm-up':16}{warmed.line}")
+        typer.echo(f"{'verdict':16}{'the bench is as certified' if good else 'the bench has moved: certify it --again'}")
+    if not good:
+        raise typer.Exit(1)
+
+
+def _reader(
+    ended: ExitStack,
+    file: files.BenchFile,
+    output: Path,
+    grab: str | None,
+    virtual: Path | None,
+    whole: bool,
+    dark: Path | None,
+    diode: str | None,
+    seed: int,
+    check: bool,
+) -> Reader | None:
+    from contextlib import closing
+
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.calibrate.first_light.image_sources import GrabCommand, ImageSource, SerialDiode, VirtualBench
+    from hilstar.certify.check import checks_in
+    from hilstar.certify.readings import ImageReader, VirtualReader
+    from hilstar.cli.options import parse_diode
+    from hilstar.files import temporary_folder
+
+    source: ImageSource
+    if virtual is not None:
+        truth = read_bench_file(virtual)
+        if not whole:
+            return VirtualReader(file, truth, seed, checks_in(output) + 1 if check else 0)
+        source = ended.enter_context(closing(VirtualBench(file, truth, seed)))
+    elif grab is not None:
+        recorder = None if diode is None else SerialDiode(*parse_diode(diode))
+        source = ended.enter_context(closing(GrabCommand(grab, dark, recorder)))
+        truth = None
+        source.gate(file)
+    else:
+        return None
+    folder = ended.enter_context(temporary_folder("certify"))
+    say(f"images by {source.identity}")
+    return ImageReader(file, source, folder, truth=truth)

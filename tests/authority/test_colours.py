@@ -1,0 +1,155 @@
+"""What a coloured display does to each channel of a tracker, against sums on a fine grid that are not hilstar's.
+
+Spectra of panels, sensors and stars are formulas here; what is summed is the light of the codes, through the panel's own
+formula, and the primaries' spectra through the sensor's.
+"""
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+
+from hilstar import load
+from hilstar.sky.spectrum import load_curve
+from tests.support.benches import ORION_Q, bench_text
+from tests.unit.monitor.test_primaries import NM, PANELS, bump, written
+
+GRID_NM = np.arange(350.0, 1000.01, 0.25)
+SENSOR_NM = np.arange(350.0, 1001.0, 10.0)
+# Three sensors of three channels, the red of which reach the near infrared, as a colour camera's behind its cut filter do more
+# or less; the first channel of each is also a tracker of its own, as "mono" all of them are.
+SENSORS = {
+    "narrow": {"r": bump(610, 45, SENSOR_NM), "g": bump(535, 45, SENSOR_NM), "b": bump(460, 40, SENSOR_NM)},
+    "wide": {"r": bump(625, 70, SENSOR_NM), "g": bump(540, 75, SENSOR_NM), "b": bump(470, 65, SENSOR_NM)},
+    "infrared": {
+        "r": bump(620, 50, SENSOR_NM) + 0.05 * (SENSOR_NM > 750),
+        "g": bump(540, 50, SENSOR_NM) + 0.02 * (SENSOR_NM > 750),
+        "b": bump(465, 45, SENSOR_NM) + 0.02 * (SENSOR_NM > 750),
+    },
+}
+MONO = {
+    "blue": bump(480, 70, SENSOR_NM),
+    "visible": bump(540, 80, SENSOR_NM),
+    "silicon": bump(620, 180, SENSOR_NM),
+}
+BITS = 14
+P95, MEDIAN = 0.02, 0.005  # each channel's electrons where the gamut allows: the issue's aims
+RATE = 5e-5  # the tables of rates between their knots, and codes of 14 bits
+PLACE_PX = 0.005
+
+
+def saved(path, values):
+    rows = "\n".join(f"{nm:g},{value:.9f}" for nm, value in zip(SENSOR_NM, values, strict=True))
+    path.write_text(f"wavelength_nm,value\n{rows}\n")
+    return np.interp(GRID_NM, SENSOR_NM, values.round(9), left=0, right=0)
+
+
+def bench(folder, panel, sensor, **render):
+    """A bench of a panel and a sensor, and the sensor's curves (channels, n) on the grid."""
+    written(folder / "panel.csv", PANELS[panel])
+    names = {"quantum_efficiency": None} if isinstance(sensor, dict) else {"quantum_efficiency": "own.csv"}
+    if isinstance(sensor, dict):
+        curves = [0.9 * saved(folder / f"{name}.csv", 0.9 * values) / 0.9 for name, values in sensor.items()]
+        names |= {f"quantum_efficiency_{name}": f"{name}.csv" for name in sensor}
+    else:
+        curves = [saved(folder / "own.csv", 0.9 * sensor)]
+    changes = {
+        "tracker": names,
+        "monitor": {"bits": BITS},
+        "monitor.primaries": {"file": "panel.csv", "layout": "rgb-stripe"},
+        "render": {"colour": "star", "quantisation": "exact"} | render,
+        "sky": {"spectrum": "blackbody", "faintest_v_mag": 6.0},
+    }
+    (folder / "bench.toml").write_text(bench_text(changes))
+    return load(folder / "bench.toml"), np.array(curves)
+
+
+def photons_of_panel(panel, curves):
+    """Each channel's electrons (channels, 3) by each primary, and the primaries' detected spectra (3, n)."""
+    glass = load_curve("n-bk7-10mm", "n-bk7-10mm")(GRID_NM)
+    spectra = np.array([np.interp(GRID_NM, NM, one, left=0, right=0) for one in PANELS[panel]])
+    seen = spectra * GRID_NM * glass
+    return trapezoid(curves[:, None] * seen, GRID_NM), seen * curves.sum(axis=0)
+
+
+def photons_of_stars(temperature_k, curves):
+    """Electrons (n, channels) of black bodies, in one unit for each star, and their detected spectra (n, grid)."""
+    power = GRID_NM**-5 / np.expm1(0.0143877688 / (GRID_NM * 1e-9 * temperature_k[:, None]))
+    seen = power * GRID_NM * load_curve("n-bk7-10mm", "n-bk7-10mm")(GRID_NM)
+    return trapezoid(seen[:, None] * curves, GRID_NM), seen * curves.sum(axis=0)
+
+
+def drives(frame, opened):
+    """The drive (n, 3) of alone standing stars by the codes about them, with sRGB's own formula; and their rows."""
+    signal = frame.codes / (2.0**BITS - 1)
+    light = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+    rows = frame.truth
+    x, y = rows["x_px"], rows["y_px"]
+    near = np.hypot(x - x[:, None], y - y[:, None]) < 16
+    alone = (near.sum(axis=0) == 1) & (x > 9) & (y > 9) & (x < 310) & (y < 230) & ~rows["clipped"]
+    rows = rows[alone]
+    cut = [
+        light[round(float(b)) - 7 : round(float(b)) + 8, round(float(a)) - 7 : round(float(a)) + 8]
+        for a, b in zip(x[alone], y[alone], strict=True)
+    ]
+    return np.array([one.sum(axis=(0, 1)) for one in cut]) * opened.flux_at_white_e_per_s, rows
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("panel", PANELS)
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, sensor):
+    opened, curves = bench(tmp_path, panel, SENSORS[sensor])
+    with opened:
+        matrix, _ = photons_of_panel(panel, curves)
+        matrix /= matrix.sum()
+        stars = opened.stars
+        wanted, _ = photons_of_stars(stars.temperature_k, curves)
+        wanted /= wanted.sum(axis=1, keepdims=True)
+        # The whole sky, by the mixtures.
+        mixed = np.linalg.solve(matrix, wanted.T).T
+        inside = (mixed >= 0).all(axis=1)
+        shown = (stars.primaries / matrix.sum(axis=0)) @ matrix.T
+        off = np.abs(shown / wanted - 1)
+        assert inside.mean() > 0.5 and np.percentile(off[inside], 95) < RATE
+        clearly = (mixed < -1e-4).any(axis=1)
+        found = opened.colours.in_gamut(opened.colours.off(opened.colours.wanted(stars), stars.primaries))
+        assert found[(mixed > 1e-4).all(axis=1)].all() and not found[clearly].any()
+        if clearly.any():  # no other mixture without negative light is nearer in electrons
+            rng = np.random.default_rng(36)
+            residual = np.square(shown - wanted).sum(axis=1)[clearly]
+            for _ in range(200):
+                other = np.maximum(stars.primaries[clearly] * rng.normal(1, 0.05, (clearly.sum(), 3)), 0)
+                assert (
+                    np.square((other / matrix.sum(axis=0)) @ matrix.T - wanted[clearly]).sum(axis=1) >= residual - 1e-12
+                ).all()
+        # One frame, by its codes.
+        drive, rows = drives(opened.frame(ORION_Q), opened)
+        by_codes = drive @ matrix.T
+        asked = np.stack([rows[f"electrons_{name}_per_s"] for name in "rgb"], axis=1)
+        errors = np.abs(by_codes / asked - 1)[rows["in_gamut"]]
+        assert len(errors) > 10 and np.percentile(errors, 95) < P95 and np.median(errors) < MEDIAN
+        told = np.stack([rows[f"electrons_shown_{name}_per_s"] for name in "rgb"], axis=1)
+        np.testing.assert_allclose(by_codes, told, rtol=P95, atol=1e-3 * asked.max())
+        same = rows["temperature_shown_k"][rows["in_gamut"]] / rows["temperature_k"][rows["in_gamut"]]
+        np.testing.assert_allclose(same, 1, rtol=1e-4)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("panel", PANELS)
+@pytest.mark.parametrize("sensor", MONO)
+def test_a_mono_tracker_has_a_stars_electrons_and_its_mean_wavelength(tmp_path, panel, sensor):
+    opened, curves = bench(tmp_path, panel, MONO[sensor])
+    with opened:
+        stars = opened.stars
+        _, of_primaries = photons_of_panel(panel, curves)
+        _, of_stars = photons_of_stars(stars.temperature_k, curves)
+        means = [(one @ GRID_NM) / one.sum(axis=1) for one in (of_primaries, of_stars)]
+        np.testing.assert_allclose(stars.primaries.sum(axis=1), 1, rtol=1e-12)
+        shown_nm = stars.primaries @ means[0]
+        reach = np.clip(means[1], means[0].min(), means[0].max())
+        np.testing.assert_allclose(shown_nm, reach, atol=0.1)  # nm; beyond the reddest and bluest primary it is that one
+        drive, rows = drives(opened.frame(ORION_Q), opened)
+        white = of_primaries.sum(axis=1) / of_primaries.sum()
+        np.testing.assert_allclose(drive @ white, rows["electrons_per_s"], rtol=P95)
+        inside = np.abs(reach - means[1]) < 1e-6
+        print(f"{panel}, {sensor}: {1 - inside.mean():.1%} of stars beyond the primaries' mean wavelengths")

@@ -9,7 +9,7 @@ import csv
 from pathlib import Path
 
 from hilstar.charts import read_records
-from hilstar.study import codes, stripes, timing
+from hilstar.study import codes, colour, stripes, timing
 from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import ROUNDING_MAG
@@ -43,7 +43,14 @@ def tradeoff_step(name: str) -> Trials:
     return Trials(name, table[0]["work"], error, second, "", trials)
 
 
+def colour_rows() -> list[tuple[str | float, ...]]:
+    """The rows of colour.csv: three names, then figures."""
+    with (HERE / "colour.csv").open(encoding="utf-8", newline="") as file:
+        return [(*row[:3], *map(float, row[3:])) for row in list(csv.reader(file))[1:]]
+
+
 if __name__ == "__main__":
+    colour.draw(DOCS / "colour.svg", colour_rows())
     timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome))
     stripes.draw(DOCS / "stripes.svg", read_records(HERE / "stripes.csv", stripes.StripePoint))
     codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.OverFrames))

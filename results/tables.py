@@ -1,6 +1,6 @@
 """Tables of README and docs/ from the CSV files beside this script: `python results/tables.py` writes them between their marks.
 
-bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by
+bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv, timing.csv and those of colour by
 `hilstar study NAME -o`, quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on
 which machine; bench_h100.csv on an NVIDIA H100.
 """
@@ -162,7 +162,75 @@ def over_frames_table() -> str:
     return table(head, [[name(panel), *(cell(at[panel, count]) for count in frames)] for panel in panels])
 
 
+def colour_table() -> str:
+    """Each choice before each tracker, by the codes."""
+    head = ["tracker", "`colour`", "codes", "colour, mean", "flux, 95 %", "a channel, 95 %", "place, 95 %"]
+    body = []
+    for row in rows_of("colour.csv"):
+        words = [row["tracker"], f"`{row['colour']}`", f"`{row['method']}`", f"{figure(float(row['subtypes']))} subtypes"]
+        channel = "-" if row["tracker"] == "mono" else f"{float(row['channel']):.2g} %"
+        body.append([*words, f"{float(row['mag']):.2g} mag", channel, f"{float(row['px']):.2g} px"])
+    return table(head, body)
+
+
+def gamut_table() -> str:
+    """How many stars have their colour on each panel before each sensor, and what is left."""
+    head = ["panel", "sensor", "condition number", "stars out of gamut", "colour off, mean", "`white`"]
+    body = []
+    for row in rows_of("colour_gamut.csv"):
+        out, off, white = (float(row[name]) for name in ("out_share", "subtypes", "subtypes_white"))
+        names = [row["panel"], row["sensor"], f"{float(row['condition']):.1f}" if "Bayer" in row["sensor"] else "-"]
+        body.append([*names, f"{100 * out:.2g} %", f"{off:.2g} subtypes" if off > 1e-6 else "none", f"{white:.0f}"])
+    return table(head, body)
+
+
+def red_table() -> str:
+    """The share of each class's electrons that is light from 700 nm on."""
+    rows = rows_of("colour_red.csv")
+    return table(
+        ["sensor", *list(rows[0])[1:]],
+        [[row["sensor"], *(f"{100 * float(row[k]):.2g} %" for k in list(row)[1:])] for row in rows],
+    )
+
+
+def lateral_table() -> str:
+    """Lateral colour that is shown, against the sky's own."""
+    rows = rows_of("colour_lateral.csv")
+    body = [
+        [
+            row["lens"],
+            row["panel"],
+            f"`{row['colour']}`",
+            f"{float(row['sky_px']):.2g} px",
+            f"{100 * float(row['off_share']):.0f} %",
+        ]
+        for row in rows
+    ]
+    return table(["lens", "panel", "`colour`", "the sky's own, rms", "off by, of that"], body)
+
+
+def mosaic_table() -> str:
+    """Places in a raw mosaic and in its superpixels."""
+    rows = {(row["sigma_px"], row["temperature_k"], row["image"]): row for row in rows_of("colour_mosaic.csv")}
+    temperatures = list(dict.fromkeys(key[1] for key in rows))
+
+    def cell(*key: str) -> str:
+        return f"{float(rows[key]['rms_px']):.2g} ({float(rows[key]['max_px']):.2g})"
+
+    head = ["sigma", *(f"{float(k):.0f} K: {image}" for k in temperatures for image in ("mosaic", "superpixel"))]
+    body = [
+        [f"{px} px", *(cell(px, k, image) for k in temperatures for image in ("mosaic", "superpixel"))]
+        for px in dict.fromkeys(key[0] for key in rows)
+    ]
+    return table(head, body)
+
+
 TABLES = {
+    "colour": colour_table,
+    "colour_gamut": gamut_table,
+    "colour_red": red_table,
+    "colour_lateral": lateral_table,
+    "colour_mosaic": mosaic_table,
     "over_frames": over_frames_table,
     "quantisation": quantisation_table,
     "centroiders": centroider_table,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.recfunctions import append_fields
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.frame.bodies import disc_stars
@@ -75,12 +76,8 @@ def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> np
     """
     if colours is None:
         return truth
-    found = np.zeros(len(truth), dtype=[*truth.dtype.descr, *((name, "f8") for name in CHANNEL_COLUMNS)])
-    for name in truth.dtype.names or ():
-        found[name] = truth[name]
-    for name, share in zip(CHANNEL_COLUMNS, np.moveaxis(colours, -1, 0), strict=True):
-        found[name] = truth["electrons_per_s"] * share
-    return found
+    light = [truth["electrons_per_s"] * share for share in np.moveaxis(colours, -1, 0)]
+    return np.asarray(append_fields(truth, CHANNEL_COLUMNS, light, usemask=False))
 
 
 def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float) -> npt.NDArray[np.void]:

@@ -6,28 +6,26 @@ for one channel the mean wavelength of detected photons.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from msgspec.structs import replace as replace_keys
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.bench.build import bench_colours, bench_optics, bench_stars, named_channels, open_bench
+from hilstar.bench.build import bench_channels, bench_colours, bench_optics, bench_stars, named_channels, open_bench
 from hilstar.bench.cameras import tracker_psf
 from hilstar.bench.colours import Colours
 from hilstar.bench.config.hardware import TrackerOptics
 from hilstar.bench.frame import Bench
-from hilstar.charts import BLUE, GREEN, MUTED, ORANGE, chart, write_csv, write_records
+from hilstar.charts import BLUE, GREEN, MUTED, ORANGE, chart, write_csv
 from hilstar.errors import InputError
-from hilstar.monitor.primaries import read_primaries
 from hilstar.monitor.response import Levels, srgb_response
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.resources import resource_path
@@ -35,8 +33,8 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s, load_library
 from hilstar.sky.spectral_types import LETTERS, class_shares, read_types
-from hilstar.sky.spectrum import Curve
-from hilstar.study.settings import GLASS, Isolation, Table, bench_text, centroid_px, lone_windows, study_optics
+from hilstar.sky.stars import Stars
+from hilstar.study.settings import GLASS, Isolation, bench_text, centroid_px, lone_windows
 from hilstar.study.sweep import OtherWork, busy_line, in_turn, is_busy
 from hilstar.tracker.centroids import CentroidSettings, LocalBackground, find_stars
 from hilstar.tracker.mosaic import CHANNELS, SUPERPIXEL_VARIANCE_PX2, in_pixels, luminance
@@ -63,76 +61,25 @@ SENSORS: dict[str, tuple[Lobes, ...]] = {
     ),
 }
 MONO = ("ccd47-20", "kai-4021")
-COLOURS, METHODS = ("white", "star", "depth"), ("round", "exact")
+INKS = {"white": MUTED, "star": BLUE, "depth": ORANGE}
 FRAME_PX = (800, 600)
 FIELDS, QUICK_FIELDS, ROUNDS, QUICK_ROUNDS = 40, 3, 15, 3
 BRIGHTEST_V_MAG, FAINTEST_V_MAG = 1.0, 5.5
 LONE = Isolation(5.0, 1e-3)
 PUBLISHED_SUBTYPES = 6.55  # of a rig with an OLED of 2025
 RED_NM = 700.0
+DWARF = 5.0  # luminosity class
 # Sigmas of a mosaic's stars, px, their black bodies, and the places along two pixels at which they stand.
 SIGMAS_PX, STARS_K, PHASES, TILE_PX = (0.55, 0.8, 1.0, 1.5), (3500.0, 6000.0, 12_000.0), 16, 24
-
-
-@dataclass(frozen=True, slots=True)
-class Gamut:
-    """Stars to V = 7 on one panel and sensor: how many have their colour, and errors of colour without codes.
-
-    `off` is the share of electrons in the wrong channel, of one channel nm of the mean wavelength.
-    """
-
-    panel: str
-    sensor: str
-    condition: float
-    out_share: float
-    off_median: float
-    off_95: float
-    temperature_percent: float
-    subtypes_star: float
-    subtypes_white: float
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """Lone stars from V = 1 to 5.5 as the codes of one choice show them, and its frame's time."""
-
-    tracker: str
-    colour: str
-    method: str
-    stars: int
-    frame_ms: float
-    cpu_ms: float
-    subtypes: float
-    temperature_percent: float
-    flux_mag_95: float
-    channel_percent_95: float
-    place_px_95: float
-
-
-@dataclass(frozen=True, slots=True)
-class Lateral:
-    """Stars' places through a lens against a star's like the Sun, rms, px: of the sky, and shown minus sky.
-
-    The lens "linear" has 1 px for 100 nm of the mean wavelength.
-    """
-
-    lens: str
-    panel: str
-    colour: str
-    sky_px: float
-    off_px: float
-    off_share: float
-
-
-@dataclass(frozen=True, slots=True)
-class MosaicPlaces:
-    """Errors of a noiseless star's place along an axis, rms and the largest over places in four pixels, px."""
-
-    sigma_px: float
-    temperature_k: float
-    image: str
-    rms_px: float
-    max_px: float
+Row = tuple[str | float, ...]
+# Stars to V = 7 without codes: share of electrons in a wrong channel, of one channel nm of the mean wavelength, and subtypes.
+GAMUT = ("panel", "sensor", "condition", "out_share", "off_median", "off_95", "off_percent_k", "subtypes", "subtypes_white")
+# Lone stars of V = 1 to 5.5 as codes show them: mean errors of colour, 95 % of light, a channel's light [%] and place; time.
+CHOICE = ("tracker", "colour", "method", "stars", "wall_ms", "cpu_ms", "subtypes", "off_percent_k", "mag", "channel", "px")
+# Places through a lens against a star's like the Sun: of the sky, and shown minus sky. "linear": 1 px for 100 nm of the mean.
+LATERAL = ("lens", "panel", "colour", "sky_px", "off_px", "off_share")
+# Errors of a noiseless star's place along an axis, over places in four pixels.
+PLACES = ("sigma_px", "temperature_k", "image", "rms_px", "max_px")
 
 
 def curve_of(lobes: Lobes) -> FloatArray:
@@ -151,61 +98,40 @@ def write_spectra(folder: Path) -> None:
             (folder / f"{name} {one}.csv").write_text("\n".join(lines))
 
 
-def sensor_optics(sensor: str) -> Optics:
-    """A sensor's channels together behind N-BK7."""
-    own = study_optics(sensor if sensor in MONO else MONO[0])
-    if sensor in MONO:
-        return own
-    return replace(own, quantum_efficiency=Curve(NM, np.sum([curve_of(lobes) for lobes in SENSORS[sensor]], axis=0)))
-
-
-def tracker_table(sensor: str) -> dict[str, Table]:
-    """The tables of a tracker with this sensor."""
-    common: Table = {"transmission": GLASS, "resolution_px": (1024, 1024)}
-    if sensor in MONO:
-        return {"tracker": {"quantum_efficiency": sensor, **common}}
-    three: Table = {f"quantum_efficiency_{one}": f"{sensor} {one}.csv" for one in CHANNELS}
-    return {"tracker": {**three, **common}, "tracker.detector": {"bayer": "rggb"}}
-
-
-def tables_of(panel: str, sensor: str, faintest_v_mag: float, **render: str | float) -> dict[str, Table]:
-    """The bench of a panel with vertical stripes and a sensor."""
-    return {
-        **tracker_table(sensor),
-        "sky": {"faintest_v_mag": faintest_v_mag},
-        "monitor": {"resolution_px": FRAME_PX, "pixel_pitch_um": 57.65},
-        "monitor.primaries": {"file": f"{panel}.csv", "layout": "rgb-stripe"},
-        "collimator": {"focal_length_mm": 180},
-        "render": {"brightest_v_mag": BRIGHTEST_V_MAG, **render},
-    }
-
-
-def file_of(folder: Path, tables: Mapping[str, Table]) -> BenchFile:
-    """A bench file in the folder of the spectra."""
+def file_of(folder: Path, panel: str, sensor: str, faintest_v_mag: float = 7.0, **render: str | float) -> BenchFile:
+    """The bench of a panel with vertical stripes and a sensor, in the folder of the spectra."""
+    three = {f"quantum_efficiency_{one}": f"{sensor} {one}.csv" for one in CHANNELS}
+    own = {"quantum_efficiency": sensor} if sensor in MONO else three
+    text = bench_text(
+        {
+            "tracker": {**own, "transmission": GLASS, "resolution_px": (1024, 1024)},
+            "tracker.detector": {} if sensor in MONO else {"bayer": "rggb"},
+            "sky": {"faintest_v_mag": faintest_v_mag},
+            "monitor": {"resolution_px": FRAME_PX, "pixel_pitch_um": 57.65},
+            "monitor.primaries": {"file": f"{panel}.csv", "layout": "rgb-stripe"},
+            "collimator": {"focal_length_mm": 180},
+            "render": {"brightest_v_mag": BRIGHTEST_V_MAG, "colour": "star", **render},
+        }
+    )
     path = folder / "bench.toml"
-    text = bench_text(tables)
-    if "quantum_efficiency" not in tables["tracker"]:
-        text = text.replace('quantum_efficiency = "ccd47-20"\n', "")
-    path.write_text(text)
+    path.write_text(text if sensor in MONO else text.replace('quantum_efficiency = "ccd47-20"\n', ""))
     return read_bench_file(path)
 
 
-class Subtypes:
-    """Spectral subtypes (0 is O0, 60 is M0) by a tracker's colour: shares of channels (n, 3), or a mean wavelength (n, 1)."""
+def subtypes_by(channels: Mapping[str, Optics]) -> Callable[[FloatArray], FloatArray]:
+    """Spectral subtypes (0 is O0, 60 is M0) by a tracker's colour: shares of channels (n, 3), or a mean wavelength (n, 1).
 
-    def __init__(self, channels: Mapping[str, Optics]) -> None:
-        library = load_library()
-        kinds = read_types(np.array(library.spectral_type, dtype=np.bytes_))
-        dwarfs, nm = kinds[:, 1] == 5, library.wavelength_nm
-        seen = np.array([one.quantum_efficiency(nm) * one.transmission(nm) * nm for one in channels.values()])
-        light = library.flux[dwarfs] @ seen.T
-        colour = light if len(seen) > 1 else (library.flux[dwarfs] @ (seen[0] * nm))[:, None] / light
-        order = np.argsort(kinds[dwarfs, 0])
-        self._index, self._kind = np.maximum.accumulate(redness(colour)[order]), kinds[dwarfs, 0][order]
-
-    def __call__(self, colour: FloatArray) -> FloatArray:
-        """The subtypes (n,); those of colours beyond the dwarfs' are their ends'."""
-        return np.asarray(np.interp(redness(colour), self._index, self._kind))
+    Those of colours beyond the dwarfs' are their ends'.
+    """
+    library = load_library()
+    kinds = read_types(np.array(library.spectral_type, dtype=np.bytes_))
+    order, nm = np.flatnonzero(kinds[:, 1] == DWARF), library.wavelength_nm
+    order = order[np.argsort(kinds[order, 0])]
+    seen = np.array([one.quantum_efficiency(nm) * one.transmission(nm) * nm for one in channels.values()])
+    light = library.flux[order] @ seen.T
+    colour = light if len(seen) > 1 else library.flux[order] @ (seen * nm).T / light
+    index = np.maximum.accumulate(redness(colour))
+    return lambda wanted: np.asarray(np.interp(redness(wanted), index, kinds[order, 0]))
 
 
 def redness(colour: FloatArray) -> FloatArray:
@@ -216,23 +142,26 @@ def redness(colour: FloatArray) -> FloatArray:
     return np.asarray(np.log(np.maximum(colour[:, 0], tiny) / np.maximum(colour[:, -1], tiny)))
 
 
-def study_gamut(folder: Path) -> Iterator[Gamut]:
-    """Every panel before every sensor."""
+def colours_of(file: BenchFile, stars: Stars) -> Colours:
+    """The mixtures of a bench that drives its primaries apart. Raises InputError."""
+    colours = bench_colours(file.config, file.folder, stars.catalog)
+    if colours is None:
+        raise AssertionError('colour = "star"')
+    return colours
+
+
+def study_gamut(folder: Path) -> Iterator[Row]:
+    """Every panel before every sensor: rows of GAMUT."""
     for panel, sensor in product(PANELS, (*MONO, *SENSORS)):
-        file = file_of(folder, tables_of(panel, sensor, 7.0, colour="star"))
+        file = file_of(folder, panel, sensor)
         stars = bench_stars(file.config, folder)
-        colours = bench_colours(file.config, folder, stars.catalog)
-        if colours is None:
-            raise AssertionError("the bench drives its primaries apart")
+        colours, subtypes = colours_of(file, stars), subtypes_by(named_channels(file.config.tracker, folder))
         wanted = colours.wanted(stars)
-        shares = colours.shares(wanted)
-        off, subtypes = colours.off(wanted, shares), Subtypes(named_channels(file.config.tracker, folder))
-        own = subtypes(wanted[:, : 1 if colours.mono else 3])
+        shares, own = colours.shares(wanted), subtypes(wanted[:, : 1 if colours.mono else 3])
+        off, warmer = colours.off(wanted, shares), np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
         by_star, by_white = (np.abs(subtypes(colours.shown(one)) - own).mean() for one in (shares, colours.of_white[None]))
-        warmer = np.abs(colours.temperature_factor(wanted, shares) - 1)
-        out, (median, most) = float((~colours.in_gamut(off)).mean()), np.percentile(off, (50, 95)).tolist()
-        condition = colours.matrix.condition or math.nan
-        yield Gamut(panel, sensor, condition, out, median, most, 100 * float(warmer.mean()), float(by_star), float(by_white))
+        out, condition = (~colours.in_gamut(off)).mean(), colours.matrix.condition or math.nan
+        yield (panel, sensor, *map(float, (condition, out, *np.percentile(off, (50, 95)), 100 * warmer, by_star, by_white)))
 
 
 def shown_stars(bench: Bench, colours: Colours, fields: int) -> Iterator[tuple[FloatArray, ...]]:
@@ -261,55 +190,50 @@ def frame_of(bench: Bench, number: int) -> Levels:
     return bench.draw(from_radec_roll_deg(84.0 + number, 0.0, 0.0)).levels
 
 
-def study_choices(folder: Path, fields: int, rounds: int) -> Iterator[Choice]:
-    """Each choice before a mono and a Bayer tracker, on the LCD; frames of all are timed in turn."""
+def study_choices(folder: Path, fields: int, rounds: int) -> Iterator[Row]:
+    """Each choice before a mono and a Bayer tracker, on the LCD; frames of all are timed in turn: rows of CHOICE."""
     for sensor in (MONO[0], "Bayer, wide dyes"):
         with ExitStack() as stack:
-            benches, found = {}, {}
-            for colour, method in product(COLOURS, METHODS):
-                tables = tables_of("sRGB LCD", sensor, 7.0, colour=colour, quantisation=method)
-                benches[colour, method] = stack.enter_context(open_bench(file_of(folder, tables)))
-            colours = benches["star", "exact"].colours
-            if colours is None:
-                raise AssertionError("the bench drives its primaries apart")
-            subtypes = Subtypes(named_channels(benches["star", "exact"].config.tracker, folder))
-            for key, bench in benches.items():
-                found[key] = [np.array(part) for part in zip(*shown_stars(bench, colours, fields), strict=True)]
+            benches = {
+                key: stack.enter_context(open_bench(file_of(folder, "sRGB LCD", sensor, colour=key[0], quantisation=key[1])))
+                for key in product(INKS, ("round", "exact"))
+            }
+            own = benches["star", "exact"]
+            colours, subtypes = colours_of(own.file, own.stars), subtypes_by(named_channels(own.config.tracker, folder))
             times = in_turn({" ".join(key): partial(frame_of, bench) for key, bench in benches.items()}, rounds)
-            for key, (wanted, shares, flux, off) in found.items():
+            for key, bench in benches.items():
+                stars = zip(*shown_stars(bench, colours, fields), strict=True)
+                wanted, shares, flux, off = (np.array(part) for part in stars)
                 shown = colours.shown(shares)
                 off = np.hypot(*(off - np.median(off, axis=0)).T)  # what all are off by is the alignment's
                 flux_mag = np.abs([magnitude(float(one)) for one in flux[:, 0]])
                 channels = np.abs(flux - 1) if colours.mono else np.abs(shown / wanted - 1)
-                frame_ms, cpu_ms = np.min(times[" ".join(key)], axis=0).tolist()
-                off_kind = float(np.abs(subtypes(shown) - subtypes(wanted[:, : shown.shape[1]])).mean())
-                off_k = 100 * float(np.abs(colours.temperature_factor(wanted, shares) - 1).mean())
-                flux_95, channel_95, place_95 = (float(np.percentile(one, 95)) for one in (flux_mag, 100 * channels, off))
-                tracker = "mono" if colours.mono else "Bayer"
-                yield Choice(tracker, *key, len(flux), frame_ms, cpu_ms, off_kind, off_k, flux_95, channel_95, place_95)
+                off_kind = np.abs(subtypes(shown) - subtypes(wanted[:, : shown.shape[1]])).mean()
+                off_k = 100 * np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
+                at_95 = (np.percentile(one, 95) for one in (flux_mag, 100 * channels, off))
+                figures = (*np.min(times[" ".join(key)], axis=0), off_kind, off_k, *at_95)
+                yield ("mono" if colours.mono else "Bayer", *key, len(flux), *map(float, figures))
 
 
-def study_lateral(folder: Path) -> Iterator[Lateral]:
-    """Stars of all colours over the field of a lens of 1897, and of a lens whose lateral colour is linear in wavelength.
+def study_lateral(folder: Path) -> Iterator[Row]:
+    """Stars of all colours over the field of a lens of 1897, and of a linear one: rows of LATERAL.
 
     A panel whose primaries its filter does not all pass has no row.
     """
     planar = read_bench_file(resource_path("configs", "planar-1897.toml")).config.tracker
     tracker = replace_keys(planar, optics=TrackerOptics(psf=str(resource_path("configs", "planar-1897.fits"))))
-    width, height = tracker.resolution_px
+    psf, (width, height) = tracker_psf(tracker, folder), tracker.resolution_px
+    if not isinstance(psf, GlassPsf):
+        raise AssertionError("the file has a glass")
     for panel in PANELS:
-        file = file_of(folder, tables_of(panel, MONO[0], FAINTEST_V_MAG, colour="star"))
+        file = file_of(folder, panel, MONO[0], FAINTEST_V_MAG)
         file = replace(file, config=replace_keys(file.config, tracker=tracker))
-        psf, stars, optics = tracker_psf(tracker, folder), bench_stars(file.config, folder), bench_optics(tracker, folder)
-        colours = None
-        with suppress(InputError):
-            colours = bench_colours(file.config, folder, stars.catalog)
-        if colours is None or not isinstance(psf, GlassPsf):
+        stars = bench_stars(file.config, folder)
+        try:
+            colours = colours_of(file, stars)
+        except InputError:
             continue
-        nm = np.arange(*optics.range_nm, 0.5)
-        seen = optics.quantum_efficiency(nm) * optics.transmission(nm) * nm
-        density = np.array([one(nm) for one in read_primaries(folder / f"{panel}.csv")]) * seen
-        by_primary = density / density.sum(axis=1, keepdims=True) @ NodeSpline(psf.wavelengths_nm)(nm)
+        by_primary = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm)
         own, wanted = StarGlass(file, psf).shares(stars, np.arange(len(stars))), colours.wanted(stars)
         solar = int(np.abs(stars.bv_mag - SOLAR_BV).argmin())
         places = np.random.default_rng(1).uniform(-0.5, (width - 0.5, height - 0.5), (len(stars), 2)).T
@@ -318,7 +242,7 @@ def study_lateral(folder: Path) -> Iterator[Lateral]:
             means = [(one - one[solar]).T / 100 for one in (wanted[:, :1], colours.shown(shares))]
             for lens, (sky, shown) in (("planar-1897", glass), ("linear", means)):
                 sky_px, off_px = (float(np.sqrt((one**2).sum(axis=0).mean())) for one in (sky, shown - sky))
-                yield Lateral(lens, panel, colour, sky_px, off_px, off_px / sky_px)
+                yield lens, panel, colour, sky_px, off_px, off_px / sky_px
 
 
 def moved_px(psf: GlassPsf, places_px: FloatArray, spectra: FloatArray, against: int) -> FloatArray:
@@ -327,14 +251,13 @@ def moved_px(psf: GlassPsf, places_px: FloatArray, spectra: FloatArray, against:
     return np.asarray(np.stack(found[0]) - np.stack(found[1]))
 
 
-def study_mosaic() -> Iterator[MosaicPlaces]:
-    """Places in a mosaic of noiseless stars, by a window as `hilstar tracker`'s, over places in a square of four pixels."""
+def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
+    """Noiseless stars in a mosaic, found as `hilstar tracker` does: rows of PLACES."""
     steps = np.arange(PHASES) / PHASES * 2
     y_px, x_px = (TILE_PX // 2 + grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
-    optics = [replace(study_optics(MONO[0]), quantum_efficiency=Curve(NM, curve_of(x))) for x in SENSORS["Bayer, wide dyes"]]
     at = np.arange(TILE_PX)
     for sigma_px, kelvin in product(SIGMAS_PX, STARS_K):
-        rates = [float(dgs_electrons_per_s(kelvin, one, Photometry())) for one in optics]
+        rates = [float(dgs_electrons_per_s(kelvin, one, Photometry())) for one in channels]
         shares = GaussianPsf((sigma_px, sigma_px)).shares((at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None])
         stars = shares.reshape(PHASES, PHASES, TILE_PX, TILE_PX).swapaxes(1, 2).reshape((PHASES * TILE_PX,) * 2)
         raw = in_pixels([stars * rate / max(rates) for rate in rates], "rggb")
@@ -347,34 +270,29 @@ def study_mosaic() -> Iterator[MosaicPlaces]:
             column, row = tiles[:, first]
             true_x, true_y = (TILE_PX * tile + TILE_PX // 2 + steps[tile] for tile in (column, row))
             off = np.concatenate([found.x_px[first] - true_x, found.y_px[first] - true_y])
-            yield MosaicPlaces(sigma_px, kelvin, name, float(np.sqrt((off**2).mean())), float(np.abs(off).max()))
+            yield sigma_px, kelvin, name, float(np.sqrt((off**2).mean())), float(np.abs(off).max())
 
 
-def draw(path: Path, choices: list[Choice]) -> str:
+def draw(path: Path, rows: Sequence[Row]) -> str:
     """The chart of the choices; its finding."""
-    star = next(one for one in choices if (one.tracker, one.colour, one.method) == ("Bayer", "star", "exact"))
-    white = next(one for one in choices if (one.tracker, one.colour, one.method) == ("Bayer", "white", "exact"))
+    choices = [dict(zip(CHOICE, row, strict=True)) for row in rows]
+    exact = {one["colour"]: one for one in choices if (one["tracker"], one["method"]) == ("Bayer", "exact")}
+    star, white = exact["star"], exact["white"]
     finding = (
-        f"Each star's own mixture is {star.subtypes:.1f} subtypes off before a Bayer tracker, white {white.subtypes:.0f};"
-        f" it takes {star.cpu_ms / white.cpu_ms:.1f} times white's frame"
+        f"Each star's own mixture is {star['subtypes']:.2g} subtypes off before a Bayer tracker, white {white['subtypes']:.0f}"
     )
     note = "Full: exact; open: round. Circles: mono; squares: Bayer. Lone stars from V = 1 to 5.5 on an sRGB LCD of 8 bits."
+    labels = {"subtypes": "colour, mean\n[subtypes]", "mag": "flux, 95 %\n[mag]", "px": "place, 95 %\n[px]"}
     with chart(path, finding, 3, note=note) as axes:
-        panels = (
-            ("subtypes", "colour off, mean\n[subtypes]"),
-            ("flux_mag_95", "flux off, 95 %\n[mag]"),
-            ("place_px_95", "place off, 95 %\n[px]"),
-        )
-        for axis, (name, label) in zip(axes, panels, strict=True):
+        for axis, (name, label) in zip(axes, labels.items(), strict=True):
             for one in choices:
-                colour = {"white": MUTED, "star": BLUE, "depth": ORANGE}[one.colour]
-                filled = {"color": colour} if one.method == "exact" else {"markeredgecolor": colour, "markerfacecolor": "none"}
-                axis.loglog(one.cpu_ms, max(getattr(one, name), 1e-5), "o" if one.tracker == "mono" else "s", ms=7, **filled)
+                ink, marker = INKS[str(one["colour"])], "o" if one["tracker"] == "mono" else "s"
+                face = ink if one["method"] == "exact" else "none"
+                axis.loglog(one["cpu_ms"], one[name], marker, ms=7, color=ink, markerfacecolor=face)
             axis.set_ylabel(label)
-        axes[0].axhline(PUBLISHED_SUBTYPES, color=GREEN, linestyle=":", linewidth=1.4)
-        for name, colour in (("white", MUTED), ("star", BLUE), ("depth", ORANGE)):
-            axes[0].plot([], [], "o", color=colour, label=name)
-        axes[0].plot([], [], ":", color=GREEN, label=f"published, {PUBLISHED_SUBTYPES:g}")
+        for name, ink in INKS.items():
+            axes[0].plot([], [], "o", color=ink, label=name)
+        axes[0].axhline(PUBLISHED_SUBTYPES, color=GREEN, linestyle=":", label=f"published, {PUBLISHED_SUBTYPES:g}")
         axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, 1.25), ncols=4, frameon=False)
         axes[2].set_xlabel("frame, CPU time [ms]")
     return finding
@@ -388,18 +306,13 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         write_spectra(folder)
         gamut, lateral = list(study_gamut(folder)), list(study_lateral(folder))
         choices = list(study_choices(folder, *((QUICK_FIELDS, QUICK_ROUNDS) if quick else (FIELDS, ROUNDS))))
-    mosaic = list(study_mosaic())
-    tables: dict[str, Sequence[Any]] = {"": choices, "_gamut": gamut, "_lateral": lateral, "_mosaic": mosaic}
-    for table, records in tables.items():
-        write_records(directory / f"colour{table}.csv", records)
-    red = [[sensor, *class_shares(sensor_optics(sensor), RED_NM).values()] for sensor in (*MONO, *SENSORS)]
-    write_csv(directory / "colour_red.csv", ["sensor", *LETTERS], red)
-    worst = max((one for one in gamut if one.sensor not in MONO), key=lambda one: one.subtypes_star)
-    raw, mean = (next(one for one in mosaic if (one.sigma_px, one.image) == (1.0, kind)) for kind in ("mosaic", "superpixel"))
-    lines = [
-        draw(directory / "colour", choices),
-        f"mixtures before a Bayer tracker are {worst.subtypes_star:.2g} subtypes off at most ({worst.panel}, {worst.sensor})",
-        *(f"lateral colour of {x.lens} by {x.colour} on {x.panel}: off by {x.off_share:.0%} of the sky's" for x in lateral),
-        f"a red star of 1 px is {raw.rms_px:.3f} px off rms in a raw mosaic, {mean.rms_px:.3f} px in its superpixels",
-    ]
+        trackers = {sensor: file_of(folder, "OLED", sensor).config.tracker for sensor in (*MONO, *SENSORS)}
+        red = [(name, *class_shares(bench_optics(one, folder), RED_NM).values()) for name, one in trackers.items()]
+        mosaic = list(study_mosaic(bench_channels(trackers["Bayer, wide dyes"], folder)))
+    three = (("", CHOICE, choices), ("_gamut", GAMUT, gamut), ("_lateral", LATERAL, lateral))
+    for table, columns, rows in (*three, ("_red", ("sensor", *LETTERS), red), ("_mosaic", PLACES, mosaic)):
+        write_csv(directory / f"colour{table}.csv", columns, rows)
+    lines = [draw(directory / "colour", choices)]
+    lines += [f"lateral colour of {lens} by {by} on {on}: off by {off:.0%} of the sky's" for lens, on, by, *_, off in lateral]
+    lines += [f"a star of {px:g} px, {k:g} K, is {rms:.3f} px off rms in a {name}" for px, k, name, rms, _ in mosaic if px == 1]
     return [*lines, busy_line(others.cores())] if is_busy(others.cores()) else lines

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -67,15 +67,6 @@ class NotDrawn:
 
 
 @dataclass(frozen=True, slots=True)
-class RedShare:
-    """The share of a star's electrons that is light from `from_nm` on, by spectral class, in a channel or in "all" of them."""
-
-    channel: str
-    from_nm: float
-    by_class: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True)
 class LightBudget:
     """The range of stars that a bench can show; its fields are the keys of the JSON object of `hilstar budget`.
 
@@ -100,7 +91,7 @@ class LightBudget:
     centroider: By
     centroid_rms_px: dict[str, float | None]
     primaries: ChannelMatrix | None
-    near_infrared: list[RedShare]
+    near_infrared: list[dict[str, Any]]
     out_of_gamut: float | None
 
 
@@ -123,10 +114,8 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     corner_share = float(bench.psf.shares(half, half[:, None]).max())  # a star on the corner of four pixels
     channels = named_channels(bench.config.tracker, bench.file.folder)
     spectra = bench_primaries(bench.config.monitor, bench.file.folder)
-    primaries, ends_nm = None, [RED_NM]
-    if spectra is not None:
-        primaries = channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
-        ends_nm.append(reddest_nm(spectra))
+    primaries = None if spectra is None else channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
+    ends_nm = [RED_NM] if spectra is None else [RED_NM, reddest_nm(spectra)]
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return LightBudget(
         method=render.quantisation
@@ -159,11 +148,12 @@ def out_of_gamut(bench: Bench) -> float | None:
     return float(1 - colours.in_gamut(off).mean())
 
 
-def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[RedShare]:
-    """What a tracker of these channels has of light from each wavelength on: all together, and each of several channels."""
-    each = channels if len(channels) > 1 else {}
-    every = {"all": all_channels(list(channels.values())), **each}
-    return [RedShare(name, nm, class_shares(one, nm)) for nm in ends_nm for name, one in every.items()]
+def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[str, Any]]:
+    """The shares of light `from_nm` on `by_class` of spectra, in "all" channels together, and in each `channel` of several."""
+    every = {"all": all_channels(list(channels.values())), **(channels if len(channels) > 1 else {})}
+    return [
+        {"channel": name, "from_nm": nm, "by_class": class_shares(one, nm)} for nm in ends_nm for name, one in every.items()
+    ]
 
 
 def zero_point_mag(bench: Bench) -> float:
@@ -312,9 +302,9 @@ def budget_lines(found: LightBudget) -> list[str]:
             shares = (f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True))
             lines.append(f"{channel:22}{', '.join(shares)}")
     for red in found.near_infrared:
-        by_class = " ".join(f"{kind} {100 * share:.1f}" for kind, share in red.by_class.items())
-        channel = "" if red.channel == "all" else f"  {red.channel}"
-        lines.append(f"{f'from {red.from_nm:.0f} nm, % of e-':22}{by_class}{channel}")
+        by_class = " ".join(f"{kind} {100 * share:.1f}" for kind, share in red["by_class"].items())
+        name = f"from {red['from_nm']:.0f} nm, % of e-"
+        lines.append(f"{name:22}{by_class}" + ("" if red["channel"] == "all" else f"  {red['channel']}"))
     every = found.centroider == "all"
     kinds = f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}" if every else f"{'centroid rms':>14}"
     lines += ["", f"{'V':>6}{'flux rms':>12}{'max mag':>10}{kinds}{'max px':>9}" + ("" if every else f"{'max arcsec':>12}")]

@@ -102,7 +102,7 @@ def test_the_budgets_near_infrared_is_the_librarys_own(sensor):
     tracker = read_bench_file(written(folder, False)).config.tracker
     optics = dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, folder), strict=True))
     rows = red_shares(optics, [700.0, reddest_nm(primaries)])
-    found = {(row.channel, row.from_nm): row.by_class for row in rows}
+    found = {(row["channel"], row["from_nm"]): row["by_class"] for row in rows}
     assert {nm for _, nm in found} == {700.0, 680.0} and len(found) == 8
     with np.load(DATA_DIR / "pickles.npz") as packed:
         nm, flux, kinds = packed["wavelength_nm"].astype(float), packed["flux"].astype(float), packed["spectral_type"]

@@ -1,0 +1,62 @@
+"""What the study of colour finds: a Bayer tracker sees each star's own colour, and what no monitor can show is stated."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+
+from hilstar.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS, run
+
+AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("colour")
+    run(folder, quick=True)
+
+    def rows(name):
+        with (folder / f"{name}.csv").open() as file:
+            return list(csv.DictReader(file))
+
+    return folder, rows
+
+
+def test_codes_of_stars_own_mixtures_keep_every_channel_and_colour_before_a_bayer_tracker(study):
+    folder, rows = study
+    at = {(row["tracker"], row["colour"], row["method"]): row for row in rows("colour")}
+    assert len(at) == 12 and (folder / "colour.png").stat().st_size > 20_000
+    star, white = (at["Bayer", colour, "exact"] for colour in ("star", "white"))
+    assert float(star["subtypes"]) < AIM_SUBTYPES < PUBLISHED_SUBTYPES < float(white["subtypes"])
+    assert float(star["channel"]) < AIM_PERCENT < float(white["channel"])
+    assert float(star["px"]) < 0.01 and float(star["mag"]) < 0.005
+    assert float(at["Bayer", "star", "round"]["subtypes"]) > float(star["subtypes"])
+
+
+def test_mixtures_reach_every_star_of_a_mosaic_and_not_the_near_infrared_of_a_mono_sensor(study):
+    _, rows = study
+    gamut = rows("colour_gamut")
+    assert {(row["panel"], row["sensor"]) for row in gamut} == {(one, two) for one in PANELS for two in (*MONO, *SENSORS)}
+    assert all(float(row["subtypes"]) < AIM_SUBTYPES for row in gamut if row["sensor"] in SENSORS)
+    wide = [row for row in gamut if row["sensor"] == "ccd47-20"]
+    assert all(0.3 < float(row["out_share"]) < 0.7 and float(row["subtypes"]) > AIM_SUBTYPES for row in wide)
+    red = {row["sensor"]: [float(row[kind]) for kind in "OBAFGKM"] for row in rows("colour_red")}
+    assert all(shares == sorted(shares) for shares in red.values())
+    assert red["ccd47-20"][-1] > 0.7 and red["Bayer, infrared cut"][-1] < 0.01
+
+
+def test_lateral_colour_that_is_linear_in_wavelength_is_the_skys_and_the_planars_is_not(study):
+    _, rows = study
+    off = {(row["lens"], row["panel"], row["colour"]): float(row["off_share"]) for row in rows("colour_lateral")}
+    assert {panel for _, panel, _ in off} == {"OLED", "sRGB LCD"}  # the planar's filter has none of a laser's blue
+    assert all((share < AIM_LATERAL) == (colour == "star" and lens == "linear") for (lens, _, colour), share in off.items())
+    assert all(share < 0.6 for (_, _, colour), share in off.items() if colour == "star")
+
+
+def test_superpixels_have_less_bias_than_the_raw_mosaic_and_wide_stars_little(study):
+    _, rows = study
+    rms = {(row["image"], row["sigma_px"], row["temperature_k"]): float(row["rms_px"]) for row in rows("colour_mosaic")}
+    assert all(rms["superpixel", *key] < off for (image, *key), off in rms.items() if image == "mosaic")
+    assert rms["superpixel", "1.5", "3500.0"] < 0.005
+    assert rms["superpixel", "0.55", "3500.0"] > 0.05

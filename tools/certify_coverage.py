@@ -6,37 +6,12 @@ readings; the truth is the file that it was drawn into. With LEVELS, so many cod
 
 from __future__ import annotations
 
-import datetime
 import sys
-from collections import defaultdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
-
-import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.certify.certificate import certify
-from hilstar.certify.readings import VirtualReader
-from tests.support.planted_certify import drawn, plant
-
-NOW = datetime.datetime(2026, 11, 26, tzinfo=datetime.UTC)
-
-
-def coverage(benches: int, seed: int, keys: str = "") -> dict[tuple[str, str], list[bool]]:
-    """By quantity and region, whether each stated interval holds the truth."""
-    rng, held = np.random.default_rng(seed), defaultdict(list)
-    with TemporaryDirectory() as folder:
-        for number in range(benches):
-            paths = plant(Path(folder), drawn(rng), f"[certify]\nfields = 1\n{keys}")
-            bench, truth = (read_bench_file(path) for path in paths)
-            found, _ = certify(bench, VirtualReader(bench, truth, number), NOW, quick=True)
-            for each in found.figures:
-                if each.truth is not None:
-                    region = "field" if each.region.startswith("field") else each.region
-                    held[each.quantity, region].append(each.lower <= each.truth <= each.upper)
-    return dict(held)
+from tests.support.planted_certify import coverage
 
 
 def main() -> None:

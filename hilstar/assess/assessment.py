@@ -27,6 +27,7 @@ from hilstar.assess.lock import Lock, lock_of
 from hilstar.assess.places import Scale
 from hilstar.attitude.logs.telemetry import Telemetry, read_telemetry
 from hilstar.bench.bench_file import BenchFile, bench_file_of
+from hilstar.bench.certificate import Certificate, bench_certificate
 from hilstar.bench.config import BenchConfig
 from hilstar.calibrate.attitude_pairs import COMMANDED, Pairs, refuse_conventions
 from hilstar.errors import HilstarError, InputError
@@ -130,6 +131,7 @@ class Assessment:
     by_magnitude: tuple[Slice, ...]
     t_s: FloatArray
     notes: tuple[str, ...]
+    certificate: Certificate | None = None
 
 
 class LedgerAnswers(NamedTuple):
@@ -203,9 +205,10 @@ def assess_files(
     freedom = parts.fov.freedom + parts.pixel.freedom + 1
     by_rate = slices_of(np.degrees(np.linalg.norm(found.rate_rad_s, axis=1)), parts.left, error, freedom)
     by_magnitude: tuple[Slice, ...] = ()
-    display = limit = glass = None
+    display = limit = glass = certificate = None
     try:
         file = run.bench_file()
+        certificate = bench_certificate(file)
         say("the field's stars")
         by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
         limit = noise_limit(file, found.commanded_q)
@@ -237,6 +240,7 @@ def assess_files(
         by_magnitude=by_magnitude,
         t_s=t_s,
         notes=(*notes, *said),
+        certificate=certificate,
     )
 
 

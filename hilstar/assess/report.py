@@ -10,7 +10,8 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.assess.assessment import Assessment
 from hilstar.assess.bench_effects import Slice
-from hilstar.assess.budget import Axes, Decomposed
+from hilstar.assess.budget import Axes, Decomposed, DecomposedRun
+from hilstar.bench.certificate import Certificate, off_by
 from hilstar.charts import BLUE, INK, MUTED, label_ends, panels_of, svg, write_csv
 from hilstar.files import write_whole
 from hilstar.html_pages import escaped, page_of, picture_of, table_of
@@ -44,7 +45,20 @@ def budget_of(found: Assessment) -> dict[str, Any]:
         "wrong": found.wrong,
         "limit_arcsec": found.limit_arcsec,
         **({} if found.glass is None else {"glass": found.glass}),
+        **({} if found.certificate is None else {"bench": bench_part(found.certificate, parts)}),
     }
+
+
+def bench_part(certificate: Certificate, parts: DecomposedRun) -> dict[str, Any]:
+    """How much of the tracker's bias the bench could have made: how far it may be off at 95 %, and that over the bias."""
+    bias = np.abs(parts.bias_arcsec)
+    found: dict[str, Any] = {"certificate": certificate.number, "off_arcsec": None, "share_of_bias": None}
+    if certificate.attitude_arcsec is not None:
+        sizes = zip(("cross", "roll"), certificate.attitude_arcsec, (float(np.hypot(*bias[:2])), float(bias[2])), strict=True)
+        each = {name: (own, min(own / measured, 1.0) if measured else 1.0) for name, own, measured in sizes}
+        found["off_arcsec"] = {name: own for name, (own, _) in each.items()}
+        found["share_of_bias"] = {name: share for name, (_, share) in each.items()}
+    return found
 
 
 class FigureRow(NamedTuple):
@@ -160,8 +174,19 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
         ("wrong", f"{len(found.wrong)}, {where} {named}" if found.wrong else "none"),
         ("display's own error", own),
         ("limit of its stars", limit_text(found.limit_arcsec)),
+        *([("bench's own error", _bench_text(found))] if found.certificate is not None else []),
         *([("glass", found.glass.line())] if found.glass is not None else []),
     ]
+
+
+def _bench_text(found: Assessment) -> str:
+    assert found.certificate is not None
+    part = bench_part(found.certificate, found.found)
+    said = f"{found.certificate.line}: {off_by(found.certificate)}"
+    if part["share_of_bias"] is None:
+        return said
+    cross, roll = (100 * share for share in part["share_of_bias"].values())
+    return f"{said}; it could have made {cross:.0f} % of the bias across and {roll:.0f} % of that about"
 
 
 def _text(axes: Axes, interval: FloatArray) -> str:

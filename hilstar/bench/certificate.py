@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from hilstar.bench.bench_file import BenchFile
 from hilstar.errors import InputError, shortened
@@ -110,11 +109,11 @@ class Certificate(msgspec.Struct, frozen=True, kw_only=True):
         found = [max(abs(each.lower), abs(each.upper)) for each in self.figures if each.quantity in set(quantities)]
         return max(found) if found else None
 
-    def standard(self, quantities: Iterable[str]) -> float | None:
-        """The root mean square of value and standard uncertainty together, of some quantities; None without any."""
-        chosen = set(quantities)
-        found = [each.value**2 + each.standard_uncertainty**2 for each in self.figures if each.quantity in chosen]
-        return float(np.sqrt(np.mean(found))) if found else None
+    @property
+    def attitude_arcsec(self) -> tuple[float, float] | None:
+        """How far the bench's own attitude may be off at 95 %, across the boresight and about it; None where not assessed."""
+        cross, roll = self.expanded(("attitude_x", "attitude_y")), self.expanded(("attitude_z",))
+        return None if cross is None or roll is None else (cross, roll)
 
     @property
     def line(self) -> str:
@@ -135,6 +134,11 @@ def read_certificate(path: Path) -> Certificate:
     return found
 
 
+@lru_cache(maxsize=16)
+def _say_once(line: str) -> None:
+    log.warning("%s", line)
+
+
 def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Certificate | None:
     """The certificate that a bench file names, None where it names none; a notice where it is not this bench's, or is over.
 
@@ -145,10 +149,24 @@ def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Ce
         return None
     found = read_certificate((file.folder / name).resolve())
     if found.bench_sha256 != file.sha256:
-        log.warning("%s is of another state of this bench file; certify it anew (hilstar certify --again)", found.line)
+        _say_once(f"{found.line} is of another state of this bench file; certify it anew (hilstar certify --again)")
     if found.valid_until < (today or datetime.datetime.now(datetime.UTC).date()).isoformat():
-        log.warning("%s is over; certify the bench anew (hilstar certify --again)", found.line)
+        _say_once(f"{found.line} is over; certify the bench anew (hilstar certify --again)")
     return found
+
+
+def off_by(found: Certificate) -> str:
+    """How far the bench's own attitude may be off, in words."""
+    if found.attitude_arcsec is None:
+        return "its own attitude was not assessed"
+    cross, roll = found.attitude_arcsec
+    return f"the bench itself is off by at most {cross:.3g} arcsec across and {roll:.3g} about the boresight (95 %)"
+
+
+def certificate_number(file: BenchFile) -> str:
+    """The number of a bench's certificate, "" without one. Raises InputError."""
+    found = bench_certificate(file)
+    return "" if found is None else found.number
 
 
 def sha256_of_bytes(data: bytes) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.bench.certificate import certificate_number
 from hilstar.bench.frame import Bench, Frame
 from hilstar.files import as_text, whole_file, written
 from hilstar.frame.truth import with_errors
@@ -170,6 +171,8 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     header["NSTARS"] = (len(frame.truth), "stars in view")
     header["CALNAME"] = (bench.calibration.name, "monitor calibration")
     header["CALSHA"] = bench.calibration.sha256
+    if number := certificate_number(bench.file):
+        header["CERTIF"] = (number, "certificate of the bench")
     if len(frame.light) > 1:
         header.update({"CTYPE3": "CHANNEL", "CRPIX3": 1.0, "CRVAL3": 1.0, "CD3_3": 1.0})
         header.update({f"CHANNEL{k}": key for k, key in enumerate(bench.config.tracker.quantum_efficiencies, 1)})

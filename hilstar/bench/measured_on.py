@@ -8,7 +8,10 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import msgspec
+
 from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.certificate import bench_certificate
 from hilstar.errors import MachineError
 from hilstar.monitor.calibration import BUILT_IN, read_toml
 from hilstar.monitor.geometry import load_notes
@@ -58,6 +61,11 @@ class MonitorCheck:
 
 def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
     """The origins of a bench's calibration and geometry files; a built-in curve has none. Raises InputError."""
+    certificate = bench_certificate(file)
+    if certificate is not None and certificate.monitor.get("identity"):  # whoever certified it looked at that monitor
+        identity = msgspec.convert(certificate.monitor["identity"], MonitorIdentity)
+        yield MeasuredOn(f"certificate {certificate.number}", identity, _date(certificate.made))
+        return
     calibration, geometry = file.config.monitor.calibration, file.config.collimator.geometry
     if calibration in BUILT_IN:
         yield MeasuredOn(calibration, built_in=True)

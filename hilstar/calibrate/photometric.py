@@ -38,7 +38,7 @@ from hilstar.calibrate.measurements import (
 )
 from hilstar.charts import BLUE, GREEN, INK, MUTED, RED, chart, label_ends
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, write_calibration
+from hilstar.monitor.calibration import CalibrationHead, ErrorsTable, NotesTable, load_calibration, write_calibration
 from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.response import srgb_light
 from hilstar.units import MAG_PER_RELATIVE
@@ -312,7 +312,9 @@ def calibrate_photometric(
     if stated["when"] == NOT_STATED:
         stated["when"] = datetime.date.today().isoformat()
     head = CalibrationHead(kind="photometric", bits=data.bits, response=output.with_suffix(".csv").name, **stated)
-    table = write_calibration(output, head, columns, noise, NotesTable(drift=drift_note, text=text), identity=identity)
+    table = write_calibration(
+        output, head, columns, noise, NotesTable(drift=drift_note, text=text), identity=identity, errors=errors_of(fits)
+    )
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
     additivity = None  # ratio of r + g + b to w at white, above black
     if len(fits) == len(CHANNELS):
@@ -326,6 +328,18 @@ def calibrate_photometric(
         "written": [str(output), str(table)],
         "sha256": load_calibration(output, data.bits).sha256,
     }
+
+
+def errors_of(fits: dict[str, ChannelFit]) -> ErrorsTable | None:
+    """How far white's levels are from the fit, and how well each is known; None where white or its repeats are missing."""
+    fit = fits.get("w")
+    if fit is None or "r" in fits or math.isnan(fit.levels.relative_noise):
+        return None
+    levels, fitted = fit.levels, fit.white * fit.light[fit.levels.code[1:]]
+    error = np.hypot(levels.standard_error(fit.noise_relative), levels.standard_error(fit.noise_relative)[0])[1:]
+    off = (levels.mean[1:] - levels.mean[0]) / fitted - 1
+    rounded = [[float(f"{x:.6g}") for x in part] for part in (fit.light[levels.code[1:]], off, error / fitted)]
+    return ErrorsTable(light=rounded[0], off=rounded[1], relative=rounded[2], dof=float((levels.count - 1).sum()))
 
 
 def fit_all(data: Measurements) -> dict[str, ChannelFit]:

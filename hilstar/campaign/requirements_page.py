@@ -8,6 +8,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.assess.places import Scale
 from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.certificate import bench_certificate, off_by
 from hilstar.campaign.plan import CONDITION, Plan
 from hilstar.campaign.requirements import MET, NOT_MET, NOT_SHOWN, RequirementVerdict, verdicts_of
 from hilstar.campaign.results import VARY, Columns, read_cases
@@ -30,7 +31,9 @@ def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> 
     """Write requirements.csv, .html and .png beside a campaign's table; the verdicts. Raises InputError."""
     cases, tracker = read_cases(table), file.config.tracker
     scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
-    found = verdicts_of(plan.require, cases, scale, plan.seed)
+    certificate = bench_certificate(file) if plan.through == "bench" else None
+    own = None if certificate is None else certificate.attitude_arcsec
+    found = verdicts_of(plan.require, cases, scale, plan.seed, own)
     write_csv(table.with_name("requirements.csv"), COLUMNS, [[summary_of(each)[name] for name in COLUMNS] for each in found])
     figure = _chart(cases, found)
     write_whole(table.with_name("requirements.png"), png(figure))
@@ -39,6 +42,7 @@ def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> 
         ("bench", f"{file.path}, sha256 {file.sha256}"),
         ("cases", f"{cases.cases} through {plan.through}, in {table.name}, sha256 {file_sha256(table)}"),
         ("program", f"hilstar {__version__}"),
+        *([("certificate", f"{certificate.line}; {off_by(certificate)}")] if certificate else []),
     ]
     page = [
         f"<p>{_badge(verdict_of(found))} {escaped(_sentence(found))}</p>",

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import map_coordinates
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
@@ -17,6 +19,8 @@ from hilstar.certify.budget import Input, Model
 from hilstar.certify.estimates import LightDeviation, Surface, evenness, light_deviation, places
 from hilstar.certify.model import Deviations, Figures, reference_stars
 from hilstar.certify.readings import Reader, dot_places, geometry_of
+from hilstar.monitor.calibration import BUILT_IN, read_toml
+from hilstar.monitor.geometry import load_notes
 from hilstar.units import MAG_PER_RELATIVE, magnitude
 
 SEED = 5  # of the order of readings
@@ -90,7 +94,7 @@ def assemble(file: BenchFile, read: Read | None, drift: tuple[float, str] | None
     )  # fmt: skip
     missing: list[str] = []
     if read is None:
-        effects = list(_of_files(file, figures, missing))
+        effects = list(_of_files(file, figures, value, missing))
     else:
         value, effects = _of_readings(file, figures, read, missing)
     effects += [*_of_settings(file, figures, drift, missing), *_of_sky(file, figures, missing)]
@@ -162,8 +166,40 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
     return value, found
 
 
-def _of_files(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
-    """The effects of a bench's calibration files."""
+def _of_files(file: BenchFile, figures: Figures, value: Deviations, missing: list[str]) -> Iterator[Effect]:
+    """The effects of a bench's calibration files, and in `value` what they have wrong: response, full scale, lens, delay."""
+    monitor, count = file.config.monitor, len(figures.stars)
+    errors = None if monitor.calibration in BUILT_IN else read_toml(file.folder / monitor.calibration).errors
+    if errors is None:
+        missing.append(f"flux: [monitor] calibration = {monitor.calibration!r} does not say how well it is known")
+    else:
+        light, relative = np.log(np.array(errors.light)), np.array(errors.relative)
+        join = CubicSpline(light, np.eye(len(light)), bc_type="natural")(np.clip(figures.log_light, light[0], light[-1]))
+        join = join - np.eye(len(light))[-1]  # relative to white, whose light is full scale
+        value.levels[0] += join @ np.array(errors.off)
+        typical, source = float(np.median(relative)), f"levels of {monitor.calibration}"
+        own = Input("response", "Student t", source, len(light), typical, "relative", errors.dof)
+        yield Effect(own, levels=(join * relative).T)
+    if (white := file.config.certify.flux_at_white_relative) is not None:
+        yield Effect(
+            Input("full scale", "normal", "[certify] flux_at_white_relative", 1, white, "relative"),
+            even=np.full((1, count), white),
+        )
+    else:
+        missing.append("full scale: nothing was read, and [certify] flux_at_white_relative is not written")
+    missing.append("evenness: nothing was read, and a map of light does not say how well it is known")
+    name = file.config.collimator.geometry
+    error = None if name is None else load_notes(file.folder / name).error
+    if error is None or error.map_arcsec is None:
+        missing.append("place and attitude: [collimator] geometry names no file with its errors (hilstar calibrate geometric)")
+    else:
+        rows = np.where(np.array(error.map_arcsec) < 0, np.nan, np.array(error.map_arcsec))
+        wide, high = monitor.resolution_px
+        at = ((figures.y_px + 0.5) / high * (rows.shape[0] - 1), (figures.x_px + 0.5) / wide * (rows.shape[1] - 1))
+        known = map_coordinates(np.where(np.isnan(rows), np.nanmax(rows), rows), at, order=1, mode="nearest") / math.sqrt(2)
+        place = np.zeros((2, count, 2))
+        place[0, :, 0], place[1, :, 1] = known, known  # all stars together: the file does not say how they are correlated
+        yield Effect(Input("geometry", "normal", f"map of errors of {name}", 2, _rms(known), "arcsec"), place=place)
     yield from _stated_delay(file, missing)
 
 

@@ -14,12 +14,14 @@ import hilstar
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.certificate import KIND, ByTrials, Certificate, CertifiedFigure, Contribution, InputRow, sha256_of_bytes
 from hilstar.bench.config import CertifySettings
-from hilstar.certify.assembly import SKY, Assembled, assemble, read_bench
+from hilstar.bench.measured_on import measured_on
+from hilstar.certify.assembly import Assembled, assemble, read_bench
 from hilstar.certify.budget import MAX_DOF, Combined, Drawn, by_trials, first_order, why_they_differ
 from hilstar.certify.check import take_check
 from hilstar.certify.model import THIRDS, true_deviations
 from hilstar.certify.readings import Reader
 from hilstar.monitor.calibration import BUILT_IN
+from hilstar.monitor.identity import MonitorIdentity
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
 
 MAX_TRIALS, QUICK_TRIALS = 200_000, 10_000
@@ -37,6 +39,11 @@ MEASURANDS = {
     "star_flux": "flux, with what the codes lose, and the errors of the catalogue and of the spectrum, mag",
     "star_place_along": "place_along, with the catalogue's error, arcsec",
     "star_place_across": "place_across, with the catalogue's error, arcsec",
+}
+UNKNOWN = {
+    "latency": ("latency",),
+    "flux": ("flux", "star_flux"),
+    "place and attitude": tuple(name for name in MEASURANDS if "place" in name or "attitude" in name),
 }
 LIMITS = {
     "flux": "max_flux_mag",
@@ -86,7 +93,7 @@ def certify(
         bench=file.path.name,
         bench_sha256=file.sha256,
         files=files,
-        monitor=_monitor(file),
+        monitor=_monitor(file, None if reader is None else reader.monitor),
         collimator={key: value for key, value in settings_of.items() if value is not None},
         read_by="nothing was read: by the calibration files" if reader is None else reader.identity,
         who=settings.who,
@@ -132,7 +139,8 @@ def _figures(
     file: BenchFile, budget: Assembled, combined: Combined, drawn: Drawn, truth: np.ndarray[Any, Any] | None
 ) -> list[CertifiedFigure]:
     found, settings = [], file.config.certify
-    missing = {"latency"} if any(each.startswith("latency") for each in budget.not_assessed) else set()
+    unknown = {each.partition(":")[0] for each in budget.not_assessed}
+    missing = {name for key, names in UNKNOWN.items() if key in unknown for name in names}
     for number, (quantity, which, unit) in enumerate(budget.names):
         if quantity in missing:
             continue
@@ -215,21 +223,13 @@ def files_of(file: BenchFile) -> dict[str, str]:
     return found
 
 
-def _monitor(file: BenchFile) -> dict[str, Any]:
-    """The monitor's identity as its calibration or geometry file carries it, and its mode by the bench file."""
+def _monitor(file: BenchFile, now: MonitorIdentity | None) -> dict[str, Any]:
+    """The monitor's mode by the bench file, and its identity: that which was read, else that of the calibration files."""
     monitor = file.config.monitor
-    found: dict[str, Any] = {
+    named = [now] if now is not None else [each.identity for each in measured_on(file) if each.identity is not None]
+    return {
         "resolution_px": list(monitor.resolution_px),
         "refresh_hz": monitor.refresh_hz,
-        "bits": monitor.bits,
         "calibration": monitor.calibration,
-        "display": monitor.display,
+        "identity": named[0].known() if named else {},
     }
-    for name in (monitor.calibration, file.config.collimator.geometry):
-        path = None if name is None or name in BUILT_IN else file.folder / name
-        if path is not None and path.suffix == ".toml" and path.is_file():
-            found |= parse_toml(path, read_text(path, "", MAX_TOML_BYTES)).get("monitor_identity", {})
-    return found
-
-
-SKY_QUANTITIES = tuple(name for name, _ in SKY)

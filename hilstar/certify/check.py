@@ -173,13 +173,13 @@ def _light(was: CheckReadings, now: CheckReadings) -> list[Figure]:
     freedom = (count - 1)[used]
     bright = codes > codes[len(codes) // 2]
     dof = float(freedom[:, bright].sum())
-    relative = math.sqrt(float((squares[used] / mean[used] ** 2)[:, bright].sum()) / dof) if dof else 0.0
+    relative = math.sqrt(float((squares[used][:, bright] / mean[used][:, bright] ** 2).sum()) / dof) if dof else 0.0
     faint = np.arange(len(codes)) < FAINT
     floor = float((squares[used] - freedom * (relative * mean[used]) ** 2)[:, faint].sum() / max(freedom[:, faint].sum(), 1))
     variance = sum(((relative * mean[k]) ** 2 + max(floor, 0.0)) / count[k] for k in (0, 1) if used[k])
     sigma = np.sqrt(variance)
     lit, white = codes > 0, mean[0, -1]
-    change, error = (mean[1] / mean[0] - 1)[lit], sigma[lit] / mean[0, lit]
+    change, error = mean[1, lit] / mean[0, lit] - 1, sigma[lit] / mean[0, lit]
     design = np.stack([np.ones(int(lit.sum())), np.log(codes[lit] / codes[-1])], axis=1)
     inverse = np.linalg.pinv(design / error[:, None]) / error
     covariance = (inverse * error**2) @ inverse.T

@@ -16,7 +16,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_calibration, open_bench
+from hilstar.bench.build import bench_calibration, open_bench, orientation_of
 from hilstar.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.geometry import sharpness
@@ -34,6 +34,7 @@ from hilstar.calibrate.latency import pair, swap_to_square_ms
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, load_calibration
+from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.response import Response
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.twin.optics import BenchGeometry
@@ -81,6 +82,11 @@ class Reader(Protocol):
     @property
     def truth(self) -> BenchFile | None:
         """The true bench, of a virtual one."""
+        ...
+
+    @property
+    def monitor(self) -> MonitorIdentity | None:
+        """The monitor that is read, where the machine can tell."""
         ...
 
     def now_ns(self) -> int:
@@ -143,8 +149,12 @@ def delays_of(recording: DiodeRecording | None, file: BenchFile) -> FloatArray:
 class VirtualReader:
     """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own noise. Raises InputError."""
 
+    monitor: MonitorIdentity | None = None
+
     def __init__(self, file: BenchFile, truth: BenchFile, seed: int, turn: int = 0) -> None:
         refuse_other_bench(file, truth)
+        if orientation_of(file.config.monitor) != orientation_of(truth.config.monitor):
+            raise InputError(f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar first-light)")
         self.file, self.truth, self._rng = file, truth, np.random.default_rng((seed, 0xCE27, turn))
         self.identity = f"virtual: {truth.path.name}, sha256 {truth.sha256}, seed {seed}"
         self._noise, self._t_s = truth.config.certify.virtual, 0.0
@@ -216,7 +226,7 @@ class ImageReader:
     _context: StepContext = field(init=False)
 
     def __post_init__(self) -> None:
-        self.identity = self.source.identity
+        self.identity, self.monitor = self.source.identity, self.source.monitor
         self._context = StepContext(self.file, self.folder, self.folder, self.source, {}, {}, 0)
 
     def now_ns(self) -> int:

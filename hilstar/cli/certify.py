@@ -77,7 +77,7 @@ def certify(
         raise InputError("--check: reads the bench; write --grab CMD, or --virtual TRUTH.toml")
     now = datetime.datetime.now(datetime.UTC)
     with ExitStack() as ended:
-        reader = _reader(ended, file, make_directory(output), grab, virtual, whole, dark, diode, seed, check)
+        reader = _reader(ended, file, make_directory(output), grab, virtual, whole, dark, diode, seed, check, again)
         if check and reader is not None:
             _check(file, reader, output, now, warm_up, as_json)
         else:
@@ -155,6 +155,7 @@ def _reader(
     diode: str | None,
     seed: int,
     check: bool,
+    again: bool,
 ) -> Reader | None:
     from contextlib import closing
 
@@ -173,8 +174,9 @@ def _reader(
         source = ended.enter_context(closing(VirtualBench(file, truth, seed)))
     elif grab is not None:
         recorder = None if diode is None else SerialDiode(*parse_diode(diode))
-        source = ended.enter_context(closing(GrabCommand(grab, dark, recorder)))
+        source = shown = ended.enter_context(closing(GrabCommand(grab, dark, recorder)))
         truth = None
+        shown.find_monitor(file, datetime.datetime.now(datetime.UTC).date(), force=again)
         source.gate(file)
     else:
         return None

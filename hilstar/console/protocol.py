@@ -28,6 +28,7 @@ class Hello(msgspec.Struct, kw_only=True):
     command: str
     bench: str
     renderer: str = ""
+    certificate: str = ""
     started_utc: str
     resolution_px: tuple[int, int]
     white_level: int

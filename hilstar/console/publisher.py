@@ -16,6 +16,7 @@ import numpy as np
 
 from hilstar.attitude.clock.rate_check import WRONG
 from hilstar.attitude.clock.sender_clock import KNOWN_MODES
+from hilstar.bench.certificate import certificate_number
 from hilstar.bench.frame import Bench
 from hilstar.console.listener import PageListener
 from hilstar.console.messages import (
@@ -439,6 +440,7 @@ def opened_page(
     bench, orders = parts.bench, OrderHandler(requests, feed, parts)
     setup = setup_for(listeners, control, description, bench.file, picture_bytes)
     setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
+    setup.hello.certificate = certificate_number(bench.file)
     setup.hello.answers = parts.answers is not None
     setup.hello.faults = [] if parts.faults is None else parts.faults.names()
     if listeners.page is not None:

@@ -203,7 +203,7 @@ def with_uniformity(
 
     `source` is a built-in name or a file, as for `load_calibration`; `when` dates a built-in's. Raises InputError.
     """
-    response, weights, noise, notes = f"{path.stem}.csv", None, 0.0, NotesTable()
+    response, weights, noise, notes, errors = f"{path.stem}.csv", None, 0.0, NotesTable(), None
     if str(source) in FORMULAS:
         head = CalibrationHead("photometric", "", when, f"none: the formula {source}", "relative", bits, response)
         columns, weights = {"w": _formula(str(source), bits).light}, WeightsTable(*REC709_WEIGHTS)
@@ -213,8 +213,8 @@ def with_uniformity(
         columns = read_response(beside(origin, file.calibration.response, "[calibration] response"), bits)
         head = msgspec.structs.replace(file.calibration, response=response)
         weights, noise, notes = file.weights, file.noise.relative if file.noise else 0.0, file.notes
-        identity = identity or file.monitor_identity
-    table = write_calibration(path, head, columns, noise, notes, weights, identity=identity)
+        identity, errors = identity or file.monitor_identity, file.errors
+    table = write_calibration(path, head, columns, noise, notes, weights, identity=identity, errors=errors)
     return (path, table) if grid is None else (path, table, add_uniformity(path, grid))
 
 
@@ -271,6 +271,15 @@ class NoiseTable(Table, frozen=True):
     relative: Annotated[float, Meta(ge=0, le=1)]
 
 
+class ErrorsTable(Table, frozen=True):
+    """[errors]: at the levels measured, by their light relative to white: measured over fitted light less 1, and its error."""
+
+    light: list[Annotated[float, Meta(gt=0, le=1)]]
+    off: list[Annotated[float, Meta(ge=-1e6, le=1e6)]]
+    relative: list[Share]
+    dof: Annotated[float, Meta(gt=0, le=1e9)]
+
+
 class NotesTable(Table, frozen=True):
     """[notes]: free text."""
 
@@ -286,6 +295,7 @@ class CalibrationFile(Table, frozen=True):
     weights: WeightsTable | None = None
     uniformity: UniformityTable | None = None
     noise: NoiseTable | None = None
+    errors: ErrorsTable | None = None
     notes: NotesTable = msgspec.field(default_factory=NotesTable)
     monitor_identity: MonitorIdentity | None = None
 
@@ -410,6 +420,7 @@ def write_calibration(
     weights: WeightsTable | None = None,
     *,
     identity: MonitorIdentity | None = None,
+    errors: ErrorsTable | None = None,
 ) -> Path:
     """Write the TOML and, beside it, the response it names; the CSV's path. Raises InputError where they cannot be written."""
     table = path.parent / head.response
@@ -422,6 +433,8 @@ def write_calibration(
     if weights is not None:
         lines += ["[weights]", *(f"{name} = {share!r}" for name, share in msgspec.structs.asdict(weights).items()), ""]
     lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
+    if errors is not None:
+        lines += ["", "[errors]", *(f"{key} = {json.dumps(value)}" for key, value in msgspec.structs.asdict(errors).items())]
     if identity is not None:
         lines += ["", identity.toml()]
     write_whole(table, comment + ",".join(["code", *columns]) + "\n" + rows)

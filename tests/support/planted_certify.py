@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import datetime
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.certify.certificate import certify
+from hilstar.certify.readings import VirtualReader
+
+NOW = datetime.datetime(2026, 11, 26, tzinfo=datetime.UTC)
 
 GRID = (9, 16)
 BENCH = """[tracker]
@@ -104,3 +113,18 @@ def plant(folder: Path, one: Plant, bench_keys: str = "", truth_keys: str = "") 
         f"drift_percent_per_h = {one.drift_percent_per_h!r}\n{truth_keys}"
     )
     return folder / "bench.toml", folder / "truth.toml"
+
+
+def coverage(benches: int, seed: int, keys: str = "") -> dict[tuple[str, str], list[bool]]:
+    """By quantity and region, whether each stated interval holds the truth."""
+    rng, held = np.random.default_rng(seed), defaultdict(list)
+    with TemporaryDirectory() as folder:
+        for number in range(benches):
+            paths = plant(Path(folder), drawn(rng), f"[certify]\nfields = 1\n{keys}")
+            bench, truth = (read_bench_file(path) for path in paths)
+            found, _ = certify(bench, VirtualReader(bench, truth, number), NOW, quick=True)
+            for each in found.figures:
+                if each.truth is not None:
+                    region = "field" if each.region.startswith("field") else each.region
+                    held[each.quantity, region].append(each.lower <= each.truth <= each.upper)
+    return dict(held)

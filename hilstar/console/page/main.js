@@ -79,7 +79,7 @@ const HEARD = {
     health.session = Boolean(said.session);
     write(byId("bench"), said.bench);
     byId("bench").title = said.bench;
-    write(byId("run-head"), `${said.command}  ${said.refresh_hz ? `${said.refresh_hz} Hz  ` : ""}${said.bits} bit`);
+    write(byId("run-head"), `${said.command}  ${said.refresh_hz ? `${said.refresh_hz} Hz  ` : ""}${said.bits} bit${said.certificate ? `  certificate ${said.certificate}` : ""}`);
     byId("run-head").title = `hilstar ${said.version}, ${said.renderer}, started ${said.started_utc}`;
     byId("events").replaceChildren();
     points = [];

@@ -34,6 +34,7 @@ from hilstar.attitude.logs.mcap_log import (
     refused_message,
 )
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.bench.certificate import certificate_number
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_write, printable
 from hilstar.files import NewFile
@@ -245,6 +246,7 @@ class Ledger(Closing):
             "bench_text": bench.file.text,
             "calibration": bench.calibration.name,
             "calibration_sha256": bench.calibration.sha256,
+            "certificate": certificate_number(bench.file),
             "gl_renderer": bench.renderer.gl_renderer,
             "gl_version": bench.renderer.gl_version,
             "render_path": bench.renderer.path,

@@ -216,7 +216,7 @@ METRICS = {
     **{"interval": "interval_ms", "late": "swap_late_ms", "draw": "draw_to_swap_ms", "age": "attitude_age_ms"},
     **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
 }
-HEAD = ("bench_sha256", "calibration", "calibration_sha256", "gl_renderer", "gl_version", "render_path")
+HEAD = ("bench_sha256", "calibration", "calibration_sha256", "certificate", "gl_renderer", "gl_version", "render_path")
 COUNTED = (
     *("frames", "duration_s", "stale_frames", "right_frames", "blank_frames", "operator_frames", "hidden_frames"),
     *("capped_frames", "events", "pulses", "memory_growth_mb"),
@@ -421,6 +421,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     bench_sha256: str | None
     calibration: str | None
     calibration_sha256: str | None
+    certificate: str | None
     gl_renderer: str | None
     gl_version: str | None
     render_path: str | None
@@ -481,5 +482,6 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
         ("bench file", f"SHA-256 {found.bench_sha256}"),
         ("calibration", f"{found.calibration}, SHA-256 {found.calibration_sha256}"),
+        *([("certificate", found.certificate)] if found.certificate else []),
         ("renderer", f"{found.gl_renderer}, OpenGL {found.gl_version or '-'}; levels by {found.render_path or '-'}"),
     ]

@@ -1,0 +1,136 @@
+"""Certificates: intervals that hold the truth, a budget that two ways agree on, and checks that catch what moved."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.certify.budget import Input, by_trials, first_order, why_they_differ
+from hilstar.certify.check import compare, take_check
+from hilstar.certify.readings import VirtualReader
+from tests.support.commands import run_hilstar_here
+from tests.support.planted_certify import coverage, drawn, plant
+
+BENCHES = 40
+FAR = 4 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
+UNCHANGED = 20
+
+
+def test_intervals_hold_the_truth_of_planted_benches() -> None:
+    held = coverage(BENCHES, 7)
+    assert {quantity for quantity, _ in held} >= {"flux", "place_along", "place_across", "attitude_x", "attitude_z", "latency"}
+    assert {region for quantity, region in held if quantity == "flux"} == {"left third", "middle third", "right third"}
+    for where, hits in held.items():
+        assert abs(np.mean(hits) - 0.95) < FAR, (where, np.mean(hits))
+
+
+def test_three_readings_hold_the_truth_by_their_t() -> None:
+    rng, trials = np.random.default_rng(3), 4000
+    read = rng.normal(0, 1, (trials, 3))
+    held = 0
+    for one in read:
+        error = float(one.std(ddof=1)) / math.sqrt(3)
+        middle = float(one.mean())
+        inputs = [Input("readings", "Student t", "", 1, error, "", 2.0)]
+        found = first_order(lambda z, middle=middle, u=error: middle + u * z[0], inputs)
+        held += bool(found.lower[0] <= 0 <= found.upper[0])
+    assert abs(held / trials - 0.95) < 4 * math.sqrt(0.95 * 0.05 / trials)
+
+
+def test_both_ways_agree_on_what_is_linear_and_say_why_where_it_is_not() -> None:
+    inputs = [Input("a", "normal", "", 2, 1.0, ""), Input("b", "rectangular", "", 1, 1.0, "")]
+    linear = lambda z: np.stack([z[0] @ [1.0, -2.0] + 0.5 * z[1][:, 0]], axis=1)  # noqa: E731
+    bent = lambda z: np.stack([z[0][:, 0] + 0.5 * z[0][:, 0] ** 2], axis=1)  # noqa: E731
+    rng = np.random.default_rng(1)
+    first, drawn_ones = first_order(linear, inputs), by_trials(linear, inputs, rng, 200_000)
+    assert drawn_ones.settled
+    assert drawn_ones.standard == pytest.approx(first.standard, rel=0.05)
+    assert why_they_differ(first, drawn_ones, inputs, 0) == ""
+    first, drawn_ones = first_order(bent, inputs), by_trials(bent, inputs, rng, 200_000)
+    assert drawn_ones.standard[0] > 1.1 * first.standard[0]  # sqrt(1 + 2 / 4)
+    assert "not linear" in why_they_differ(first, drawn_ones, inputs, 0)
+
+
+def test_correlations_within_an_input_count() -> None:
+    both = [Input("a", "normal", "", 1, 1.0, "")]
+    assert first_order(lambda z: z[0] - z[0], both).standard[0] == 0
+
+
+CHANGES = {
+    "brightness": {"white": 1.01},
+    "darker": {"white": 0.99},
+    "shift": {"mount_arcsec": (2.0, 0.0, 0.0)},
+    "roll": {"mount_arcsec": (0.0, 0.0, 2.0)},
+    "gamma": {"gamma": 0.02},
+}
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory: pytest.TempPathFactory):
+    """A planted bench, its readings at its certificate, and a function that checks it with other things planted."""
+    one = dataclasses.replace(drawn(np.random.default_rng(5)), reading_noise=0.002, dot_noise_px=0.02, drift_percent_per_h=0.0)
+    folder = tmp_path_factory.mktemp("check")
+    bench, truth = (read_bench_file(path) for path in plant(folder, one))
+    reference = take_check(bench, VirtualReader(bench, truth, 0))
+
+    def check(seed: int, focus: float = 1.0, **changes: float | tuple[float, float, float]):
+        changed = one
+        for name, value in changes.items():
+            now = getattr(one, name)
+            if isinstance(value, tuple):
+                new = tuple(a + b for a, b in zip(now, value, strict=True))
+            else:
+                new = now * value if name == "white" else now + value
+            changed = dataclasses.replace(changed, **{name: new})
+        as_it_is = read_bench_file(plant(folder, changed)[1])
+        tracker = msgspec.structs.replace(as_it_is.config.tracker, psf_sigma_px=(0.55 * focus, 0.55 * focus))
+        as_it_is = dataclasses.replace(as_it_is, config=msgspec.structs.replace(as_it_is.config, tracker=tracker))
+        return compare(bench, reference, take_check(bench, VirtualReader(bench, as_it_is, seed, 1)))
+
+    return check
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_check_catches_what_moved(checked, change: str) -> None:
+    for seed in range(3):
+        assert not all(each.in_tolerance for each in checked(seed, **CHANGES[change])), change
+
+
+def test_a_check_catches_a_new_focus(checked) -> None:
+    assert [each.quantity for each in checked(1, focus=1.05) if not each.in_tolerance] == ["psf"]
+
+
+def test_a_check_is_quiet_where_nothing_moved(checked) -> None:
+    for seed in range(UNCHANGED):
+        figures = checked(seed)
+        assert all(each.in_tolerance for each in figures), seed
+        assert all(abs(each.value) < 6 * each.standard_uncertainty for each in figures if each.quantity != "psf")
+
+
+def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
+    bench, truth = plant(
+        tmp_path, drawn(np.random.default_rng(5)), '[certify]\nfields = 1\nmax_latency_ms = 1.0\nwho = "A. Tester"\n'
+    )
+    words = ["certify", str(bench), "-o", str(tmp_path / "out"), "--virtual", str(truth)]
+    done = run_hilstar_here(*words, "--quick", "--json")
+    found = msgspec.json.decode(done.stdout)
+    assert done.returncode == 0
+    assert found["conforms"] is False  # the bench file's delay is 8 ms, the truth's is not
+    assert found["who"] == "A. Tester"
+    figure = next(each for each in found["figures"] if each["quantity"] == "latency")
+    assert figure["lower"] < figure["value"] < figure["upper"]
+    assert figure["contributions"][0]["input"] == "delay"
+    assert (tmp_path / "out" / "index.html").read_text().count("<h2>") > 4
+    assert run_hilstar_here(*words).returncode == 2
+    assert run_hilstar_here(*words, "--check").returncode == 0
+    plant(tmp_path, dataclasses.replace(drawn(np.random.default_rng(5)), white=1e6))
+    moved = run_hilstar_here(*words, "--check", "--json")
+    assert moved.returncode == 1
+    assert msgspec.json.decode(moved.stdout)["checks"] == 2
+    again = run_hilstar_here(*words, "--again", "--quick", "--json")
+    assert msgspec.json.decode(again.stdout)["replaces"] == found["number"]

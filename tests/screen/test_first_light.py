@@ -94,7 +94,7 @@ def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_p
     steps = {step["name"]: step for step in session["steps"]}
     assert steps["orientation"]["figures"] == {"seen": "mirrored top to bottom", "told_by": "a key"}
     assert steps["focus"]["verdict"] == "done"
-    assert (session["running"], list(steps)) == ("geometry", ["machine", "display", "orientation", "focus"])
+    assert (session["running"], list(steps)) == ("geometry", ["machine", "display", "orientation", "focus", "warm-up"])
     assert "flip_y = true" in bench.read_text()
 
 

@@ -6,11 +6,9 @@ The fields of view tell a length in the wrong unit: no lens and no pixel is ten 
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +16,12 @@ import numpy as np
 from msgspec.structs import replace
 
 from hilstar.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, RenderSettings, Tracker
-from hilstar.bench.glass import bench_glass_psf, decentre_px, glass_in, through_glass
+from hilstar.bench.glass import bench_glass_psf, decentre_px, glass_in, say_once, through_glass
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import load_distortion, load_geometry, monitor_camera
 from hilstar.scene.camera import Camera, bounded
 from hilstar.scene.psf import GaussianPsf, Psf, read_psf
 
-log = logging.getLogger(__name__)
 NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
 MIN_SEEN, MIN_FILLED = 0.1, 0.5  # share of the screen that the tracker sees; share of the tracker's field that the screen fills
 MAX_PIXELS = 10.0  # tracker pixels to a monitor pixel, or the reverse
@@ -76,14 +73,9 @@ def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
     if tracker.optics.psf == GAUSSIAN:
         return GaussianPsf(tracker.psf_sigma_px)
     if tracker.psf_sigma_px != DEFAULT_PSF_SIGMA_PX:
-        _say_once(f"[tracker] psf_sigma_px is not used: [tracker.optics] psf is {tracker.optics.psf}")
+        say_once(f"psf_sigma_px is not used: [tracker.optics] psf is {tracker.optics.psf}", "[tracker]")
     glass = glass_in(tracker, folder)
     return read_psf(folder / tracker.optics.psf) if glass is None else bench_glass_psf(glass, tracker, folder)
-
-
-@lru_cache(maxsize=1)
-def _say_once(line: str) -> None:
-    log.warning("%s", line)
 
 
 def real_monitor(config: BenchConfig, path: Path) -> Camera:

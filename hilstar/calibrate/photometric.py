@@ -316,14 +316,18 @@ def calibrate_photometric(
         output, head, columns, noise, NotesTable(drift=drift_note, text=text), identity=identity, errors=errors_of(fits)
     )
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
-    additivity = None  # ratio of r + g + b to w at white, above black
+    additivity, crosstalk = None, None  # r + g + b against w, above black: at white, and at codes decades below it
     if len(fits) == len(CHANNELS):
-        additivity = 100 * (sum(fits[name].white for name in PRIMARIES) / fits["w"].white - 1)
+        together = np.sum([fits[name].white * fits[name].light for name in PRIMARIES], axis=0)
+        more = 100 * (together / np.maximum(fits["w"].white * fits["w"].light, 1e-300) - 1)
+        additivity = float(more[-1])
+        crosstalk = {f"1e-{decade}": float(more[place]) for decade, place in _decades(fits["w"]).items()}
     return channels[next(iter(columns))] | {
         "bits": data.bits,
         "channels": channels,
         "noise_relative": noise,
         "additivity_percent": additivity,
+        "crosstalk_percent": crosstalk,
         "drift_percent": None if math.isnan(drift) else 100 * drift,
         "written": [str(output), str(table)],
         "sha256": load_calibration(output, data.bits).sha256,
@@ -352,11 +356,15 @@ def fit_all(data: Measurements) -> dict[str, ChannelFit]:
     return {name: fit_channel(data, name) for name in channels}
 
 
+def _decades(fit: ChannelFit) -> dict[int, int]:
+    """The codes whose light is nearest to so many decades below white."""
+    log_light = np.log(np.maximum(fit.light, 1e-12))
+    return {decade: int(np.argmin(np.abs(log_light + decade * math.log(10)))) for decade in DECADES}
+
+
 def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
     """One channel's figures: its black level over white and in the unit of measurement, and errors at decades below white."""
     count = fit.levels.count
-    log_light = np.log(np.maximum(fit.light, 1e-12))
-    places = {decade: int(np.argmin(np.abs(log_light + decade * math.log(10)))) for decade in DECADES}
     return {
         "codes": len(count),
         "repeats": {"min": int(count.min()), "max": int(count.max())},
@@ -364,7 +372,7 @@ def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
         "noise_relative": fit.noise_relative,
         "shape": fit.shape,
         "parameters": fit.parameters,
-        "error_percent": {f"1e-{decade}": 100 * float(fit.error[place]) for decade, place in places.items()},
+        "error_percent": {f"1e-{decade}": 100 * float(fit.error[place]) for decade, place in _decades(fit).items()},
         "holdout": held_out(fit),
     }
 

@@ -32,13 +32,13 @@ from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s, load_library
-from hilstar.sky.spectral_types import LETTERS, class_shares, read_types
+from hilstar.sky.spectral_types import CLASSES, LETTERS, class_shares, read_types
 from hilstar.sky.stars import Stars
 from hilstar.study.settings import GLASS, Isolation, bench_text, centroid_px, lone_windows
 from hilstar.study.sweep import OtherWork, busy_line, in_turn, is_busy
 from hilstar.tracker.centroids import CentroidSettings, LocalBackground, find_stars
 from hilstar.tracker.mosaic import CHANNELS, SUPERPIXEL_VARIANCE_PX2, in_pixels, luminance
-from hilstar.twin.budget import SOLAR_BV
+from hilstar.twin.budget import RED_NM, SOLAR_BV
 from hilstar.twin.glass import StarGlass
 from hilstar.units import magnitude
 
@@ -67,8 +67,6 @@ FIELDS, QUICK_FIELDS, ROUNDS, QUICK_ROUNDS = 40, 3, 15, 3
 BRIGHTEST_V_MAG, FAINTEST_V_MAG = 1.0, 5.5
 LONE = Isolation(5.0, 1e-3)
 PUBLISHED_SUBTYPES = 6.55  # of a rig with an OLED of 2025
-RED_NM = 700.0
-DWARF = 5.0  # luminosity class
 # Sigmas of a mosaic's stars, px, their black bodies, and the places along two pixels at which they stand.
 SIGMAS_PX, STARS_K, PHASES, TILE_PX = (0.55, 0.8, 1.0, 1.5), (3500.0, 6000.0, 12_000.0), 16, 24
 Row = tuple[str | float, ...]
@@ -125,7 +123,7 @@ def subtypes_by(channels: Mapping[str, Optics]) -> Callable[[FloatArray], FloatA
     """
     library = load_library()
     kinds = read_types(np.array(library.spectral_type, dtype=np.bytes_))
-    order, nm = np.flatnonzero(kinds[:, 1] == DWARF), library.wavelength_nm
+    order, nm = np.flatnonzero(kinds[:, 1] == CLASSES["V"]), library.wavelength_nm
     order = order[np.argsort(kinds[order, 0])]
     seen = np.array([one.quantum_efficiency(nm) * one.transmission(nm) * nm for one in channels.values()])
     light = library.flux[order] @ seen.T

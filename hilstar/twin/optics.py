@@ -25,7 +25,7 @@ from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import pack_sprites
+from hilstar.scene.sprites import pack_sprites, with_mean
 from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
@@ -114,11 +114,10 @@ class DisplayColours:
         config, colours, stars, folder = bench.config, bench.colours, bench.stars, bench.file.folder
         bayer, primaries = config.tracker.detector.bayer, bench_primaries(config.monitor, folder)
         if bayer is None or stars.colours is None:
-            return cls(None, np.ones((1, 1)), np.ones(1))
+            return cls(None, np.empty((0, 0)), np.empty(0))
         if colours is not None:
-            return cls(bayer, colours.by_primary, colours.matrix.e_per_s.sum(axis=1))
-        rates = stars.rates_e_per_s
-        white = rates @ stars.colours[: len(rates)] / rates.sum()
+            return cls(bayer, colours.by_primary, colours.by_primary @ colours.of_white)
+        white = with_mean(stars.colours, stars)[-1]
         if primaries is not None:
             white = channel_matrix(primaries, named_channels(config.tracker, folder), 1.0).e_per_s.sum(axis=1)
         return cls(bayer, white[:, None], white)

@@ -181,12 +181,18 @@ def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rn
 
 def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
     shares = {"w": 1.02, "r": 0.2, "g": 0.7, "b": 0.1}
+
+    def light(code, channel):  # primaries add to each other's light, more at dark codes
+        return shares[channel] * (code / 255) ** 2.2 * (1 + 0.1 * (channel == "w") * (1 - code / 255)) + 1e-3
+
     rows = [
-        (p.code, p.channel, (shares[p.channel] * (p.code / 255) ** 2.2 + 1e-3) * (1 + 0.005 * rng.standard_normal()))
+        (p.code, p.channel, light(p.code, p.channel) * (1 + 0.005 * rng.standard_normal()))
         for p in plan_patches(PlanSettings(8, 24, channels="wrgb"), rng)
     ]
     summary = calibrate_photometric(write(tmp_path / "m.csv", rows), tmp_path / "monitor.toml")
     assert summary["additivity_percent"] == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)  # four whites to 0.2 % each
+    assert summary["crosstalk_percent"]["1e-0"] == summary["additivity_percent"]
+    assert summary["crosstalk_percent"]["1e-1"] == pytest.approx(100 * (1 / (1.02 * 1.065) - 1), abs=1.2)  # at code 90 of 255
     calibration = load_calibration(tmp_path / "monitor.toml", 8, bit_stealing=True)
     assert calibration.weights == pytest.approx((0.2, 0.7, 0.1), rel=0.01)
     assert len(calibration.response.light) == 1786

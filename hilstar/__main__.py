@@ -1,7 +1,5 @@
 """The door to the commands: what they import takes a third of a second, and Ctrl-C may come in it."""
 
-from __future__ import annotations
-
 import sys
 from typing import NoReturn
 

@@ -1,7 +1,5 @@
 """Names for the array types that cross room borders."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -3,8 +3,6 @@
 A figure is as wide as a page shows it, so that its points are the page's points. Its SVG has the colours of both themes.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import itertools
@@ -108,7 +106,7 @@ def read_records(path: Path, record: type[Record]) -> list[Record]:
 
 
 @contextmanager
-def chart(path: Path, finding: str, panels: int = 1, columns: int = 1, **layout: Any) -> Iterator[list[Axes]]:
+def chart(path: Path, finding: str, panels: int = 1, columns: int = 1, **layout: Any) -> "Iterator[list[Axes]]":
     """Panels titled by their finding, laid out as `panels_of` says, and written when they are drawn.
 
     `path` without an ending gives both NAME.png and NAME.svg. Raises InputError where a file cannot be written.
@@ -129,7 +127,7 @@ def panels_of(
     share_y: bool | Share = False,
     heights: Sequence[float] | None = None,
     height_inch: float | None = None,
-) -> Iterator[list[Axes]]:
+) -> "Iterator[list[Axes]]":
     """Axes to draw on, row by row, of a figure titled by its finding; `note` says below, in small type, what it holds for."""
     # Not pyplot: it would change the backend of a program that imports this.
     from cycler import cycler
@@ -148,7 +146,7 @@ def panels_of(
         finish(figure)
 
 
-def finish(figure: Figure) -> None:
+def finish(figure: "Figure") -> None:
     """Make labels, ticks and names at the side uniform, and lay the figure out: to know its panels' sizes, then for good."""
     from matplotlib.ticker import LogLocator
 
@@ -196,7 +194,7 @@ def title_lines(finding: str, columns: int = TITLE_COLUMNS) -> str:
     return "\n".join(wrapped(narrowest))
 
 
-def plain_ticks(axis: Axis, values: Sequence[float]) -> None:
+def plain_ticks(axis: "Axis", values: Sequence[float]) -> None:
     """Ticks of a logarithmic axis as a person writes them: 3000, not 3 x 10^3."""
     axis.set_ticks(values, labels=[plain(value) for value in values])
     axis.set_ticks([], minor=True)
@@ -217,7 +215,7 @@ def two_digits(value: float) -> str:
     return plain(float(f"{value:.2g}")) if math.isfinite(value) else "-"
 
 
-def log_ticks(axis: Axis, room: float) -> None:
+def log_ticks(axis: "Axis", room: float) -> None:
     """Round ticks of a logarithmic axis within its limits, as many as stand apart where there is room for `room`."""
     low, high = sorted(axis.get_view_interval())
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
@@ -230,13 +228,13 @@ def log_ticks(axis: Axis, room: float) -> None:
     plain_ticks(axis, ticks)
 
 
-def label_ends(*panels: Axes) -> None:
+def label_ends(*panels: "Axes") -> None:
     """Names of lines in their colours, right of each panel where each line ends, in place of a legend."""
     for axes in panels:
         name_at_side(axes, [])
 
 
-def name_at_side(axes: Axes, named: SideNames) -> None:
+def name_at_side(axes: "Axes", named: SideNames) -> None:
     """Names of points (x, y) of the data, with their colours, in a column right of the axes, level where there is room.
 
     Without any, lines are named where they end. The names are placed when the chart is finished.
@@ -244,7 +242,7 @@ def name_at_side(axes: Axes, named: SideNames) -> None:
     _SIDE_NAMES.setdefault(axes.figure, []).append((axes, named))
 
 
-def _line_ends(axes: Axes) -> Iterator[tuple[str, tuple[float, float], str]]:
+def _line_ends(axes: "Axes") -> Iterator[tuple[str, tuple[float, float], str]]:
     """The name, the last point in view (x, y) and the colour of each line that has a name."""
     low, high = sorted(axes.get_xlim())
     for line in axes.get_lines():
@@ -257,7 +255,7 @@ def _line_ends(axes: Axes) -> Iterator[tuple[str, tuple[float, float], str]]:
             yield str(line.get_label()), place, str(line.get_color())
 
 
-def _name_at_side(axes: Axes, named: SideNames, arrows: bool = True) -> list[Text]:
+def _name_at_side(axes: "Axes", named: SideNames, arrows: bool = True) -> "list[Text]":
     """The names of a panel, kept apart at its present height, with arrows to far points."""
     gap = 1.3 * SMALL_PT / 72 * axes.figure.dpi / axes.bbox.height
     texts: list[Text] = []
@@ -295,7 +293,7 @@ def spread(heights: Sequence[float], gap: float) -> list[float]:
     return placed
 
 
-def value_bars(axes: Axes, names: Sequence[str], values: Sequence[float], colours: Sequence[str] | str) -> None:
+def value_bars(axes: "Axes", names: Sequence[str], values: Sequence[float], colours: Sequence[str] | str) -> None:
     """Horizontal bars, the first on top, each with its figure at its end in the place of an axis."""
     bars = axes.barh(range(len(names)), values, color=colours)
     axes.set_yticks(range(len(names)), names)
@@ -308,21 +306,21 @@ def value_bars(axes: Axes, names: Sequence[str], values: Sequence[float], colour
     axes.spines["bottom"].set_visible(False)
 
 
-def save(figure: Figure, path: Path) -> None:
+def save(figure: "Figure", path: Path) -> None:
     """Write a figure as PNG, as SVG, or where its path has no ending as both. Raises InputError where one cannot be written."""
     for target in [path] if path.suffix in ENDINGS else [path.with_name(path.name + ending) for ending in ENDINGS]:
         data = svg(figure).encode() if target.suffix == ".svg" else png(figure)
         write_whole(target, data)
 
 
-def png(figure: Figure) -> bytes:
+def png(figure: "Figure") -> bytes:
     """A figure as PNG, in the light colours."""
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=PNG_DPI)
     return data.getvalue()
 
 
-def svg(figure: Figure) -> str:
+def svg(figure: "Figure") -> str:
     """A figure as SVG with both sets of colours: dark ones where the reader, or the page around it, prefers them."""
     from matplotlib import rc_context
 

@@ -1,7 +1,5 @@
 """Rows of CSV tables: columns by name, an optional `valid`, and one line for an error."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Iterator

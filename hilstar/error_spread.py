@@ -1,7 +1,5 @@
 """How the errors of a sample are spread."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

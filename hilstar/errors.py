@@ -1,7 +1,5 @@
 """The two kinds of refusal, each with its exit code, how it quotes what it refuses, and what it takes a wrong word for."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 MAX_QUOTED_CHARACTERS = 120

@@ -4,8 +4,6 @@ A run's ledger is never overwritten unless the user asks for it. Temporary names
 is written goes through the open file, never again by its name: nobody who can write to the folder can turn it elsewhere.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """Pages that need no other file: the operator's page's colours, light, dark and on paper, with cards, tables and pictures."""
 
-from __future__ import annotations
-
 import base64
 import html
 import math

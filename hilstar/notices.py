@@ -5,8 +5,6 @@ MAX_QUIET_S, and then said with how many there were meanwhile; so is its end, by
 counted is not recorded either, but for what a person did.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -3,8 +3,6 @@
 A pipe would be awaited for ever, a device never ends, and a file of gigabytes is no bench file: each is refused instead.
 """
 
-from __future__ import annotations
-
 import codecs
 import io
 import os

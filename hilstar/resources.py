@@ -1,7 +1,5 @@
 """Where the files that are not Python live, installed or editable."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hilstar.errors import InputError

@@ -1,7 +1,5 @@
 """Percentiles, mean and deviation of a figure over a run of any length, in memory that does not grow."""
 
-from __future__ import annotations
-
 import math
 
 import msgspec
@@ -19,7 +17,7 @@ class Percentiles(msgspec.Struct, frozen=True):
     p99: float | None
     max: float | None
 
-    def times(self, factor: float) -> Percentiles:
+    def times(self, factor: float) -> "Percentiles":
         """The same in another unit."""
         return Percentiles(*(None if value is None else value * factor for value in (self.p50, self.p99, self.max)))
 

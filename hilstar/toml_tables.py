@@ -3,8 +3,6 @@
 The line says table, key, value, and what is wanted, in the place of msgspec's own message.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin

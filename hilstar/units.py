@@ -1,7 +1,5 @@
 """Units: the constants and conversions that the rooms share, each of them once."""
 
-from __future__ import annotations
-
 import math
 from typing import TYPE_CHECKING, overload
 
@@ -22,8 +20,8 @@ MAG_PER_RELATIVE = 2.5 / math.log(10)  # a small relative error of a flux, in ma
 @overload
 def flux_ratio(mag: float) -> float: ...
 @overload
-def flux_ratio(mag: FloatArray) -> FloatArray: ...
-def flux_ratio(mag: float | FloatArray) -> float | FloatArray:
+def flux_ratio(mag: "FloatArray") -> "FloatArray": ...
+def flux_ratio(mag: "float | FloatArray") -> "float | FloatArray":
     """The flux of a star of magnitude `mag` relative to one of magnitude 0 (Pogson 1856)."""
     return 10 ** (-0.4 * mag)
 
@@ -31,8 +29,8 @@ def flux_ratio(mag: float | FloatArray) -> float | FloatArray:
 @overload
 def magnitude(ratio: float) -> float: ...
 @overload
-def magnitude(ratio: FloatArray) -> FloatArray: ...
-def magnitude(ratio: float | FloatArray) -> float | FloatArray:
+def magnitude(ratio: "FloatArray") -> "FloatArray": ...
+def magnitude(ratio: "float | FloatArray") -> "float | FloatArray":
     """The magnitude of a flux relative to that of magnitude 0; infinite for no flux."""
     if hasattr(ratio, "shape"):
         import numpy as np  # 0.1 s, which Tab and --help do not need

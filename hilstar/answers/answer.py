@@ -1,7 +1,5 @@
 """An answer of a star tracker, whatever its format: when, which attitude, and what the tracker says of itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 

@@ -1,7 +1,5 @@
 """An answer explained: which bytes became which field, why bytes were refused, and which convention makes it what is shown."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import product
 

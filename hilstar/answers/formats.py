@@ -8,8 +8,6 @@ Laws:
 4. A frame whose checksum is wrong is never an answer.
 """
 
-from __future__ import annotations
-
 import binascii
 import importlib
 import math

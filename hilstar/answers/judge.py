@@ -6,8 +6,6 @@ too late by delta turns a residual by omega delta, so that e_i = b + omega_i del
 answers of the last minute. Before the rate has changed enough, D is what is guessed: half an exposure and GUESSED_DELAY_S.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable
@@ -53,7 +51,7 @@ class AnswerRules:
     latency_s: float | None = None
 
     @classmethod
-    def of(cls, config: BenchConfig) -> Self:
+    def of(cls, config: "BenchConfig") -> Self:
         """Those of a bench file; the defaults for one without `[answers]`."""
         settings, exposure_s = config.answers, config.tracker.exposure_s
         if settings is None:

@@ -1,7 +1,5 @@
 """An answer and what was lit while the tracker looked: the mean attitude over an exposure, frame by frame."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -5,8 +5,6 @@ of what it refused. It decodes at most MAX_BYTES_PER_S, for at most WORK_SHARE o
 the rest is counted as `flood`: noise in which a frame may begin at every byte would otherwise take a whole core.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ The source's attitude is the body's; each head's `[tracker] q_body_to_cam` makes
 heads, in place of their own.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -1,7 +1,5 @@
 """A bench's catalogue as its tracker sees it: a row a star, with errors, origins and synthetic magnitudes; and its files."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple

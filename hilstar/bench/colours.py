@@ -8,8 +8,6 @@ detected photons is nearest to the star's (Cramer's distance, which is finite fo
 Both ask the same of a star: its electrons through some curves of wavelength, which the tables of its rates give.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -5,8 +5,6 @@ and ends with the next frame, so that a ledger has one moment for it, and a repl
 MAX_ON faults are on at once, and MAX_ASKED requests wait; the others are refused.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass

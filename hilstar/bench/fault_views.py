@@ -1,7 +1,5 @@
 """The faults of a bench as its two cameras see them: the monitor, and the virtual tracker."""
 
-from __future__ import annotations
-
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
@@ -33,7 +31,7 @@ def display_view(bench: Bench, scenario: Scenario = NO_SCENARIO) -> FaultView:
 
 
 def tracker_view(
-    file: BenchFile, canvas: Canvas, stars: Stars, moving: MovingSky | None, scenario: Scenario = NO_SCENARIO
+    file: BenchFile, canvas: Canvas, stars: Stars, moving: "MovingSky | None", scenario: Scenario = NO_SCENARIO
 ) -> FaultView:
     """The faults of a scenario as they fall on the virtual tracker's detector, which is `canvas`."""
     camera = _fault_camera(file, canvas, bench_camera(file.config, file.folder), canvas.camera, stars, moving)
@@ -41,7 +39,7 @@ def tracker_view(
 
 
 def _fault_camera(
-    file: BenchFile, canvas: Canvas, monitor: Camera, tracker: Camera, stars: Stars, moving: MovingSky | None
+    file: BenchFile, canvas: Canvas, monitor: Camera, tracker: Camera, stars: Stars, moving: "MovingSky | None"
 ) -> FaultCamera:
     velocity_km_s = file.config.sky.observer_velocity_km_s
     tables = cache(lambda: star_rates(file.config, file.folder))  # 0.1 s, which only a fault needs

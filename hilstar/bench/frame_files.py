@@ -5,8 +5,6 @@ CRPIX is at CD (X + A(X, Y), Y + B(X, Y)) on the tangent plane, and AP and BP le
 right to GOOD_PX at pixels that were held out.
 """
 
-from __future__ import annotations
-
 import csv
 import gzip
 import io

@@ -1,7 +1,5 @@
 """The moving part of a bench's sky, from its file: bodies, satellites, the observer, and bodies wider than a point."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from pathlib import Path

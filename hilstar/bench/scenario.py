@@ -1,7 +1,5 @@
 """A scenario: the file of faults with their times and the seed of their randomness, and which are on at a moment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -7,8 +7,6 @@ rotation M = T C* of all pairs is then Q'* Q, and Q' = Q M*.
 The residual is judged by attitudes that were repeated: their scatter is noise, and what exceeds it no rotation explains.
 """
 
-from __future__ import annotations
-
 import datetime
 from dataclasses import asdict, dataclass
 from pathlib import Path

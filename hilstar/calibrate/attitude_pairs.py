@@ -9,8 +9,6 @@ taken separately across and about the boresight: a tracker knows its roll severa
 A wrong convention (inverse, scalar last, mirrored) is recognised because all pairs agree when it is undone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial

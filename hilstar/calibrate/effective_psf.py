@@ -7,8 +7,6 @@ convolved in the model, so what is found is without it; the pixel is integrated,
 the fit say how right both are, and whether the data ask for more than the Gaussian.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -57,7 +55,7 @@ class Dots:
     y_px: FloatArray
     side_px: FloatArray
 
-    def at(self, chosen: IntArray) -> Dots:
+    def at(self, chosen: IntArray) -> "Dots":
         """The dots at indices `chosen`."""
         return Dots(*(getattr(self, name)[chosen] for name in self.__slots__))
 
@@ -150,7 +148,7 @@ def _functions(knots_px: FloatArray, offset_px: FloatArray, side_px: FloatArray)
     return np.asarray((high - low) / (2 * half))
 
 
-def effective_psf(file: BenchFile, images: Sequence[Path], plan: Path, dark: Path | None, per_px: int) -> Found:
+def effective_psf(file: BenchFile, images: Sequence[Path], plan: Path, dark: Path | None, per_px: int) -> "Found":
     """The effective PSF from a tracker's images of planned dots. Raises InputError."""
     config = file.config
     nominal = Nominal(

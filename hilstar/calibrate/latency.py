@@ -1,7 +1,5 @@
 """Latency by a photodiode: the edges that it saw, paired with the frames of the ledger that caused them."""
 
-from __future__ import annotations
-
 import re
 from array import array
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Measured patches: reading MEASURED.csv, and the checks that refuse a set of measurements."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import math

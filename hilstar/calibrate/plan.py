@@ -1,7 +1,5 @@
 """Patches for a monitor's response: the plan of codes in order, written as pictures or shown on a display."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time
@@ -167,7 +165,7 @@ def show_patches(planned: Sequence[Patch], bits: int, display: int | str, second
     return len(planned)
 
 
-def stays_until_key(window: Window, presenter: Presenter, seconds: float | None) -> bool:
+def stays_until_key(window: "Window", presenter: Presenter, seconds: float | None) -> bool:
     """Present until space is pressed or `seconds` are over; False if q was pressed. Raises MachineError without the display."""
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     while time.monotonic() < end_s:

@@ -1,7 +1,5 @@
 """Full scale of the light by the tracker: stars shown, their DN read, and the light of white that follows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Photon transfer (Janesick 2007; EMVA 1288, release 4.0): two frames of one expos
 fixed pattern by their covariance. Shot noise makes the variance K times the signal, with K in DN/e-.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -10,8 +10,6 @@ Where neither explains them (a step, a second time constant at the start), the f
 the second, and so on. A law is refused where successive residuals are alike (von Neumann 1941) or one of them jumps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

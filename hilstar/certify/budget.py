@@ -6,8 +6,6 @@ by Welch-Satterthwaite (G.4.1), coverage 95 % by Student's t. By Supplement 1 (J
 drawn in batches until two digits of every figure stand, or the largest number of trials is reached.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """From a budget to a certificate: figures with their intervals, conformity by the decision rule, files, dates, its number."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from pathlib import Path

@@ -4,8 +4,6 @@ Each figure is a difference with its uncertainty. It is out of tolerance where i
 explains, at a probability by which all figures of a check together raise a false alarm once in 10 000 checks (Bonferroni).
 """
 
-from __future__ import annotations
-
 import csv
 import datetime
 import io

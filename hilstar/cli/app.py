@@ -1,7 +1,5 @@
 """The table of commands, grouped as `hilstar --help` shows them."""
 
-from __future__ import annotations
-
 import copy
 import sys
 from collections.abc import Callable
@@ -89,7 +87,7 @@ class Application(typer.Typer):
         names = [each.name for each in self.registered_commands] + [each.name for each in self.registered_groups]
         return built(self, words[0] if words and words[0] in names else None)(*arguments, **named)
 
-    def with_one(self, name: str | None) -> Application:
+    def with_one(self, name: str | None) -> "Application":
         """The application with only the command or group of this name; whole without a name."""
         if name is None:
             return self

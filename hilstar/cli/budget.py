@@ -1,7 +1,5 @@
 """hilstar budget: which magnitudes a bench can show and how well, or the noise of its tracker's stars."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated

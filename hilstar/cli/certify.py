@@ -1,7 +1,5 @@
 """hilstar certify: how sure a bench is, stated and dated; and whether it has moved since."""
 
-from __future__ import annotations
-
 import datetime
 from contextlib import ExitStack
 from pathlib import Path
@@ -85,7 +83,13 @@ def certify(
 
 
 def _certify(
-    file: files.BenchFile, reader: Reader | None, output: Path, now: datetime.datetime, again: bool, quick: bool, as_json: bool
+    file: "files.BenchFile",
+    reader: "Reader | None",
+    output: Path,
+    now: datetime.datetime,
+    again: bool,
+    quick: bool,
+    as_json: bool,
 ) -> None:
     from hilstar.bench.certificate import read_certificate, sha256_of_bytes
     from hilstar.certify.certificate import certify as certified
@@ -111,7 +115,9 @@ def _certify(
         typer.echo(f"{name:24}{text}")
 
 
-def _check(file: files.BenchFile, reader: Reader, output: Path, now: datetime.datetime, warm_up: float, as_json: bool) -> None:
+def _check(
+    file: "files.BenchFile", reader: "Reader", output: Path, now: datetime.datetime, warm_up: float, as_json: bool
+) -> None:
     from dataclasses import asdict
 
     from hilstar.bench.certificate import read_certificate
@@ -146,7 +152,7 @@ def _check(file: files.BenchFile, reader: Reader, output: Path, now: datetime.da
 
 def _reader(
     ended: ExitStack,
-    file: files.BenchFile,
+    file: "files.BenchFile",
     output: Path,
     grab: str | None,
     virtual: Path | None,
@@ -156,7 +162,7 @@ def _reader(
     seed: int,
     check: bool,
     again: bool,
-) -> Reader | None:
+) -> "Reader | None":
     from contextlib import closing
 
     from hilstar.bench.bench_file import read_bench_file

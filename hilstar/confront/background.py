@@ -1,7 +1,5 @@
 """The background of a photograph, smooth over the field, and the noise about it; sources above both."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

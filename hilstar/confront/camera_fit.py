@@ -4,8 +4,6 @@ Robust least squares of places. A larger lens, and refraction, are taken where s
 them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -53,7 +51,7 @@ class Places:
     sigma_px: FloatArray
     vectors: FloatArray
 
-    def at(self, chosen: BoolArray | IntArray) -> Places:
+    def at(self, chosen: BoolArray | IntArray) -> "Places":
         """Some of them."""
         return Places(self.x_px[chosen], self.y_px[chosen], self.sigma_px[chosen], self.vectors[chosen])
 

@@ -3,8 +3,6 @@
 Parts of the detector and of colour are fitted to residuals, and what as many random columns would take is taken off again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

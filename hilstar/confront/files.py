@@ -1,7 +1,5 @@
 """The bench file that photographs give of a tracker, and the files that it names; and such a file read back."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable

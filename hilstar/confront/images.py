@@ -1,7 +1,5 @@
 """Photographs as they were taken: FITS, TIFF, PNG and JPEG, mono or a raw Bayer mosaic by planes, with their time if known."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

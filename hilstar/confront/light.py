@@ -4,8 +4,6 @@ Magnitudes are compared with what hilstar computes of each star's spectrum throu
 star's instrument magnitude less the fitted one: positive where the photograph has less light.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -217,7 +215,9 @@ def _pair(values: FloatArray) -> Correction:
     return float(values[0]), float(values[1])
 
 
-def _about_v(stars: StarLight, base: FloatArray, use: BoolArray, ones: FloatArray, vignetting: Sequence[FloatArray]) -> _Robust:
+def _about_v(
+    stars: StarLight, base: FloatArray, use: BoolArray, ones: FloatArray, vignetting: Sequence[FloatArray]
+) -> "_Robust":
     """The power of the light that DN follow, and about V the colour term and zero points."""
     bv = np.nan_to_num(stars.bv_mag)
     both = _robust(np.column_stack([base, ones, *vignetting]), stars.instrument_mag, stars.sigma_mag, use)

@@ -6,8 +6,6 @@ field lie on sources too, by more than chance allows. The camera is a pinhole he
 tolerance.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The page of a confrontation: each photograph, its prediction and residual to blink between, and charts; one file."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

@@ -1,7 +1,5 @@
 """hilstar confront: photographs in, a tracker's bench file and the verdict out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """From photographs to one camera: attitudes, stars by a PSF, geometry and light of all photographs together."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -201,7 +199,7 @@ def run_session(
     base: Camera,
     start: FloatArray | None,
     *,
-    fixed: FixedCamera | None = None,
+    fixed: "FixedCamera | None" = None,
 ) -> Session:
     """Everything about photographs of one camera; with `fixed` that camera, to which only attitudes and offsets are fitted.
 

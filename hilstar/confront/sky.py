@@ -1,7 +1,5 @@
 """The catalogue's sky on the day of a photograph, brightest stars first; the planets on that day."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache

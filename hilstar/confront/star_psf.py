@@ -4,8 +4,6 @@ The core is an elliptical Gaussian whose covariance is a polynomial of the place
 colour). The wings are a round Gaussian with a share of the light. Both are integrated over pixels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -114,7 +112,7 @@ class Stamps:
     def __len__(self) -> int:
         return len(self.column)
 
-    def at(self, chosen: BoolArray) -> Stamps:
+    def at(self, chosen: BoolArray) -> "Stamps":
         """Some of them."""
         return Stamps(self.values[chosen], self.variance[chosen], self.column[chosen], self.row[chosen], self.bv_mag[chosen])
 

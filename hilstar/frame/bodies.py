@@ -1,7 +1,5 @@
 """Bodies that a camera sees as discs: what they hide, and the light that they add."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable
@@ -38,7 +36,7 @@ LATTICE = 9  # places along each side of a disc's rectangle at which clipping is
 class BodyLayer:
     """Bodies wider than POINT_PX as discs; narrower ones are points among the stars."""
 
-    def __init__(self, moving: MovingSky, canvas: Canvas) -> None:
+    def __init__(self, moving: "MovingSky", canvas: Canvas) -> None:
         self.canvas, self._moving = canvas, moving
         px_rad = canvas.camera.scales_px_rad()
         self._px_sr, self._px_per_rad = px_rad[0] ** -2, px_rad[1]

@@ -6,8 +6,6 @@ middle, spread by a round Gaussian of the PSF's variance, times its solid angle.
 smooth light little, is left out.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -77,7 +75,7 @@ class DiffuseLayer:
         drawn = "is drawn where it passes one" if steps > 1 else "is not drawn; the virtual tracker has it"
         return f"[sky.diffuse] map: its brightest pixel has {steps:.3g} of the light of the screen's first step; it {drawn}"
 
-    def _lit(self, face: _Face, icrs_to_cam: FloatArray, taken: BoolArray | None) -> list[LightMap]:
+    def _lit(self, face: "_Face", icrs_to_cam: FloatArray, taken: BoolArray | None) -> list[LightMap]:
         """The map of each group of cells that have light at an attitude.
 
         Pixels (h, w) that another face has `taken` are left out, and those of this one are noted.
@@ -103,7 +101,7 @@ class DiffuseLayer:
             found.append(LightMap(image * sr * part.own, part.corner_px))
         return found
 
-    def _part(self, box: tuple[slice, ...], around: tuple[slice, ...], own: BoolArray) -> _Part:
+    def _part(self, box: tuple[slice, ...], around: tuple[slice, ...], own: BoolArray) -> "_Part":
         """The pixels of a box of cells, counted from the first ones `around`, of which some are `own`."""
         first = [part.start + whole.start for part, whole in zip(box, around, strict=True)]
         rows, columns = (

@@ -4,8 +4,6 @@ Light is in electrons per second, or in electrons of one exposure of the tracker
 or `radec_deg` on the sky, `tracker_px` on the tracker's detector, `screen_px` on the monitor.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

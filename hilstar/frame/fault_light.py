@@ -3,8 +3,6 @@
 The display and the virtual tracker have a `FaultView` each; nothing else differs between them.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import threading
@@ -183,7 +181,7 @@ class FaultView:
         rate = self.light_e_per_s(fault) * share
         return AddedLight(fault.name, float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)
 
-    def camera_points(self, now: Sequence[Now], scan: Scan | None) -> tuple[list[PointChain], list[AddedLight]]:
+    def camera_points(self, now: Sequence[Now], scan: Scan | None) -> "tuple[list[PointChain], list[AddedLight]]":
         """False stars and flashes that move with the camera, and tracks: chains, and the name and light of each line."""
         chains, lights = [], []
         for one in now:
@@ -199,7 +197,7 @@ class FaultView:
                 lights += [AddedLight(fault.name, v_mag, TRACK_BV_MAG, rate)] * fault.number
         return chains, lights
 
-    def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> PointChain:
+    def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> "PointChain":
         """A point's path over the pixels while they are lit."""
         by, (source, place) = self.by, self._source(fault)
         rate, since_s = np.array(fault.rate_px_s), one.since_ns / NS_PER_S
@@ -212,7 +210,7 @@ class FaultView:
         light = np.array([self.light_e_per_s(fault) * one.share])
         return Lines(ends[0], ends[1], light).seen_by(by.canvas.camera, source, by.canvas.psf)
 
-    def _burst(self, fault: CosmicRays, since_ns: int) -> PointChain:
+    def _burst(self, fault: CosmicRays, since_ns: int) -> "PointChain":
         """The tracks of the exposure that a moment is in, counted from the burst's beginning."""
         by = self.by
         number = int(since_ns // round(by.exposure_s * NS_PER_S))
@@ -280,7 +278,7 @@ class FaultView:
             self._glow_kept = fault, share, made
         return made
 
-    def footprints(self, chains: list[PointChain]) -> list[Sprites]:
+    def footprints(self, chains: "list[PointChain]") -> list[Sprites]:
         """The sprites of chains. Their lines are numbered from one chain to the next, as stars -1, -2 and on."""
         made, first = [], 0
         for chain in chains:

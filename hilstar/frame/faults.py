@@ -1,7 +1,5 @@
 """The faults that are on in one image: what they do to its view and to its light, and whether it is shown at all."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

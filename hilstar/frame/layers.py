@@ -1,7 +1,5 @@
 """The light of a view: stars, then diffuse light, bodies, then satellites, then faults."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -27,14 +25,14 @@ class Sources:
     That is bodies, satellites and the observer (`moving`, None where the sky stands still), and `diffuse` light, e-/s/sr.
     """
 
-    moving: MovingSky | None = None
-    diffuse: tuple[TangentImage, ...] = ()
+    moving: "MovingSky | None" = None
+    diffuse: "tuple[TangentImage, ...]" = ()
 
 
 NO_SOURCES = Sources()
 
 
-def seen_in(view: View, stars: Stars, moving: MovingSky | None) -> Stars:
+def seen_in(view: View, stars: Stars, moving: "MovingSky | None") -> Stars:
     """A bench's stars as a view has them; bodies are moved to their places in the arrays of `stars`."""
     return stars.seen_at(view.velocity_km_s) if moving is None else moving.seen(stars, *view.observer)
 

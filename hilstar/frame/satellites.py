@@ -1,7 +1,5 @@
 """Satellites in an image: each a streak along its path, a disc where it is wide enough to have a face."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -30,7 +28,7 @@ ROW_ROUNDS = 2  # as for stars: see `scene.frame_motion`
 class SatelliteLayer:
     """The satellites of a sky of at least `faintest_e_per_s` in an image."""
 
-    moving: MovingSky
+    moving: "MovingSky"
     canvas: Canvas
     faintest_e_per_s: float = 0.0
 
@@ -64,7 +62,7 @@ class SatelliteLayer:
         satellites.write(stars, found.index, found.middle, found.electrons_per_s)
         return with_trails(light, found, len(stars) - len(stars.bodies))
 
-    def discs(self, stars: Stars, view: View) -> list[Disc]:
+    def discs(self, stars: Stars, view: View) -> "list[Disc]":
         """The satellites in the image of a camera at rest that are discs."""
         satellites = self.moving.satellites
         if satellites is None or not satellites.sized:
@@ -76,7 +74,7 @@ class SatelliteLayer:
         names = satellites.names
         return [disc_of(seen.only(np.array([k])), names[seen.index[k]], 0.0, stars.velocity_km_s) for k in broad.tolist()]
 
-    def _passing(self, view: View, reach_rad: float, longest_s: float, faintest_e_per_s: float | None = None) -> Pass | None:
+    def _passing(self, view: View, reach_rad: float, longest_s: float, faintest_e_per_s: float | None = None) -> "Pass | None":
         """The satellites that may be within `reach_rad` of the boresight; None for none."""
         from hilstar.sky.bodies.passes import Cone  # imports SGP4, which only satellites need
 
@@ -88,7 +86,7 @@ class SatelliteLayer:
         most, poses = (EXPOSURE_SPRITES, EXPOSURE_POSES) if view.exposed else (FRAME_SPRITES, FRAME_POSES)
         return Brush(self.canvas.psf, most, poses)
 
-    def _lit(self, seen: Pass, path: TrailView, view: View) -> Lit:
+    def _lit(self, seen: "Pass", path: TrailView, view: View) -> Lit:
         """When each satellite's row is lit."""
         rows, late_s = view.rows, np.zeros(len(seen))
         for _ in range(ROW_ROUNDS if rows.scanout_s else 0):
@@ -96,7 +94,7 @@ class SatelliteLayer:
             late_s = np.nan_to_num(rows.late_s(x_px, y_px, self.canvas.camera.resolution_px))
         return Lit(view.begin_s + late_s, rows.hold_s)
 
-    def _with_discs(self, light: Sprites, stars: Stars, seen: Pass, path: TrailView, view: View) -> Sprites:
+    def _with_discs(self, light: Sprites, stars: Stars, seen: "Pass", path: TrailView, view: View) -> Sprites:
         """The light before with satellites as discs, the farthest first, and without what they hide."""
         satellites: Satellites | None = self.moving.satellites
         if satellites is None:

@@ -3,8 +3,6 @@
 Both are computed once, in the camera's own pixels: what each collects of the light of a tracker pixel.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import math

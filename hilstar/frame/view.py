@@ -1,7 +1,5 @@
 """From where and when an image is lit, on what, and what a layer of light is."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -58,7 +56,7 @@ class View:
         t_ns: int | None = None,
         velocity_km_s: FloatArray | None = None,
         place_km: FloatArray | None = None,
-    ) -> View:
+    ) -> "View":
         """The view of a detector whose pixels all collect light for `exposure_s`; `t_ns` is the middle of that time."""
         scan = Scan(hold_s=exposure_s)
         return cls(q_icrs_to_cam, rate_cam_rad_s, t_ns, velocity_km_s, place_km, scan, exposed=True)

@@ -5,8 +5,6 @@ near the span of ten: light and first moments of all pixels, the same under a Ga
 before and after the tracker's own blur), and moments in boxes of 3 x 3 and 5 x 5 of the tracker's pixels (centres of mass).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 configs/CALIBRATION.md describes the files (TOML and CSV).
 """
 
-from __future__ import annotations
-
 import csv
 import datetime
 import hashlib

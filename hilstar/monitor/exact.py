@@ -9,8 +9,6 @@ In the straight foot of sRGB all steps are equal, so a star of N steps cannot ha
 This is the oracle of shaders/exact.comp, and what draws where that cannot run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
@@ -61,7 +59,7 @@ class Carried:
     error: Float32Array
     phase: Float32Array
 
-    def of(self, some: IntArray) -> Carried:
+    def of(self, some: IntArray) -> "Carried":
         """The same of some of the sprites."""
         return Carried(self.error[:, some], self.phase[some])
 

@@ -1,7 +1,5 @@
 """The monitor behind its collimator as the camera that the tracker looks into, and the file of a geometric calibration."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Which monitor, in which mode and with which settings: what calibration files carry, and how two of them differ."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct

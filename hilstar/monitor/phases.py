@@ -1,7 +1,5 @@
 """One star at every sub-pixel phase through a quantisation method: the errors of its flux and centroid."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import islice

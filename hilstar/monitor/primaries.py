@@ -3,8 +3,6 @@
 The spectra come from a table, from an ArgyllCMS file of the display's own samples, or from CIE chromaticities.
 """
 
-from __future__ import annotations
-
 import itertools
 import shlex
 from collections.abc import Mapping, Sequence

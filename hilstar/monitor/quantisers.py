@@ -1,7 +1,5 @@
 """Every quantisation by the name that the bench file gives it."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from hilstar.monitor.exact import ExactQuantiser

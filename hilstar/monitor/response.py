@@ -1,7 +1,5 @@
 """Levels and light: a monitor's response, and rounding to the nearest level."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NewType

@@ -8,8 +8,6 @@ pulses (a sigma-delta modulation), and each star begins at a place of its own in
 in step. A star keeps its remainder for as long as every frame has it, and begins anew when it comes back.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from hilstar.arrays import Float32Array, IntArray

@@ -1,7 +1,5 @@
 """A map of PSF images, measured or simulated, with a table of where each belongs, as a tracker's glass."""
 
-from __future__ import annotations
-
 import warnings
 from io import BytesIO
 from pathlib import Path

@@ -6,8 +6,6 @@ Fourier Optics, section 3.10). Where the pupil would need too many rays, because
 the aberrations, rays are counted as they fall.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import math

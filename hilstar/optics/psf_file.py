@@ -10,8 +10,6 @@ The layout is one FITS file. docs/optics.md states it for writers; `read_glass` 
 - the table TRANSMISSION (`wavelength_nm`, `transmission`) and the keys `K1` to `P2` are there where they are known.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -355,7 +353,7 @@ def _glass_in(path: Path, content: bytes) -> Glass | None:
     return found
 
 
-def _parsed(hdus: fits.HDUList) -> Glass:
+def _parsed(hdus: "fits.HDUList") -> Glass:
     header, basis, table = hdus[0].header, hdus[0].data, hdus[POINTS].data
     per_px, integrated = header.get("OVERSAMP", 1), header.get("PIXINT", False)
     if header.get("PSFVERS") != VERSION:

@@ -5,8 +5,6 @@ The pupil's field is exp(2 pi i W / wavelength) within the aperture, W the wavef
 down. Coordinates in the pupil are relative to its radius.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import product
 from pathlib import Path

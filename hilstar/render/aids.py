@@ -1,7 +1,5 @@
 """Crosshair, grid, blank and patch over the levels of a frame: `present.frag` in NumPy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Headless OpenGL contexts through EGL, on which GPU, and what they can draw."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ moderngl keeps Python's lock in every call. That is right for calls that only qu
 for a back buffer, every other thread of the process would wait too.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Programs of shaders/, a PSF for them, and the pass that makes levels of a linear image by counting thresholds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

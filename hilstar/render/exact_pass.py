@@ -3,8 +3,6 @@
 With `temporal` what each star leaves is kept on the GPU from frame to frame.
 """
 
-from __future__ import annotations
-
 import math
 
 import moderngl

@@ -6,8 +6,6 @@ under a zenith Sun, and within AIR_SMOOTH for air. Tiles at the edges are drawn 
 On llvmpipe this draws a disc that fills the field several times faster.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 On llvmpipe this takes a third of the time of sprites that are rasterised into a texture, which is then read.
 """
 
-from __future__ import annotations
-
 import ctypes
 import mmap
 from typing import cast

@@ -1,7 +1,5 @@
 """The last pass: the levels of a renderer onto the window that its context belongs to."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

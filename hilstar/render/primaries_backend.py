@@ -1,7 +1,5 @@
 """Frames of primaries that are driven apart: a backend for each, side by side, and one picture of three codes a pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The oracle: what the renderer should draw, in NumPy float64 with an exact erf, and discs by many rays a pixel."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray

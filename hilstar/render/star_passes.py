@@ -4,8 +4,6 @@ Each pixel's light is a sum of whole units, which is the same in whatever order 
 draws star by star, in a quarter of the time of rasterised sprites; a graphics card blends sprites of the same units.
 """
 
-from __future__ import annotations
-
 import math
 
 import moderngl

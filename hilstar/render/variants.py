@@ -1,7 +1,5 @@
 """Renderers for measurements only: one with another splat, for the study of trade-offs, and one that times its stages."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

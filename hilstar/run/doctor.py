@@ -4,8 +4,6 @@ Its row in the table *Tested with* (docs/where-it-fails.md) has parts and versio
 path and no serial number. Of a monitor's EDID only its maker, model, size and year are read.
 """
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import os

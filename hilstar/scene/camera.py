@@ -6,8 +6,6 @@ direction to pixel, which every frame uses; `Camera.tangents` is the inverse. Th
 form plus the lens's shift on a coarse grid.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -48,7 +46,7 @@ class ResidualField:
     resolution_px: tuple[int, int]
 
     @classmethod
-    def of_terms(cls, x: FloatArray, y: FloatArray, degree: int, resolution_px: tuple[int, int]) -> ResidualField:
+    def of_terms(cls, x: FloatArray, y: FloatArray, degree: int, resolution_px: tuple[int, int]) -> "ResidualField":
         """The field of coefficients (terms,) in the order of `field_terms`."""
         squares = np.zeros((2, degree + 1, degree + 1))
         i, j = _exponents(degree)
@@ -143,7 +141,7 @@ def _onto_plane(tilt_rad: tuple[float, float]) -> FloatArray:
     return np.array([foot[2] * right - foot[0] * normal, foot[2] * down - foot[1] * normal, normal])
 
 
-def ray_shifts(camera: Camera) -> Float32Array:
+def ray_shifts(camera: "Camera") -> Float32Array:
     """The difference between a lens and a pinhole: tangents (u, v), float32 (rows, columns, 2), at nodes over the image.
 
     The first and the last node of a row lie on the image's edges, -0.5 and width - 0.5; a column's likewise. Where the lens
@@ -307,7 +305,7 @@ class Camera:
         x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, n) for size, n in zip(self.resolution_px, counts, strict=True)))
         return x.ravel(), y.ravel()
 
-    def pixels_from(self, other: Camera, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def pixels_from(self, other: "Camera", x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """This camera's pixels at pixels (n,) of another; NaN behind this camera, and beyond a lens."""
         if other is self:
             return np.asarray(x_px, dtype=np.float64), np.asarray(y_px, dtype=np.float64)

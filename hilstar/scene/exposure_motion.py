@@ -7,8 +7,6 @@ Where rows are exposed one after the other, time on a path is that of the row on
 rows is exposed for longer, by 1 / (1 - the rows that it crosses while one is read). Its PSF is as wide as at one moment.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ drawn in order, before the sprites. Compared by identity: one object drawn twice
 its spread places, a larger one is drawn ray by ray.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

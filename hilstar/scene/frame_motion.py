@@ -6,8 +6,6 @@ that it has reached by then is written again, as a chain of sprites. Frame by fr
 runs with the scan meets fewer frames in a second, and has more light in each: 1 % at 10 deg/s, which would else be missing.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ Paths of stars over a short turn as polynomials in time, through a few places th
 A place on such a path costs two short sums, where an exact one costs a rotation and, behind a real lens, a hundred operations.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from copy import copy
 from dataclasses import dataclass, replace
@@ -100,7 +98,7 @@ class Paths:
     def __len__(self) -> int:
         return int(self._seen.shape[1])
 
-    def through(self, camera: Camera) -> Paths:
+    def through(self, camera: Camera) -> "Paths":
         """The same paths seen by another camera that turns with this one."""
         paths = copy(self)
         paths.camera = camera
@@ -134,7 +132,7 @@ class Chords:
     x_px: FloatArray
     y_px: FloatArray
 
-    def to(self, longer: FloatArray) -> Chords:
+    def to(self, longer: FloatArray) -> "Chords":
         """The same ways from their begins, so many times (n,) as long."""
         x_px, y_px = (np.stack([ends[0], ends[0] + (ends[1] - ends[0]) * longer]) for ends in (self.x_px, self.y_px))
         return Chords(x_px, y_px)

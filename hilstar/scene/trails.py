@@ -6,8 +6,6 @@ cut into equal times, each with a sprite in its middle that has the mean light o
 Satellites wide enough to have a face: diffuse spheres along their paths, which hide the stars behind them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -52,14 +50,14 @@ class TrailView:
     rate_image_rad_s: FloatArray
     velocity_km_s: FloatArray | None = None
 
-    def places_px(self, seen: Pass, which: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def places_px(self, seen: "Pass", which: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of satellites `which` (k,) of a pass, each at its own of `seconds` (k,); NaN behind the camera."""
         turned = seen.directions(which, seconds, self.velocity_km_s) @ self.icrs_to_image.T
         if not self.rate_image_rad_s.any():
             return self.camera.project_outward(turned)
         return Paths(turned, self.rate_image_rad_s, self.camera).places_px(EVERY, seconds)
 
-    def in_reach(self, seen: Pass, longest_s: float, margin_px: float) -> IntArray:
+    def in_reach(self, seen: "Pass", longest_s: float, margin_px: float) -> IntArray:
         """Places of the satellites that can come within a margin of the image within that time of the moment, and some more."""
         turned = seen.directions(EVERY, np.zeros(len(seen)), self.velocity_km_s) @ self.icrs_to_image.T
         reach_rad = (float(seen.speeds_rad_s().max()) + float(np.linalg.norm(self.rate_image_rad_s))) * longest_s
@@ -101,7 +99,7 @@ class Trails:
     middle: FloatArray  # unit vectors (k, 3), ICRS, in the middle of each one's time, as `Pass.directions`
 
 
-def trails(seen: Pass, view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
+def trails(seen: "Pass", view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
     """The satellites of a pass along their paths; one whose mean rate is fainter than `faintest_e_per_s` is left out."""
     wanted, (begin, end) = sprite_counts(seen, view, lit, brush)
     counts, total = wanted, int(wanted.sum())
@@ -125,7 +123,7 @@ def trails(seen: Pass, view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s
     return Trails(sprites, seen.index[found], rates[found], seen.directions(found, lit.middle_s[found]))
 
 
-def sprite_counts(seen: Pass, view: TrailView, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
+def sprite_counts(seen: "Pass", view: TrailView, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
     """How many sprites each path should have (0: it misses the image), and its part on the image."""
     at = np.linspace(0.0, 1.0, SAMPLES)[:, None]
     which = np.tile(np.arange(len(seen)), SAMPLES)
@@ -167,13 +165,13 @@ class DiscTrail:
     brightest_e_per_s: float
 
 
-def wide(seen: Pass, px_per_rad: float, wider_px: float) -> BoolArray:
+def wide(seen: "Pass", px_per_rad: float, wider_px: float) -> BoolArray:
     """Which satellites (n,) of a pass are wider than so many pixels."""
     size_km = seen.brightness.size_m[seen.index] / M_PER_KM
     return np.asarray(size_km * px_per_rad > wider_px * np.linalg.norm(seen.seen_km[0], axis=1))
 
 
-def disc_of(seen: Pass, name: str, second: float, velocity_km_s: FloatArray | None) -> Disc:
+def disc_of(seen: "Pass", name: str, second: float, velocity_km_s: FloatArray | None) -> Disc:
     """The disc of the only satellite of a pass at a time after its moment, without light."""
     at = np.array([second])
     radius_km = float(seen.brightness.size_m[seen.index[0]]) / M_PER_KM / 2
@@ -190,7 +188,7 @@ def disc_of(seen: Pass, name: str, second: float, velocity_km_s: FloatArray | No
     )
 
 
-def disc_trail(seen: Pass, name: str, view: TrailView, lit: Lit, brush: Brush) -> DiscTrail | None:
+def disc_trail(seen: "Pass", name: str, view: TrailView, lit: Lit, brush: Brush) -> DiscTrail | None:
     """The only satellite of a pass along its path; None where it misses the image or has no light."""
     counts, (begin, end) = sprite_counts(seen, view, lit, brush)
     radius_sigma = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px / min(brush.psf.width_px)

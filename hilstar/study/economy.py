@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from hilstar.bench.frame import Bench
-from hilstar.charts import BLUE, MUTED, ORANGE, RED, SMALL_PT, chart, write_records
+from hilstar.charts import BLUE, MUTED, ORANGE, RED, SMALL_PT, chart, two_digits, write_records
 from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
@@ -199,13 +199,13 @@ def draw(path: Path, comparisons: list[EffortComparison]) -> None:
             (0.2, autos, BLUE, 'effort = "auto"'),
         ):
             bars = cost.bar(at + shift, [o.frame_ms for o in mine], 0.38, color=colour, label=name)
-            cost.bar_label(bars, fmt="%.2g", padding=2, fontsize=SMALL_PT)
+            cost.bar_label(bars, fmt=two_digits, padding=2, fontsize=SMALL_PT)
         for shift, values, colour, name in (
             (-0.2, [o.flux_max_mag for o in autos], ORANGE, "light [mag]"),
             (0.2, [o.worst_px for o in autos], BLUE, "place [monitor px]"),
         ):
             bars = error.bar(at + shift, values, 0.38, color=colour, label=name)
-            error.bar_label(bars, fmt="%.2g", padding=2, fontsize=SMALL_PT)
+            error.bar_label(bars, fmt=two_digits, padding=2, fontsize=SMALL_PT)
         for place, outcome in zip(at, autos, strict=True):
             error.plot([place - 0.45, place + 0.45], [outcome.tolerance] * 2, color=RED, label="_" if place else "tolerance")
         cost.set_ylabel("time of a frame [ms]")

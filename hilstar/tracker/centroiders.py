@@ -6,8 +6,6 @@
 fiftieth of the brightest. What a display does to a star's light, each sees differently.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Literal, get_args

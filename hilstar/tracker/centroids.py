@@ -10,8 +10,6 @@ s = 0.4, 0.0023 at 0.5, under 1e-5 from 0.75 on. The Gaussian window's is larger
 tests/authority/test_centroids.py measures all of this, with the noise.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass

@@ -16,8 +16,6 @@ Laws:
 3. Quantisation noise is what rounding does. The thesis's added Gaussian (table 4.1) is off unless asked for.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -10,8 +10,6 @@ scipy's distribution decides. From there on the expansion alone decides (Giles, 
 Fisher's kind, with the 1/3 of a discrete law): its errors are in `tests/unit/tracker/test_frame_noise.py`.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

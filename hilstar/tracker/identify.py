@@ -1,7 +1,5 @@
 """From found stars to an attitude: which star is which, by where they are expected or lost in space, and Wahba's problem."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass

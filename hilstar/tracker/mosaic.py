@@ -1,7 +1,5 @@
 """A Bayer mosaic: light by channel to the pixels that see it, and the luminance in which a tracker's software finds stars."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

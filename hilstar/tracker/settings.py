@@ -1,7 +1,5 @@
 """A detector's settings in plain numbers, which are also the keys of a bench file's [tracker.detector]."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints

@@ -5,8 +5,6 @@ Stars stand in the tiles of a square image (`monitor.phases`); each row and colu
 phase of its own.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The answering end of a tracker's link: packets or JSON over ZeroMQ, UDP or a serial line, and garbage on request."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

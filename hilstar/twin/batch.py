@@ -1,7 +1,5 @@
 """Frames of the virtual tracker along a log, over all cores."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable

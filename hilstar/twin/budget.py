@@ -3,8 +3,6 @@
 Every error is measured: single stars at a grid of sub-pixel phases through the bench's own method.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several heads through their twins: the angles between them, as solved from what each tracker would see."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace

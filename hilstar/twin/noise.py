@@ -7,8 +7,6 @@ of its flux under the weights share / variance, which no other weights beat: its
 reaches it. Pixels that clip tell nothing. Fixed patterns count as noise: all this holds over places on the detector.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterator

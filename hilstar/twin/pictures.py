@@ -3,8 +3,6 @@
 In the picture for people bright stars are discs, because saturated pixels cannot tell them apart.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from dataclasses import replace

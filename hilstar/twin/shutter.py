@@ -1,7 +1,5 @@
 """A detector whose rows are exposed one after the other, before the sky or a screen that lights row by row."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ An exposure is one of `exposure_s` every 1 / rate seconds. It is computed once a
 GRACE_NS later. One that cannot begin in time, because those before it took too long, is passed over and counted.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 import threading

@@ -1,7 +1,5 @@
 """[answers]: where a tracker's answers come from, and what their bytes mean."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from itertools import chain

@@ -1,7 +1,5 @@
 """The tables of the streams: [attitude], with the checks of its keys for each kind of link, and [faults]."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from msgspec import Meta

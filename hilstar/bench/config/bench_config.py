@@ -1,7 +1,5 @@
 """The whole bench file: read, its keys checked together, and refused in one line where it is wrong."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

@@ -1,7 +1,5 @@
 """The table [certify]: what a certificate says beside its figures, its limits, and what no calibration file holds."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from msgspec import Meta

@@ -3,8 +3,6 @@
 All of it comes from the classes of the tables: keys, types, units, limits, defaults and meanings.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints

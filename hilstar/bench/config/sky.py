@@ -1,7 +1,5 @@
 """The tables of the sky: [sky] and [sky.bodies], [spacecraft] from which it is seen, and [background]."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import msgspec

@@ -1,7 +1,5 @@
 """The kinds of value in a bench file."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from msgspec import Meta

@@ -1,7 +1,5 @@
 """The context of a step: the bench file as it stands, the step's folder, the source of images, and figures of earlier steps."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

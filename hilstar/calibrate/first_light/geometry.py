@@ -1,7 +1,5 @@
 """The steps that find where the tracker sees each pixel: orientation, focus, geometry."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import astuple, dataclass, replace

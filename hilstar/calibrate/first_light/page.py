@@ -1,7 +1,5 @@
 """The page of a session, first-light.html: a verdict, a card for each step, and what changed in the bench file."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A session's records: session.json, and the keys set in the bench file."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The session: its steps in order, each done once, and again when what it depends on has changed."""
 
-from __future__ import annotations
-
 import datetime
 import hashlib
 import math

@@ -1,7 +1,5 @@
 """The steps of warm-up and uniformity: light of dots against time, and against place on the screen."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """A geometric calibration from centroids to a file: matching, fit, checks, summary, notes and chart."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Every dot is lit in the same number of frames, which shows lost and false centro
 number of dots allows.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from pathlib import Path

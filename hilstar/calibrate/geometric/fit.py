@@ -1,7 +1,5 @@
 """A bench's geometry fitted to centroids of dots: parameters, robust least squares, choice of a model, uncertainty."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -130,7 +128,7 @@ class MatchedDots:
     def __len__(self) -> int:
         return len(self.dot)
 
-    def at(self, chosen: IntArray) -> MatchedDots:
+    def at(self, chosen: IntArray) -> "MatchedDots":
         """The matches at indices `chosen`."""
         return MatchedDots(self.seen.at(chosen), self.dot[chosen])
 

@@ -5,8 +5,6 @@ that match one dot clearly give a first map; by that map every centroid is match
 mirrored, turned, or moved between frames is refused, with the cure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple

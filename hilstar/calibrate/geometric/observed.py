@@ -1,7 +1,5 @@
 """Centroids of the dots by frame and pose, from a table or measured in the tracker's images."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings
@@ -41,7 +39,7 @@ class Observed:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def at(self, chosen: IntArray) -> Observed:
+    def at(self, chosen: IntArray) -> "Observed":
         """The centroids at indices `chosen`."""
         return Observed(self.frame[chosen], self.pose[chosen], self.x_px[chosen], self.y_px[chosen], self.sigma_px[chosen])
 

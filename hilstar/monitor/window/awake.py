@@ -7,8 +7,6 @@ again, such as another run that has ended: it prevents that too, and restores it
 This file is also that process's program, by its path and without hilstar's other modules: it takes 20 ms to begin.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

@@ -4,8 +4,6 @@ Its own search begins a Python process that loads each library and says its vers
 signal ends the start-up meanwhile, that process prints its traceback.
 """
 
-from __future__ import annotations
-
 import os
 from importlib.util import find_spec
 from pathlib import Path

@@ -5,8 +5,6 @@ RandR; xf86-video-amdgpu's own; nvidia-settings' attributes). `dithering mode`, 
 `max bpc` and vibrance were read in drivers' sources; the other names are from their documentation. None was tried on hardware.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple

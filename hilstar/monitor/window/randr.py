@@ -3,8 +3,6 @@
 Only what the server already knows is asked for, so that no request makes it probe a monitor.
 """
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

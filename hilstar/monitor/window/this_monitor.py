@@ -1,7 +1,5 @@
 """The identity of a display of this machine: by RandR, DRM and, where the program ddcutil is installed, DDC/CI."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shutil

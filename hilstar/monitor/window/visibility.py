@@ -1,7 +1,5 @@
 """Whether an X11 window is seen: a thread with its own connection listens, so that no frame ever asks the server."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import select

@@ -3,8 +3,6 @@
 A thread with connections of its own looks once a second, so that no frame ever asks the server.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import threading

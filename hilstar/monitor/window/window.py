@@ -1,7 +1,5 @@
 """The window on the monitor: full screen on a chosen display, or an ordinary window. The only user of glfw."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import logging

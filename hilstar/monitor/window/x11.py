@@ -4,8 +4,6 @@ or the window is gone.
 Each answer is None or False where the system has no such thing: Wayland, or a driver without the extension.
 """
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import time

@@ -4,8 +4,6 @@ What a fault should bring is what it adds to the linear image, through the same 
 figures is a reason against a bench.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ their size; the screen's tilt (a, b) adds d' (a y' - b x') to first order. Stars
 (blends) count as one, at the centroid of their light.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -114,7 +112,7 @@ def fit_geometry(displaced: Sequence[Displaced], tracker: Camera, limit_px: floa
     return _summed_up(next(fit for fit in fits if fit.noise <= good), back.T.ravel(), focal_px)
 
 
-def _fits(seen: FloatArray, back: FloatArray) -> list[_MotionFit]:
+def _fits(seen: FloatArray, back: FloatArray) -> "list[_MotionFit]":
     """Every model that so many stars (n, 2) can determine, the smallest first."""
     parts, wanted = _parts(*seen.T), back.T.ravel()
     fits = [_MotionFit.of({name: parts[name] for name in model}, wanted) for model in MODELS]
@@ -144,7 +142,7 @@ class _MotionFit:
     unknowns: int
 
     @classmethod
-    def of(cls, parts: dict[str, FloatArray], wanted: FloatArray) -> _MotionFit:
+    def of(cls, parts: dict[str, FloatArray], wanted: FloatArray) -> "_MotionFit":
         design = np.hstack(list(parts.values()))
         values = np.linalg.lstsq(design, wanted, rcond=None)[0]
         ends = np.cumsum([part.shape[1] for part in parts.values()])
@@ -261,7 +259,7 @@ class Measured:
     true_calibration: Calibration | None
     gl_renderer: str
     wide_bodies: list[str]
-    glass: GlassEffect | None = None
+    glass: "GlassEffect | None" = None
 
 
 class GlassEffect(NamedTuple):

@@ -7,8 +7,6 @@ faint ones. Of magnitudes the largest change is tried first, and the smallest th
 What a proposal says to a person, and the bench file with it.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import math

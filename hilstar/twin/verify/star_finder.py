@@ -1,7 +1,5 @@
 """From an image to stars: the centroider as wide as the bench's stars, and which of its finds is which star."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -41,7 +39,7 @@ class Matched:
     found: Centroids
     index: IntArray
 
-    def against(self, other: Matched, k: int) -> Difference:
+    def against(self, other: "Matched", k: int) -> Difference:
         """Star `k` against itself in another image."""
         i, j = self.index[k], other.index[k]
         if i < 0 or j < 0:

@@ -1,7 +1,5 @@
 """`hilstar verify`: the twin over random fields, its figures as JSON and text, the table of stars and the charts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import astuple, fields, replace

@@ -1,7 +1,5 @@
 """The verdict of a bench: the display's errors without their common zero point, the limits exceeded, and the likely causes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 

@@ -341,4 +341,4 @@ def test_a_session_that_is_stopped_says_so_and_keeps_what_was_done(tmp_path, end
         assert process.returncode == 128 + ending
         assert "Traceback" not in process.stderr.read()
     session = json.loads((folder / "s" / "session.json").read_text())
-    assert (session["running"], len(session["steps"])) == ("geometry", 4)
+    assert (session["running"], len(session["steps"])) == ("geometry", 5)

@@ -1,6 +1,6 @@
 """The pictures of docs/console.md: the page of a run, single pixels of it, and the run's report, in Debian's chromium.
 
-`python tools/make_screenshot.py` writes docs/console.png, docs/pixels.png and docs/report.png, and each again as
+`python tools/make_screenshot.py` writes console.png, pixels.png, report.png and first-light.png into docs, and each again as
 NAME-light.png. The run goes by the clock, so that no two are alike. The page is taken once it has been on time for a minute; on
 a machine that is too busy for that, the picture shows and says what was missed.
 """
@@ -30,6 +30,7 @@ COLOURS = 256  # size of the palette
 CALM_S = 60.0  # within which a minute without a missed frame may come
 ON_TIME = "/fresh, frames on time/.test(document.getElementById('health-reasons').textContent)"
 HILSTAR = [sys.executable, "-m", "hilstar"]
+WARM_UP = "\n[certify.virtual]\ncold_percent = 4.0\nwarm_up_min = 4.0\n"
 SIRIUS = "101.287,-16.716,25"
 
 
@@ -78,8 +79,28 @@ def watch(page: Browser, folder: Path) -> None:
         run.terminate()
 
 
+def first_light(page: Browser, folder: Path) -> None:
+    """The page of a session before a monitor that warms up."""
+    for name in ("demo.toml", "truth-example.toml"):
+        text = (DOCS.parent / "configs" / name).read_text().replace("[monitor]", "[monitor]\nphotodiode_px = 40", 1)
+        (folder / name).write_text(text + ("" if name == "demo.toml" else WARM_UP))
+    words = ["first-light", "demo.toml", "-o", "session", "--virtual", folder / "truth-example.toml"]
+    subprocess.run([*HILSTAR, *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    take_session(page, folder / "session" / "first-light.html")
+
+
+def take_session(page: Browser, path: Path) -> None:
+    """A session's verdict, and its cards from the focus on."""
+    page.size(1100, 1240)
+    for theme, ending in (("light", "-light"), ("dark", "")):
+        page.prefer(color_scheme=theme)
+        page.get(path.as_uri())
+        page.run("for (const name of ['machine', 'display', 'orientation']) document.getElementById(name).remove()")
+        keep(page.get_screenshot_as_png(), f"first-light{ending}.png")
+
+
 def main() -> None:
-    """Watch a run, and look at its report."""
+    """Watch a run, and look at its report; then bring up a bench."""
     with tempfile.TemporaryDirectory() as scratch, browser() as page:
         page.size(*SIZE_PX)
         page.prefer(color_scheme="dark")
@@ -90,6 +111,7 @@ def main() -> None:
         page.until("document.body.dataset.ready === 'true'")
         page.press("#chart-age canvas")
         keep_both(page, "#charts", "report")
+        first_light(page, Path(scratch))
 
 
 if __name__ == "__main__":

@@ -57,6 +57,8 @@ def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp
     found = did(folder, uniformity)
     assert found.verdict == "done", found.line
     assert found.figures["truth_rms_mag"] < MAP_MAG
+    assert found.figures["truth_rms_mag"] < 1.5 * found.figures["map_error_mag"]
+    assert found.number.error > 0 and found.number.value == pytest.approx(100 * found.figures["darkest_of_brightest"])
     assert found.figures["change_rms_mag"] == pytest.approx(seen, rel=0.5)
     assert (folder / "uniformity.svg") in found.pictures
     assert load_calibration(folder / "light.toml", 10).uniformity is not None

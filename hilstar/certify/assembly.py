@@ -24,7 +24,7 @@ from hilstar.monitor.calibration import BUILT_IN, read_toml
 from hilstar.monitor.geometry import load_notes
 from hilstar.sky.facts import errors_of, motion_at
 from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
-from hilstar.units import MAG_PER_RELATIVE, magnitude
+from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 
 SEED = 5  # of the order of readings
 DOT_IMAGES = 4
@@ -56,6 +56,7 @@ class Read:
     even: Surface
     place: Surface
     delays_ms: FloatArray
+    centroid_px: float = 0.0
 
 
 def read_bench(file: BenchFile, reader: Reader) -> Read:
@@ -64,7 +65,7 @@ def read_bench(file: BenchFile, reader: Reader) -> Read:
     codes = planned_codes(2**file.config.monitor.bits - 1, certify.levels, certify.repeats, rng)
     light = light_deviation(file, reader.light(codes))
     dots = reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
-    return Read(light, evenness(file, dots), places(file, dots), reader.delays_ms())
+    return Read(light, evenness(file, dots), places(file, dots), reader.delays_ms(), reader.centroid_px)
 
 
 def planned_codes(white: int, levels: int, repeats: int, rng: np.random.Generator) -> IntArray:
@@ -160,6 +161,12 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
             place=by_place.reshape(-1, len(figures.stars), 2),
         ),
     ]
+    if read.centroid_px:
+        count, arcsec = len(figures.stars), read.centroid_px / geometry_of(file).tracker.focal_length_px * ARCSEC_PER_RAD
+        own = np.zeros((2, count, count, 2))
+        own[0, range(count), range(count), 0] = own[1, range(count), range(count), 1] = arcsec
+        centroids = Input("centroids", "normal", "what the pattern of pixels does to them", 2 * count, arcsec, "arcsec")
+        found.append(Effect(centroids, place=own.reshape(2 * count, count, 2)))
     if len(late_ms) > 1:
         error = float(late_ms.std(ddof=1)) / math.sqrt(len(late_ms))
         source = f"{len(late_ms)} edges of a photodiode"

@@ -121,7 +121,6 @@ class Certificate(msgspec.Struct, frozen=True, kw_only=True):
         return f"certificate {self.number} of {self.made[:10]}, valid until {self.valid_until}"
 
 
-@lru_cache(maxsize=4)
 def read_certificate(path: Path) -> Certificate:
     """A certificate. Raises InputError for a file that is none."""
     raw = read_bytes(path, ADVICE, MAX_BYTES)

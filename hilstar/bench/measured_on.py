@@ -62,7 +62,8 @@ class MonitorCheck:
 def measured_on(file: BenchFile) -> Iterator[MeasuredOn]:
     """The origins of a bench's calibration and geometry files; a built-in curve has none. Raises InputError."""
     certificate = bench_certificate(file)
-    if certificate is not None and certificate.monitor.get("identity"):  # whoever certified it looked at that monitor
+    # Whoever certified it by readings looked at that monitor; one made from the files alone would make old files fresh.
+    if certificate is not None and certificate.reference_sha256 and certificate.monitor.get("identity"):
         identity = msgspec.convert(certificate.monitor["identity"], MonitorIdentity)
         yield MeasuredOn(f"certificate {certificate.number}", identity, _date(certificate.made))
         return

@@ -14,14 +14,17 @@ from scipy.ndimage import map_coordinates
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import star_flux
+from hilstar.bench.build import star_flux, star_kinds, star_rates
+from hilstar.bench.catalogue import sigma_instrument_mag
 from hilstar.certify.budget import Input, Model
 from hilstar.certify.estimates import LightDeviation, Surface, evenness, light_deviation, places
 from hilstar.certify.model import Deviations, Figures, reference_stars
 from hilstar.certify.readings import Reader, dot_places, geometry_of
 from hilstar.monitor.calibration import BUILT_IN, read_toml
 from hilstar.monitor.geometry import load_notes
-from hilstar.units import MAG_PER_RELATIVE, magnitude
+from hilstar.sky.facts import errors_of, motion_at
+from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
+from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 
 SEED = 5  # of the order of readings
 DOT_IMAGES = 4
@@ -53,6 +56,7 @@ class Read:
     even: Surface
     place: Surface
     delays_ms: FloatArray
+    centroid_px: float = 0.0
 
 
 def read_bench(file: BenchFile, reader: Reader) -> Read:
@@ -61,7 +65,7 @@ def read_bench(file: BenchFile, reader: Reader) -> Read:
     codes = planned_codes(2**file.config.monitor.bits - 1, certify.levels, certify.repeats, rng)
     light = light_deviation(file, reader.light(codes))
     dots = reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
-    return Read(light, evenness(file, dots), places(file, dots), reader.delays_ms())
+    return Read(light, evenness(file, dots), places(file, dots), reader.delays_ms(), reader.centroid_px)
 
 
 def planned_codes(white: int, levels: int, repeats: int, rng: np.random.Generator) -> IntArray:
@@ -157,6 +161,12 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
             place=by_place.reshape(-1, len(figures.stars), 2),
         ),
     ]
+    if read.centroid_px:
+        count, arcsec = len(figures.stars), read.centroid_px / geometry_of(file).tracker.focal_length_px * ARCSEC_PER_RAD
+        own = np.zeros((2, count, count, 2))
+        own[0, range(count), range(count), 0] = own[1, range(count), range(count), 1] = arcsec
+        centroids = Input("centroids", "normal", "what the pattern of pixels does to them", 2 * count, arcsec, "arcsec")
+        found.append(Effect(centroids, place=own.reshape(2 * count, count, 2)))
     if len(late_ms) > 1:
         error = float(late_ms.std(ddof=1)) / math.sqrt(len(late_ms))
         source = f"{len(late_ms)} edges of a photodiode"
@@ -257,11 +267,11 @@ def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[E
         slopes[np.arange(count), kind, np.arange(count)] = values
         return slopes
 
-    mag, arcsec = np.array([star.sigma_mag for star in stars]), np.array([star.sigma_arcsec for star in stars])
+    mag, arcsec = catalogue_errors(file, np.array([star.row for star in stars], dtype=np.intp))
     source = "each star's errors in the catalogue"
     rms = _rms(mag), _rms(arcsec)
     yield Effect(Input("catalogue light", "normal", source, count, rms[0], "mag"), sky=each(mag, 0))
-    both = np.concatenate([each(arcsec / math.sqrt(2), 1), each(arcsec / math.sqrt(2), 2)])
+    both = np.concatenate([each(arcsec, 1), each(arcsec, 2)])
     yield Effect(Input("catalogue place", "normal", source, 2 * count, rms[1], "arcsec"), sky=both)
     colour, source = spectrum_mag(file, np.array([star.b_v_mag for star in stars]))
     yield Effect(
@@ -272,6 +282,19 @@ def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[E
     light = float(lost.std(ddof=1)) if count > 2 else 0.0
     source = "scatter of what the codes of the reference stars lose"
     yield Effect(Input("quantisation", "normal", source, count, light, "mag"), sky=each(np.full(count, light), 0))
+
+
+def catalogue_errors(file: BenchFile, row: IntArray) -> tuple[FloatArray, FloatArray]:
+    """The catalogue's errors of stars (n,) by their rows: of light in the tracker, mag, and of place along an axis, arcsec."""
+    sky = file.config.sky
+    source = sky.catalogue if sky.catalogue == "hipparcos" else file.folder / sky.catalogue
+    choice = TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear)
+    stars = choose_catalog(choice).taken(row)
+    facts = table_facts(choice, stars, errors_of(stars))
+    covariance = motion_at(stars, facts, sky.epoch_jyear).covariance
+    place_mas = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
+    mag = sigma_instrument_mag(stars, facts, star_rates(file.config, file.folder), star_kinds(file.config, stars))
+    return np.nan_to_num(mag), np.nan_to_num(place_mas) / 1000
 
 
 def _rms(values: FloatArray) -> float:

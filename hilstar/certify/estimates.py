@@ -35,6 +35,7 @@ DOTS_A_TERM = 4
 MAP = (16, 9)  # fields of a usual map of light, columns and rows
 MIN_LEVELS = 4
 FAINT_SIGMAS = 5.0
+BRIGHT = 0.05  # relative to white: light by which a reading's relative noise is first told from its floor
 MIN_DOF = 2
 
 
@@ -82,13 +83,13 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     design[np.arange(len(read.code)), place] = 1.0
     if timed:
         design[:, -1] = hours * mean[place]
-    sigma, noise = np.maximum(mean[place], 1e-9 * mean[-1]), 1.0
-    for _ in range(2):
-        inverse = np.linalg.pinv(design / sigma[:, None])
-        found = inverse @ (read.light / sigma)
-        noise = math.sqrt(float((((read.light - design @ found) / sigma)[read.code > 0] ** 2).sum()) / dof)
-        floor = max(spread**2 - (noise * mean[0]) ** 2, 0.0)
-        sigma = np.sqrt(np.maximum(mean[place], 1e-9 * mean[-1]) ** 2 + floor / max(noise, 1e-12) ** 2)
+    total, bright = np.maximum(mean[place], 1e-9 * mean[-1]), mean[place] > BRIGHT * mean[-1]
+    free = int(bright.sum()) - len(np.unique(place[bright]))
+    noise = math.sqrt(float(((read.light / total - 1)[bright] ** 2).sum()) / max(free, 1))
+    floor = max(spread**2 - (noise * mean[0]) ** 2, 0.0)
+    sigma = np.sqrt(total**2 + floor / max(noise, 1e-12) ** 2)
+    inverse = np.linalg.pinv(design / sigma[:, None])
+    found = inverse @ (read.light / sigma)
     noise = math.sqrt(float((((read.light - design @ found) / sigma) ** 2).sum()) / dof)
     factors, light, size = noise * inverse, found[1 : len(codes)] - found[0], len(codes)
     if not light[-1] > FAINT_SIGMAS * float(np.linalg.norm(factors[size - 1] - factors[0])):

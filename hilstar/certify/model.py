@@ -37,16 +37,13 @@ THIRDS = ("left third", "middle third", "right third")
 class ReferenceStar:
     """A star of a reference field: its place on the monitor, its direction in cam, and its pixels with their shares of light.
 
-    `log_light` (p,) is that asked of its pixels, relative to white, `quantised_mag` how much too faint their codes make it;
-    the sigmas are its catalogue's.
+    `log_light` (p,) is that asked of its pixels, relative to white, `quantised_mag` how much too faint their codes make it.
     """
 
     hip: int
     row: int
     v_mag: float
     b_v_mag: float
-    sigma_mag: float
-    sigma_arcsec: float
     field: int
     third: int
     x_px: float
@@ -100,8 +97,6 @@ def _of_field(bench: Bench, frame: Frame, number: int, geometry: BenchGeometry) 
                 row=int(bench.stars.row[frame.star[k]]),
                 v_mag=float(truth["v_mag"][k]),
                 b_v_mag=float(truth["bv"][k]),
-                sigma_mag=float(np.nan_to_num(truth["sigma_mag"][k])),
-                sigma_arcsec=float(np.nan_to_num(truth["sigma_pos_mas"][k])) / 1000,
                 field=number,
                 third=each,
                 x_px=float(x[k]),

@@ -15,7 +15,7 @@ from hilstar.files import write_whole
 from hilstar.html_pages import Markup, escaped, page_of, picture_of, table_of
 
 PRINTED = """<style>@page { size: A4; margin: 16mm } @media print { body { margin: 0; max-width: none; font-size: 11px }
-details { display: block } details > * { display: block } h2 { break-after: avoid } table, img, p { break-inside: avoid } }
+details { display: block } details > * { display: block } h2 { break-after: avoid } tr, img, p { break-inside: avoid } }
 .banner { border-left: .5rem solid; padding: .5rem 1rem; margin: 1rem 0; font-size: 1.1em }</style>"""
 VERDICTS = {True: ("#2e7d32", "Conforms"), False: ("#c62828", "Does not conform"), None: ("#0b62a4", "Stated, no limits")}
 SHOWN = ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "attitude_z", "latency")

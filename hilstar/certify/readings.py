@@ -44,6 +44,7 @@ APART_TRACKER_PX = 12.0  # from dot to dot: a dot that moved by half of it would
 EDGE_TRACKER_PX = 8.0
 MAX_DOTS = 4000
 MIN_DOTS = 60
+CENTROID_PX = 0.003  # 36 stars of a virtual bench by its images were 0.002 px rms from its truth beyond noise
 DOT_LIGHT = 0.25  # relative to white: a dot of nine pixels at white could saturate the tracker
 WATCHED_S = 5.0
 THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
@@ -82,6 +83,11 @@ class Reader(Protocol):
     @property
     def truth(self) -> BenchFile | None:
         """The true bench, of a virtual one."""
+        ...
+
+    @property
+    def centroid_px(self) -> float:
+        """What the pattern of pixels does to a centroid, one sigma along an axis, tracker px."""
         ...
 
     @property
@@ -150,6 +156,7 @@ class VirtualReader:
     """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own noise. Raises InputError."""
 
     monitor: MonitorIdentity | None = None
+    centroid_px = 0.0
 
     def __init__(self, file: BenchFile, truth: BenchFile, seed: int, turn: int = 0) -> None:
         refuse_other_bench(file, truth)
@@ -223,6 +230,7 @@ class ImageReader:
     source: ImageSource
     folder: Path
     truth: BenchFile | None = None
+    centroid_px: float = CENTROID_PX
     _context: StepContext = field(init=False)
 
     def __post_init__(self) -> None:
@@ -244,8 +252,9 @@ class ImageReader:
         meter = Photometer(self._context, sigma_px, Assumed({"w": grey.light}, grey.black))
         start_ns, gain = self.now_ns(), self.file.config.tracker.detector.gain_e_per_dn
         found = meter.read([Patch(int(code), "w") for code in codes])
+        level = found.light[codes == 0].mean()
         t_s = np.linspace(0.0, (self.now_ns() - start_ns) / NS_PER_S, len(codes))  # patches take the same time each
-        return LightReadings(codes, found.light * gain, t_s)
+        return LightReadings(codes, (found.above_black + level) * gain, t_s)
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
         """One image of dots, each found near where the bench file has it."""

@@ -139,6 +139,7 @@ class LatticeRatio:
 class Readings:
     """Light (n,) of a lit pixel for each patch, black level included, DN/s; the exposure; how lattices agree.
 
+    `above_black` (n,) is without it, and may be negative by noise, which `light` is not.
     `black_known` says whether the black level was measured; else it is the bench file's.
     """
 
@@ -148,6 +149,7 @@ class Readings:
     links: list[LatticeRatio]
     black_known: bool
     images: tuple[Path, ...]
+    above_black: FloatArray
 
     def write(self, path: Path) -> None:
         """MEASURED.csv, as `calibrate photometric` reads it. Raises InputError."""
@@ -199,8 +201,9 @@ class Photometer:
                 chosen[patch] = 2 * period  # brighter than the bench file says
             sums.append(total)
         links = [link for channel in self.assumed.light for link in self._links(channel, chosen)]
-        light, black_known = self._light(planned, np.array(sums), chosen, links)
-        return Readings(planned, light, self.exposure_s, links, black_known, tuple(self.images))
+        above = self._above_black(planned, np.array(sums), chosen, links)
+        light, black_known = self._with_black(planned, above)
+        return Readings(planned, light, self.exposure_s, links, black_known, tuple(self.images), above)
 
     def _expose(self) -> float:
         """Choose an exposure in which white does not saturate, first the bench file's; returns a white dot's peak, DN."""
@@ -245,10 +248,10 @@ class Photometer:
                 raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
             yield LatticeRatio(patch, dense, sparse, dots[0] / dots[1])
 
-    def _light(
+    def _above_black(
         self, planned: list[Patch], sums: FloatArray, chosen: dict[Patch, int], links: list[LatticeRatio]
-    ) -> tuple[FloatArray, bool]:
-        """Light (n,) of a pixel of each patch on the sparsest lattice's scale, DN/s, and whether black was measured."""
+    ) -> FloatArray:
+        """Light (n,) above black of a pixel of each patch on the sparsest lattice's scale, DN/s."""
         order, dark = np.arange(len(planned)), np.array([patch.code == 0 for patch in planned])
         under = np.interp(order, order[dark], sums[dark])
         factor = {(channel, self.periods[-1]): 1.0 for channel in self.assumed.light}
@@ -260,6 +263,10 @@ class Photometer:
         light = (sums - under) / (np.array(lit) * self.exposure_s)
         # On a black screen every pixel glows alike; the repeats tell how well that is known.
         light[dark] = (sums[dark] - sums[dark].mean()) / (self.field.monitor_px * self.exposure_s)
+        return np.asarray(light)
+
+    def _with_black(self, planned: list[Patch], light: FloatArray) -> tuple[FloatArray, bool]:
+        """Light (n,) with the black level, DN/s, and whether that was measured."""
         unlit = self.context.unlit()
         if unlit is not None:  # a black screen minus one that is switched off
             self.images.append(unlit)

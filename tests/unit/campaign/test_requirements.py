@@ -135,6 +135,15 @@ def test_answers_of_one_case_that_go_together_are_not_counted_as_independent(rng
     assert found.verdict == NOT_SHOWN and found.more is not None and "design effect" in found.method
 
 
+def test_the_benchs_own_error_is_taken_off_a_limit(rng: np.random.Generator) -> None:
+    cases, require = simulated(rng, ERRORS, noise=2.0), [Require(quantity="noise", maximum=2.5)]
+    assert verdicts_of(require, cases, SCALE, 1)[0].verdict == MET
+    found = verdicts_of(require, cases, SCALE, 1, (0.6, 30.0))[0]
+    assert found.verdict == NOT_SHOWN
+    assert "0.6 arcsec taken off for the bench" in found.method
+    assert verdicts_of([Require(quantity="noise", maximum=1.8)], cases, SCALE, 1, (0.6, 30.0))[0].verdict == NOT_SHOWN
+
+
 def test_too_few_cases_say_how_many_more_it_takes(rng: np.random.Generator) -> None:
     # 59 cases without one over the limit show 95 % at 95 %, by 0.95^59 = 4.8 %.
     few = verdict(simulated(rng, 40), quantity="recovery", maximum=1.0, share=0.95)

@@ -8,13 +8,19 @@ import math
 import msgspec
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.certify.budget import Input, by_trials, first_order, why_they_differ
 from hilstar.certify.check import compare, take_check
 from hilstar.certify.readings import VirtualReader
-from tests.support.commands import run_hilstar_here
+from hilstar.run.record.ledger_records import read_head
+from tests.support.benches import bench_text
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.planted_certify import coverage, drawn, plant
+from tests.support.planted_run import write_run
+from tests.support.planted_tracker import Planted, Sizes, scan
+from tests.support.planted_tracker import plant as plant_tracker
 
 BENCHES = 40
 FAR = 4 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
@@ -132,5 +138,34 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
     moved = run_hilstar_here(*words, "--check", "--json")
     assert moved.returncode == 1
     assert msgspec.json.decode(moved.stdout)["checks"] == 2
-    again = run_hilstar_here(*words, "--again", "--quick", "--json")
-    assert msgspec.json.decode(again.stdout)["replaces"] == found["number"]
+    again = msgspec.json.decode(run_hilstar_here(*words, "--again", "--quick", "--json").stdout)
+    assert again["replaces"] == found["number"]
+    assert "drift" in {each["name"] for each in again["inputs"]}  # by the checks between
+
+
+def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run: Planted) -> None:
+    bench, truth = plant(tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n")
+    words = ("certify", bench, "-o", tmp_path / "out", "--virtual", truth, "--quick", "--json")
+    number = msgspec.json.decode(run_hilstar_here(*words).stdout)["number"]
+    bench.write_text(bench.read_text() + 'certificate = "out/certificate.json"\n')
+    assert run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "a.fits").returncode == 0
+    assert fits.getheader(tmp_path / "a.fits")["CERTIF"] == number
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0.0,1,0,0,0\n0.1,1,0,0,0\n")
+    words = ("replay", bench, tmp_path / "log.csv", "--headless", "--speed", "max", "--ledger", tmp_path / "run.mcap")
+    assert run_hilstar_here(*words).returncode == 0
+    assert read_head(tmp_path / "run.mcap")["certificate"] == number
+    ledger, telemetry = write_run(
+        tmp_path, planted_run, bench_text({"certify": {"certificate": str(tmp_path / "out/certificate.json")}})
+    )
+    words = ("assess", ledger, telemetry, "-o", tmp_path / "assessed", "--json", "--display-attitudes", "0")
+    part = msgspec.json.decode(run_hilstar_here(*words).stdout)["bench"]
+    assert part["certificate"] == number
+    assert 0 < part["share_of_bias"]["cross"] <= 1
+    assert "could have made" in (tmp_path / "assessed" / "budget.html").read_text()
+    (tmp_path / "out" / "certificate.json").write_text("{}")
+    assert_refused(run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "b.fits"), 2, "is no certificate")
+
+
+@pytest.fixture(scope="module")
+def planted_run() -> Planted:
+    return plant_tracker(scan, Sizes(wild=5, offset_s=0.02), np.random.default_rng(11), seconds=60.0)

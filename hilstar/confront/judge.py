@@ -37,6 +37,10 @@ CELLS = 4
 DIM_MAG, DIM_STARS, DIM_SIGMAS = 0.25, 2, 4.0
 HOT_SIGMAS, HOT_SHARE, HOT_LIGHT = 6.0, 0.75, 0.5
 MOVED_PX = 5.0  # by which stars move between photographs that tell them from hot pixels
+# Hipparcos is complete to 7.3 + 1.1 |sin b| for late types (ESA SP-1200 vol. 1, 1.1). From V = 8 to 10 the stars of the whole
+# sky grow 2.9 times a magnitude (Allen 1973).
+GALACTIC_POLE = np.array([-0.867666, -0.198076, 0.455984])
+COMPLETE_V_MAG, COUNTS_SLOPE = (7.3, 1.1), 0.46
 NOT_COUNTED = frozenset({"saturated", "blended", "missing", "dim region"})
 
 
@@ -108,6 +112,7 @@ class Verdict:
     star_chi2: float
     dim: list[str]
     dated: DatedBy | None
+    fainter: Fainter
     predicted: FloatArray = field(repr=False)
     residual: FloatArray = field(repr=False)
 
@@ -120,6 +125,15 @@ class Verdict:
     def missing(self) -> list[StarRow]:
         """Stars that should be there."""
         return [one for one in self.stars if "missing" in one.flags]
+
+
+@dataclass(frozen=True, slots=True)
+class Fainter:
+    """Stars that a photograph reaches beyond its catalogue: V to which that is complete and V of LISTED_SNR, and how many."""
+
+    complete_v_mag: float
+    reached_v_mag: float
+    expected: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +223,7 @@ class Judge:
             star_chi2=float(np.median(shot.found.chi2[shot.clean])) if shot.clean.any() else math.nan,
             dim=dim,
             dated=self._dated(number),
+            fainter=self._fainter(number, expected),
             predicted=level + light_dn,
             residual=residual,
         )
@@ -317,6 +332,20 @@ class Judge:
         lit = np.abs(light_sigma) > LIT_SIGMA
         lit |= source_mask(shot.sources, shot.level.above(shot.photo.dn), MASK_PX)
         return np.asarray(~(lit | self.hot | self.dead))
+
+    def _fainter(self, number: int, expected: Expected) -> Fainter:
+        """How many sources are stars beyond Hipparcos, by its own stars in the image and the slope of star counts."""
+        shot = self.session.shots[number]
+        sine = abs(float(self.session.camera.pointings[number].boresight @ GALACTIC_POLE))
+        complete = COMPLETE_V_MAG[0] + COMPLETE_V_MAG[1] * sine
+        if not shot.clean.any():
+            return Fainter(complete, math.nan, 0.0)
+        places = np.column_stack([shot.found.x_px, shot.found.y_px])[shot.clean]
+        near = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px])).query(places)[1]
+        depth = shot.sky.v_mag[shot.star[shot.clean]] + 2.5 * np.log10(shot.sources.snr[near])
+        reached, v_mag = float(np.median(depth)) - 2.5 * math.log10(LISTED_SNR), shot.sky.v_mag[expected.star]
+        every = float((v_mag <= complete).sum()) * 10 ** (COUNTS_SLOPE * (reached - complete))
+        return Fainter(complete, reached, max(every - float((v_mag <= reached).sum()), 0.0) if reached > complete else 0.0)
 
     def _dated(self, number: int) -> DatedBy | None:
         """How far off the date is by the stars that move fastest over the image; None without stars."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.charts import BLUE, MUTED, ORANGE, chart, write_records
+from hilstar.charts import BLUE, MUTED, ORANGE, SMALL_PT, chart, write_records
 from hilstar.confront.report import Confronted
 from hilstar.confront.run import confront
 from hilstar.errors import InputError
@@ -137,4 +137,4 @@ def draw(path: Path, found: Sequence[PhotographFound]) -> None:
             axes.set_yticks(places, [])
             axes.invert_yaxis()
         labels = [f"{row.camera}, {Path(row.image).stem[-14:]}" for row in rows]
-        panels[0].set_yticks(places, labels, fontsize=8, color=MUTED)
+        panels[0].set_yticks(places, labels, fontsize=SMALL_PT, color=MUTED)

@@ -14,12 +14,14 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.bench.build import bench_moving
 from hilstar.confront.background import EIGHT_NEIGHBOURS, source_mask
 from hilstar.confront.light import BRIGHT_V_MAG
 from hilstar.confront.session import MATCH_PX, Session, Shot
 from hilstar.confront.sky import planets_seen
 from hilstar.frame.view import STILL
 from hilstar.rotation import to_matrix
+from hilstar.sky.bodies.passes import Cone
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
 from hilstar.twin.simulator import Simulator
 from hilstar.units import MAD_TO_SIGMA as MAD
@@ -29,6 +31,7 @@ LISTED_SNR = 8.0  # from which a source that nothing explains counts
 EXPECTED_SNR = 15.0  # of a star that is missing where no source is
 NEFF_PX = 4 * math.pi  # pixels whose noise a source's signal has: those of the Gaussian of 1 px by which it was found
 SAME_LIGHT = 0.15  # a star explains a source where it has so much of its light
+SATELLITE_RAD = math.radians(0.2)  # elements are off by 1 to 3 km a day, which is 0.2 degrees at 400 km
 PLANET_RAD = math.radians(3 / 60)
 EDGE_PX = 3.0  # a star so far outside an image has light on it
 HALO_PX = 15.0  # about a saturated star, sources are its own light
@@ -290,7 +293,7 @@ class Judge:
         session, shot = self.session, self.session.shots[number]
         sources, sky = shot.sources, shot.sky
         tree = cKDTree(np.column_stack([expected.x_px, expected.y_px])) if len(expected.star) else None
-        planets = self._planets(number)
+        planets, satellites = self._planets(number), self._satellites(number) if sources.trail.any() else {}
         pixel_dn = math.sqrt(float(np.median(session.pixels.variance_dn2(shot.level.level))))
         near, hot = _saturated(shot), ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
         height, width = light_sigma.shape
@@ -301,7 +304,9 @@ class Judge:
             at = float(sources.x_px[k]), float(sources.y_px[k])
             planet = next((name for name, place in planets.items() if math.dist(place, at) < reach), "")
             if planet or sources.trail[k]:
-                return planet or f"a trail {sources.length_px[k]:.0f} px long"
+                reach_px = sources.length_px[k] / 2 + SATELLITE_RAD * session.camera.camera.focal_length_px
+                name = next((name for name, place in satellites.items() if math.dist(place, at) < reach_px), "a trail")
+                return planet or f"{name}, {sources.length_px[k]:.0f} px long"
             light_dn = SAME_LIGHT * sources.snr[k] * pixel_dn * math.sqrt(NEFF_PX)
             beside = [] if tree is None else tree.query_ball_point(at, max(MATCH_PX + 0.5, sources.length_px[k] / 2))
             if beside and expected.dn[beside].sum() > light_dn:
@@ -326,6 +331,25 @@ class Judge:
         camera = self.session.camera
         x, y = camera.pointings[number].places_px(camera.camera, np.array(list(seen.values())))
         return {n: (float(a), float(b)) for n, a, b in zip(seen, x, y, strict=True) if math.isfinite(a) and math.isfinite(b)}
+
+    def _satellites(self, number: int) -> dict[str, tuple[float, float]]:
+        """Places of satellites in the middle of the exposure, by the bench's list; none without a list, a site and a date."""
+        file, photo = self.session.file, self.session.shots[number].photo
+        config, camera = file.config, self.session.camera
+        if config.sky.bodies.satellites is None or config.site is None or photo.t_ns is None:
+            return {}
+        utc = f"{np.datetime64(photo.t_ns, 'ns').astype('datetime64[ms]')}Z"
+        sky = msgspec.structs.replace(config.sky, epoch_utc=utc, epoch_jyear=self.session.shots[number].sky.epoch_jyear)
+        moving, pointing = bench_moving(msgspec.structs.replace(config, sky=sky), file.folder), camera.pointings[number]
+        if moving is None or moving.satellites is None:
+            return {}
+        moving.air = self.session.air
+        seen = moving.passing(Cone(pointing.boresight, camera.camera.field_radius_rad(0.0), photo.exposure_s or 0.0), 0)
+        if seen is None:
+            return {}
+        directions = seen.directions(slice(None), np.zeros(len(seen)))
+        x, y = camera.camera.project(directions @ to_matrix(pointing.q_icrs_to_cam).T)
+        return {moving.satellites.names[k]: (float(a), float(b)) for k, a, b in zip(seen.index, x, y, strict=True)}
 
     def _background(self, shot: Shot, light_sigma: FloatArray) -> BoolArray:
         """Pixels without light of stars and sources."""

@@ -126,7 +126,8 @@ def draw(path: Path, found: Sequence[PhotographFound]) -> None:
     if not rows:
         return
     best, worst = min(row.rms_px for row in rows), max(row.rms_px for row in rows)
-    finding = f"{len(rows)} photographs: stars to V = 6.5 are {best:.2f} to {worst:.2f} px off their places"
+    of = f"{len(rows)} photograph{'s' * (len(rows) > 1)}"
+    finding = f"{of}: stars to V = 6.5 are {best:.2f} to {worst:.2f} px off their places"
     note = "Bars: with a camera that all images of it fitted. Points: with the camera of the others."
     places = np.arange(len(rows))
     with chart(path, finding, 1, 2, note=note, share_x=False, height_inch=1.6 + 0.3 * len(rows)) as panels:

@@ -30,7 +30,7 @@ def test_a_set_has_a_row_and_a_page_for_each_camera_and_says_what_is_no_photogra
     assert "is no image" in rows["b.png"]["refused"]
     assert "planted/b.png: refused: is no image" in done.stdout
     assert (tmp_path / "out" / "planted" / "index.html").exists()
-    assert (tmp_path / "out" / "confront.svg").exists()
+    assert (tmp_path / "out" / "confront.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv, timing.csv and those of colour by
 `hilstar study NAME -o`, quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on
 which machine; bench_h100.csv on an NVIDIA H100.
+confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine changes it.
 """
 
 from __future__ import annotations
@@ -225,12 +226,29 @@ def mosaic_table() -> str:
     return table(head, body)
 
 
+def confronted_table() -> str:
+    """What is left of each photograph of the set, and why others were refused."""
+    head = ["camera, image", "stars to V = 6.5", "px rms", "mag rms", "background chi²", "unexplained", "held out"]
+    body = []
+    for row in rows_of("confronted.csv"):
+        name = f"{row['camera']}, {row['image']}"
+        if row["refused"]:
+            body.append([name, f"refused: {row['refused'].split(';')[0]}", *[""] * 5])
+            continue
+        figures = [f"{float(row[key]):.3f}" for key in ("rms_px", "rms_mag")]
+        held = [float(row[f"held_out_{key}"]) for key in ("px", "mag")]
+        out = "" if math.isnan(held[0]) else f"{held[0]:.3f} px, {held[1]:.3f} mag"
+        body.append([name, row["stars"], *figures, f"{float(row['background_chi2']):.2f}", row["unexplained"], out])
+    return table(head, body)
+
+
 TABLES = {
     "colour": colour_table,
     "colour_gamut": gamut_table,
     "colour_red": red_table,
     "colour_lateral": lateral_table,
     "colour_mosaic": mosaic_table,
+    "confronted": confronted_table,
     "over_frames": over_frames_table,
     "quantisation": quantisation_table,
     "centroiders": centroider_table,

@@ -14,12 +14,14 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.bench.build import bench_moving
 from hilstar.confront.background import EIGHT_NEIGHBOURS, source_mask
 from hilstar.confront.light import BRIGHT_V_MAG
 from hilstar.confront.session import MATCH_PX, Session, Shot
 from hilstar.confront.sky import planets_seen
 from hilstar.frame.view import STILL
 from hilstar.rotation import to_matrix
+from hilstar.sky.bodies.passes import Cone
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
 from hilstar.twin.simulator import Simulator
 from hilstar.units import MAD_TO_SIGMA as MAD
@@ -29,6 +31,7 @@ LISTED_SNR = 8.0  # from which a source that nothing explains counts
 EXPECTED_SNR = 15.0  # of a star that is missing where no source is
 NEFF_PX = 4 * math.pi  # pixels whose noise a source's signal has: those of the Gaussian of 1 px by which it was found
 SAME_LIGHT = 0.15  # a star explains a source where it has so much of its light
+SATELLITE_RAD = math.radians(0.2)  # elements are off by 1 to 3 km a day, which is 0.2 degrees at 400 km
 PLANET_RAD = math.radians(3 / 60)
 EDGE_PX = 3.0  # a star so far outside an image has light on it
 HALO_PX = 15.0  # about a saturated star, sources are its own light
@@ -37,6 +40,10 @@ CELLS = 4
 DIM_MAG, DIM_STARS, DIM_SIGMAS = 0.25, 2, 4.0
 HOT_SIGMAS, HOT_SHARE, HOT_LIGHT = 6.0, 0.75, 0.5
 MOVED_PX = 5.0  # by which stars move between photographs that tell them from hot pixels
+# Hipparcos is complete to 7.3 + 1.1 |sin b| for late types (ESA SP-1200 vol. 1, 1.1). From V = 8 to 10 the stars of the whole
+# sky grow 2.9 times a magnitude (Allen 1973).
+GALACTIC_POLE = np.array([-0.867666, -0.198076, 0.455984])
+COMPLETE_V_MAG, COUNTS_SLOPE = (7.3, 1.1), 0.46
 NOT_COUNTED = frozenset({"saturated", "blended", "missing", "dim region"})
 
 
@@ -108,6 +115,7 @@ class Verdict:
     star_chi2: float
     dim: list[str]
     dated: DatedBy | None
+    fainter: Fainter
     predicted: FloatArray = field(repr=False)
     residual: FloatArray = field(repr=False)
 
@@ -120,6 +128,15 @@ class Verdict:
     def missing(self) -> list[StarRow]:
         """Stars that should be there."""
         return [one for one in self.stars if "missing" in one.flags]
+
+
+@dataclass(frozen=True, slots=True)
+class Fainter:
+    """Stars that a photograph reaches beyond its catalogue: V to which that is complete and V of LISTED_SNR, and how many."""
+
+    complete_v_mag: float
+    reached_v_mag: float
+    expected: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +226,7 @@ class Judge:
             star_chi2=float(np.median(shot.found.chi2[shot.clean])) if shot.clean.any() else math.nan,
             dim=dim,
             dated=self._dated(number),
+            fainter=self._fainter(number, expected),
             predicted=level + light_dn,
             residual=residual,
         )
@@ -275,7 +293,7 @@ class Judge:
         session, shot = self.session, self.session.shots[number]
         sources, sky = shot.sources, shot.sky
         tree = cKDTree(np.column_stack([expected.x_px, expected.y_px])) if len(expected.star) else None
-        planets = self._planets(number)
+        planets, satellites = self._planets(number), self._satellites(number) if sources.trail.any() else {}
         pixel_dn = math.sqrt(float(np.median(session.pixels.variance_dn2(shot.level.level))))
         near, hot = _saturated(shot), ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
         height, width = light_sigma.shape
@@ -286,7 +304,9 @@ class Judge:
             at = float(sources.x_px[k]), float(sources.y_px[k])
             planet = next((name for name, place in planets.items() if math.dist(place, at) < reach), "")
             if planet or sources.trail[k]:
-                return planet or f"a trail {sources.length_px[k]:.0f} px long"
+                reach_px = sources.length_px[k] / 2 + SATELLITE_RAD * session.camera.camera.focal_length_px
+                name = next((name for name, place in satellites.items() if math.dist(place, at) < reach_px), "a trail")
+                return planet or f"{name}, {sources.length_px[k]:.0f} px long"
             light_dn = SAME_LIGHT * sources.snr[k] * pixel_dn * math.sqrt(NEFF_PX)
             beside = [] if tree is None else tree.query_ball_point(at, max(MATCH_PX + 0.5, sources.length_px[k] / 2))
             if beside and expected.dn[beside].sum() > light_dn:
@@ -312,11 +332,44 @@ class Judge:
         x, y = camera.pointings[number].places_px(camera.camera, np.array(list(seen.values())))
         return {n: (float(a), float(b)) for n, a, b in zip(seen, x, y, strict=True) if math.isfinite(a) and math.isfinite(b)}
 
+    def _satellites(self, number: int) -> dict[str, tuple[float, float]]:
+        """Places of satellites in the middle of the exposure, by the bench's list; none without a list, a site and a date."""
+        file, photo = self.session.file, self.session.shots[number].photo
+        config, camera = file.config, self.session.camera
+        if config.sky.bodies.satellites is None or config.site is None or photo.t_ns is None:
+            return {}
+        utc = f"{np.datetime64(photo.t_ns, 'ns').astype('datetime64[ms]')}Z"
+        sky = msgspec.structs.replace(config.sky, epoch_utc=utc, epoch_jyear=self.session.shots[number].sky.epoch_jyear)
+        moving, pointing = bench_moving(msgspec.structs.replace(config, sky=sky), file.folder), camera.pointings[number]
+        if moving is None or moving.satellites is None:
+            return {}
+        moving.air = self.session.air
+        seen = moving.passing(Cone(pointing.boresight, camera.camera.field_radius_rad(0.0), photo.exposure_s or 0.0), 0)
+        if seen is None:
+            return {}
+        directions = seen.directions(slice(None), np.zeros(len(seen)))
+        x, y = camera.camera.project(directions @ to_matrix(pointing.q_icrs_to_cam).T)
+        return {moving.satellites.names[k]: (float(a), float(b)) for k, a, b in zip(seen.index, x, y, strict=True)}
+
     def _background(self, shot: Shot, light_sigma: FloatArray) -> BoolArray:
         """Pixels without light of stars and sources."""
         lit = np.abs(light_sigma) > LIT_SIGMA
         lit |= source_mask(shot.sources, shot.level.above(shot.photo.dn), MASK_PX)
         return np.asarray(~(lit | self.hot | self.dead))
+
+    def _fainter(self, number: int, expected: Expected) -> Fainter:
+        """How many sources are stars beyond Hipparcos, by its own stars in the image and the slope of star counts."""
+        shot = self.session.shots[number]
+        sine = abs(float(self.session.camera.pointings[number].boresight @ GALACTIC_POLE))
+        complete = COMPLETE_V_MAG[0] + COMPLETE_V_MAG[1] * sine
+        if not shot.clean.any():
+            return Fainter(complete, math.nan, 0.0)
+        places = np.column_stack([shot.found.x_px, shot.found.y_px])[shot.clean]
+        near = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px])).query(places)[1]
+        depth = shot.sky.v_mag[shot.star[shot.clean]] + 2.5 * np.log10(shot.sources.snr[near])
+        reached, v_mag = float(np.median(depth)) - 2.5 * math.log10(LISTED_SNR), shot.sky.v_mag[expected.star]
+        every = float((v_mag <= complete).sum()) * 10 ** (COUNTS_SLOPE * (reached - complete))
+        return Fainter(complete, reached, max(every - float((v_mag <= reached).sum()), 0.0) if reached > complete else 0.0)
 
     def _dated(self, number: int) -> DatedBy | None:
         """How far off the date is by the stars that move fastest over the image; None without stars."""

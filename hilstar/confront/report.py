@@ -104,6 +104,11 @@ def _image_figures(session: Session, verdict: Verdict) -> dict[str, Any]:
         "star_chi2": _number(verdict.star_chi2),
         "unexplained": len(verdict.unexplained),
         "missing": len(verdict.missing),
+        "fainter_than_catalogue": {
+            "complete_v_mag": verdict.fainter.complete_v_mag,
+            "reached_v_mag": _number(verdict.fainter.reached_v_mag),
+            "expected": verdict.fainter.expected,
+        },
         "dim": verdict.dim,
         "offset_mag": float(session.light.offsets_mag[verdict.number]),
         "altitude_deg": pointing.altitude_deg,
@@ -180,7 +185,7 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
     if defects[0] or defects[1]:
         found.append(f"pixels: {defects[0]} hot and {defects[1]} dead, in most of the photographs")
     for verdict in verdicts:
-        found += [f"{verdict.shot.photo.name}: {line}" for line in (*verdict.dim, *_dated(verdict))]
+        found += [f"{verdict.shot.photo.name}: {line}" for line in (*verdict.dim, *_beyond(verdict), *_dated(verdict))]
     if excess is not None:
         found.append(f"scatter of {excess.stars} stars: {excess.rms_px:.3f} px an axis, {excess.rms_mag:.3f} mag")
     return found
@@ -195,6 +200,17 @@ def _tone(session: Session) -> str:
     said = f"DN go as light to the power {light.linearity:.3f} +- {sigma:.3f}"
     bent = abs(light.linearity - 1) > max(LINEAR_OFF, LINEAR_SIGMAS * sigma)
     return f"{said}: a tone curve that is no power, which stays in all figures" if bent else f"{said}: no tone curve"
+
+
+def _beyond(verdict: Verdict) -> Iterator[str]:
+    """What the unexplained sources may be: stars that no catalogue here has."""
+    fainter = verdict.fainter
+    if verdict.unexplained and fainter.expected >= 1:
+        yield (
+            f"{len(verdict.unexplained)} sources unexplained; about {fainter.expected:.0f} stars fainter than the catalogue's"
+            f" limit are to be expected: it is complete to V = {fainter.complete_v_mag:.1f}, the image reaches"
+            f" {fainter.reached_v_mag:.1f}"
+        )
 
 
 def _dated(verdict: Verdict) -> Iterator[str]:

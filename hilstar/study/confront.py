@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.charts import BLUE, MUTED, ORANGE, chart, write_records
+from hilstar.charts import BLUE, MUTED, ORANGE, SMALL_PT, chart, write_records
 from hilstar.confront.report import Confronted
 from hilstar.confront.run import confront
 from hilstar.errors import InputError
@@ -126,7 +126,8 @@ def draw(path: Path, found: Sequence[PhotographFound]) -> None:
     if not rows:
         return
     best, worst = min(row.rms_px for row in rows), max(row.rms_px for row in rows)
-    finding = f"{len(rows)} photographs: stars to V = 6.5 are {best:.2f} to {worst:.2f} px off their places"
+    of = f"{len(rows)} photograph{'s' * (len(rows) > 1)}"
+    finding = f"{of}: stars to V = 6.5 are {best:.2f} to {worst:.2f} px off their places"
     note = "Bars: with a camera that all images of it fitted. Points: with the camera of the others."
     places = np.arange(len(rows))
     with chart(path, finding, 1, 2, note=note, share_x=False, height_inch=1.6 + 0.3 * len(rows)) as panels:
@@ -137,4 +138,4 @@ def draw(path: Path, found: Sequence[PhotographFound]) -> None:
             axes.set_yticks(places, [])
             axes.invert_yaxis()
         labels = [f"{row.camera}, {Path(row.image).stem[-14:]}" for row in rows]
-        panels[0].set_yticks(places, labels, fontsize=8, color=MUTED)
+        panels[0].set_yticks(places, labels, fontsize=SMALL_PT, color=MUTED)

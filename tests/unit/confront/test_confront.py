@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from skyfield.api import EarthSatellite, wgs84
 
 from hilstar.attitude.logs.earth import q_icrs_to_enu
 from hilstar.rotation import conjugate, rotate
 from tests.support.commands import run_hilstar_here
 from tests.support.planted_sky import HEIGHT, NOTHING_WRONG, SKY, WIDTH, Extras, Planted, photograph, rotation_of, write_bench
+from tests.support.skies import STATION_TLE, skyfield
 
 RAW = sorted((Path(__file__).parents[2] / "data" / "confront").glob("*.tiff"))
 RAW_BENCH = """[tracker]
@@ -123,7 +125,7 @@ def test_a_planted_camera_comes_back_within_its_errors_and_what_was_planted_is_n
     assert not any(image["dim"] for image in found["images"][1:])
     others = [r for r in rows_of(tmp_path / "out" / "sources.csv") if r["image"] and not r["explained_by"].startswith("HIP ")]
     named = [r for r in others if float(r["snr"]) >= 8]
-    words = {r["explained_by"].rstrip("0123456789 pxlong") for r in named} - {"light of a bright star"}
+    words = {r["explained_by"].rstrip("0123456789 pxlong,") for r in named} - {"light of a bright star"}
     assert sorted(words) == ["", "a hot pixe", "a trai"]
     unexplained = [(float(r["x_px"]), float(r["y_px"])) for r in named if not r["explained_by"]]
     assert len(unexplained) == len(FALSE_STARS)
@@ -237,3 +239,33 @@ def test_a_date_that_is_ten_years_off_is_told_by_a_fast_star(tmp_path: Path) -> 
         found = confronted(bench, [tmp_path / "cygnus.png"], tmp_path / year, "--at", f"{year}-01-01T00:00:00")
         image_figures = found["images"][0]
         assert image_figures["date_off_years"] == pytest.approx(off, abs=max(3 * image_figures["date_sigma_years"], 0.5))
+
+
+def test_a_trail_has_the_name_of_the_satellite_that_passed_there(tmp_path: Path) -> None:
+    """The station of 2008, seen from a place beside its path; where it is, Skyfield says."""
+    with skyfield() as (times, kernel):
+        station = EarthSatellite(*STATION_TLE.splitlines()[1:3], "ISS", times)
+        hours = (times.utc(2008, 9, 20, hour) for hour in range(24))
+        when = next(t for t in hours if station.at(t).is_sunlit(kernel))
+        below = wgs84.subpoint(station.at(when))
+        latitude, longitude = below.latitude.degrees - 3, below.longitude.degrees
+        seen = station - wgs84.latlon(latitude, longitude)
+        ends = [seen.at(times.tt_jd(when.tt + seconds / 86400)).radec()[:2] for seconds in (-1.0, 0.0, 1.0)]
+    places = [np.radians([ra.hours * 15, dec.degrees]) for ra, dec in ends]
+    vectors = np.array([(np.cos(d) * np.cos(r), np.cos(d) * np.sin(r), np.sin(d)) for r, d in places])
+    pointing = (*np.degrees(places[1]), 0.0)
+    x, y, z = rotation_of(*pointing) @ vectors.T
+    camera = Planted(epoch_jyear=2008.7, vignetting_mag=0.0)
+    trail = [(camera.centre_px[0] + 3000 * a / c, camera.centre_px[1] + 3000 * b / c) for a, b, c in zip(x, y, z, strict=True)]
+    utc = when.utc_datetime().strftime("%Y-%m-%dT%H:%M:%S")
+    t_ns = np.datetime64(utc, "ns").astype(np.int64)
+    up = rotate(conjugate(q_icrs_to_enu(np.array([t_ns]), latitude, longitude)[0]), np.array([[0.0, 0.0, 1.0]]))[0]
+    extras = Extras(trail_px=(trail[0], trail[2]), zenith=tuple(up))
+    Image.fromarray(photograph(camera, pointing, np.random.default_rng(4), extras)).save(tmp_path / "pass.png")
+    (tmp_path / "tles.txt").write_text(STATION_TLE)
+    keys = f"[site]\nlatitude_deg = {latitude}\nlongitude_deg = {longitude}\n"
+    keys += '[sky]\nepoch_utc = "2008-09-20T12:00:00Z"\n[sky.bodies]\nsatellites = "tles.txt"\n'
+    confronted(write_bench(tmp_path / "guess.toml", more=keys), [tmp_path / "pass.png"], tmp_path / "out", "--at", utc)
+    trails = [row["explained_by"] for row in rows_of(tmp_path / "out" / "sources.csv") if " px long" in row["explained_by"]]
+    assert trails
+    assert all(text.startswith("ISS (ZARYA), ") for text in trails)

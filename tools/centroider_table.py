@@ -16,7 +16,7 @@ from hilstar.campaign.plan import Centroiding
 from hilstar.campaign.solvers import CentroidSolver
 from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.twin.glass_errors import split_errors
+from hilstar.twin.glass import split_errors
 from hilstar.twin.simulator import Simulator
 from tests.support.benches import bench_text
 from tests.support.glass import SIDE_PX, stack

@@ -18,15 +18,14 @@ from scipy.spatial import cKDTree
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.assess.budget import Axes, axes_of_variance
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_stars
+from hilstar.bench.build import StarGlass, bench_stars
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.optics.glass_psf import GlassPsf
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.tracker.centroiders import star_places
-from hilstar.twin.glass import StarGlass, told_psf
-from hilstar.twin.glass_errors import MIN_STARS as MIN_SPLIT_STARS
-from hilstar.twin.glass_errors import split_errors
+from hilstar.twin.glass import MIN_STARS as MIN_SPLIT_STARS
+from hilstar.twin.glass import split_errors, told_psf
 from hilstar.twin.noise import attitude_limits_arcsec, field_stars
 from hilstar.twin.verify.star_finder import star_finder
 from hilstar.twin.verify.twin import Twin

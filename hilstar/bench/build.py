@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from msgspec.structs import replace
 
-from hilstar.arrays import Float32Array, FloatArray
+from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.bench.cameras import bench_camera, display_psf, tracker_camera, tracker_psf
+from hilstar.bench.cameras import before_detector, bench_camera, display_psf, tracker_camera, tracker_psf
 from hilstar.bench.colours import Colours, mixed_for
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, Tracker
 from hilstar.bench.config.bench_config import drives_apart, epoch_utc_ns, has_observer, sky_jd
@@ -33,6 +33,7 @@ from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration,
 from hilstar.monitor.primaries import chromatic_primaries, read_primaries
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.quantisers import QUANTISERS, Quantisation
+from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.render.backend import Target, level_cost
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.rotation import from_radec_roll_deg
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
 
 S_PER_MS = 1e-3
+# Bands of a star's light as a glass sees it: twice as fine moves no share by over 1e-3 (tests/unit/twin/test_glass.py)
+BAND_NM, KNOT_NM = 25.0, 5.0
 # Codes are timed in fields spread evenly over the sky, turning at 1 deg/s, as often as these times allow. The fastest frame of
 # each field counts.
 TIMED_FIELDS = [from_radec_roll_deg(*place, 0.0) for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
@@ -92,14 +95,14 @@ def assembled(
 
 def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: Sources, timed: bool) -> Bench:
     render, calibration = file.config.render, bench_calibration(file.config, file.folder)
-    psf = display_psf(render)
+    camera = bench_camera(file.config, file.folder)
+    psf, drawn = display_psf(file.config, file.folder, camera)
     colours = bench_colours(file.config, file.folder, stars.catalog)
     stars = stars if colours is None else colours.on(stars)
     drive = 1.0 if stars.primaries is None or colours is None else colours.drive(stars.primaries)
     white_e_per_s = render.flux_at_white_e_per_s or brightest_peak_e_per_s(stars, psf, render.brightest_v_mag, drive)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())
-    camera = bench_camera(file.config, file.folder)
     light = Light(
         response=calibration.response,
         # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
@@ -110,6 +113,7 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
         refresh_hz=file.config.monitor.refresh_hz,
         seen=seen_by(file, camera),
         centroider=file.config.verify.judge,
+        psf=psf,
         exposure_frames=file.config.exposure_frames,
         cost=partial(level_cost, context=context),
     )
@@ -119,6 +123,7 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
     def bench_by(effort: Effort | None) -> Bench:
         config, codes = file.config, render.quantisation
         if effort is not None:
+            effort = effort if drawn is None else dataclasses.replace(effort, choices=(*effort.choices, drawn))
             codes = effort.quantisation
             chosen = replace(render, quantisation=codes, motion_above_px=effort.motion_above_px)
             config = replace(config, render=chosen)
@@ -153,7 +158,9 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
             shown_stars=seen_with(shown),
             faint_stars=faint,
             sources=sources,
-            tracker_psf=tracker_psf(config.tracker, file.folder),
+            tracker_psf=before_detector(config, file.folder, camera),
+            spectra=StarGlass(file, psf).shares if isinstance(psf, GlassPsf) else None,
+            drawn=drawn,
             renderer=open_backend(target, context),
             colours=colours,
             panel=Panel(calibration.response, white_e_per_s, uniformity, panels),
@@ -216,7 +223,8 @@ def seen_by(file: BenchFile, camera: Camera) -> Seen:
     """How the tracker sees the monitor at the boresight: its blur and its pixel in monitor pixels."""
     tracker = file.config.tracker
     pixel_px = camera.focal_length_px * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
-    return Seen(blur_px=math.sqrt(math.prod(tracker_psf(tracker, file.folder).width_px)) * pixel_px, pixel_px=pixel_px)
+    blur_px = math.sqrt(math.prod(before_detector(file.config, file.folder, camera).width_px)) * pixel_px
+    return Seen(blur_px=blur_px, pixel_px=pixel_px)
 
 
 def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
@@ -444,3 +452,80 @@ def orientation_of(monitor: Monitor) -> Orientation:
 def scan_of(monitor: Monitor) -> Scan:
     """When the rows light, and for how long."""
     return Scan(orientation_of(monitor).down, monitor.panel_scanout_ms * S_PER_MS, monitor.panel_hold_ms * S_PER_MS)
+
+
+class StarGlass:
+    """The shares that a `psf`'s wavelengths have of the light of a bench's stars, through one channel's `optics` or all.
+
+    The band is cut into narrow ones, whose electrons come from the same tables as a star's total, so every model of
+    spectra (`[sky] brightness`, `spectrum`, `temperature`) counts here too.
+    """
+
+    def __init__(self, file: BenchFile, psf: GlassPsf, optics: Optics | None = None, band_nm: float = BAND_NM) -> None:
+        self.psf, self._config, self._mean = psf, file.config, psf.mean_shares
+        self._catalog: Catalog | None = None
+        self._of_row = np.empty((0, 0))
+        self._bands: list[StarRates] = []
+        self._of_band = np.ones((0, 1))
+        if len(psf.wavelengths_nm) > 1:
+            flat = self._cut(file, optics or bench_optics(file.config.tracker, file.folder), band_nm)
+            if optics is not None and self._bands:
+                self._mean = flat @ self._of_band / flat.sum()
+
+    def _cut(self, file: BenchFile, optics: Optics, band_nm: float) -> FloatArray:
+        """Bands that overlap as triangles do, so that they sum to the tracker's own; each one's response to even photons."""
+        low_nm, high_nm = optics.range_nm
+        nodes_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / band_nm) + 1)
+        fine_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / KNOT_NM) + 1)
+        own_nm = optics.quantum_efficiency.wavelength_nm
+        knots_nm = np.union1d(np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)])
+        efficiency = optics.quantum_efficiency(knots_nm)
+        shares, of_band, flat = NodeSpline(self.psf.wavelengths_nm)(knots_nm), [], []
+        for number in range(len(nodes_nm)):
+            part = efficiency * np.interp(knots_nm, nodes_nm, np.eye(len(nodes_nm))[number])
+            response = part * optics.transmission(knots_nm) * np.gradient(knots_nm)
+            if not response.any():
+                continue
+            try:
+                rates = channel_rates(file.config.sky, dataclasses.replace(optics, quantum_efficiency=Curve(knots_nm, part)))
+            except InputError:  # so little light that some spectrum has none: the bands beside it stand for it
+                continue
+            self._bands.append(rates)
+            flat.append(response.sum())
+            of_band.append(response @ shares / flat[-1])
+        self._of_band = np.array(of_band)
+        return np.array(flat)
+
+    def shares(self, stars: Stars, which: IntArray) -> FloatArray:
+        """The shares (n, L) of stars at places (n,) of `stars`; those of light without a spectrum where a place is negative."""
+        if not self._bands:
+            return self._mean
+        if self._catalog is not stars.catalog:
+            self._catalog, self._of_row = stars.catalog, np.full((len(stars.catalog), self._of_band.shape[1]), np.nan)
+        found = np.tile(self._mean, (len(which), 1))
+        rows = np.where(which >= 0, stars.row[np.maximum(which, 0)], -1)
+        listed, body = rows >= 0, (rows < 0) & (which >= 0)
+        new = np.unique(rows[listed][np.isnan(self._of_row[rows[listed], 0])])
+        if len(new):
+            some = stars.catalog.taken(new)
+            self._of_row[new] = self._through(some.bv_mag, some.vi_mag, star_kinds(self._config, some))
+        found[listed] = self._of_row[rows[listed]]
+        if body.any():
+            bv_mag = stars.bv_mag[which[body]]
+            kind = (
+                np.full((len(bv_mag), 2), np.nan)
+                if star_kinds(self._config, stars.catalog.taken(np.arange(0))) is not None
+                else None
+            )
+            found[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
+        return found
+
+    def shares_of(self, stars: Stars, hip: IntArray) -> FloatArray:
+        """The same by Hipparcos numbers (n,) of `stars`, 0 for a body."""
+        order = np.argsort(stars.hip)
+        at = np.minimum(np.searchsorted(stars.hip, hip, sorter=order), len(order) - 1)
+        return self.shares(stars, np.where(hip > 0, order[at], -1))
+
+    def _through(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
+        rates = np.stack([band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1)
+        return np.asarray(rates @ self._of_band / rates.sum(axis=1, keepdims=True))

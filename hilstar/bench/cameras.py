@@ -9,18 +9,21 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 
-from hilstar.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, RenderSettings, Tracker
-from hilstar.bench.glass import bench_glass_psf, decentre_px, glass_in, say_once, through_glass
+from hilstar.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, Tracker
+from hilstar.bench.glass import Onto, bench_glass_psf, decentre_px, glass_in, say_once, through_glass
+from hilstar.bench.least_psf import ONE_PSF, WHOLE, Choice, least_psf
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import load_distortion, load_geometry, monitor_camera
+from hilstar.optics.glass_psf import regridded
 from hilstar.scene.camera import Camera, bounded
-from hilstar.scene.psf import GaussianPsf, Psf, read_psf
+from hilstar.scene.psf import GaussianPsf, Psf, SampledPsf, read_psf
 
 NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
 MIN_SEEN, MIN_FILLED = 0.1, 0.5  # share of the screen that the tracker sees; share of the tracker's field that the screen fills
@@ -43,13 +46,16 @@ MM = {"um": 1e-3, "cm": 10.0, "inches": 25.4, "m": 1000.0}
 UM = {"nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 GRID = 64  # places along each side
 MAX_MENDS = 3
+FIELD_PLACES = 5  # along each side of the detector, where the PSFs that a display may draw are compared
+OBLIQUE, UM_PER_MM = 1e-3, 1e3
+NO_OBJECTIVE_PX = 1e-3, 1e-3  # far under a monitor pixel on the detector, by whose own squares light is spread
 
 
 def bench_camera(config: BenchConfig, folder: Path) -> Camera:
     """The monitor behind its collimator, by its geometry file where it has one. Raises InputError."""
     if config.collimator.geometry is None:
         return ideal_monitor(config)
-    return real_monitor(config, folder / config.collimator.geometry)
+    return real_monitor(config, folder, config.collimator.geometry)
 
 
 def ideal_monitor(config: BenchConfig) -> Camera:
@@ -63,9 +69,48 @@ def ideal_monitor(config: BenchConfig) -> Camera:
     )
 
 
-def display_psf(render: RenderSettings) -> Psf:
-    """How a star is drawn on the monitor."""
-    return GaussianPsf(render.sprite_sigma_px)
+def display_psf(config: BenchConfig, folder: Path, display: Camera) -> tuple[Psf, Choice | None]:
+    """How a star is drawn on the monitor, and why so where the file leaves it to the tolerance. Raises InputError."""
+    render = config.render
+    if render.psf == GAUSSIAN:
+        return GaussianPsf(render.sprite_sigma_px), None
+    tracker = replace(config.tracker, effort="full")
+    optics, camera = tracker.optics, tracker_camera(tracker, folder)
+    own, onto = tracker_psf(tracker, folder), Onto(display, camera)
+    x_px, y_px = camera.grid_px(FIELD_PLACES)
+    places_px = onto.places_px(np.stack([x_px, y_px], axis=1))
+    if not np.isfinite(places_px).all():
+        raise InputError('[render] psf = "tracker": the tracker looks past the display; check [collimator] q_cam_to_mon')
+    try:
+        if isinstance(own, GaussianPsf):
+            spread = onto.matrix @ np.diag(np.square(own.sigma_px)) @ onto.matrix.T
+            if abs(spread[0, 1]) > OBLIQUE * spread.trace():
+                raise InputError("its Gaussian is oval and lies obliquely on the display; give [tracker.optics] psf a file")
+            return GaussianPsf((math.sqrt(spread[0, 0]), math.sqrt(spread[1, 1]))), None
+        if isinstance(own, SampledPsf) and own.pixel_integrated:
+            raise InputError("it has the tracker's pixel in it (PIXINT), which the detector adds again; give one without")
+        glass = glass_in(tracker, folder)
+        if glass is not None:
+            drawn: SampledPsf = bench_glass_psf(glass, tracker, folder, onto)
+        else:
+            image = read_psf(folder / optics.psf)
+            samples, per_px = regridded(image.samples[None], image.per_px, onto.matrix)
+            drawn = SampledPsf(samples[0], per_px)
+        among = None if render.effort == "auto" else frozenset((ONE_PSF, WHOLE))
+        return least_psf(drawn, places_px, (render.tolerance_mag, render.tolerance_px), among)
+    except InputError as error:
+        raise InputError(f'[render] psf = "tracker", with {optics.psf}: {error}') from error
+
+
+def before_detector(config: BenchConfig, folder: Path, display: Camera) -> Psf:
+    """How what lies between display and detector spreads a point, tracker pixels: the collimator, and the tracker's optics.
+
+    A display that draws the tracker's PSF has a detector without its objective before it.
+    """
+    bare = config.render.psf != GAUSSIAN
+    psf = GaussianPsf(NO_OBJECTIVE_PX) if bare else tracker_psf(config.tracker, folder)
+    blur_px = config.collimator.psf_sigma_px * tracker_camera(config.tracker, folder).focal_length_px / display.focal_length_px
+    return psf.blurred(blur_px) if blur_px else psf
 
 
 def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
@@ -75,13 +120,31 @@ def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
     if tracker.psf_sigma_px != DEFAULT_PSF_SIGMA_PX:
         say_once(f"psf_sigma_px is not used: [tracker.optics] psf is {tracker.optics.psf}", "[tracker]")
     glass = glass_in(tracker, folder)
-    return read_psf(folder / tracker.optics.psf) if glass is None else bench_glass_psf(glass, tracker, folder)
+    own = read_psf(folder / tracker.optics.psf) if glass is None else bench_glass_psf(glass, tracker, folder)
+    if tracker.effort == "full":
+        return own
+    return _least(own, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px))
 
 
-def real_monitor(config: BenchConfig, path: Path) -> Camera:
+@lru_cache(maxsize=4)
+def _least(own: SampledPsf, size_px: tuple[int, int], tolerance: tuple[float, float]) -> Psf:
+    """The least PSF that `[tracker] effort = "auto"` allows, which a notice names."""
+    columns, rows = np.meshgrid(*(np.linspace(0, size - 1, FIELD_PLACES) for size in size_px))
+    found, choice = least_psf(own, np.stack([columns.ravel(), rows.ravel()], axis=1), tolerance)
+    say_once(choice.line(), "[tracker] effort")
+    return found
+
+
+def real_monitor(config: BenchConfig, folder: Path, path: str) -> Camera:
     """The monitor as a geometry file has it, bounded to what sprites on it need. Raises InputError."""
-    camera = load_geometry(path, config.monitor.resolution_px)
-    return _bounded(camera, display_psf(config.render).footprint_px / 2 + 1, path)
+    camera = load_geometry(folder / path, config.monitor.resolution_px)
+    if config.render.psf == GAUSSIAN:
+        footprint_px = GaussianPsf(config.render.sprite_sigma_px).footprint_px
+    else:
+        tracker = config.tracker
+        ratio = camera.focal_length_px / (tracker.focal_length_mm * UM_PER_MM / tracker.pixel_pitch_um)
+        footprint_px = math.ceil(ratio * tracker_psf(tracker, folder).footprint_px) + 1
+    return _bounded(camera, footprint_px / 2 + 1, folder / path)
 
 
 def tracker_camera(tracker: Tracker, folder: Path) -> Camera:

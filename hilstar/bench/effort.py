@@ -13,10 +13,10 @@ from functools import lru_cache
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.cameras import display_psf
 from hilstar.bench.config import RenderSettings
+from hilstar.bench.least_psf import MAG_PER_SHARE, Choice
 from hilstar.monitor.balance import AS_USUAL, Balance, Seen
-from hilstar.monitor.phases import UNLIKE, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.monitor.phases import UNLIKE, USUAL_PSF, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.monitor.quantise import EXPOSURE_FRAMES, LevelCost, Panel, Quantiser
 from hilstar.monitor.quantisers import BY_COST, QUANTISERS, Quantisation
 from hilstar.monitor.response import Response
@@ -30,7 +30,6 @@ from hilstar.units import flux_ratio
 CODES_SHARE, EDGES_SHARE, MOTION_SHARE = 0.5, 0.25, 0.25
 PHASES = 12
 MAGNITUDES = 5  # at which codes are judged, from white down to the faintest star
-MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
@@ -39,20 +38,6 @@ CHEAP, BEST = BY_COST[0], BY_COST[-1]
 # Between these times, in limits, a measured frame leaves the choice as the table has it: two starts of a run then have the same
 # codes. Other programs slow frames down, and nothing speeds them up: the upper time is a whole refresh.
 SURELY_IN_TIME, SURELY_LATE = 0.8, 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """One choice: its subject, its value, its error, and what it saves compared with full effort."""
-
-    what: str
-    chosen: str
-    error: str
-    saving: str
-
-    def line(self) -> str:
-        """The choice as one line of text."""
-        return f"{self.what}: {self.chosen}; {self.error}; {self.saving}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +119,9 @@ class Light:
 
     `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
     whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider` what it finds stars by: None
-    where the bench does not say, and then all of them judge. Its exposure has `exposure_frames`. `cost` is what a quantiser
-    costs by the table, `measured` what it costs where the bench is drawn (None: not measured).
+    where the bench does not say, and then all of them judge. `psf` is how stars are drawn. The exposure has
+    `exposure_frames`. `cost` is what a quantiser costs by the table, `measured` what it costs where the bench is drawn (None:
+    not measured).
     """
 
     response: Response
@@ -146,6 +132,7 @@ class Light:
     refresh_hz: float = 60.0
     seen: Seen = AS_USUAL
     centroider: Centroider | None = None
+    psf: Psf = USUAL_PSF
     exposure_frames: int = EXPOSURE_FRAMES
     cost: Callable[[type[Quantiser], Psf], LevelCost] = level_cost
     measured: FieldCost | None = None
@@ -183,7 +170,7 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
             method, (), motion_px, errors.flux_mag, errors.place_px + motion_px, (codes.choice,), by_cost=codes.by_cost
         )
     sprites, rates = choose_sides(render, light, method), light.rates_e_per_s
-    limit = QUANTISERS[method].faintest_e_per_s(light.panel, display_psf(render))
+    limit = QUANTISERS[method].faintest_e_per_s(light.panel, light.psf)
     dark = rates < limit
     share = float(rates[dark].sum() / rates.sum()) if dark.any() else 0.0
     stars = Choice(
@@ -228,7 +215,7 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
 
     `auto` does not take `exact` where that would be late in fields of many stars and `round` would not.
     """
-    table = light.tabulated_cost(display_psf(render))
+    table = light.tabulated_cost(light.psf)
     known = light.measured
     if known is None and render.codes_ms is not None:
         known = FieldCost(*render.codes_ms, "by [render] codes_ms")
@@ -285,7 +272,7 @@ class _CodeStars:
 
 
 def _code_stars(render: RenderSettings, light: Light) -> _CodeStars:
-    psf, response = display_psf(render), light.response
+    psf, response = light.psf, light.response
     faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
     deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / psf.peak_share / faintest))
     mags = tuple(np.linspace(0.0, deepest, MAGNITUDES).tolist())
@@ -323,10 +310,10 @@ def _code_errors(stars: _CodeStars, method: Quantisation, limit_mag: float) -> C
 
 def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> ChosenSides:
     """The smallest sprites whose edges stay within their part of the tolerance."""
-    psf = display_psf(render)
+    psf = light.psf
     full = psf.footprint_px
     allowed_mag, allowed_px = EDGES_SHARE * render.tolerance_mag, EDGES_SHARE * render.tolerance_px
-    sizes = range(full % 2 or 2, full, 2)
+    sizes = range(0) if psf.by_place else range(full % 2 or 2, full, 2)
     largest = next((s for s in sizes if cut_mag(s, psf) <= allowed_mag and cut_px(s, psf) <= allowed_px), full)
     sides = [(math.inf, largest)]
     if unlit := UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel):

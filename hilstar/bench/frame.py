@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Self
@@ -17,6 +17,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.colours import Colours, lit_alone
 from hilstar.bench.config import BenchConfig, Vector
 from hilstar.bench.effort import Effort
+from hilstar.bench.least_psf import Choice
 from hilstar.errors import InputError
 from hilstar.frame.bodies import BodyLayer, disc_stars
 from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
@@ -28,6 +29,7 @@ from hilstar.monitor.footprints import FootprintMap, star_losses_mag
 from hilstar.monitor.quantise import Panel, Quantiser, shown_light
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Codes, Levels, code_dtype
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.render.backend import Backend, linear_light
 from hilstar.rotation import normalise
 from hilstar.scene.camera import Camera
@@ -107,7 +109,8 @@ class Bench:
     `config` is that of `file` with everything chosen that the file left to its tolerance (`effort`, None where it left
     nothing). Of `stars` those from `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are
     `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of white, None where that is 1 everywhere, and
-    `darkest` its minimum. `tracker_psf` is how its optics spread a star.
+    `darkest` its minimum. `tracker_psf` is how collimator and tracker spread a monitor's point. `drawn` says which PSF
+    stars are drawn by where the display brings the tracker's; `spectra` are their shares of its wavelengths, by place.
     `sources` are the sky's light beside stars, whose bodies have places among `stars` and `shown_stars`.
     `output` says how the display's output is set that its frames are shown on; {} without one. `panel` is the monitor's light
     by its levels. Where its primaries are driven apart, `colours` says what for, and stars have the light of each.
@@ -130,6 +133,8 @@ class Bench:
     renderer: Backend
     panel: Panel
     colours: Colours | None = None
+    spectra: Callable[[Stars, IntArray], FloatArray] | None = None
+    drawn: Choice | None = None
     sources: Sources = NO_SOURCES
     output: dict[str, object] = field(default_factory=dict, repr=False)
 
@@ -212,12 +217,15 @@ class Bench:
 
     def _light(self, layers: tuple[Layer, ...], stars: Stars, view: View, faults: FaultLayer | None) -> Sprites:
         layers = layers if faults is None else (*layers, faults)
-        return light_of(self.canvas, layers, seen_in(view, stars, self.moving), view)
+        return self._coloured(light_of(self.canvas, layers, seen_in(view, stars, self.moving), view), stars)
+
+    def _coloured(self, sprites: Sprites, stars: Stars) -> Sprites:
+        return sprites if self.spectra is None else replace(sprites, spectra=self.spectra(stars, sprites.star))
 
     def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
         """The sprites of `stars` (by default those bright enough to show) as points, at an attitude (unit quaternion)."""
         stars = self.shown_stars if stars is None else stars
-        return light_of(self.canvas, self.layers[:1], stars, View(q_icrs_to_cam))
+        return self._coloured(light_of(self.canvas, self.layers[:1], stars, View(q_icrs_to_cam)), stars)
 
     def draw(
         self,
@@ -355,9 +363,17 @@ class Bench:
         return np.asarray(rgb[levels], dtype=code_dtype(self.calibration.response.bits))
 
     def _clipped(self, sprites: Sprites, stars: Stars) -> IntArray:
+        psf, spectra = self.psf, sprites.spectra
+        if isinstance(psf, GlassPsf) and spectra is not None:  # as bright as the mean PSF's stars with the same peaks
+            data, half_white = sprites.data.copy(), 0.5 * self.flux_at_white_e_per_s * self.darkest
+            bright = np.flatnonzero(data["electrons_per_s"] * (sprites.per_star * psf.peak_share) > half_white)
+            x_px, y_px, rate = sprites.x_px[bright], sprites.y_px[bright], data["electrons_per_s"][bright]
+            stamps = psf.of_stars(x_px, y_px, spectra[bright] if spectra.ndim == 2 else spectra, rate)
+            data["electrons_per_s"][bright] = stamps.max(axis=(1, 2)) / psf.shares(np.rint(x_px) - x_px, np.rint(y_px) - y_px)
+            sprites = replace(sprites, data=data)
         parts = (sprites,) if self.colours is None else self.colours.parts(replace(sprites, extended=()), stars)
         over = [
-            clipped_sprites(part, self.psf, one.flux_at_white_e_per_s, self.camera.resolution_px, self.uniformity, self.darkest)
+            clipped_sprites(part, psf, one.flux_at_white_e_per_s, self.camera.resolution_px, self.uniformity, self.darkest)
             for part, one in zip(parts, self.panel.primaries or (self.panel,), strict=True)
         ]
         return over[0] if len(over) == 1 else np.unique(np.concatenate(over))
@@ -413,6 +429,11 @@ def clipping_line(bench: Bench) -> str | None:
     stars = f"1 {one} of the sky is" if len(found) == 1 else f"{len(found)} {many} of the sky are"
     key = "flux_at_white_e_per_s" if render.brightest_v_mag is None else f"brightest_v_mag = {render.brightest_v_mag:g}"
     return f"{stars} brighter than white and clip in view: {named(found, NAMED_STARS)} ([render] {key})"
+
+
+def drawn_line(bench: Bench) -> str | None:
+    """One line on the PSF by which stars are drawn, where the display brings the tracker's; otherwise None."""
+    return None if bench.drawn is None else f"[render] {bench.drawn.line()}"
 
 
 def shares_line(bench: Bench) -> str | None:

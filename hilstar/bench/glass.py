@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import GAUSSIAN, Tracker
-from hilstar.optics.glass_psf import GlassPsf, NodeSpline, glass_psf
+from hilstar.optics.glass_psf import GlassPsf, NodeSpline, glass_psf, regridded
 from hilstar.optics.psf_file import Glass, read_glass
 from hilstar.scene.camera import Camera
 from hilstar.sky.electrons import Optics
@@ -31,12 +31,31 @@ def glass_in(tracker: Tracker, folder: Path) -> Glass | None:
     return found if isinstance(found, Glass) else None
 
 
-def bench_glass_psf(glass: Glass, tracker: Tracker, folder: Path) -> GlassPsf:
-    """A tracker's glass at its focus; the same again is the same object. Says what the file does not cover."""
+@dataclass(frozen=True, slots=True)
+class Onto:
+    """How the tracker's pixels lie on the display."""
+
+    display: Camera
+    tracker: Camera
+
+    def places_px(self, places_px: FloatArray) -> FloatArray:
+        """Display pixels (n, 2) of tracker pixels (n, 2), without a mirror."""
+        return np.stack(self.display.project(self.tracker.rays(*places_px.T) @ self.display.cam_to_image.T), axis=1)
+
+    @property
+    def matrix(self) -> FloatArray:
+        """Takes offsets of tracker pixels to display pixels (2, 2): by places half a pixel beside the principal point."""
+        sides = np.array([(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
+        ends = self.places_px(np.array(self.tracker.principal_point_px) + sides)
+        return np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=1)
+
+
+def bench_glass_psf(glass: Glass, tracker: Tracker, folder: Path, onto: Onto | None = None) -> GlassPsf:
+    """A tracker's glass at its focus, or as a display draws it; the same again is the same object. Says what is not covered."""
     shares = _mean_shares(glass, tracker, folder)
     optics = tracker.optics
     focus_um = optics.focus_um + optics.focus_um_per_k * optics.warmer_k
-    return _glass_psf(glass, focus_um, decentre_px(tracker), tuple(shares.tolist()), tracker.resolution_px)
+    return _glass_psf(glass, focus_um, decentre_px(tracker), tuple(shares.tolist()), tracker.resolution_px, onto)
 
 
 def decentre_px(tracker: Tracker) -> tuple[float, float]:
@@ -46,10 +65,22 @@ def decentre_px(tracker: Tracker) -> tuple[float, float]:
 
 @lru_cache(maxsize=4)
 def _glass_psf(
-    glass: Glass, focus_um: float, moved_px: tuple[float, float], shares: tuple[float, ...], resolution_px: tuple[int, int]
+    glass: Glass,
+    focus_um: float,
+    moved_px: tuple[float, float],
+    shares: tuple[float, ...],
+    resolution_px: tuple[int, int],
+    onto: Onto | None,
 ) -> GlassPsf:
     if any(moved_px):
         glass = replace(glass, places_px=glass.places_px + np.array(moved_px))
+    if onto is not None:
+        basis, per_px = regridded(glass.basis.astype(np.float64), glass.per_px, onto.matrix)
+        weights = glass.weights / (glass.weights @ basis.sum(axis=(1, 2)))[..., None]
+        places_px, lateral_px = np.round(onto.places_px(glass.places_px), 6), glass.lateral_px @ onto.matrix.T
+        fine = basis.astype(np.float32)
+        glass = replace(glass, places_px=places_px, basis=fine, weights=weights, lateral_px=lateral_px, per_px=per_px)
+        return glass_psf(glass, focus_um, np.array(shares))
     found = glass_psf(glass, focus_um, np.array(shares))
     width, height = resolution_px
     corners = np.array([(x, y) for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])

@@ -8,8 +8,8 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
-from hilstar.bench.cameras import tracker_camera
-from hilstar.bench.config import BenchConfig
+from hilstar.bench.cameras import before_detector, tracker_camera
+from hilstar.bench.config import GAUSSIAN, BenchConfig
 from hilstar.frame.layers import Sources, light_of, sky_layers
 from hilstar.frame.view import View
 from hilstar.monitor.quantise import primary_lights
@@ -70,7 +70,9 @@ class DisplayTracker:
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
     def _load_optics(self) -> None:
-        self._optics = TwinOptics(true_geometry(self._bench, self.camera), self.canvas.psf)
+        self._optics = TwinOptics(
+            true_geometry(self._bench, self.camera), before_detector(self.config, self.file.folder, self._bench.camera)
+        )
         self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
 
     def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
@@ -149,8 +151,8 @@ def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
     """The keys that decide the bench's frames; of the tracker those of its light gathering and exposure."""
     tracker = config.tracker
     gathers = tracker.aperture_mm, tracker.quantum_efficiencies, tracker.transmission, tracker.exposure_s
-    open_part = tracker.detector.fill_factor
-    return config.sky, config.spacecraft, config.monitor, config.collimator, config.render, gathers, open_part
+    open_part, drawn = tracker.detector.fill_factor, None if config.render.psf == GAUSSIAN else _optics_keys(config)
+    return config.sky, config.spacecraft, config.monitor, config.collimator, config.render, gathers, open_part, drawn
 
 
 def _optics_keys(config: BenchConfig) -> tuple[object, ...]:
@@ -163,5 +165,6 @@ def _optics_keys(config: BenchConfig) -> tuple[object, ...]:
         tracker.principal_point_px,
         tracker.distortion,
         tracker.optics,
+        tracker.psf_sigma_px,
     )
     return config.monitor, config.collimator, config.verify, lens

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.build import StarGlass
 from hilstar.bench.cameras import flight_camera, tracker_psf
 from hilstar.bench.config import GAUSSIAN
 from hilstar.bench.config.hardware import TrackerOptics
@@ -40,7 +41,7 @@ from hilstar.tracker.centroiders import Places, psf_places
 from hilstar.tracker.centroids import CentroidSettings, estimate_background, find_stars
 from hilstar.tracker.identify import wahba
 from hilstar.tracker.mosaic import software_image, software_psf_px
-from hilstar.twin.glass import StarGlass, told_psf
+from hilstar.twin.glass import told_psf
 from hilstar.twin.live_exposure import LiveTracker
 from hilstar.twin.pictures import write_dn_picture
 from hilstar.twin.simulator import Exposure, Simulator

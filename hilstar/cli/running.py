@@ -133,9 +133,9 @@ def forced_on(screen: Any) -> str:
 
 def say_of_light(bench: Any) -> None:
     """Name the stars that this bench shows too faint, and the assumption about its primaries."""
-    from hilstar.bench.frame import clipping_line, colour_line, shares_line
+    from hilstar.bench.frame import clipping_line, colour_line, drawn_line, shares_line
 
-    for line in (clipping_line(bench), shares_line(bench), colour_line(bench)):
+    for line in (clipping_line(bench), drawn_line(bench), shares_line(bench), colour_line(bench)):
         if line is not None:
             say(line)
 

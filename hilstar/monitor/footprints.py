@@ -14,6 +14,7 @@ from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import Levels
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 from hilstar.units import magnitude
@@ -117,7 +118,12 @@ class FootprintMap:
         fraction = data["fraction_px"].astype(np.float64).T
         cell = np.clip((fraction + order.bias) * PHASES, 0, PHASES - 1).astype(np.intp)
         row, column = (table.take(cell[1] * PHASES + cell[0], axis=1) for table in (order.row, order.column))
-        stamps = self._psf.stamps(fraction, data["electrons_per_s"], order.size)
+        if isinstance(self._psf, GlassPsf) and sprites.spectra is not None:
+            x_px, y_px = data["pixel"].T + fraction
+            stamps = self._psf.of_stars(x_px, y_px, sprites.spectra, data["electrons_per_s"])
+            stamps = np.ascontiguousarray(np.moveaxis(stamps, 0, 2))
+        else:
+            stamps = self._psf.stamps(fraction, data["electrons_per_s"], order.size)
         light = stamps.take((row * order.size + column) * count + np.arange(count, dtype=np.int32))
         row += order.first
         column += order.first
@@ -176,7 +182,8 @@ def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, le
     if len(hidden):
         whole = np.bincount(found.place.ravel(), found.light.ravel(), minlength=footprints.pixels + 1)
     for k in hidden.tolist():
-        alone = footprints.find(replace(sprites, data=sprites.data[k : k + 1]))
+        spectra = sprites.spectra if sprites.spectra is None or sprites.spectra.ndim == 1 else sprites.spectra[k : k + 1]
+        alone = footprints.find(replace(sprites, data=sprites.data[k : k + 1], spectra=spectra))
         place, light = alone.place[:, 0], alone.light[:, 0].astype(np.float64)
         lit = light > 0
         wanted[k] = light.sum()

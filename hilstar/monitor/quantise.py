@@ -360,7 +360,7 @@ class ThresholdCounter:
         self._threshold = np.append(thresholds, np.float32(np.inf))
 
     def count(self, light: Float32Array) -> IntArray:
-        """How many thresholds are at or below each light, which is finite and not negative; same shape."""
+        """How many thresholds are at or below each light, which is finite; same shape."""
         place = np.clip((light.view(np.int32) >> self._shift) - self._first_bin, 0, len(self._first) - 1)
         count: IntArray = self._first[place]
         while (more := light >= self._threshold[count]).any():

@@ -13,15 +13,26 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray
+from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.optics.psf_file import MAX_NEGATIVE, TOLERANCE, Glass, moment_carriers, principal
-from hilstar.scene.psf import BLACK_SAMPLES, MAX_FOOTPRINT_PX, MAX_UNEVEN, SPLINE_DEGREE, SampledPsf
+from hilstar.scene.psf import (
+    BLACK_SAMPLES,
+    MAX_FOOTPRINT_PX,
+    MAX_UNEVEN,
+    MIN_WIDTH_PX,
+    PIXEL_VARIANCE,
+    SPLINE_DEGREE,
+    SampledPsf,
+)
 from hilstar.scene.sprites import Sprites
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 MAX_CUT = 3e-5  # share of any PSF's light that a footprint leaves out: at 10 px it moves a centroid by up to 3e-4 px
 MAX_STEPS_A_PX, MIN_STEPS_A_PX, TABLE_SIDE = 32, 12, 1024
@@ -29,11 +40,13 @@ MAX_STEPS_A_PX, MIN_STEPS_A_PX, TABLE_SIDE = 32, 12, 1024
 STAMP_TOLERANCE = 3e-4
 FIRST_STAMPS, MAX_STAMPS = 48, 400
 PHASE_TOLERANCE = 1e-4  # the same of the functions of a star's place in its pixel
+PAIR_TOLERANCE, MOMENTS = 2e-4, 6  # the same of pairs of both; the stamps that carry moments keep all of theirs
 MAX_DEGREE = 3  # splines over wavelength and focus, polynomials over a scattered field
 MAX_GRID_DEGREE = 4
 ON_EDGE_PX = 1e-6
 SMALLEST = 1e-15
 SPRITES_AT_ONCE_PX = 2_000_000
+MIN_REGRIDDED, WIDTH_ROUNDS = 4, 20
 STARS_AT_ONCE = 128  # whose sums over the basis stay in a processor's cache: all at once takes three times as long
 
 
@@ -143,13 +156,17 @@ class _Stamps:
     """What pixels get: `stamps` (R, side^2), whose coefficients are a sum over functions of a star's place in its pixel.
 
     `phases` (S + 1, S + 1, Q) are these functions, y first, and `parts` (K, Q, R) what a basis image has of a stamp by each.
-    `sums` (R,) are those of the stamps.
+    `sums` (R,) are those of the stamps. Most pairs of a stamp and a function have next to no light: `pairs` (K, P) are the
+    others' parts, by stamps, `phase_of` (P,) their functions, and `sums_of_pairs` (R, P), sparse, adds up each stamp's.
     """
 
     stamps: Float32Array
     phases: Float32Array
     parts: Float32Array
     sums: Float32Array
+    pairs: Float32Array
+    phase_of: IntArray
+    sums_of_pairs: csr_array
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,12 +235,22 @@ class GlassPsf(SampledPsf):
         return side
 
     @cached_property
+    def peak_share(self) -> float:
+        """The largest of the sharpest PSF, where a star is in a pixel's middle, and of the mean."""
+        stamps, count = self._stamps, len(self.optics.basis)
+        middle = np.einsum("q,kqr->kr", stamps.phases[self._phases // 2, self._phases // 2], stamps.parts)
+        each = self.optics.weights.reshape(-1, count) @ middle.astype(np.float64)
+        return max(float(self._table.max()), float((each @ stamps.stamps).max()))
+
+    @cached_property
     def _phases(self) -> int:
         return min(MAX_STEPS_A_PX, max(MIN_STEPS_A_PX, TABLE_SIDE // self.footprint_px))
 
     @cached_property
     def _stamps(self) -> _Stamps:
         """The basis as pixels get it at (S + 1)^2 places of a star in its middle pixel, reduced to few stamps."""
+        from scipy.sparse import csr_array  # as `NodeSpline`
+
         steps, side = self._phases, self.footprint_px
         at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
         count, height, width = self.optics.basis.shape
@@ -243,24 +270,35 @@ class GlassPsf(SampledPsf):
         phases = vectors[:, ::-1][:, :needed].astype(np.float32)
         parts = (phases.T @ flat).reshape(needed, count, -1).transpose(1, 0, 2) / np.maximum(used, 1e-30)[:, None, None]
         phases = phases.reshape(steps + 1, steps + 1, needed)
-        return _Stamps(stamps, phases, np.ascontiguousarray(parts), stamps.sum(axis=1))
+        by_stamp = parts.transpose(0, 2, 1)
+        of_psfs = np.linalg.qr(self.optics.weights.reshape(-1, count))[1].astype(np.float32)
+        light = np.square(of_psfs @ by_stamp.reshape(count, -1)).sum(axis=0)  # of each pair in all PSFs
+        order = np.argsort(light)
+        kept = np.ones(by_stamp.shape[1:], dtype=bool)
+        kept.flat[order[np.cumsum(light[order], dtype=np.float64) <= PAIR_TOLERANCE**2 * light.sum(dtype=np.float64)]] = False
+        kept[:MOMENTS] = True
+        kept[np.arange(len(kept)), light.reshape(kept.shape).argmax(axis=1)] = True
+        of_stamp, phase_of = np.nonzero(kept)
+        each = np.ones(len(of_stamp), dtype=np.float32), (of_stamp, np.arange(len(of_stamp)))
+        adds, pairs = csr_array(each, shape=(len(kept), len(of_stamp))), np.ascontiguousarray(by_stamp[:, kept])
+        return _Stamps(stamps, phases, np.ascontiguousarray(parts), stamps.sum(axis=1), pairs, phase_of, adds)
 
     def _mixed(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> Float32Array:
         """How much stars at places (n,) have of each basis image (n, K); `shares` as in `of_stars`."""
-        optics, by_field = self.optics, self.field(x_px, y_px)
-        by_place = by_field @ self._light.reshape(len(by_field.T), -1)
-        by_place = by_place.reshape(len(x_px), -1, len(optics.basis))
-        return np.asarray(np.einsum("nlk,nl->nk", by_place, np.broadcast_to(shares, by_place.shape[:2])), dtype=np.float32)
+        by_field, shares = self.field(x_px, y_px).astype(np.float32), shares.astype(np.float32)
+        by_point = by_field[:, :, None] * shares.reshape(-1, 1, shares.shape[-1])
+        return np.asarray(by_point.reshape(len(x_px), -1) @ self._light)
 
     @cached_property
-    def _sums(self) -> FloatArray:
-        return np.asarray(self.optics.basis.sum(axis=(1, 2)))
+    def _sums(self) -> Float32Array:
+        return np.asarray(self.optics.basis.sum(axis=(1, 2)), dtype=np.float32)
 
     @cached_property
-    def _light(self) -> FloatArray:
-        """The weights of each point's light (F, L, K): a PSF's, times its illumination inside the image."""
+    def _light(self) -> Float32Array:
+        """The weights of each point's and wavelength's light (F L, K): a PSF's, times its illumination inside the image."""
         optics = self.optics
-        return np.asarray(optics.weights * (optics.illumination * optics.inside)[..., None])
+        found = optics.weights * (optics.illumination * optics.inside)[..., None]
+        return np.asarray(found.reshape(-1, len(optics.basis)), dtype=np.float32)
 
     def _phased(self, x_px: FloatArray, y_px: FloatArray) -> Float32Array:
         """The functions of a star's place in its pixel (n, Q), linear between the tabulated phases."""
@@ -302,13 +340,13 @@ class GlassPsf(SampledPsf):
         Their light has `shares` (n, L) at each wavelength, or (L,) all of it.
         """
         weights, phased = self._mixed(x_px, y_px, shares), self._phased(x_px, y_px)
-        count, functions, stamps = self._stamps.parts.shape
-        of_basis = self._stamps.parts.reshape(count, -1)
-        parts = np.empty((len(x_px), stamps), dtype=np.float32)
+        made = self._stamps
+        parts = np.empty((len(x_px), len(made.stamps)), dtype=np.float32)
         for begin in range(0, len(x_px), STARS_AT_ONCE):
             part = slice(begin, begin + STARS_AT_ONCE)
-            mixed = (weights[part] @ of_basis).reshape(-1, functions, stamps)
-            parts[part] = np.matmul(phased[part, None, :], mixed)[:, 0]
+            mixed = made.pairs.T @ weights[part].T  # stars in rows: neighbours in memory have one pair
+            mixed *= phased[part].T.take(made.phase_of, axis=0)
+            parts[part] = (made.sums_of_pairs @ mixed).T
         # Interpolated phases and reduced stamps keep all light but some 1e-5 of it; this restores the rest.
         light, whole = weights @ self._sums, parts @ self._stamps.sums
         scale = electrons_per_s * light / np.where(whole > 0, whole, np.inf)
@@ -318,7 +356,8 @@ class GlassPsf(SampledPsf):
     def image(self, sprites: Sprites, shares: FloatArray, resolution_px: tuple[int, int]) -> Float32Array:
         """The light of sprites (n,) in all pixels (height, width), electrons per second; `shares` as in `of_stars`."""
         side, (width, height) = self.footprint_px, resolution_px
-        room = np.zeros((height + 2 * side, width + 2 * side), dtype=np.float32)
+        across = width + 2 * side
+        room, near = np.zeros((height + 2 * side) * across, dtype=np.float32), np.arange(side)
         at_once = max(1, SPRITES_AT_ONCE_PX // side**2)
         for begin in range(0, len(sprites), at_once):
             part = slice(begin, begin + at_once)
@@ -326,9 +365,9 @@ class GlassPsf(SampledPsf):
             own = shares[part] if shares.ndim == 2 else shares
             stamps = self.of_stars(x_px, y_px, own, sprites.data["electrons_per_s"][part])
             columns, rows = (np.floor(place + 0.5).astype(np.intp) + side - side // 2 for place in (x_px, y_px))
-            for stamp, column, row in zip(stamps, columns.tolist(), rows.tolist(), strict=True):
-                room[row : row + side, column : column + side] += stamp
-        return room[side:-side, side:-side]
+            places = (rows * across + columns)[:, None, None] + near[:, None] * across + near
+            np.add.at(room, places.ravel(), stamps.ravel())
+        return room.reshape(-1, across)[side:-side, side:-side]
 
     def blurred(self, sigma_px: float) -> GlassPsf:
         """The basis convolved with a round Gaussian, with room for what spreads beyond it."""
@@ -365,10 +404,78 @@ def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPs
     )
 
 
+def regridded(images: FloatArray, per_px: int, matrix: FloatArray) -> tuple[FloatArray, int]:
+    """PSFs (n, height, width) by other pixels, and their samples a pixel: `matrix` (2, 2) takes offsets in pixels to these.
+
+    There are at least as many samples to the same length as before, and MIN_REGRIDDED to a pixel.
+    """
+    from scipy.ndimage import map_coordinates
+
+    _, height, width = images.shape
+    area = abs(float(np.linalg.det(matrix)))
+    new_per_px = max(MIN_REGRIDDED, math.ceil(per_px / math.sqrt(area)))
+    to_samples = np.linalg.inv(matrix) * per_px / new_per_px
+    half_x, half_y = np.ceil(np.abs(np.linalg.inv(to_samples)) @ (np.array([width, height]) // 2)).astype(int).tolist()
+    y, x = np.indices((2 * half_y + 1, 2 * half_x + 1)) - np.array([half_y, half_x])[:, None, None]
+    columns, rows = np.tensordot(to_samples, np.stack([x, y]), axes=1)
+    at = np.stack([rows + height // 2, columns + width // 2])
+    drawn: FloatArray = np.stack([map_coordinates(image, at, np.float64, SPLINE_DEGREE) for image in images])
+    return drawn * abs(float(np.linalg.det(to_samples))), new_per_px
+
+
 def _middle(optics: Focused, field: Field, shares: FloatArray) -> FloatArray:
     """The PSF (height, width) in the middle of the field."""
     middle = field(*field.places_px.mean(axis=0)[:, None])[0]
     return np.asarray(np.tensordot(np.einsum("f,l,flk->k", middle, shares, optics.weights), optics.basis, axes=1))
+
+
+def with_components(psf: GlassPsf, count: int) -> GlassPsf:
+    """A glass by so many basis images: the mean and the principal components of its PSFs' light. Each PSF still sums to 1."""
+    optics = psf.optics
+    flat, basis = optics.weights.reshape(-1, len(optics.basis)), optics.basis.reshape(len(optics.basis), -1)
+    mean = flat.mean(axis=0)
+    values, vectors = np.linalg.eigh(basis @ basis.T)
+    scale = vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))  # its square is the metric of weights
+    turned, sizes, components = np.linalg.svd((flat - mean) @ scale, full_matrices=False)
+    kept = min(count - 1, int((sizes > 1e-9 * sizes[0]).sum()))
+    images = np.vstack([mean, components[:kept] @ np.linalg.pinv(scale)]) @ basis
+    weights = np.hstack([np.ones((len(flat), 1)), turned[:, :kept] * sizes[:kept]])
+    return _of_images(psf, images, weights)
+
+
+def as_gaussians(psf: GlassPsf) -> GlassPsf:
+    """A glass whose PSFs are Gaussians, each of its own axes and angle: the centroids, and widths by adaptive moments."""
+    optics, side = psf.optics, psf.footprint_px
+    flat = optics.weights.reshape(-1, len(optics.basis))
+    middle = np.einsum("q,kqr->kr", psf._stamps.phases[psf._phases // 2, psf._phases // 2], psf._stamps.parts)
+    stamps = (flat @ middle.astype(np.float64)) @ psf._stamps.stamps
+    pixel = np.stack([part.ravel() for part in np.indices((side, side))[::-1]], axis=1) - side // 2
+    _, height, width = optics.basis.shape
+    y, x = np.indices((height, width))
+    place = np.stack([x.ravel() - width // 2, y.ravel() - height // 2], axis=1) / psf.per_px
+    images = []
+    for stamp, centroid in zip(stamps, psf._centroids_px.reshape(-1, 2), strict=True):
+        off, spread = pixel - centroid, np.eye(2)
+        for _ in range(WIDTH_ROUNDS):  # as `SampledPsf.width_px`
+            light = stamp * np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off))
+            spread = 2 * (off.T * light) @ off / light.sum()
+            spread += np.eye(2) * max(0.0, PIXEL_VARIANCE + MIN_WIDTH_PX**2 - float(np.linalg.eigvalsh(spread)[0]))
+        if not psf.pixel_integrated:
+            spread = spread - np.eye(2) * PIXEL_VARIANCE
+        off = place - centroid
+        images.append(np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off)))
+    found = np.stack(images)
+    found /= found.sum(axis=1, keepdims=True)
+    basis, weights, _ = principal(found, optics.basis.shape[1:], TOLERANCE, 1 if psf.pixel_integrated else psf.per_px)
+    return _of_images(psf, basis.astype(np.float64), weights)
+
+
+def _of_images(psf: GlassPsf, images: FloatArray, weights: FloatArray) -> GlassPsf:
+    """A glass by other images (K, m) and weights (n, K) of its PSFs."""
+    basis = images.reshape(-1, *psf.optics.basis.shape[1:])
+    weights = (weights / (weights @ images.sum(axis=1))[:, None]).reshape(*psf.optics.weights.shape[:2], -1)
+    optics = replace(psf.optics, basis=basis, weights=weights)
+    return replace(psf, samples=_middle(optics, psf.field, psf.mean_shares), optics=optics)
 
 
 def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:

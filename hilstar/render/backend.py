@@ -20,9 +20,11 @@ from hilstar.monitor.exact import COMPUTE_VERSION
 from hilstar.monitor.quantise import LevelCost, Panel, Quantiser
 from hilstar.monitor.quantisers import Quantisation
 from hilstar.monitor.response import Levels, Response
+from hilstar.optics.glass_psf import GlassPsf
+from hilstar.scene.extended import LightMap
 from hilstar.scene.frame_motion import Orientation
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import Sprites, by_channel
+from hilstar.scene.sprites import Sprites, by_channel, without_stars
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -190,6 +192,15 @@ class Backend(ABC):
     @abstractmethod
     def close(self) -> None:
         """Free what the backend holds."""
+
+
+def as_maps(sprites: Sprites | None, target: Target) -> Sprites | None:
+    """Sprites whose PSF changes over the field as one map of their light, which NumPy adds up; all others as they are."""
+    psf = target.psf
+    if sprites is None or sprites.spectra is None or not isinstance(psf, GlassPsf):
+        return sprites
+    image = np.ascontiguousarray(psf.image(sprites, sprites.spectra, target.resolution_px))
+    return replace(without_stars(sprites), extended=(*sprites.extended, LightMap(image, lasting=False)))
 
 
 def linear_light(backend: Backend, sprites: Sprites, stars: Stars, drawn: bool = False) -> Float32Array:

@@ -20,7 +20,7 @@ from hilstar.monitor.quantise import FrameLight
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.aids import LINE_SHARE, lay_over
-from hilstar.render.backend import EGL_LIBRARY, NO_FRAME, Backend, ScreenView, Target
+from hilstar.render.backend import EGL_LIBRARY, NO_FRAME, Backend, ScreenView, Target, as_maps
 from hilstar.render.primaries_backend import PrimariesBackend
 from hilstar.render.reference import add_stars, extended_image
 from hilstar.scene.extended import ExtendedLight
@@ -156,6 +156,7 @@ class NumpyBackend(Backend):
     def _image(self, sprites: Sprites | None, shrunk: bool) -> Float32Array:
         """The linear image; `shrunk` draws fainter stars within the target's `sides`, as their levels are."""
         width, height = self.target.resolution_px
+        sprites = as_maps(sprites, self.target)
         if sprites is None:
             return np.zeros((height, width), dtype=np.float32)
         image = self._extended(sprites.extended).copy()

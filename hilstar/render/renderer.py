@@ -18,7 +18,7 @@ from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import DitherQuantiser, Panel
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
-from hilstar.render.backend import NO_FRAME, Backend, ScreenView, Target
+from hilstar.render.backend import NO_FRAME, Backend, ScreenView, Target, as_maps
 from hilstar.render.context import Context, check_limits, computes_in_software, create_context
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
@@ -170,6 +170,9 @@ class Renderer(Backend):
             self._last_frame = frame
             extended = sprites is not None and bool(sprites.extended)
             self._by_numpy = self._by_star is not None and (self._exact_pass is None or extended)
+            if not self._by_numpy:
+                sprites = as_maps(sprites, self.target)
+                extended = sprites is not None and bool(sprites.extended)
             units = None if self._by_numpy or extended else self._units
             unit_e_per_s = None if units is None else units.unit_for(sprites)
             passes = self._passes
@@ -280,7 +283,7 @@ class Renderer(Backend):
 
     def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
-        self._undrawn = None
+        self._undrawn, sprites = None, as_maps(sprites, self.target)
         self._on_host = self._host is not None and whole and not (sprites is not None and sprites.extended)
         if self._host is not None and self._on_host:
             self._host.draw(sprites)

@@ -16,7 +16,7 @@ from functools import cached_property, lru_cache, reduce
 from io import BytesIO
 from itertools import count, zip_longest
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,8 @@ BOUND_PLACES = 200
 MAX_SAMPLED_CUT = 1e-4
 MAX_NEGATIVE = 0.02  # share of a PSF's light below zero, of noise or of a spline's overshoot: it is set to zero
 MAX_UNEVEN = 0.05  # by which the light of a star's pixels may change with its place in a pixel
-SPLINE_DEGREE, BLACK_SAMPLES = 5, 12  # the spline through the samples, and how many black ones stand round them
+SPLINE_DEGREE: Final = 5  # of the spline through the samples
+BLACK_SAMPLES = 12  # so many stand round them
 # Shares are tabulated at most so finely, and with so many places along a side, or twice as many for FINE_STEPS_A_PX.
 # Interpolated linearly they are off by an eighth of the squared step times their curvatures: 7e-5 of a star's light in a pixel
 # at a sigma of 0.5 px. An Airy pattern with a core of 0.6 px is off by 3e-4 in a footprint of 100 px, by 1.2e-3 in one of 200.

@@ -99,6 +99,7 @@ class Sprites:
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
     divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, because
     the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
+    `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that changes over the field; None draws all by its mean.
     `extended` is the frame's light other than stars, in the order in which it is drawn; `discs` names the bodies among it, and
     `over_white` those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for `star`.
     `primaries` are the sprites of each of the monitor's primaries, where those are driven apart.
@@ -112,6 +113,7 @@ class Sprites:
     per_star: int = 1
     capped: int = 0
     rate_cam_rad_s: FloatArray | None = None
+    spectra: FloatArray | None = None
     extended: tuple[ExtendedLight, ...] = ()
     added: tuple[AddedLight, ...] = ()
     discs: tuple[str, ...] = ()

@@ -19,7 +19,7 @@ from msgspec.structs import replace as replace_keys
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.bench.build import bench_channels, bench_colours, bench_optics, bench_stars, named_channels, open_bench
+from hilstar.bench.build import StarGlass, bench_channels, bench_colours, bench_optics, bench_stars, named_channels, open_bench
 from hilstar.bench.cameras import tracker_psf
 from hilstar.bench.colours import Colours
 from hilstar.bench.config.hardware import TrackerOptics
@@ -39,7 +39,6 @@ from hilstar.study.sweep import OtherWork, busy_line, in_turn, is_busy
 from hilstar.tracker.centroids import CentroidSettings, LocalBackground, find_stars
 from hilstar.tracker.mosaic import CHANNELS, SUPERPIXEL_VARIANCE_PX2, in_pixels, luminance
 from hilstar.twin.budget import RED_NM, SOLAR_BV
-from hilstar.twin.glass import StarGlass
 from hilstar.units import magnitude
 
 NM = np.arange(380.0, 1001.0, 2.0)

@@ -1,30 +1,17 @@
-"""The spectra of a bench's stars as its glass sees them: what share of a star's electrons each of the file's wavelengths has.
-
-The tracker's band is cut into narrow ones, whose electrons come from the same tables as a star's total, so every model of
-spectra (`[sky] brightness`, `spectrum`, `temperature`) counts here too.
-"""
+"""A glass to who measures stars: the PSF that a centroider is told, and errors of places by what would take them away."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from hilstar.arrays import FloatArray, IntArray
-from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import StarRates, bench_optics, channel_rates, star_kinds
-from hilstar.errors import InputError
-from hilstar.optics.glass_psf import GlassPsf, NodeSpline
+from hilstar.arrays import FloatArray
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.scene.psf import Psf
-from hilstar.sky.catalog import Catalog
-from hilstar.sky.electrons import Optics
-from hilstar.sky.spectrum import Curve
-from hilstar.sky.stars import Stars
 from hilstar.tracker.centroiders import Pixels, ToldPsf
 
-BAND_NM = 25.0  # twice as fine moves no star's shares by more than 1e-3 (tests/unit/twin/test_glass.py)
-KNOT_NM = 5.0
+MIN_STARS = 40  # for 26 coefficients
 
 
 def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None = None) -> ToldPsf:
@@ -52,74 +39,35 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
     return of
 
 
-class StarGlass:
-    """A `psf` and the shares of its wavelengths in the light of a bench's stars, through one channel's `optics` or all."""
+@dataclass(frozen=True, slots=True)
+class ErrorSplit:
+    """Errors of stars' places, px (n, 2): in all, what a distortion takes, what B-V takes besides, and the rest."""
 
-    def __init__(self, file: BenchFile, psf: GlassPsf, optics: Optics | None = None, band_nm: float = BAND_NM) -> None:
-        self.psf, self._config, self._mean = psf, file.config, psf.mean_shares
-        self._catalog: Catalog | None = None
-        self._of_row = np.empty((0, 0))
-        self._bands: list[StarRates] = []
-        self._of_band = np.ones((0, 1))
-        if len(psf.wavelengths_nm) > 1:
-            flat = self._cut(file, optics or bench_optics(file.config.tracker, file.folder), band_nm)
-            if optics is not None and self._bands:
-                self._mean = flat @ self._of_band / flat.sum()
+    total: FloatArray
+    distortion: FloatArray
+    colour: FloatArray
 
-    def _cut(self, file: BenchFile, optics: Optics, band_nm: float) -> FloatArray:
-        """Bands that overlap as triangles do, so that they sum to the tracker's own; each one's response to even photons."""
-        low_nm, high_nm = optics.range_nm
-        nodes_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / band_nm) + 1)
-        fine_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / KNOT_NM) + 1)
-        own_nm = optics.quantum_efficiency.wavelength_nm
-        knots_nm = np.union1d(np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)])
-        efficiency = optics.quantum_efficiency(knots_nm)
-        shares, of_band, flat = NodeSpline(self.psf.wavelengths_nm)(knots_nm), [], []
-        for number in range(len(nodes_nm)):
-            part = efficiency * np.interp(knots_nm, nodes_nm, np.eye(len(nodes_nm))[number])
-            response = part * optics.transmission(knots_nm) * np.gradient(knots_nm)
-            if not response.any():
-                continue
-            try:
-                rates = channel_rates(file.config.sky, replace(optics, quantum_efficiency=Curve(knots_nm, part)))
-            except InputError:  # so little light that some spectrum has none: the bands beside it stand for it
-                continue
-            self._bands.append(rates)
-            flat.append(response.sum())
-            of_band.append(response @ shares / flat[-1])
-        self._of_band = np.array(of_band)
-        return np.array(flat)
+    @property
+    def psf(self) -> FloatArray:
+        """What neither takes: the PSF's shape against pixel and window, and noise where the errors have it."""
+        return np.asarray(self.total - self.distortion - self.colour)
 
-    def shares(self, stars: Stars, which: IntArray) -> FloatArray:
-        """The shares (n, L) of stars at places (n,) of `stars`; those of light without a spectrum where a place is negative."""
-        if not self._bands:
-            return self._mean
-        if self._catalog is not stars.catalog:
-            self._catalog, self._of_row = stars.catalog, np.full((len(stars.catalog), self._of_band.shape[1]), np.nan)
-        found = np.tile(self._mean, (len(which), 1))
-        rows = np.where(which >= 0, stars.row[np.maximum(which, 0)], -1)
-        listed, body = rows >= 0, (rows < 0) & (which >= 0)
-        new = np.unique(rows[listed][np.isnan(self._of_row[rows[listed], 0])])
-        if len(new):
-            some = stars.catalog.taken(new)
-            self._of_row[new] = self._through(some.bv_mag, some.vi_mag, star_kinds(self._config, some))
-        found[listed] = self._of_row[rows[listed]]
-        if body.any():
-            bv_mag = stars.bv_mag[which[body]]
-            kind = (
-                np.full((len(bv_mag), 2), np.nan)
-                if star_kinds(self._config, stars.catalog.taken(np.arange(0))) is not None
-                else None
-            )
-            found[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
-        return found
+    def rms_px(self) -> dict[str, float]:
+        """The rms distance of each part, px."""
+        parts = {"total": self.total, "distortion": self.distortion, "colour": self.colour, "psf": self.psf}
+        return {name: float(np.sqrt((part**2).sum(axis=1).mean())) for name, part in parts.items()}
 
-    def shares_of(self, stars: Stars, hip: IntArray) -> FloatArray:
-        """The same by Hipparcos numbers (n,) of `stars`, 0 for a body."""
-        order = np.argsort(stars.hip)
-        at = np.minimum(np.searchsorted(stars.hip, hip, sorter=order), len(order) - 1)
-        return self.shares(stars, np.where(hip > 0, order[at], -1))
 
-    def _through(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
-        rates = np.stack([band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1)
-        return np.asarray(rates @ self._of_band / rates.sum(axis=1, keepdims=True))
+def split_errors(places_px: FloatArray, bv_mag: FloatArray, errors_px: FloatArray, size_px: tuple[int, int]) -> ErrorSplit:
+    """Errors (n, 2) of stars at places (n, 2): by least squares a cubic of the place, and B-V times a line of the place.
+
+    A distortion file can hold the first, a correction by catalogue colour the second. Raises ValueError for under MIN_STARS.
+    """
+    if len(places_px) < MIN_STARS:
+        raise ValueError(f"{len(places_px)} stars; a split takes {MIN_STARS}")
+    u, v = ((place - (size - 1) / 2) / (size / 2) for place, size in zip(places_px.T, size_px, strict=True))
+    by_place = np.stack([u**j * v**k for j in range(4) for k in range(4 - j)], axis=1)
+    by_colour = (bv_mag - bv_mag.mean())[:, None] * np.stack([np.ones_like(u), u, v], axis=1)
+    found = np.linalg.lstsq(np.hstack([by_place, by_colour]), errors_px, rcond=None)[0]
+    count = by_place.shape[1]
+    return ErrorSplit(errors_px, by_place @ found[:count], by_colour @ found[count:])

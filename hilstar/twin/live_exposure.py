@@ -165,7 +165,7 @@ class LiveTracker(Closing):
             self._panel = true_panel(bench)
             self._rgb, self._primaries = bench.calibration.response.rgb, seen_primaries(bench)
             self._colours = DisplayColours.of(bench)
-            self._optics = TwinOptics(true_geometry(bench, self.camera), self.canvas.psf)
+            self._optics = TwinOptics(true_geometry(bench, self.camera), bench.tracker_psf)
             glow_e_per_s = self._optics.glow_e_per_s(self._panel)
             noise_e2 = tracker.detector.noise(np.median(glow_e_per_s) * self.exposure_s, self.exposure_s).total_e2
             faintest = SEEN_SIGMAS * float(np.sqrt(noise_e2)) / self.canvas.psf.peak_share / self.exposure_s

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_channels, bench_optics, bench_sources, bench_stars, moved
+from hilstar.bench.build import StarGlass, bench_channels, bench_optics, bench_sources, bench_stars, moved
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.config.bench_config import sky_jd
@@ -48,7 +48,6 @@ from hilstar.sky.zodiacal import ZodiacalLight, sunward, tabled_light
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.mosaic import in_pixels
 from hilstar.tracker.settings import MAX_E, DetectorSettings
-from hilstar.twin.glass import StarGlass
 from hilstar.twin.shutter import rolled
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 

@@ -178,6 +178,15 @@ class Tracker(Table, frozen=True):
             extra={"default": "the body's axes, with a notice"},
         ),
     ] = None
+    effort: Annotated[
+        Literal["full", "auto"],
+        Meta(
+            description='`"auto"`: of the point spread functions of `[tracker.optics] psf` as few as keep flux and centroid of '
+            'a star within the next two, a Gaussian first; a notice says which. `"full"`: all of the file.'
+        ),
+    ] = "full"
+    tolerance_mag: Annotated[Positive, Meta(description='Flux error that a star may then have, for `effort = "auto"`.')] = 0.02
+    tolerance_px: Annotated[Positive, Meta(description="Centroid error that it may have, in tracker pixels.")] = 0.02
     optics: Annotated[TrackerOptics, Meta(description="See below.")] = msgspec.field(default_factory=TrackerOptics)
     detector: Annotated[DetectorSettings, Meta(description="See below.")] = msgspec.field(default_factory=DetectorSettings)
 
@@ -397,11 +406,15 @@ class Collimator(Table, frozen=True):
             extra={"default": "the middle of the screen"},
         ),
     ] = None
+    psf_sigma_px: Annotated[
+        NotNegative,
+        Meta(description="Gaussian sigma of the collimator's or relay's own blur, in monitor pixels, as the twin sees it."),
+    ] = 0.0
     geometry: Annotated[
         str | None,
         Meta(
             description="The path of a file that `hilstar calibrate geometric` or `alignment` wrote: the lens and "
-            "the real alignment. It takes the place of the other keys of this table.",
+            "the real alignment. It takes the place of the other keys of this table but `psf_sigma_px`.",
             extra={"default": "an ideal lens"},
         ),
     ] = None

@@ -84,6 +84,14 @@ class RenderSettings(Table, frozen=True):
         0.85,
         0.85,
     )
+    psf: Annotated[
+        Literal["gaussian", "tracker"],
+        Meta(
+            description='How a star is drawn: `"gaussian"`, of `sprite_sigma_px`, for a tracker that brings its objective. '
+            '`"tracker"`: by the point spread function of `[tracker.optics]`, for a detector without its objective; the '
+            "virtual tracker before the display has none then. See [real glass](optics.md#the-display)."
+        ),
+    ] = "gaussian"
     flux_at_white_e_per_s: Annotated[
         Positive | None,
         Meta(

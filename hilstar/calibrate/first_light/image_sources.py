@@ -24,7 +24,7 @@ from msgspec.structs import replace
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_optics, open_bench, orientation_of
-from hilstar.bench.cameras import tracker_camera, tracker_psf
+from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.bench.measured_on import check_monitor
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
@@ -495,10 +495,10 @@ class VirtualBench(ImageSource):
         refuse_other_bench(bench, truth)
         config = truth.config
         with open_bench(truth) as real:
-            self._panel, camera = real.panel, real.camera
+            self._panel, camera, psf = real.panel, real.camera, real.tracker_psf
         tracker = config.tracker
         self.geometry = BenchGeometry(camera, tracker_camera(tracker, truth.folder))
-        self._optics = TwinOptics(self.geometry, tracker_psf(tracker, truth.folder))
+        self._optics = TwinOptics(self.geometry, psf)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self._glow_e_per_s: FloatArray = self._optics.glow_e_per_s(self._panel)
         self._sky_e_per_s: FloatArray = background_e(config, bench_optics(tracker, truth.folder)) / tracker.exposure_s

@@ -253,7 +253,7 @@ def _spot_sigma_px(context: StepContext) -> tuple[float, float]:
     """The sigma of a star in the tracker's image: its own and the sprite's, (x, y)."""
     geometry = context.geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    sprite = display_psf(context.file.config.render).width_px
+    sprite = display_psf(context.file.config, context.file.folder, geometry.monitor)[0].width_px
     x, y = (math.hypot(a, ratio * b) for a, b in zip(context.tracker_psf.width_px, sprite, strict=True))
     return x, y
 
@@ -407,7 +407,8 @@ def scale(context: StepContext) -> StepOutcome:
     """Find what white is worth by stars, and set it in the bench file. Raises InputError."""
     seen = see_stars(context)
     white = _white_e_per_s(context.file)
-    used = seen.sure & (seen.e_per_s * display_psf(context.file.config.render).peak_share <= white)
+    drawn, _ = display_psf(context.file.config, context.file.folder, context.geometry().monitor)
+    used = seen.sure & (seen.e_per_s * drawn.peak_share <= white)
     if used.sum() < MIN_STARS:
         raise InputError(
             f"the light of {used.sum()} stars can be read and {MIN_STARS} are needed; the others of {len(used)} saturate the"

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.build import bench_stars
-from hilstar.bench.cameras import display_psf, ideal_monitor, tracker_psf
+from hilstar.bench.cameras import ideal_monitor, tracker_psf
 from hilstar.bench.config import BenchConfig, RenderSettings, read_config
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.phases import measure
@@ -25,6 +25,7 @@ from hilstar.resources import resource_path
 from hilstar.rotation import angle_between_rad, normalise, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
+from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites, pack_sprites
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import CELL_DEG, Stars, cell_grid, make_stars
@@ -42,7 +43,7 @@ from hilstar.study.predictors import (
 from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.units import NS_PER_MS, NS_PER_S
 
-SPRITE_PSF = display_psf(RenderSettings())
+SPRITE_PSF = GaussianPsf(RenderSettings().sprite_sigma_px)
 NO_LIMIT_V_MAG = 20.0
 ATTITUDES = 60
 SEED = 1

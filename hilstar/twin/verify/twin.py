@@ -5,6 +5,7 @@ The twin of a bench: from an attitude to what falls on the tracker's detector, a
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +35,9 @@ from hilstar.twin.optics import BenchGeometry, TwinOptics, seen_primaries
 from hilstar.twin.simulator import TrackerBackground
 
 PHASES = 4  # frames of a sequence with which an exposure may begin
+
+
+log = logging.getLogger(__name__)
 
 
 def exposure_lights(
@@ -136,6 +140,10 @@ class Twin(Closing):
         self.bench = open_bench(file)
         self.config = self.bench.config
         tracker = self.config.tracker
+        if tracker.detector.shutter != "global":
+            log.warning(
+                '[tracker.detector] shutter: verify exposes all rows at once; `campaign` with through = "bench" does not'
+            )
         self.camera = tracker_camera(tracker, file.folder)
         self.differs = any(name.startswith("true_") for name in changed_keys(self.config.verify))
         self.true_panel = true_panel(self.bench)
@@ -204,7 +212,7 @@ def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
     config = bench.config
     verify, collimator, monitor = config.verify, config.collimator, config.monitor
     if verify.true_geometry is not None:
-        camera = real_monitor(config, bench.file.folder / verify.true_geometry)
+        camera = real_monitor(config, bench.file.folder, verify.true_geometry)
         return BenchGeometry(camera, tracker, verify.true_mirror)
     if (verify.true_q_cam_to_mon, verify.true_pixel_pitch_um, verify.true_focal_length_mm) == (None, None, None):
         return BenchGeometry(bench.camera, tracker, verify.true_mirror)

@@ -20,7 +20,7 @@ from hilstar.assess.lock import lock_of
 from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.run.record.commanded import Commanded
 from hilstar.run.record.ledger_records import AnswerRecord
-from hilstar.twin.glass_errors import split_errors
+from hilstar.twin.glass import split_errors
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible

@@ -185,8 +185,9 @@ def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_sa
     assert choose_codes(settings(), replace(crowded, refresh_hz=90.0)).method == "exact"  # `round` would be late, too
     assert choose_codes(settings(quantisation="exact"), crowded).method == "exact"
     assert "9 ms of 16.7" in choose_codes(settings(quantisation="exact"), crowded).choice.saving
-    few, wide = replace(crowded, rates_e_per_s=np.full(70, 1e3)), {"sprite_sigma_px": (2.5, 2.5)}
-    assert (choose_codes(settings(), few).method, choose_codes(settings(**wide), few).method) == ("exact", "round")
+    few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
+    wide = replace(few, psf=GaussianPsf((2.5, 2.5)))
+    assert (choose_codes(settings(), few).method, choose_codes(settings(), wide).method) == ("exact", "round")
 
 
 def cost(cheap_ms: float, best_ms: float) -> FieldCost:

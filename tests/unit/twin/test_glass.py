@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import bench_optics, bench_stars
+from hilstar.bench.build import BAND_NM, StarGlass, bench_optics, bench_stars
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import say_once
 from hilstar.campaign.cases import attitude_error_arcsec
@@ -23,7 +23,7 @@ from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.electrons import electron_response
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m
 from hilstar.tracker.centroiders import psf_places, star_places
-from hilstar.twin.glass import BAND_NM, StarGlass, told_psf
+from hilstar.twin.glass import told_psf
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.simulator import Simulator
 from tests.support.benches import ORION_Q, bench_text

@@ -84,7 +84,7 @@ def first_light(page: Browser, folder: Path) -> None:
     for name in ("demo.toml", "truth-example.toml"):
         text = (DOCS.parent / "configs" / name).read_text().replace("[monitor]", "[monitor]\nphotodiode_px = 40", 1)
         (folder / name).write_text(text + ("" if name == "demo.toml" else WARM_UP))
-    words = ["first-light", "demo.toml", "-o", "session", "--virtual", folder / "truth-example.toml"]
+    words = ["first-light", "demo.toml", "-o", "session", "--virtual", str(folder / "truth-example.toml")]
     subprocess.run([*HILSTAR, *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
     take_session(page, folder / "session" / "first-light.html")
 

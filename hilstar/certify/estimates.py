@@ -35,7 +35,7 @@ DOTS_A_TERM = 4
 MAP = (16, 9)  # fields of a usual map of light, columns and rows
 MIN_LEVELS = 4
 FAINT_SIGMAS = 5.0
-BRIGHT = 0.05  # relative to white: light by which a reading's relative noise is first told from its floor
+BRIGHT, FAINT = 0.05, 0.001  # relative to white: light by which a reading's relative noise is told from its floor
 MIN_DOF = 2
 
 
@@ -70,7 +70,7 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     where a black screen scatters by more than that.
     """
     codes, place, count = np.unique(read.code, return_inverse=True, return_counts=True)
-    hours, dark = (read.t_s - read.t_s[0]) / 3600, read.light[read.code == 0]
+    hours = (read.t_s - read.t_s[0]) / 3600
     timed = float(np.ptp(hours)) > 0
     dof = len(read.code) - len(codes) - timed
     if len(codes) <= MIN_LEVELS or codes[0] != 0 or dof < MIN_DOF:
@@ -78,7 +78,6 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
             f"{len(read.code)} readings of {len(codes)} codes; read black and {MIN_LEVELS} codes or more, some of them again"
         )
     mean = np.bincount(place, read.light) / count
-    spread = float(dark.std(ddof=1)) if len(dark) > 1 else 0.0
     design = np.zeros((len(read.code), len(codes) + timed))
     design[np.arange(len(read.code)), place] = 1.0
     if timed:
@@ -86,7 +85,10 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     total, bright = np.maximum(mean[place], 1e-9 * mean[-1]), mean[place] > BRIGHT * mean[-1]
     free = int(bright.sum()) - len(np.unique(place[bright]))
     noise = math.sqrt(float(((read.light / total - 1)[bright] ** 2).sum()) / max(free, 1))
-    floor = max(spread**2 - (noise * mean[0]) ** 2, 0.0)
+    faint = mean[place] - mean[0] < FAINT * (mean[-1] - mean[0])  # black among them
+    scatter = (read.light - mean[place])[faint]
+    repeats = max(int(faint.sum()) - len(np.unique(place[faint])), 1)
+    floor = max(float((scatter**2).sum()) / repeats - float(((noise * mean[place][faint]) ** 2).mean()), 0.0)
     sigma = np.sqrt(total**2 + floor / max(noise, 1e-12) ** 2)
     inverse = np.linalg.pinv(design / sigma[:, None])
     found = inverse @ (read.light / sigma)

@@ -204,7 +204,7 @@ def ended_at(process, folder, image, ending):
         time.sleep(0.01)
     process.send_signal(ending)
     process.wait(PATIENCE_S)
-    return {path: path.stat().st_mtime_ns for path in sorted((folder / "s").glob(f"images/{image.split('/')[0]}/*.png"))}
+    return {path: path.stat().st_mtime_ns for path in sorted((folder / "s").glob(f"images/{image.split('/')[0]}/[!.]*.png"))}
 
 
 def untouched(taken):

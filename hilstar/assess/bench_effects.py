@@ -6,8 +6,6 @@ display's attitude error is the small rotation e that turns the sky's directions
 weighted by their light.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 The fields of view tell a length in the wrong unit: no lens and no pixel is ten times as large as the others imply.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator

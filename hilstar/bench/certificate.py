@@ -1,7 +1,5 @@
 """certificate.json: how sure a bench is, as `hilstar certify` states it and `serve`, `assess` and requirements read it."""
 
-from __future__ import annotations
-
 import datetime
 import hashlib
 import logging

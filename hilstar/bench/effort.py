@@ -3,8 +3,6 @@
 Half of the tolerance is for the codes, a quarter for the sprites' edges and a quarter for motion that is not drawn.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """A bench's glass: the PSFs of `[tracker.optics] psf` at its focus, and the lens and transmission that belong with them."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -4,8 +4,6 @@ Candidates are compared with the whole glass at places all over the field, for t
 all of its pixels and in a Gaussian window as wide as the star.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

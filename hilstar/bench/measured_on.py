@@ -1,7 +1,5 @@
 """Whether a bench's calibration files are of the monitor that is there: another monitor, mode or setting, or too old a file."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import logging

@@ -11,8 +11,6 @@ The stiffness of the penalty and the shape are those of the maximum marginal lik
 coefficients); the noise comes from the repeats. Black is a parameter with the repeats of code 0 as its prior.
 """
 
-from __future__ import annotations
-
 import datetime
 import math
 from collections.abc import Callable

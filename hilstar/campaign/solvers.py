@@ -4,8 +4,6 @@ There are three: the centroider alone, whose stars the truth identifies; a Pytho
 command that gets an image and prints a quaternion.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

@@ -1,7 +1,5 @@
 """From a bench, and its readings where there are some, to the inputs of its budget and the model that they go through."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

@@ -10,8 +10,6 @@ nearer to the truth on the whole, and not hold it where its bias is larger than 
 A polynomial's degree rises from its first one as long as the next is better by an F test.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ lens shows the pixel that the bench draws it at. A field's attitude is the rotat
 (Wahba's problem, by SVD), which is what a tracker would report.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The page of a certificate, one file that needs no other and prints on A4: statement, conformity, budget, identity, files."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path

@@ -4,8 +4,6 @@
 image. `ImageReader` shows the patterns by a first-light image source and measures the tracker's images.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass, field

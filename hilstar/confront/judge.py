@@ -1,7 +1,5 @@
 """Photographs against what `simulate` predicts of them with the fitted camera: pixels, sources, stars that are missing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -115,7 +113,7 @@ class Verdict:
     star_chi2: float
     dim: list[str]
     dated: DatedBy | None
-    fainter: Fainter
+    fainter: "Fainter"
     predicted: FloatArray = field(repr=False)
     residual: FloatArray = field(repr=False)
 

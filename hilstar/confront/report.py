@@ -1,7 +1,5 @@
 """What a confrontation found: its figures for --json, its verdicts in words, and what is beyond the limits of --strict."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 `PixelOrder` sorts a footprint's pixels by distance from the star, for each sub-pixel phase: `exact` decides them in that order.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

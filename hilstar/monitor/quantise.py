@@ -7,8 +7,6 @@ All compute in float32 like the renderer, which has to give every pixel the same
 Counting thresholds is fast by a table: the bits of a positive float rise with its value, so its leading bits are an index.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,7 +45,7 @@ class Panel:
     response: Response
     flux_at_white_e_per_s: float
     uniformity: Float32Array | None = None
-    primaries: tuple[Panel, ...] = ()
+    primaries: "tuple[Panel, ...]" = ()
 
     def __post_init__(self) -> None:
         if self.uniformity is not None and not (np.isfinite(self.uniformity).all() and (self.uniformity > 0).all()):
@@ -116,7 +114,7 @@ class Quantiser(ABC):
 
     @classmethod
     @abstractmethod
-    def by_pixel(cls) -> type[PixelQuantiser]:
+    def by_pixel(cls) -> "type[PixelQuantiser]":
         """The quantiser that the GL draws before it looks at stars: a PixelQuantiser itself, `round` for the others."""
 
     @classmethod
@@ -158,7 +156,7 @@ class PixelQuantiser(Quantiser):
         """No frame knows of another."""
 
     @classmethod
-    def by_pixel(cls) -> type[PixelQuantiser]:
+    def by_pixel(cls) -> "type[PixelQuantiser]":
         """Itself."""
         return cls
 

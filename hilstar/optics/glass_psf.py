@@ -6,8 +6,6 @@ are interpolated as the images are. What the pixels get at each place in a pixel
 stamps: a star's pixels are one product of a few numbers with these.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
@@ -166,7 +164,7 @@ class _Stamps:
     sums: Float32Array
     pairs: Float32Array
     phase_of: IntArray
-    sums_of_pairs: csr_array
+    sums_of_pairs: "csr_array"
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,7 +367,7 @@ class GlassPsf(SampledPsf):
             np.add.at(room, places.ravel(), stamps.ravel())
         return room.reshape(-1, across)[side:-side, side:-side]
 
-    def blurred(self, sigma_px: float) -> GlassPsf:
+    def blurred(self, sigma_px: float) -> "GlassPsf":
         """The basis convolved with a round Gaussian, with room for what spreads beyond it."""
         from scipy.ndimage import fourier_gaussian
 

@@ -3,8 +3,6 @@
 Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on a machine without OpenGL.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -64,9 +62,9 @@ class Target:
     uniformity: Float32Array | None = None
     sides: SpriteSides = ()
     seen: Seen = AS_USUAL
-    primaries: tuple[Target, ...] = ()
+    primaries: "tuple[Target, ...]" = ()
 
-    def of_primary(self, panel: Panel) -> Target:
+    def of_primary(self, panel: Panel) -> "Target":
         """The target of a primary with the light of a panel: sprites are as large as those of a white star as bright."""
         share = panel.flux_at_white_e_per_s / self.flux_at_white_e_per_s
         sides = tuple(SpriteSide(side.below_e_per_s * share, side.side_px) for side in self.sides)
@@ -111,7 +109,7 @@ class Backend(ABC):
     gl_renderer: str
     gl_version: str
     path: Path
-    context: Context | None
+    context: "Context | None"
 
     @abstractmethod
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
@@ -143,7 +141,7 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
+    def show_on(self, view: ScreenView, beside: "Sequence[Backend]" = ()) -> None:
         """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in.
 
         Its levels are red's codes where those `beside` it, of the same context, have green's and blue's.
@@ -218,7 +216,7 @@ def linear_light(backend: Backend, sprites: Sprites, stars: Stars, drawn: bool =
     return images
 
 
-def level_cost(quantiser: type[Quantiser], psf: Psf, context: Context | None = None) -> LevelCost:
+def level_cost(quantiser: type[Quantiser], psf: Psf, context: "Context | None" = None) -> LevelCost:
     """The tabulated cost of a quantiser by the OpenGL of a context.
 
     Where NumPy draws everything (None) no frame waits for a screen, so the bench is planned as for a usual GL.

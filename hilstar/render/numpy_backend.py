@@ -3,8 +3,6 @@
 The linear image is that of `reference` in float32, and the quantisers are those of `monitor`, which the shaders follow.
 """
 
-from __future__ import annotations
-
 import ctypes
 import logging
 from collections.abc import Sequence
@@ -33,7 +31,7 @@ NUMPY = "NumPy"
 log = logging.getLogger(__name__)
 
 
-def open_backend(target: Target, context: Context | None) -> Backend:
+def open_backend(target: Target, context: "Context | None") -> Backend:
     """The backend of a target: OpenGL in a context, NumPy without one (see `headless_context`)."""
     if target.primaries:
         return PrimariesBackend(target, [open_backend(one, context) for one in target.primaries])
@@ -44,7 +42,7 @@ def open_backend(target: Target, context: Context | None) -> Backend:
     return Renderer(target, context)
 
 
-def headless_context(gpu: int | str | None = None) -> Context | None:
+def headless_context(gpu: int | str | None = None) -> "Context | None":
     """A headless GL context on a GPU (see `create_context`); None where this machine has no OpenGL, so that NumPy draws.
 
     Raises InputError where the machine has no such GPU.

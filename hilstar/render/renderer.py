@@ -3,8 +3,6 @@
 This room is the only user of moderngl.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext

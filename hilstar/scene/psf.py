@@ -6,8 +6,6 @@ same arithmetic (shaders/shares.glsl). `GaussianPsf` is the Gaussian of thesis e
 both in pixels. `SampledPsf` is an image on a fine grid: its shares are tabulated by offset and interpolated.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from abc import ABC, abstractmethod
@@ -128,7 +126,7 @@ class Psf(ABC):
         """The same shares for shaders/shares.glsl, right within a footprint of `side_px`."""
 
     @abstractmethod
-    def blurred(self, sigma_px: float) -> Psf:
+    def blurred(self, sigma_px: float) -> "Psf":
         """This PSF convolved with a round Gaussian."""
 
     @property
@@ -227,7 +225,7 @@ class GaussianPsf(Psf):
         polynomial = reduce(lambda sum, term: f"({sum} * square + {term})", reversed(terms))
         return ShareShader((f"LOG2_SHARE(square) {polynomial}",), uniforms)
 
-    def blurred(self, sigma_px: float) -> GaussianPsf:
+    def blurred(self, sigma_px: float) -> "GaussianPsf":
         """A wider Gaussian."""
         x, y = (math.hypot(sigma, sigma_px) for sigma in self.sigma_px)
         return GaussianPsf((x, y))
@@ -408,7 +406,7 @@ class SampledPsf(Psf):
         cells = np.stack([near, right - near, down - near, both - right - down + near], axis=2)
         return ShareShader((f"SHARE_STEPS {self._steps}.0",), {}, np.ascontiguousarray(cells))
 
-    def blurred(self, sigma_px: float) -> SampledPsf:
+    def blurred(self, sigma_px: float) -> "SampledPsf":
         """The samples convolved, with room for what spreads beyond them."""
         from scipy.ndimage import fourier_gaussian
 

@@ -4,8 +4,6 @@ Candidates, the stars about a field, are kept from frame to frame, because most 
 `clipped_sprites` finds the stars that need more light than one monitor pixel has.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -118,7 +116,7 @@ class Sprites:
     added: tuple[AddedLight, ...] = ()
     discs: tuple[str, ...] = ()
     over_white: tuple[str, ...] = ()
-    primaries: tuple[Sprites, ...] = ()
+    primaries: "tuple[Sprites, ...]" = ()
 
     def __len__(self) -> int:
         return len(self.data)

@@ -1,7 +1,5 @@
 """A glass to who measures stars: the PSF that a centroider is told, and errors of places by what would take them away."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The virtual tracker before a display that runs: light of its frames over an exposure, DN, found stars, an attitude."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass

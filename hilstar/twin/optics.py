@@ -5,8 +5,6 @@ Gaussian of the square's own variance, spread by the tracker's PSF. The black le
 density on the image.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -109,7 +107,7 @@ class DisplayColours:
     white: FloatArray
 
     @classmethod
-    def of(cls, bench: Bench) -> DisplayColours:
+    def of(cls, bench: Bench) -> "DisplayColours":
         """Those of a bench. Where a mosaic's panel has no known primaries, white has the mean colour of the stars."""
         config, colours, stars, folder = bench.config, bench.colours, bench.stars, bench.file.folder
         bayer, primaries = config.tracker.detector.bayer, bench_primaries(config.monitor, folder)

@@ -3,8 +3,6 @@
 An exposure with faults is cut where a fault begins or ends; each piece has its own view and its own faults.
 """
 
-from __future__ import annotations
-
 import itertools
 import logging
 from collections.abc import Callable, Sequence
@@ -107,7 +105,7 @@ class Simulator(Closing):
     does not `refuse` views goes on near the Sun (see `TrackerBackground`).
     """
 
-    def __init__(self, file: BenchFile, context: Context | None = None, *, refuse: bool = True) -> None:
+    def __init__(self, file: BenchFile, context: "Context | None" = None, *, refuse: bool = True) -> None:
         self.file, self._refuse = file, refuse
         self.config = file.config
         self._load_sky()
@@ -158,7 +156,7 @@ class Simulator(Closing):
             self.renderer = open_backend(target, headless_context(self.config.render.gpu))
 
     @property
-    def moving(self) -> MovingSky | None:
+    def moving(self) -> "MovingSky | None":
         """The bodies, the satellites and the observer; None where the sky stands still."""
         return self.sources.moving
 
@@ -178,7 +176,7 @@ class Simulator(Closing):
         """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate (see `View`)."""
         return View.exposure(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s, t_ns, velocity_km_s, place_km)
 
-    def expose(self, view: View, rng: np.random.Generator | None, faults: FaultyExposure | None = None) -> Exposure:
+    def expose(self, view: View, rng: np.random.Generator | None, faults: "FaultyExposure | None" = None) -> Exposure:
         """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
         exposure_s, canvas, view = self.config.tracker.exposure_s, self.canvas, rolled(view, self.config.tracker)
         stars = seen_in(view, self.stars, self.moving)
@@ -449,7 +447,7 @@ class TrackerBackground:
         *,
         refuse: bool = True,
         mosaic: bool = True,
-        moving: MovingSky | None = None,
+        moving: "MovingSky | None" = None,
     ) -> None:
         self._bayer, tracker = config.tracker.detector.bayer if mosaic else None, config.tracker
         channels = (bench_optics(tracker, folder),) if self._bayer is None else bench_channels(tracker, folder)

@@ -1,7 +1,5 @@
 """The tables of the bench's hardware: [tracker], [monitor], [collimator], [sync], and [verify], their true state."""
 
-from __future__ import annotations
-
 import json
 import re
 from typing import Annotated, Literal

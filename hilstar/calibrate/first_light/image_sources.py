@@ -1,7 +1,5 @@
 """Patterns on the monitor, and where the images of them come from: a command, a person, or the virtual bench."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import logging
@@ -125,7 +123,7 @@ class ImageSource:
         """The tracker's image with the monitor switched off, at the bench file's exposure; None where there is none."""
         return None
 
-    def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
+    def diode(self, file: BenchFile, seconds: float) -> "DiodeRecording | None":
         """Record the display's square by a photodiode; None where there is none. Raises InputError, MachineError."""
         return None
 
@@ -166,7 +164,7 @@ class SerialDiode:
     port: str
     baud: int
 
-    def watch(self, display: PatternDisplay, file: BenchFile, seconds: float) -> DiodeRecording:
+    def watch(self, display: "PatternDisplay", file: BenchFile, seconds: float) -> DiodeRecording:
         """Show the square for `seconds` and record. Raises InputError without edges, MachineError, Stopped."""
         with ThreadPoolExecutor(1) as pool:
             listening: list[Future[Edges]] = []
@@ -192,14 +190,14 @@ class Stopped(HilstarError):
     exit_code = 1
 
 
-def _go_on(window: Window, stopped: bool) -> None:
+def _go_on(window: "Window", stopped: bool) -> None:
     if window.gone is not None:
         raise MachineError(window.gone)
     if window.closing or stopped:
         raise Stopped("stopped at the display; run the same command again to go on")
 
 
-def _presenter(file: BenchFile, window: Window, codes: CodeImage) -> tuple[Presenter, Callable[[], None]]:
+def _presenter(file: BenchFile, window: "Window", codes: CodeImage) -> tuple[Presenter, Callable[[], None]]:
     """A presenter of codes (h, w) or (h, w, 3) for the window, and the function that frees its texture."""
     monitor, triples = file.config.monitor, None
     if codes.ndim == 3:
@@ -283,7 +281,7 @@ class PatternDisplay(Closing):
                 _go_on(window, screen.closing)
         return edges_of(np.array(swap_ns, dtype=np.int64), np.array(light, dtype=np.int64))
 
-    def _window_for(self, file: BenchFile) -> Window:
+    def _window_for(self, file: BenchFile) -> "Window":
         from hilstar.monitor.window.window import Window, WindowSettings
 
         monitor = file.config.monitor

@@ -1,7 +1,5 @@
 """The step of photometry: the tracker as a photometer, by dots on lattices that do not saturate it."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The steps with stars on the screen: the scale of the light, and the comparison with sky and twin."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -86,7 +84,7 @@ class StarsSeen:
         """A mask of the stars whose light is known well enough (n,)."""
         return self.noise_mag < SURE_MAG
 
-    def scatter(self, off_mag: FloatArray, used: npt.NDArray[np.bool_]) -> Scatter:
+    def scatter(self, off_mag: FloatArray, used: npt.NDArray[np.bool_]) -> "Scatter":
         """The scatter of the used stars' light, `off_mag` (used,) fainter than asked for, and its errors."""
         left = off_mag - self.codes_mag[used]
         left = left - np.median(left)

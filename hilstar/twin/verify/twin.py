@@ -3,8 +3,6 @@
 The twin of a bench: from an attitude to what falls on the tracker's detector, and what that reads out.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Sequence

@@ -61,7 +61,7 @@ class PageSubject(Protocol):
 class _Page:
     """A page's process, and the channel to it."""
 
-    process: subprocess.Popen[bytes]
+    process: "subprocess.Popen[bytes]"
     channel: socket.socket
     begun_s: float
 

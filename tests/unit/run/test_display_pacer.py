@@ -38,6 +38,7 @@ class FakeScreen:
         self.timestamp_source = "a fake"
         self.window = SimpleNamespace(hidden="", gone=None, ramp_changed=False, presented={})
         self.output = None
+        self.forced = ()
         self.aids = Aids()
         self.presented: list[int] = []
         self._host, self._by_screen, self._closes_at = clock, by_screen, closes_at

@@ -38,13 +38,14 @@ from hilstar.run.record.report import figures_of, summarise
 from tests.support.full_disk import files_of_at_most
 from tests.support.waiting import wait_for
 
+UNCERTIFIED = SimpleNamespace(certify=SimpleNamespace(certificate=None))
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture
 def bench(small_bench_file):
     return SimpleNamespace(
-        file=SimpleNamespace(path=small_bench_file, text=small_bench_file.read_text(), sha256="0" * 64),
+        file=SimpleNamespace(path=small_bench_file, text=small_bench_file.read_text(), sha256="0" * 64, config=UNCERTIFIED),
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
         output={},
         renderer=SimpleNamespace(

@@ -43,7 +43,12 @@ def ledger(tmp_path, small_bench_file):
 def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
     """Ten frames, one each 20 ms, the fourth of them blank, the last four aberrated, the last two on paths."""
     bench = SimpleNamespace(
-        file=SimpleNamespace(path=small_bench_file, text=SMALL_BENCH, sha256="0" * 64),
+        file=SimpleNamespace(
+            path=small_bench_file,
+            text=SMALL_BENCH,
+            sha256="0" * 64,
+            config=SimpleNamespace(certify=SimpleNamespace(certificate=None)),
+        ),
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
         output={},
         renderer=SimpleNamespace(

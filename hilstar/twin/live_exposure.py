@@ -1,5 +1,6 @@
 """The virtual tracker before a display that runs: light of its frames over an exposure, DN, found stars, an attitude."""
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -179,7 +180,7 @@ class LiveTracker(Closing):
 
     def _light(self, frame: ShownFrame) -> FloatArray:
         levels = frame.codes if self._rgb is None else _levels_of(frame.codes, self._rgb)
-        panels, columns = self._panel.primaries or (self._panel,), levels.reshape(len(levels), -1).T
+        panels, columns = self._panel.primaries or (self._panel,), levels.reshape(len(levels), math.prod(levels.shape[1:])).T
         lights = [one.response.light[k] * one.flux_at_white_e_per_s for one, k in zip(panels, columns, strict=True)]
         light = np.stack(lights, axis=1)
         if self._panel.uniformity is not None:

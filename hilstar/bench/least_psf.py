@@ -84,8 +84,9 @@ def least_psf(
 
 def psf_errors(psf: SampledPsf, other: Psf, places_px: FloatArray) -> PsfErrors:
     """The largest errors of stars at places (n, 2) that are drawn by another PSF."""
-    wanted, found = (_measured(one, psf, places_px) for one in (psf, other))
-    mag = MAG_PER_SHARE * float(np.abs(found[..., 0] / wanted[..., 0] - 1).max())
+    with np.errstate(divide="ignore", invalid="ignore"):  # where a field's corner has no light, nothing but the whole will do
+        wanted, found = (_measured(one, psf, places_px) for one in (psf, other))
+        mag = MAG_PER_SHARE * float(np.abs(found[..., 0] / wanted[..., 0] - 1).max())
     return PsfErrors(mag, float(np.hypot(*np.moveaxis(found[..., 1:] - wanted[..., 1:], 2, 0)).max()))
 
 

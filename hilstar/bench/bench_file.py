@@ -109,7 +109,9 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     true = (config.verify.true_calibration, config.verify.true_geometry)
     orbit = None if config.spacecraft.orbit in {GEOCENTRE, SOURCE} else config.spacecraft.orbit
     bodies = config.sky.bodies
-    named: tuple[str | float | None, ...] = (*curves, *files, *true, orbit, bodies.satellites, bodies.satellite_magnitudes)
+    air = () if config.site is None else (config.site.extinction, config.site.sky_spectrum)
+    sky = (orbit, bodies.satellites, bodies.satellite_magnitudes, *air)
+    named: tuple[str | float | None, ...] = (*curves, *files, *true, *sky)
     for name in named:
         if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos", GAUSSIAN):
             with suppress(InputError):  # its own reader explains better why a file cannot be read

@@ -2,22 +2,21 @@
 
 import datetime
 import hashlib
-import logging
 from collections.abc import Iterable
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.glass import say_once
 from hilstar.errors import InputError, shortened
 from hilstar.reading import NOT_JSON, read_bytes
 
 KIND = "hilstar certificate 1"
 MAX_BYTES = 50_000_000
+ANEW = "certify the bench anew (hilstar certify --again)"
 ADVICE = "give the certificate.json that `hilstar certify BENCH.toml -o DIR` wrote"
-log = logging.getLogger(__name__)
 
 
 class Contribution(msgspec.Struct, frozen=True, kw_only=True):
@@ -131,11 +130,6 @@ def read_certificate(path: Path) -> Certificate:
     return found
 
 
-@lru_cache(maxsize=16)
-def _say_once(line: str) -> None:
-    log.warning("%s", line)
-
-
 def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Certificate | None:
     """The certificate that a bench file names, None where it names none; a notice where it is not this bench's, or is over.
 
@@ -146,9 +140,9 @@ def bench_certificate(file: BenchFile, today: datetime.date | None = None) -> Ce
         return None
     found = read_certificate((file.folder / name).resolve())
     if found.bench_sha256 != file.sha256:
-        _say_once(f"{found.line} is of another state of this bench file; certify it anew (hilstar certify --again)")
+        say_once(f"{found.line} is of another state of this bench file; {ANEW}", "[certify] certificate")
     if found.valid_until < (today or datetime.datetime.now(datetime.UTC).date()).isoformat():
-        _say_once(f"{found.line} is over; certify the bench anew (hilstar certify --again)")
+        say_once(f"{found.line} is over; {ANEW}", "[certify] certificate")
     return found
 
 

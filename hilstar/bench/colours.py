@@ -19,7 +19,7 @@ from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
 from hilstar.scene.extended import shifted
-from hilstar.scene.sprites import Sprites, by_share, with_mean
+from hilstar.scene.sprites import Sprites, by_share, shares_at
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
 from hilstar.sky.stars import Stars
@@ -137,7 +137,7 @@ class Colours:
         shares = self.on(stars).primaries
         if shares is None:
             raise AssertionError("made above")
-        return with_mean(shares, stars)[np.where(star < 0, -1, star)]
+        return shares_at(shares, stars, star)
 
     def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.

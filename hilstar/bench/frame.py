@@ -256,19 +256,24 @@ class Bench:
 
     def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
-        sprites = self._driven(sprites)
+        parts = self._parts(sprites, self.shown_stars)
+        sprites = self._driven(sprites, parts)
         self.renderer.draw(sprites, frame)
-        clipped = None if sprites is None else self._clipped(sprites, self.shown_stars)
+        clipped = None if sprites is None else self._clipped(sprites, parts)
         if sprites is None or clipped is None or not len(clipped):
             return Drawn(self.renderer, sprites, () if sprites is None else sprites.over_white)
         return Drawn(self.renderer, sprites, (*designations(self.shown_stars, sprites, clipped), *sprites.over_white))
 
-    def _driven(self, sprites: Sprites | None) -> Sprites | None:
-        """Sprites with those of each primary, where those are driven apart."""
-        if sprites is None or self.colours is None:
+    def _parts(self, sprites: Sprites | None, stars: Stars) -> tuple[Sprites, ...]:
+        """The sprites of each primary, where those are driven apart, else none; `sprites.star` has places among `stars`."""
+        return () if sprites is None or self.colours is None else self.colours.parts(sprites, stars)
+
+    def _driven(self, sprites: Sprites | None, parts: tuple[Sprites, ...]) -> Sprites | None:
+        """Sprites with those of each primary that can light a pixel."""
+        if sprites is None or not parts:
             return sprites
-        parts = zip(self.colours.parts(sprites, self.shown_stars), self._faintest_e_per_s, strict=True)
-        return replace(sprites, primaries=tuple(lit_alone(*part) for part in parts))
+        each = zip(parts, self._faintest_e_per_s, strict=True)
+        return replace(sprites, primaries=tuple(lit_alone(*part) for part in each))
 
     @cached_property
     def _faintest_e_per_s(self) -> list[float]:
@@ -286,7 +291,8 @@ class Bench:
         if self.sources.diffuse:
             lights = (*lights, LightMap(np.zeros((1, 1), dtype=np.float32), lasting=False))
         if lights:
-            self.renderer.draw(self._driven(replace(self.sprites(WARM_UP_ATTITUDE), extended=lights)))
+            sprites = replace(self.sprites(WARM_UP_ATTITUDE), extended=lights)
+            self.renderer.draw(self._driven(sprites, self._parts(sprites, self.shown_stars)))
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
         self.renderer.begin_anew()
@@ -309,12 +315,12 @@ class Bench:
         sprites = self._light(self._all_layers, self.stars, view, faults)
         shown = self.light(view, faults)
         self.renderer.begin_anew()
-        self.renderer.draw(self._driven(shown), number)
+        self.renderer.draw(self._driven(shown, self._parts(shown, self.shown_stars)), number)
         levels = Levels(self.renderer.levels().copy())
         drawn = len(sprites) == len(shown) and not (len(self.faint_stars) or self.renderer.target.sides)
         drawn &= self.colours is None
         light = linear_light(self.renderer, sprites, self.stars, drawn)
-        truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites, self.stars))
+        truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites, self._parts(sprites, self.stars)))
         if sprites.discs:
             discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
             found = disc_stars(self.stars, (disc.name for disc in discs))
@@ -362,7 +368,8 @@ class Bench:
             return levels
         return np.asarray(rgb[levels], dtype=code_dtype(self.calibration.response.bits))
 
-    def _clipped(self, sprites: Sprites, stars: Stars) -> IntArray:
+    def _clipped(self, sprites: Sprites, parts: tuple[Sprites, ...]) -> IntArray:
+        """Places of the sprites that are over white: of light as a whole, or of any primary's `parts`."""
         psf, spectra = self.psf, sprites.spectra
         if isinstance(psf, GlassPsf) and spectra is not None:  # as bright as the mean PSF's stars with the same peaks
             data, half_white = sprites.data.copy(), 0.5 * self.flux_at_white_e_per_s * self.darkest
@@ -371,10 +378,9 @@ class Bench:
             stamps = psf.of_stars(x_px, y_px, spectra[bright] if spectra.ndim == 2 else spectra, rate)
             data["electrons_per_s"][bright] = stamps.max(axis=(1, 2)) / psf.shares(np.rint(x_px) - x_px, np.rint(y_px) - y_px)
             sprites = replace(sprites, data=data)
-        parts = (sprites,) if self.colours is None else self.colours.parts(replace(sprites, extended=()), stars)
         over = [
             clipped_sprites(part, psf, one.flux_at_white_e_per_s, self.camera.resolution_px, self.uniformity, self.darkest)
-            for part, one in zip(parts, self.panel.primaries or (self.panel,), strict=True)
+            for part, one in zip(parts or (sprites,), self.panel.primaries or (self.panel,), strict=True)
         ]
         return over[0] if len(over) == 1 else np.unique(np.concatenate(over))
 

@@ -235,10 +235,19 @@ def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
     return [sprites] if stars.colours is None else by_share(sprites, stars, stars.colours)
 
 
-def with_mean(shares: FloatArray, stars: Stars) -> FloatArray:
-    """Shares (n, columns) of stars, and in one more row those of all stars' light together, without bodies'."""
+def mean_share(shares: FloatArray, stars: Stars) -> FloatArray:
+    """The shares (columns,) of all stars' light together, without bodies', by those of each (n, columns)."""
     rates = stars.rates_e_per_s
-    return np.vstack([shares, rates @ shares[: len(rates)] / (rates.sum() or 1.0)])
+    return np.asarray(rates @ shares[: len(rates)] / (rates.sum() or 1.0))
+
+
+def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
+    """Shares (n, columns) of stars at places (n,); below 0, where light is no star's, their `mean_share`."""
+    found, own = np.empty((len(places), shares.shape[1])), places >= 0
+    found[own] = shares[places[own]]
+    if not own.all():
+        found[~own] = mean_share(shares, stars)
+    return found
 
 
 def by_share(sprites: Sprites, stars: Stars, shares: FloatArray) -> list[Sprites]:
@@ -246,15 +255,15 @@ def by_share(sprites: Sprites, stars: Stars, shares: FloatArray) -> list[Sprites
 
     Light that is neither a star's nor a body's, as a fault's, has the mean share of the stars.
     """
-    alone, shares = len(stars.rates_e_per_s), with_mean(shares, stars)
-    bodies = {name: alone + k for k, name in enumerate(stars.bodies)}
-    of_sprites = np.where(sprites.star < 0, -1, sprites.star)
-    of_extended = [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended]
+    bodies = {name: len(stars.rates_e_per_s) + k for k, name in enumerate(stars.bodies)}
+    lights = [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended]
+    of_sprites = shares_at(shares, stars, sprites.star).astype(np.float32)
+    of_extended = shares_at(shares, stars, np.array(lights, dtype=np.intp))
     parts = []
-    for share in shares.T:
+    for share, wide in zip(of_sprites.T, of_extended.T, strict=True):
         data = sprites.data.copy()
-        data["electrons_per_s"] *= share[of_sprites].astype(np.float32)
-        extended = tuple(times(light, float(share[k])) for light, k in zip(sprites.extended, of_extended, strict=True))
+        data["electrons_per_s"] *= share
+        extended = tuple(times(light, float(part)) for light, part in zip(sprites.extended, wide, strict=True))
         parts.append(replace(sprites, data=data, extended=extended))
     return parts
 

@@ -23,7 +23,7 @@ from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import pack_sprites, with_mean
+from hilstar.scene.sprites import mean_share, pack_sprites
 from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
@@ -115,7 +115,7 @@ class DisplayColours:
             return cls(None, np.empty((0, 0)), np.empty(0))
         if colours is not None:
             return cls(bayer, colours.by_primary, colours.by_primary @ colours.of_white)
-        white = with_mean(stars.colours, stars)[-1]
+        white = mean_share(stars.colours, stars)
         if primaries is not None:
             white = channel_matrix(primaries, named_channels(config.tracker, folder), 1.0).e_per_s.sum(axis=1)
         return cls(bayer, white[:, None], white)

@@ -271,3 +271,13 @@ def test_a_site_needs_a_date_and_tells_of_the_sun(tmp_path):
     result = run_hilstar_here(*command)
     assert result.returncode == 0
     assert "the Sun stands at" in result.stderr
+
+
+def test_the_benchs_hash_covers_the_sites_curves(tmp_path):
+    """As it covers every file that makes frames."""
+    curve = tmp_path / "air.csv"
+    curve.write_text("wavelength_nm,value\n400,0.4\n900,0.1\n")
+    keys = 'extinction = "air.csv"\nsky_v_mag_arcsec2 = 21\nsky_spectrum = "air.csv"'
+    before = bench(tmp_path, keys).sha256
+    curve.write_text("wavelength_nm,value\n400,0.5\n900,0.1\n")
+    assert bench(tmp_path, keys).sha256 != before

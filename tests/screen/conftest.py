@@ -9,6 +9,7 @@ import pytest
 
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.x11.screens import Screen, xvfb
+from tests.support.x11.xorg import Xorg, xorg
 
 
 @pytest.fixture(scope="module")
@@ -25,3 +26,17 @@ def bench_file(tmp_path: Path) -> Path:
     path.write_text(SCREEN_BENCH)
     still_log(tmp_path / "still.csv")
     return path
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory) -> Iterator[Xorg]:
+    with xorg(tmp_path_factory.mktemp("xorg")) as running:
+        running.xrandr("--output", "DUMMY0", "--gamma", "1:1:1")
+        yield running
+
+
+@pytest.fixture
+def here(server, monkeypatch) -> Xorg:
+    """The server, as this process's own."""
+    monkeypatch.setenv("DISPLAY", server.display)
+    return server

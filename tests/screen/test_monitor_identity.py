@@ -6,7 +6,6 @@ import datetime
 import json
 import subprocess
 import tomllib
-from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from tests.support.forks import HILSTAR, Started
 from tests.support.ledgers import read_run
 from tests.support.pages import ADDRESS, PageAddress
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.x11.xorg import Xorg, xorg
+from tests.support.x11.xorg import Xorg
 from tests.unit.run.test_machine_row import edid
 
 TODAY = datetime.datetime.now(datetime.UTC).date()
@@ -36,20 +35,6 @@ DDCUTIL = """#!/bin/sh
 [ "$1 $2 $3 $4 $5 $6 $7" = "getvcp 10 12 14 C0 --terse --edid" ] || exit 1
 printf 'VCP 10 C %d 100\\nVCP 12 C 75 100\\nVCP 14 SNC x%02x\\nVCP C0 CNC x00 xff x04 xb0\\n'
 """
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory) -> Iterator[Xorg]:
-    with xorg(tmp_path_factory.mktemp("xorg")) as running:
-        running.xrandr("--output", "DUMMY0", "--gamma", "1:1:1")
-        yield running
-
-
-@pytest.fixture
-def here(server, monkeypatch) -> Xorg:
-    """The server as this process's own."""
-    monkeypatch.setenv("DISPLAY", server.display)
-    return server
 
 
 def plugged(server: Xorg, block: bytes = edid()) -> AbstractContextManager[None]:

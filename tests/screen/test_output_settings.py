@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import json
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,22 +17,7 @@ from tests.screen.test_monitors import bench, showing
 from tests.support.commands import run_hilstar
 from tests.support.ledgers import read_run
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.x11.xorg import Xorg, xorg
 from tests.unit.monitor.test_output_settings import HALF, edid
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory) -> Iterator[Xorg]:
-    with xorg(tmp_path_factory.mktemp("xorg")) as running:
-        running.xrandr("--output", "DUMMY0", "--gamma", "1:1:1")
-        yield running
-
-
-@pytest.fixture
-def here(server, monkeypatch) -> Xorg:
-    """The server, as this process's own."""
-    monkeypatch.setenv("DISPLAY", server.display)
-    return server
 
 
 def dummy0() -> OutputState:

@@ -285,7 +285,7 @@ class GlassPsf(SampledPsf):
         """How much stars at places (n,) have of each basis image (n, K); `shares` as in `of_stars`."""
         by_field, shares = self.field(x_px, y_px).astype(np.float32), shares.astype(np.float32)
         by_point = by_field[:, :, None] * shares.reshape(-1, 1, shares.shape[-1])
-        return np.asarray(by_point.reshape(len(x_px), -1) @ self._light)
+        return np.asarray(by_point.reshape(len(x_px), len(self._light)) @ self._light)
 
     @cached_property
     def _sums(self) -> Float32Array:

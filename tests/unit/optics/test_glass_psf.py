@@ -144,6 +144,11 @@ def test_a_corner_that_is_vignetted_whole_is_dark(glass):
     assert (x[0], y[0], relative[0]) == pytest.approx((0, 0, 0), abs=1e-9)
 
 
+def test_a_field_without_stars_has_no_light(glass):
+    nowhere = np.empty(0)
+    assert glass_psf(glass, 0.0, MEAN).of_stars(nowhere, nowhere, np.empty((0, 4)), nowhere).shape[0] == 0
+
+
 def test_noise_of_a_measured_map_and_its_negative_lobes_move_no_star(rng):
     """The noise of 1e-4 of the light a pixel moves one image's centroid by 1e-4 sqrt(sum of x^2) over 15 x 15 px, 6.5e-3 px."""
     plain = stack(integrated=True, per_px=1)

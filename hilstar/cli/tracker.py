@@ -179,7 +179,9 @@ def parse_silent(text: str | None) -> tuple[float, float]:
 
 
 def checked_rate(rate_hz: float | None, exposure_s: float) -> float:
-    """The rate of answers. Raises InputError where exposures would overlap."""
+    """The rate of answers. Raises InputError where exposures would overlap, or collect nothing."""
+    if not exposure_s:
+        raise InputError("[tracker] exposure_s = 0: the tracker collects no light; write a longer exposure")
     fastest_hz = min(1 / exposure_s, MAX_RATE_HZ)
     if rate_hz is None:
         return min(USUAL_RATE_HZ, fastest_hz)

@@ -87,6 +87,8 @@ class FaultView:
 
     def prepare(self, fault: Fault) -> Fault:
         """The fault with everything prepared that a frame has no time for. Raises InputError (see `FaultSchedule`)."""
+        if not self.by.exposure_s and getattr(fault, "electrons", None) is not None:
+            raise InputError("electrons: [tracker] exposure_s is 0, and no exposure has them; write a longer one")
         if isinstance(fault, CosmicRays) and fault.for_s is None:
             fault = msgspec.structs.replace(fault, for_s=self.by.exposure_s)
         by_star = isinstance(fault, Flash | StarGone) and (fault.hip or fault.star)

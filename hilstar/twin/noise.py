@@ -243,6 +243,10 @@ def noise_budget(
     if tracker.detector.bayer is not None:
         say_once("--noise is of a pixel that adds up all channels; a mosaic's has its own alone", "[tracker.detector] bayer")
     camera, stars = tracker_camera(tracker, file.folder), bench_stars(config, file.folder)
+    if not tracker.exposure_s:
+        raise InputError("[tracker] exposure_s = 0: no light is collected; write a longer exposure")
+    if not len(stars):
+        raise InputError(f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger magnitude")
     star = NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s)
     background = TrackerBackground(config, file.folder, camera, mosaic=False)
     sights, levels_e = [], []

@@ -249,6 +249,30 @@ def test_a_number_that_no_bench_has_is_refused_before_it_takes_memory(table, lin
         assert f"[{table}] {key} = " in refusal(*words)
 
 
+BURST = '[[fault]]\nname = "protons"\nkind = "cosmic-rays"\nat_s = 0\nnumber = 4\nelectrons = 800\n'
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("budget", "bench.toml", "--noise", "-o", "budget"),
+        ("tracker", "bench.toml", "--watch", "tcp://127.0.0.1:5563", "--answer", "tcp://127.0.0.1:5564"),
+        (*SIMULATE, "--scenario", "burst.toml"),
+        (*FRAME, "--scenario", "burst.toml"),
+    ],
+    ids=lambda w: w[0],
+)
+def test_an_exposure_of_no_length_is_refused_where_light_is_divided_by_it(words):
+    Path("bench.toml").write_text(BENCH.replace("[tracker]", "[tracker]\nexposure_s = 0"))
+    Path("burst.toml").write_text(BURST)
+    assert "exposure_s" in refusal(*words)
+
+
+def test_a_noise_budget_of_no_star_is_refused():
+    Path("bench.toml").write_text(BENCH + "\n[sky]\nfaintest_v_mag = -3\n")
+    assert "[sky] faintest_v_mag = -3 leaves no star" in refusal("budget", "bench.toml", "--noise", "-o", "budget")
+
+
 @pytest.mark.parametrize(("table", "size"), [("tracker", "[64, 64]"), ("monitor", "[64, 48]")])
 def test_an_image_of_a_thousand_million_pixels_is_refused(table, size):
     assert BENCH.count(f"resolution_px = {size}") == 1

@@ -5,13 +5,13 @@ them.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.rotation import from_rotation_vector, multiply, to_matrix
+from hilstar.rotation import from_rotation_vectors, multiply, to_matrix
 from hilstar.scene.camera import Camera, Lens
 from hilstar.sky.stars import AirAbove
 from hilstar.units import MAD_TO_SIGMA
@@ -24,7 +24,6 @@ DIFFERENCE = 1e-4  # of a number, for its derivative
 HUBER = 2.0
 FOLDS = 5
 GAIN = 0.985  # a larger model is taken where it brings the held-out error below this share of the smaller one's
-STARTS = 8  # directions of the zenith from which refraction is fitted
 # name -> step that makes a number of order 1
 STEPS = {"log_focal": 1e-3, "centre_x": 10.0, "centre_y": 10.0, "k1": 0.1, "k2": 1.0, "p1": 1e-3, "p2": 1e-3}
 # sigma of a number's prior, in its steps: so wide that it decides only what stars leave open
@@ -85,14 +84,21 @@ class Pointing:
             return self.air.bent(vectors)
         if self.zenith is None:
             return vectors
-        up = np.array([*self.zenith, 1.0]) / math.hypot(1.0, *self.zenith) @ to_matrix(self.q_icrs_to_cam)
-        cosine = np.maximum(vectors @ up, MIN_COS_ZENITH)
-        bent = vectors + REFRACTION_RAD * (up / cosine[:, None] - vectors)
-        return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True))
+        matrix = to_matrix(self.q_icrs_to_cam)
+        return np.asarray(refracted(vectors @ matrix.T, np.array([self.zenith])) @ matrix)
 
     def places_px(self, camera: Camera, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels of directions (n, 3), ICRS."""
         return camera.project(self.seen(vectors) @ to_matrix(self.q_icrs_to_cam).T)
+
+
+def refracted(cam: FloatArray, zenith: FloatArray) -> FloatArray:
+    """Directions (n, 3) in cam, bent towards zeniths (n, 2) or (1, 2), which are tangents from the boresight."""
+    up = np.column_stack([zenith, np.ones(len(zenith))])
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    cosine = np.maximum((cam * up).sum(axis=1), MIN_COS_ZENITH)
+    bent = cam + REFRACTION_RAD * (up / cosine[:, None] - cam)
+    return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,85 +141,92 @@ def with_values(camera: Camera, values: dict[str, float]) -> Camera:
     )
 
 
-@dataclass(frozen=True, slots=True)
 class _Loss:
-    """The residuals of places in sigmas by a camera's numbers and each photograph's own: a turn, and its zenith if fitted."""
+    """The residuals of places in sigmas by a camera's numbers, each photograph's turn, and its zenith where that is fitted."""
 
-    base: Camera
-    pointings: Sequence[Pointing]
-    photographs: Sequence[Places]
-    names: tuple[str, ...]
-    floor_px: float
-
-    @property
-    def sizes(self) -> list[int]:
-        """How many numbers each photograph has."""
-        return [3 if one.zenith is None else 5 for one in self.pointings]
-
-    @property
-    def ends(self) -> list[int]:
-        """Where each photograph's numbers end."""
-        return [len(self.names) + int(end) for end in np.cumsum(self.sizes)]
+    def __init__(
+        self,
+        base: Camera,
+        pointings: Sequence[Pointing],
+        photographs: Sequence[Places],
+        names: tuple[str, ...],
+        floor_px: float,
+    ) -> None:
+        self.base, self.pointings, self.names = base, pointings, names
+        self.owner = np.repeat(np.arange(len(photographs)), [len(one.x_px) for one in photographs])
+        self.x_px, self.y_px, sigma_px = (
+            np.concatenate([getattr(one, name) for one in photographs]) for name in ("x_px", "y_px", "sigma_px")
+        )
+        self.sigma_px = np.hypot(sigma_px, floor_px)
+        seen = [  # in cam as it is, behind an air that is known
+            (one.air.bent(places.vectors) if one.air is not None else places.vectors) @ to_matrix(one.q_icrs_to_cam).T
+            for one, places in zip(pointings, photographs, strict=True)
+        ]
+        self.cam = np.concatenate(seen)
+        self.bent = np.array([one.zenith is not None and one.air is None for one in pointings], dtype=bool)
+        self.zenith_of = np.cumsum(self.bent) - 1  # the row of a photograph's zenith
 
     def start(self) -> FloatArray:
         """The numbers of the base and the pointings as they are."""
-        numbers = np.zeros(len(self.names) + sum(self.sizes))
         lens = self.base.lens or Lens()
         own = dict(zip(LENS_NAMES, (*lens.radial[:2], *lens.tangential), strict=True))
-        numbers[: len(self.names)] = [own.get(name, 0.0) / STEPS[name] for name in self.names]
-        for one, end in zip(self.pointings, self.ends, strict=True):
-            if one.zenith is not None:
-                numbers[end - 2 : end] = one.zenith
-        return numbers
+        zeniths = [one.zenith for one, bent in zip(self.pointings, self.bent, strict=True) if bent and one.zenith]
+        turns = np.zeros(3 * len(self.pointings))
+        return np.concatenate([[own.get(name, 0.0) / STEPS[name] for name in self.names], turns, np.ravel(zeniths)])
 
-    def unpacked(self, numbers: FloatArray) -> tuple[Camera, list[Pointing]]:
-        """The camera and the pointings of numbers."""
+    def parts(self, numbers: FloatArray) -> tuple[Camera, FloatArray, FloatArray]:
+        """The camera, each photograph's turn (m, 4), and the fitted zeniths (z, 2) of numbers."""
+        own, last = len(self.names), len(self.names) + 3 * len(self.pointings)
         camera = with_values(self.base, {name: STEPS[name] * float(n) for name, n in zip(self.names, numbers, strict=False)})
         # the image's middle stays where it is when the principal point moves: else the loss is one long valley
         dx, dy = (a - b for a, b in zip(camera.principal_point_px, self.base.principal_point_px, strict=True))
         follow = np.array([dy, -dx, 0.0]) / camera.focal_length_px
-        found = []
-        for one, end, size in zip(self.pointings, self.ends, self.sizes, strict=True):
-            own = numbers[end - size : end]
-            q = multiply(from_rotation_vector(ATTITUDE_STEP_RAD * own[:3] + follow), one.q_icrs_to_cam)
-            found.append(replace(one, q_icrs_to_cam=q, zenith=None if size == 3 else (float(own[3]), float(own[4]))))
-        return camera, found
+        turns = from_rotation_vectors(ATTITUDE_STEP_RAD * numbers[own:last].reshape(-1, 3) + follow)
+        return camera, turns, numbers[last:].reshape(-1, 2)
+
+    def unpacked(self, numbers: FloatArray) -> tuple[Camera, tuple[Pointing, ...]]:
+        """The camera and the pointings of numbers."""
+        camera, turns, zeniths = self.parts(numbers)
+        found = [replace(p, q_icrs_to_cam=multiply(q, p.q_icrs_to_cam)) for p, q in zip(self.pointings, turns, strict=True)]
+        for i in np.flatnonzero(self.bent):
+            found[i] = replace(found[i], zenith=tuple(zeniths[self.zenith_of[i]].tolist()))
+        return camera, tuple(found)
 
     def residuals(self, numbers: FloatArray) -> FloatArray:
-        """Those of the places, x and then y of each photograph, then the priors."""
-        camera, found = self.unpacked(numbers)
-        parts = []
-        for one, places in zip(found, self.photographs, strict=True):
-            x, y = one.places_px(camera, places.vectors)
-            sigma = np.hypot(places.sigma_px, self.floor_px)
-            parts += [(places.x_px - x) / sigma, (places.y_px - y) / sigma]
-        parts.append(np.array([numbers[k] / PRIOR[name] for k, name in enumerate(self.names)]))
-        parts += [np.array(one.zenith) / ZENITH_PRIOR for one in found if one.zenith is not None]
-        return np.clip(np.nan_to_num(np.concatenate(parts), nan=1e4), -1e4, 1e4)
+        """Those of all places, x and then y, then the priors."""
+        camera, turns, zeniths = self.parts(numbers)
+        cam = np.einsum("nij,nj->ni", to_matrix(turns)[self.owner], self.cam)
+        if len(zeniths):
+            some = self.bent[self.owner]
+            cam[some] = refracted(cam[some], zeniths[self.zenith_of[self.owner[some]]])
+        x, y = camera.project(cam)
+        parts = [(self.x_px - x) / self.sigma_px, (self.y_px - y) / self.sigma_px]
+        parts += [numbers[: len(self.names)] / [PRIOR[name] for name in self.names], zeniths.ravel() / ZENITH_PRIOR]
+        return np.asarray(np.clip(np.nan_to_num(np.concatenate(parts), nan=1e4), -1e4, 1e4))
 
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
         """Derivatives by differences: a photograph's own numbers move its own places alone, all photographs' at once."""
-        owner = np.repeat(np.arange(len(self.photographs)), [2 * len(places.x_px) for places in self.photographs])
+        own, stars, photographs = len(self.names), len(self.owner), len(self.pointings)
         found = np.zeros((len(off), len(numbers)))
 
-        def changed(columns: Sequence[int]) -> FloatArray:
+        def changed(columns: IntArray) -> FloatArray:
             moved = numbers.copy()
-            moved[list(columns)] += DIFFERENCE
+            moved[columns] += DIFFERENCE
             return (self.residuals(moved) - off) / DIFFERENCE
 
-        for k in range(len(self.names)):
-            found[:, k] = changed([k])
-        row = len(owner) + len(self.names)
-        for k in range(max(self.sizes, default=0)):
-            mine = [(i, end - size + k) for i, (end, size) in enumerate(zip(self.ends, self.sizes, strict=True)) if k < size]
-            change = changed([column for _, column in mine])
-            for i, column in mine:
-                rows = np.flatnonzero(owner == i)
-                found[rows, column] = change[rows]
-        for end, size in zip(self.ends, self.sizes, strict=True):
-            if size == 5:
-                found[row, end - 2] = found[row + 1, end - 1] = 1 / ZENITH_PRIOR
-                row += 2
+        for k in range(own):
+            found[:, k] = changed(np.array([k]))
+        each = [(np.arange(own + k, own + 3 * photographs, 3), self.owner, np.arange(stars)) for k in range(3)]
+        if self.bent.any():
+            lit = np.flatnonzero(self.bent[self.owner])
+            zenith = self.zenith_of[self.owner[lit]]
+            each += [(np.arange(own + 3 * photographs + k, len(numbers), 2), zenith, lit) for k in range(2)]
+        for columns, which, rows in each:
+            change = changed(columns)
+            for first in (0, stars):
+                found[first + rows, columns[which]] = change[first + rows]
+        priors = np.arange(own + 3 * photographs, len(numbers))
+        found[2 * stars + own + np.arange(len(priors)), priors] = 1 / ZENITH_PRIOR
         return found
 
 
@@ -225,29 +238,35 @@ def fit_model(
     `base` is the camera about which the numbers count. A pointing with a zenith has it fitted.
     """
     loss = _Loss(base, pointings, photographs, names, floor_px)
-    numbers, hessian = _minimised(loss)
-    camera, every = loss.unpacked(numbers)
+    numbers, hessian = minimised(loss.residuals, loss.slopes, loss.start())
     covariance = np.asarray(np.linalg.pinv(hessian), dtype=np.float64)
-    return camera, tuple(every), covariance[: len(names), : len(names)]
+    return *loss.unpacked(numbers), covariance[: len(names), : len(names)]
 
 
-def _minimised(loss: _Loss) -> tuple[FloatArray, FloatArray]:
-    """The numbers with the smallest Huber loss (Levenberg and Marquardt, reweighted), and the normal matrix there."""
+def minimised(
+    residuals: Callable[[FloatArray], FloatArray],
+    slopes: Callable[[FloatArray, FloatArray], FloatArray],
+    numbers: FloatArray,
+    least_gain: float = MIN_GAIN,
+) -> tuple[FloatArray, FloatArray]:
+    """The numbers with the smallest Huber loss (Levenberg and Marquardt, reweighted), and the normal matrix there.
+
+    `slopes` are the derivatives of residuals, which it is given too.
+    """
 
     def value(off: FloatArray) -> float:
         size = np.abs(off)
         return float(np.where(size <= HUBER, size**2 / 2, HUBER * (size - HUBER / 2)).sum())
 
-    numbers = loss.start()
-    off, damping = loss.residuals(numbers), FIRST_DAMPING
+    off, damping = residuals(numbers), FIRST_DAMPING
     best, normal = value(off), np.eye(len(numbers))
     for _ in range(MAX_STEPS):
-        design = loss.slopes(numbers, off)
+        design = slopes(numbers, off)
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), HUBER))
         normal, downhill = design.T @ (weight[:, None] * design), design.T @ (weight * off)
         for _ in range(MAX_DAMPINGS):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -downhill)
-            trial = loss.residuals(numbers + step)
+            trial = residuals(numbers + step)
             new = value(trial)
             if new <= best:
                 break
@@ -255,7 +274,7 @@ def _minimised(loss: _Loss) -> tuple[FloatArray, FloatArray]:
         else:
             break
         gain, numbers, off, best, damping = best - new, numbers + step, trial, new, damping / 10
-        if gain < MIN_GAIN:
+        if gain < least_gain:
             break
     return numbers, normal
 
@@ -274,11 +293,11 @@ def own_floor_px(residuals: Sequence[FloatArray], photographs: Sequence[Places],
 
 
 def fit_camera(
-    base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], *, fixed: bool, refraction: bool
+    base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], *, fixed: bool, last: bool
 ) -> CameraFit:
     """The camera of photographs, least model that held-out stars ask for; `fixed`: the pointings alone.
 
-    `refraction`: whether it may be fitted; a pointing that has a zenith already keeps one.
+    Refraction may be fitted. Where better places are to come, and it is not the `last`, the largest model serves without it.
     """
     bare = tuple(pointings)
     count = sum(len(one.x_px) for one in photographs)
@@ -288,20 +307,23 @@ def fit_camera(
     if not models:
         models = {"pinhole": MODELS["pinhole"]}
     # the error of a place by the largest model, so that all are weighed alike
-    camera, bare, floor = _settled(base, bare, photographs, list(models.values())[-1])
-    chosen, best, held = next(iter(models)), math.inf, {}
+    largest = list(models)[-1]
+    camera, bare, floor = _settled(base, bare, photographs, models[largest])
+    if not last:
+        return CameraFit(camera, bare, largest, floor_px=floor)
+    chosen, best, held = largest, math.inf, {}
     for name, names in models.items():
         held[name] = _held_out(base, bare, photographs, names, floor)
         if held[name] < GAIN * best:
             best, chosen = held[name], name
-    names = () if fixed else MODELS[chosen]
-    camera, bare, floor = _settled(base, bare, photographs, names)
-    if refraction and any(one.air is None for one in bare):
+    names = models[chosen]
+    if chosen != largest:
+        camera, bare, floor = _settled(base, bare, photographs, names)
+    if any(one.air is None for one in bare):
         bent = tuple(
-            one if one.zenith or one.air else _with_zenith(camera, one, places, floor)
-            for one, places in zip(bare, photographs, strict=True)
+            one if one.air else _with_zenith(camera, one, places, floor) for one, places in zip(bare, photographs, strict=True)
         )
-        plain_px = _held_out(camera, bare, photographs, names, floor)
+        plain_px = best if chosen == largest else _held_out(camera, bare, photographs, names, floor)
         bent_px = _held_out(camera, bent, photographs, names, floor)
         held[f"{chosen}, refraction"] = bent_px
         if bent_px < GAIN * plain_px:
@@ -331,6 +353,7 @@ def _held_out(
 ) -> float:
     """Rms error of stars that were held out, px an axis, weighed by their errors, each counted up to HUBER + 1 sigmas."""
     squares = weights = 0.0
+    camera, pointings, _ = fit_model(camera, pointings, photographs, names, floor_px)  # from which folds are near
     for fold in range(FOLDS):
         out = [np.arange(len(one.x_px)) % FOLDS == fold for one in photographs]
         kept = [one.at(~mask) for one, mask in zip(photographs, out, strict=True)]
@@ -348,14 +371,19 @@ def _held_out(
 def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: float) -> Pointing:
     """The pointing with the zenith that fits best, the camera as it is."""
 
-    def loss(trial: Pointing) -> float:
-        off = CameraFit(camera, (trial,), "").residuals_px([places])[0] / np.hypot(places.sigma_px, floor_px)[:, None]
-        return float(np.minimum(off**2, 9).sum())
+    def off(trial: Pointing) -> FloatArray:
+        return CameraFit(camera, (trial,), "").residuals_px([places])[0] / np.hypot(places.sigma_px, floor_px)[:, None]
 
-    fits: list[Pointing] = []
-    for k in range(STARTS):
-        angle = 2 * math.pi * k / STARTS
-        start = Pointing(pointing.q_icrs_to_cam, (math.cos(angle), math.sin(angle)))
-        _, (found,), _ = fit_model(camera, [start], [places], (), floor_px)
-        fits.append(found)
-    return min(fits, key=loss)
+    # a zenith (a, b) squeezes a field by 1 + a^2 along x, 1 + b^2 along y and a b across both: it is known but for its sign
+    (cx, cy), zero = camera.principal_point_px, np.zeros(len(places.x_px))
+    u, v, one = places.x_px - cx, places.y_px - cy, zero + 1
+    columns = [(one, zero), (zero, one), (v, -u), (u, v), (u, -v), (v, u)]
+    weight = 1 / np.hypot(places.sigma_px, floor_px)
+    design = np.stack([np.concatenate([x * weight, y * weight]) for x, y in columns], axis=1)
+    plain = np.clip(off(replace(pointing, zenith=None)).T.ravel(), -5, 5)
+    *_, p, q = np.linalg.lstsq(design, plain, rcond=None)[0].tolist()
+    tangent, angle = math.sqrt(2 * math.hypot(p, q) / REFRACTION_RAD), math.atan2(-q, -p) / 2
+    tangent = min(max(tangent, 0.3), 3.0)
+    starts = [replace(pointing, zenith=(s * tangent * math.cos(angle), s * tangent * math.sin(angle))) for s in (1, -1)]
+    fits = [fit_model(camera, [start], [places], (), floor_px)[1][0] for start in starts]
+    return min(fits, key=lambda trial: float(np.minimum(off(trial) ** 2, 9).sum()))

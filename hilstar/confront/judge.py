@@ -261,14 +261,15 @@ class Judge:
         sky, found = shot.sky, shot.found
         _, double, variable = sky.within(shot.star)
         place = {star: k for k, star in enumerate(expected.star.tolist())}
+        v_mag, bv_mag, hip = sky.v_mag, sky.bv_mag, sky.hip
         kinds = {"saturated": shot.saturated, "blended": shot.blended, "double": double, "variable": variable}
 
         def row(star: int, seen: Iterable[float], flags: tuple[str, ...]) -> StarRow:
             x, y, dn, sigma = (float(value) for value in seen)
             k = place[star]
             predicted = float(expected.x_px[k]), float(expected.y_px[k])
-            light, v, bv = float(expected.dn[k]), float(sky.v_mag[star]), float(sky.bv_mag[star])
-            return StarRow(star, int(sky.hip[star]), sky.name(star), x, y, *predicted, dn, sigma, light, v, bv, flags)
+            light, v, bv = float(expected.dn[k]), float(v_mag[star]), float(bv_mag[star])
+            return StarRow(star, int(hip[star]), sky.name(star), x, y, *predicted, dn, sigma, light, v, bv, flags)
 
         rows = []
         for k, star in enumerate(shot.star.tolist()):

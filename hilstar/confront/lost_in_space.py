@@ -33,7 +33,8 @@ MAX_CANDIDATES = 20_000  # of a hypothesis
 MIN_MATCHED = 5
 # The triangles of one sky serve others of about its date: an arcminute changes a ratio by less than a tenth of its tolerance.
 KEPT_STARS, KEPT_RAD = 1000, 3e-4
-Triangles = tuple[IntArray, FloatArray, FloatArray]
+STRETCH = np.array([MAX_RATIO_OFF / STEP, 1.0, 1.0])  # of triangles' keys, so that one distance is every tolerance
+Triangles = tuple[IntArray, FloatArray, cKDTree]  # triples (t, 3), which way round they go (t,), and their stretched keys
 _KEPT: dict[float, tuple[FloatArray, Triangles]] = {}
 
 
@@ -88,24 +89,15 @@ def solve_lost(field: Field, focal_length_px: float, vectors: FloatArray, near: 
     return _solved(field, focal_length_px, vectors, kept[1])
 
 
-def _solved(
-    field: Field, focal_length_px: float, vectors: FloatArray, sky: tuple[IntArray, FloatArray, FloatArray]
-) -> Solved | None:
-    triples, keys, turns = sky
-    if not len(triples):
-        return None
-    tree = cKDTree(keys)
-    for times in HYPOTHESES:
-        found = _by_hypothesis(field, focal_length_px * times, vectors, (triples, turns, tree))
-        if found is not None:
-            return found
-    return None
+def _solved(field: Field, focal_length_px: float, vectors: FloatArray, sky: Triangles) -> Solved | None:
+    tries = (_by_hypothesis(field, focal_length_px * times, vectors, sky) for times in HYPOTHESES)
+    return next((found for found in tries if found is not None), None)
 
 
 def _triangles_of_sky(
     vectors: FloatArray, smaller_rad: float, near: FloatArray | None = None, reach: float = math.pi
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Triangles (t, 3) of stars, their keys (t, 3), and which way round they go (t,)."""
+) -> Triangles:
+    """Triangles of stars."""
     radius_rad = smaller_rad * CIRCLE
     spacing_rad = radius_rad * 0.8
     circles = math.ceil(4 * math.pi / spacing_rad**2)
@@ -126,11 +118,13 @@ def _triangles_of_sky(
         if len(rows):
             every.append(rows[:, list(itertools.combinations(range(size), 3))].reshape(-1, 3))
     if not every:
-        return np.empty((0, 3), dtype=np.intp), np.empty((0, 3)), np.empty(0)
-    triples = np.unique(np.concatenate(every), axis=0)
+        return np.empty((0, 3), dtype=np.intp), np.empty(0), cKDTree(np.empty((0, 3)))
+    count = len(vectors)  # one number a triple, in order: three times as quick to sort as rows
+    code = np.unique(np.concatenate(every) @ np.array([count**2, count, 1]))
+    triples = np.column_stack([code // count**2, code // count % count, code % count])
     ordered, keys, turns = _keys(triples, vectors)
     wide = keys[:, 0] > math.log(MIN_SIDE * 2 * radius_rad * 0.8)
-    return ordered[wide], keys[wide], turns[wide]
+    return ordered[wide], turns[wide], cKDTree(keys[wide] * STRETCH)
 
 
 def _keys(triples: IntArray, vectors: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -165,20 +159,16 @@ def _image_triples(field: Field) -> Iterator[tuple[int, int, int]]:
     yield from sorted(found, key=sum)
 
 
-def _by_hypothesis(
-    field: Field, focal_px: float, vectors: FloatArray, sky: tuple[IntArray, FloatArray, cKDTree]
-) -> Solved | None:
+def _by_hypothesis(field: Field, focal_px: float, vectors: FloatArray, sky: Triangles) -> Solved | None:
     triples, turns, tree = sky
     rays = field.rays(focal_px)
     mine = np.array(list(_image_triples(field)), dtype=np.intp).reshape(-1, 3)
-    if not len(mine):
+    if not len(mine) or not len(triples):
         return None
     mine, keys, turn = _keys(mine, rays)
     proof = _Proof(field, vectors)
-    stretch = np.array([MAX_RATIO_OFF / STEP, 1.0, 1.0])
-    scaled = cKDTree(tree.data * stretch)
     tried = 0
-    near = scaled.query_ball_point(keys * stretch, MAX_RATIO_OFF * 1.2)
+    near = tree.query_ball_point(keys * STRETCH, MAX_RATIO_OFF * 1.2)
     for row, candidates in enumerate(near):
         for candidate in candidates:
             if turns[candidate] != turn[row]:
@@ -186,7 +176,7 @@ def _by_hypothesis(
             tried += 1
             if tried > MAX_CANDIDATES:
                 return None
-            scale = math.exp(keys[row, 0] - tree.data[candidate, 0])
+            scale = math.exp(keys[row, 0] - tree.data[candidate, 0] / STRETCH[0])
             found = proof.of(mine[row], triples[candidate], focal_px * scale)
             if found is not None:
                 return found

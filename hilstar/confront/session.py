@@ -289,7 +289,7 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         )
         for s in shots
     ]
-    camera = before or fit_camera(start.base, pointings, first, fixed=fixed is not None, refraction=False)
+    camera = before or fit_camera(start.base, pointings, first, fixed=fixed is not None, last=False)
     pixels = _pixels(shots, start.assumed) if fixed is None else fixed.pixels
     gain = pixels.gain_e_per_dn
     passes = PASSES if before is None else 1
@@ -302,10 +302,7 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         if before is not None:
             continue
         places = [_places(shot) for shot in shots]
-        turned = [replace(one, zenith=None) for one in camera.pointings] if number == 0 else list(camera.pointings)
-        camera = fit_camera(
-            start.base, turned, places, fixed=fixed is not None, refraction=number == PASSES - 1 or fixed is not None
-        )
+        camera = fit_camera(start.base, camera.pointings, places, fixed=fixed is not None, last=number == passes - 1)
         for shot, pointing in zip(shots, camera.pointings, strict=True):
             shot.pointing = pointing
     stars = _star_light(shots, camera.camera)

@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.special import expit
 
 from hilstar.arrays import BoolArray, FloatArray
+from hilstar.confront.camera_fit import minimised
 
 STAMP_PX = 11
 HALF = STAMP_PX // 2
@@ -20,6 +21,8 @@ MIN_SIGMA_PX, MAX_SIGMA_PX = 0.15, 5.0
 MEAN_BV_MAG = 0.65
 PLACE_STEPS, SHAPE_ROUNDS = 8, 2
 PLACE_DONE_PX = 1e-3
+SHAPE_GAIN = 0.1  # a step of the PSF's numbers that lowers the loss by less is the last
+WING_SIGMA_PX = 0.8, 6.0
 MODEL_ERROR = 0.01  # share of a pixel's light by which the model may be wrong: so no bright star outvotes all others
 STARS_FOR = ((40, 6), (12, 2), (0, 1))  # stars that a number of terms of the field takes
 
@@ -56,12 +59,25 @@ class StarPsf:
         light = np.sum([share / v[:, None] * np.exp(-(radius**2) / (2 * v[:, None])) for share, v in parts], axis=0)
         return np.asarray(2 * radius[(light > light[:, :1] / 2).sum(axis=1) - 1])
 
-    def on_pixels(self, dx: FloatArray, dy: FloatArray, core: FloatArray) -> FloatArray:
-        """Shares (n, rows, columns) of light in pixels at offsets dx (n, columns), dy (n, rows) from the stars."""
+    def on_pixels(self, dx: FloatArray, dy: FloatArray, core: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Shares of light in pixels at offsets dx (n, columns), dy (n, rows) from the stars, (n, rows, columns).
+
+        With them their derivatives by the star's x and y.
+        """
         share = self.wing_share
-        wing = np.broadcast_to([self.wing_sigma_px**2, self.wing_sigma_px**2, 0.0], core.shape)
-        shares = (1 - share) * _gaussian(dx, dy, core)
-        return shares + share * _gaussian(dx, dy, wing) if share else shares
+        both = (1 - share) * _gaussian(dx, dy, core) + share * _gaussian(dx, dy, self._wing(len(core)))
+        return both[0], both[1], both[2]
+
+    def by_shape(self, dx: FloatArray, dy: FloatArray, core: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Shares as `on_pixels`, and their derivatives (5, n, rows, columns) by xx, yy, xy, the wings' share and sigma."""
+        share, narrow = self.wing_share, _gaussian(dx, dy, core, shape=True)
+        wide = _gaussian(dx, dy, self._wing(len(core)), shape=True)
+        by_wing = share * 2 * self.wing_sigma_px * (wide[3] + wide[4])
+        slopes = np.stack([*((1 - share) * narrow[3:]), wide[0] - narrow[0], by_wing])
+        return (1 - share) * narrow[0] + share * wide[0], slopes
+
+    def _wing(self, count: int) -> FloatArray:
+        return np.broadcast_to([self.wing_sigma_px**2, self.wing_sigma_px**2, 0.0], (count, 3))
 
     def samples(self, x_px: float, y_px: float, per_px: int, half_px: int) -> FloatArray:
         """The light itself on a grid of `per_px` samples a pixel, (side, side), without the pixel; sums to 1."""
@@ -82,17 +98,31 @@ def field_terms(x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int]) ->
     return np.column_stack([np.ones_like(u), u * u + v * v, u, v, u * u - v * v, u * v])
 
 
-def _gaussian(dx: FloatArray, dy: FloatArray, covariance: FloatArray) -> FloatArray:
-    """An elliptical Gaussian integrated over pixels by Gauss's rule of 3 x 3 points: 1e-4 of the light at 0.4 px of sigma."""
+def _gaussian(dx: FloatArray, dy: FloatArray, covariance: FloatArray, shape: bool = False) -> FloatArray:
+    """Integrals (3, n, rows, columns) of Gaussians over pixels and their derivatives by the centre's x and y.
+
+    By nine points in each pixel: good to 1e-3 from 0.35 px of sigma. With `shape` there are six, also by xx, yy and xy.
+    """
     xx, yy, xy = (covariance[:, k, None, None] for k in range(3))
     det = xx * yy - xy * xy
     nodes, weights = GAUSS3
-    total = np.zeros((len(dx), dy.shape[1], dx.shape[1]))
+    total = np.zeros((6 if shape else 3, len(dx), dy.shape[1], dx.shape[1]))
     for a, wa in zip(nodes, weights, strict=True):
         x = (dx + a)[:, None, :]
         for b, wb in zip(nodes, weights, strict=True):
             y = (dy + b)[:, :, None]
-            total += wa * wb * np.exp((-0.5 / det) * (yy * x * x - 2 * xy * x * y + xx * y * y))
+            by_x, by_y = (yy * x - xy * y) / det, (xx * y - xy * x) / det
+            light = wa * wb * np.exp(-0.5 * (x * by_x + y * by_y))
+            total[0] += light
+            total[1] += light * by_x
+            total[2] += light * by_y
+            if shape:
+                total[3] += light * by_x**2
+                total[4] += light * by_y**2
+                total[5] += light * by_x * by_y
+    if shape:
+        total[3:5] = (total[3:5] - total[0] * np.stack([yy, xx]) / det) / 2
+        total[5] += total[0] * xy / det
     return np.asarray(total / (2 * math.pi * np.sqrt(det)))
 
 
@@ -155,12 +185,9 @@ def measure(stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, ga
     core = psf.core(x, y, stamps.bv_mag)
     weight = 1 / stamps.variance
     flux, level = np.zeros(len(x)), np.zeros(len(x))
-    step = 0.02
     for number in range(PLACE_STEPS):
         dx, dy = stamps.column[:, None] + reach - x[:, None], stamps.row[:, None] + reach - y[:, None]
-        shape = psf.on_pixels(dx, dy, core)
-        by_x = (psf.on_pixels(dx - step, dy, core) - psf.on_pixels(dx + step, dy, core)) / (2 * step)
-        by_y = (psf.on_pixels(dx, dy - step, core) - psf.on_pixels(dx, dy + step, core)) / (2 * step)
+        shape, by_x, by_y = psf.on_pixels(dx, dy, core)
         if number:  # photon noise of the model, not of what was seen: else faint stars come out too faint
             star = np.maximum(flux, 0)[:, None, None] * shape
             weight = 1 / (stamps.variance + star / gain_e_per_dn + (MODEL_ERROR * star) ** 2)
@@ -222,31 +249,51 @@ def _shape(stamps: Stamps, at: Measured, psf: StarPsf, gain_e_per_dn: float, *, 
     reach = np.arange(-HALF, HALF + 1)
     dx = stamps.column[:, None] + reach - at.x_px[:, None]
     dy = stamps.row[:, None] + reach - at.y_px[:, None]
-    terms = psf.covariance.shape[1]
-    light = np.maximum(at.dn, 0)[:, None, None] * psf.on_pixels(dx, dy, psf.core(at.x_px, at.y_px, stamps.bv_mag))
+    count = psf.covariance.shape[1]
+    terms = field_terms(at.x_px, at.y_px, psf.size_px)[:, :count]
+    light = np.maximum(at.dn, 0)[:, None, None] * psf.on_pixels(dx, dy, psf.core(at.x_px, at.y_px, stamps.bv_mag))[0]
     weight = 1 / (stamps.variance + light / gain_e_per_dn + (MODEL_ERROR * light) ** 2)
     root = np.sqrt(weight)
+    redder = np.nan_to_num(stamps.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
+    ratio = np.clip(psf.wing_share, 0.01, 0.49) / 0.5
+    tail = [psf.colour, math.log(ratio / (1 - ratio)), math.log(psf.wing_sigma_px)] if wide else []
+    start = np.concatenate([psf.covariance.ravel(), tail])
+    # weak: terms of the field are 0 +- 1 px^2, and the wings stay within factors of those before
+    prior, about = np.eye(len(start)), np.where(np.arange(len(start)) < 3 * count, 0.0, start)
+    prior = prior[[*(np.arange(3 * count) % count > 0), *(False, True, True)[: len(tail)]]]
 
     def of(numbers: FloatArray) -> StarPsf:
-        covariance = numbers[: 3 * terms].reshape(3, terms)
+        covariance = numbers[: 3 * count].reshape(3, count)
         if not wide:
             return replace(psf, covariance=covariance)
-        share, sigma = 0.5 / (1 + math.exp(-numbers[-2])), math.exp(numbers[-1])
-        return replace(
-            psf, covariance=covariance, colour=numbers[-3], wing_share=share, wing_sigma_px=float(np.clip(sigma, 0.8, 6))
-        )
+        share, sigma = 0.5 * float(expit(numbers[-2])), math.exp(np.clip(numbers[-1], *np.log(WING_SIGMA_PX)))
+        return replace(psf, covariance=covariance, colour=float(numbers[-3]), wing_share=share, wing_sigma_px=sigma)
 
     def residuals(numbers: FloatArray) -> FloatArray:
         trial = of(numbers)
-        shape = trial.on_pixels(dx, dy, trial.core(at.x_px, at.y_px, stamps.bv_mag))
+        shape = trial.on_pixels(dx, dy, trial.core(at.x_px, at.y_px, stamps.bv_mag))[0]
         flux, level = _linear(shape, stamps.values, weight)
         off = (stamps.values - flux[:, None, None] * shape - level[:, None, None]) * root
-        prior = (covariance_prior @ numbers[: 3 * terms]) if terms > 1 else np.zeros(0)
-        return np.concatenate([np.clip(off.ravel(), -30, 30), prior])
+        return np.concatenate([np.clip(off.ravel(), -30, 30), prior @ (numbers - about)])
 
-    # weak: a tenth of the width each term
-    covariance_prior = np.eye(3 * terms)[np.arange(3 * terms) % terms > 0]
-    own = psf.covariance.ravel()
-    ratio = np.clip(psf.wing_share, 0.01, 0.49) / 0.5
-    start = np.concatenate([own, [psf.colour, math.log(ratio / (1 - ratio)), math.log(psf.wing_sigma_px)]]) if wide else own
-    return of(least_squares(residuals, start, loss="soft_l1", f_scale=3.0, max_nfev=7, x_scale="jac").x)
+    def slopes(numbers: FloatArray, off: FloatArray) -> FloatArray:
+        """Derivatives with each star's flux and level following (Kaufman 1975)."""
+        trial = of(numbers)
+        shape, by = trial.by_shape(dx, dy, trial.core(at.x_px, at.y_px, stamps.bv_mag))
+        redness = 1 + trial.colour * redder
+        columns = [by[k] * (redness * terms[:, t])[:, None, None] for k in range(3) for t in range(count)]
+        if wide:
+            plain = terms @ trial.covariance.T
+            columns.append(sum(by[k] * (plain[:, k] * redder)[:, None, None] for k in range(3)))
+            columns += [by[3] * trial.wing_share * (1 - 2 * trial.wing_share), by[4] * trial.wing_sigma_px]
+        flux = _linear(shape, stamps.values, weight)[0][:, None, None]
+        left = []
+        for column in columns:
+            of_shape, of_level = _linear(shape, flux * column, weight)
+            change = flux * column - of_shape[:, None, None] * shape - of_level[:, None, None]
+            left.append(np.concatenate([-(change * root).ravel(), np.zeros(len(prior))]))
+        found = np.stack(left, axis=1)
+        found[len(off) - len(prior) :] = prior
+        return found
+
+    return of(minimised(residuals, slopes, start, SHAPE_GAIN)[0])

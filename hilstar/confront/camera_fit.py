@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.errors import InputError
 from hilstar.rotation import from_rotation_vectors, multiply, to_matrix
-from hilstar.scene.camera import Camera, Lens
+from hilstar.scene.camera import Camera, Lens, bounded
 from hilstar.sky.stars import AirAbove
 from hilstar.units import MAD_TO_SIGMA
 
@@ -23,6 +24,7 @@ MIN_GAIN = 1e-3  # a step that lowers the loss by less, in half squares of a sig
 DIFFERENCE = 1e-4  # of a number, for its derivative
 HUBER = 2.0
 FOLDS = 5
+EDGE_PX = 10.0  # beyond an image's edges, to which its lens is used
 GAIN = 0.985  # a larger model is taken where it brings the held-out error below this share of the smaller one's
 # name -> step that makes a number of order 1
 STEPS = {"log_focal": 1e-3, "centre_x": 10.0, "centre_y": 10.0, "k1": 0.1, "k2": 1.0, "p1": 1e-3, "p2": 1e-3}
@@ -307,10 +309,14 @@ def fit_camera(
     if not models:
         models = {"pinhole": MODELS["pinhole"]}
     # the error of a place by the largest model, so that all are weighed alike
-    largest = list(models)[-1]
-    camera, bare, floor = _settled(base, bare, photographs, models[largest])
+    for largest in reversed(list(models)):
+        camera, start, floor = _settled(base, bare, photographs, models[largest])
+        if (within := _bounded(camera)) is not None:
+            break
+        del models[largest]  # too many terms for so few stars: it folds
+    bare = start
     if not last:
-        return CameraFit(camera, bare, largest, floor_px=floor)
+        return CameraFit(within or camera, bare, largest, floor_px=floor)
     chosen, best, held = largest, math.inf, {}
     for name, names in models.items():
         held[name] = _held_out(base, bare, photographs, names, floor)
@@ -331,7 +337,15 @@ def fit_camera(
             chosen += ", refraction"
     camera, bare, covariance = fit_model(camera, bare, photographs, names, floor)
     sigma = {name: STEPS[name] * math.sqrt(covariance[k, k]) for k, name in enumerate(names)}
-    return CameraFit(camera, bare, chosen, sigma, held, floor)
+    return CameraFit(_bounded(camera) or camera, bare, chosen, sigma, held, floor)
+
+
+def _bounded(camera: Camera) -> Camera | None:
+    """The camera without directions far outside, which its polynomials fold into the image; None if it folds inside."""
+    try:
+        return bounded(camera, EDGE_PX)
+    except InputError:
+        return None
 
 
 def _settled(

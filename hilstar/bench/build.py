@@ -404,8 +404,9 @@ def bench_colours(config: BenchConfig, folder: Path, catalog: Catalog) -> Colour
             ' [monitor.primaries] file, or xy_r to xy_b; or colour = "white"'
         )
     places_px = [orientation_of(monitor).in_image(*place) for place in monitor.primaries.places_px]
-    rates_by = partial(channel_rates, config.sky)
-    return mixed_for(primaries, named_channels(config.tracker, folder), places_px, rates_by, star_kinds(config, catalog))
+    channels, rates_by = named_channels(config.tracker, folder), partial(channel_rates, config.sky)
+    psf = before_detector(config, folder, bench_camera(config, folder)) if len(channels) == 1 else None
+    return mixed_for(primaries, channels, places_px, rates_by, star_kinds(config, catalog), psf).for_stars(catalog)
 
 
 def primary_panels(

@@ -1,5 +1,6 @@
 """A tracker of three channels against three trackers of one, and against quadrature that is not the package's."""
 
+import json
 from contextlib import ExitStack
 from dataclasses import replace
 
@@ -18,7 +19,9 @@ from hilstar.errors import InputError
 from hilstar.render.backend import linear_light
 from hilstar.rotation import direction_of, from_radec_roll_deg
 from hilstar.sky.spectrum import load_curve
+from hilstar.testing import compare
 from tests.support.benches import ORION_Q, bench_text
+from tests.support.commands import run_hilstar_here
 
 # A Gaussian passband each, in percent at 25 nm from 350 to 1000 nm; the red one sees the near infrared, as silicon does.
 NM = np.arange(350.0, 1001.0, 25.0)
@@ -145,6 +148,19 @@ def test_the_fits_of_three_channels_is_a_cube_with_the_skys_own_axes(curves, tmp
     ra_deg, dec_deg, channel = cube.all_pix2world(first["x_px"], first["y_px"], 1, 0)
     np.testing.assert_allclose(direction_of(ra_deg, dec_deg), bench.stars.vectors[frame.star[0]], atol=1e-7)
     assert channel == 2
+    # `compare` sees what the sum of the channels does not have: red light that has become blue.
+    both = [tmp_path / "cube.fits", tmp_path / "bluer.fits"]
+    bluer = frame.light * np.array([0.9, 1.0, 1.0], np.float32)[:, None, None]
+    bluer[2] += 0.1 * frame.light[0]
+    with fits.open(both[0]) as (hdu,):
+        fits.PrimaryHDU(bluer, hdu.header).writeto(both[1])
+    found = [json.loads(run_hilstar_here("compare", one, both[0], "--json").stdout) for one in both]
+    assert [one["same"] for one in found] == [True, False] and found[1]["flux_error_mag"]["max"] < 1e-3
+    off = {name: (one["flux_error_mag"]["rms"], one["same"]) for name, one in found[1]["channels"].items()}
+    assert off["g"] == (pytest.approx(0, abs=1e-6), True) and off["r"] == (pytest.approx(0.1144, abs=1e-3), False)
+    said = run_hilstar_here("compare", both[1], both[0])
+    assert said.returncode == 1 and "flux error, r       0.11" in said.stdout and "star at" in said.stdout
+    assert compare(frame, frame.linear).same and compare(frame, both[0]).channels["b"].star_count > 10
 
 
 @pytest.mark.parametrize(

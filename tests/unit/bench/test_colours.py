@@ -1,6 +1,7 @@
 """Primaries that are driven apart: a stripe panel by a twin of sub-pixels, files of primaries, and what is refused."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from hilstar import load
 from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.console.overlay import colour_notes
 from hilstar.errors import InputError
 from hilstar.monitor.primaries import chromatic_primaries, nearest_mixtures, read_primaries
 from hilstar.monitor.quantise import primary_lights
@@ -253,10 +255,16 @@ def test_a_star_redder_than_the_red_primary_is_named(tmp_path):
     with load(bench_path(tmp_path, channels="v")) as bench:
         rows = bench.frame(from_radec_roll_deg(86.5, 3.0, 0.0)).truth
         alnilam, betelgeuse = (rows[rows["hip"] == hip][0] for hip in (26311, 27989))
+        notes = {bench.shown_stars.hip[star]: note for star, note in colour_notes(bench).items()}
     assert alnilam["in_gamut"] and alnilam["wavelength_nm"] == pytest.approx(alnilam["wavelength_shown_nm"], abs=0.01)
     assert not betelgeuse["in_gamut"] and betelgeuse["wavelength_nm"] > betelgeuse["wavelength_shown_nm"] + 50
     assert betelgeuse["temperature_shown_k"] > 1.2 * betelgeuse["temperature_k"]
     assert betelgeuse["electrons_shown_per_s"] == pytest.approx(betelgeuse["electrons_per_s"], rel=1e-12)
+    assert notes[26311] == f"{alnilam['wavelength_nm']:.0f} nm"  # on the operator's page
+    wanted, shown = betelgeuse["wavelength_nm"], betelgeuse["wavelength_shown_nm"]
+    assert notes[27989] == f"{wanted:.0f} nm, shown {shown:.0f} nm, out of gamut"
+    with load(bench_path(tmp_path)) as bench:
+        assert re.fullmatch(r"r \d+% g \d+% b \d+%(, out of gamut)?", next(iter(colour_notes(bench).values())))
 
 
 @pytest.mark.parametrize(

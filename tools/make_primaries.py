@@ -1,4 +1,4 @@
-"""Make the spectra of primaries in configs: an LCD's and a CRT's as measured, and shapes of an OLED's and of a projector's lasers.
+"""Make the spectra of primaries in configs: an LCD's and a CRT's as measured, shapes of an OLED's and of a projector's lasers.
 
     pip install colour-science==0.4.7      (an environment of its own will do)
     python tools/make_primaries.py
@@ -18,7 +18,7 @@ MEASURED = {
     "lcd": ("Apple Studio Display", "Fairchild and Wyble 1998, Colorimetric characterization of the Apple Studio Display, RIT"),
     "crt": ("Typical CRT Brainard 1997", "Brainard 1997, in Machado 2010"),
 }
-SHAPES = {"oled": "OLED", "laser": "laser"}
+SHAPES = {"oled": ("OLED", "an OLED"), "laser": ("laser", "a projector of lasers")}
 REACH = 1e-4  # of a set's largest power
 
 

@@ -36,15 +36,13 @@ def main() -> None:
     """Write all four."""
     import colour
 
-    for name, (key, source) in MEASURED.items():
-        one = colour.MSDS_DISPLAY_PRIMARIES[key]
-        words = f"{key}: primaries as measured, relative power per nm. {source}; colour-science 0.4.7 (PyPI, BSD-3-Clause)"
+    for name, (display, source) in MEASURED.items():
+        one = colour.MSDS_DISPLAY_PRIMARIES[display]
+        words = f"{display}: primaries as measured, relative power per nm. {source}; colour-science 0.4.7 (PyPI, BSD-3-Clause)"
         written(name, words, ((float(nm), *map(float, row)) for nm, row in zip(one.wavelengths, one.values, strict=True)))
-    for name, key in SHAPES.items():
-        words = (
-            f"Not measured: Gaussians as wide as the primaries of {'an OLED' if name == 'oled' else 'a projector of lasers'}"
-        )
-        written(name, words, zip(NM.tolist(), *(curve_of(lobes).tolist() for lobes in PANELS[key]), strict=True))
+    for name, (panel, whose) in SHAPES.items():
+        rows = zip(NM.tolist(), *(curve_of(lobes).tolist() for lobes in PANELS[panel]), strict=True)
+        written(name, f"Not measured: Gaussians as wide as the primaries of {whose}", rows)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.errors import InputError
+from hilstar.frame.truth import with_columns
 from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.scene.extended import shifted
@@ -27,7 +28,7 @@ from hilstar.scene.sprites import Sprites, by_share, shares_at
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
-from hilstar.sky.stars import Stars
+from hilstar.sky.stars import BV_MAG, Stars
 
 STEP_NM = 0.25  # of the spectra of primaries
 KNOT_STEPS = 8
@@ -185,7 +186,12 @@ class Colours:
 
     def on(self, stars: Stars) -> Stars:
         """The stars with the light of each primary."""
-        return stars if stars.primaries is not None else replace(stars, primaries=self.shares(self.wanted(stars)))
+        if stars.primaries is not None:
+            return stars
+        by_bv, unknown = stars.colours_by_bv, np.full_like(BV_MAG, np.nan)
+        if by_bv is None:
+            by_bv = self._means(BV_MAG, unknown, None if self._kinds is None else np.full((len(BV_MAG), 2), np.nan))
+        return replace(stars, primaries=self.shares(self.wanted(stars)), primaries_by_bv=self.shares(by_bv))
 
     def drive(self, shares: FloatArray) -> FloatArray:
         """How much of white stars of so much light of each primary (n, 3) ask for, relative to a white star, (n,)."""
@@ -241,16 +247,7 @@ class Colours:
             for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
                 added |= {f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)}
             added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
-        known = [*(truth.dtype.names or ()), "in_gamut"]
-        kinds = [*truth.dtype.descr, *((name, "f8") for name in added if name not in known), ("in_gamut", "?")]
-        found = np.zeros(len(truth), dtype=kinds)
-        for name in truth.dtype.names or ():
-            found[name] = truth[name]
-        for name, values in added.items():
-            found[name] = np.nan
-            found[name][own] = values
-        found["in_gamut"][own] = self.in_gamut(off)
-        return found
+        return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, own)
 
     def parts(self, sprites: Sprites, stars: Stars) -> tuple[Sprites, ...]:
         """The sprites of each primary, each light where that primary has to be drawn for it to lie in its place."""
@@ -258,7 +255,7 @@ class Colours:
             raise AssertionError("the stars of a bench that drives its primaries apart have their shares")
         bias = 0.5 if sprites.footprint_px % 2 else 0.0  # as in pack_sprites
         found, places = [], self.places_px.tolist()
-        each = by_share(sprites, stars, stars.primaries)
+        each = by_share(sprites, stars, stars.primaries, stars.primaries_by_bv)
         extended: list[Any] = [()] * len(each)
         if sprites.extended:
             if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once

@@ -169,7 +169,7 @@ def colour_table() -> str:
     body = []
     for row in rows_of("colour.csv"):
         words = [row["tracker"], f"`{row['colour']}`", f"`{row['method']}`", f"{figure(float(row['subtypes']))} subtypes"]
-        channel = "-" if row["tracker"] == "mono" else f"{float(row['channel']):.2g} %"
+        channel = "-" if row["tracker"].startswith("mono") else f"{float(row['channel']):.2g} %"
         body.append([*words, f"{float(row['mag']):.2g} mag", channel, f"{float(row['px']):.2g} px"])
     return table(head, body)
 
@@ -181,8 +181,21 @@ def gamut_table() -> str:
     for row in rows_of("colour_gamut.csv"):
         out, off, white = (float(row[name]) for name in ("out_share", "subtypes", "subtypes_white"))
         names = [row["panel"], row["sensor"], f"{float(row['condition']):.1f}" if "Bayer" in row["sensor"] else "-"]
-        body.append([*names, f"{100 * out:.2g} %", f"{off:.2g} subtypes" if off > 1e-6 else "none", f"{white:.0f}"])
+        body.append([*names, f"{100 * out:.2g} %", f"{off:.2g} subtypes" if off > 1e-4 else "none", f"{white:.0f}"])
     return table(head, body)
+
+
+def class_table() -> str:
+    """What a mono sensor's mixtures on an sRGB LCD lack, by spectral class."""
+    at = {(row["sensor"], row["class"]): row for row in rows_of("colour_class.csv") if row["panel"] == "sRGB LCD"}
+    classes = list(dict.fromkeys(kind for _, kind in at))
+
+    def cell(row: dict[str, str]) -> str:
+        off_nm, subtypes = float(row["off_nm"]), float(row["subtypes"])
+        return f"{figure(off_nm)} nm, {subtypes:.2g}" if subtypes > 1e-3 else "none"
+
+    sensors = dict.fromkeys(sensor for sensor, _ in at)
+    return table(["sensor", *classes], [[sensor, *(cell(at[sensor, kind]) for kind in classes)] for sensor in sensors])
 
 
 def red_table() -> str:
@@ -246,6 +259,7 @@ TABLES = {
     "colour": colour_table,
     "colour_gamut": gamut_table,
     "colour_red": red_table,
+    "colour_class": class_table,
     "colour_lateral": lateral_table,
     "colour_mosaic": mosaic_table,
     "confronted": confronted_table,

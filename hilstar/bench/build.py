@@ -46,7 +46,7 @@ from hilstar.sky.electrons import Optics, Photometry, all_channels, star_tempera
 from hilstar.sky.spectral_types import star_types, tabulate_types
 from hilstar.sky.spectrum import Curve, load_curve
 from hilstar.sky.star_table import TableChoice, choose_catalog
-from hilstar.sky.stars import Stars, aberrate, make_stars, split_by_rate, total_and_colours, unit_vectors_icrs
+from hilstar.sky.stars import BV_MAG, Stars, aberrate, make_stars, split_by_rate, total_and_colours, unit_vectors_icrs
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -249,10 +249,10 @@ def bench_sources(config: BenchConfig, folder: Path) -> Sources:
         return Sources(moving)
     from hilstar.sky.diffuse import read_diffuse_map  # WCS and coordinates take 200 ms, which only a map needs
 
-    one = np.ones(1)
-    v0_e_per_s = np.float32(star_rates(config, folder)(0 * one, diffuse.bv_mag * one, np.nan * one)[0])
+    one, bv_mag = np.ones(1), diffuse.bv_mag
+    v0_e_per_s = np.float32(star_rates(config, folder)(0 * one, bv_mag * one, np.nan * one)[0])
     faces = read_diffuse_map(folder / diffuse.map)
-    return Sources(moving, tuple(dataclasses.replace(face, image=face.image * v0_e_per_s) for face in faces))
+    return Sources(moving, tuple(dataclasses.replace(face, image=face.image * v0_e_per_s, bv_mag=bv_mag) for face in faces))
 
 
 def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
@@ -289,10 +289,13 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
         unread = int(np.isnan(kind).any(axis=1).sum())
         note = f"{unread} of {len(catalog)} stars have no MK type of O to M, and their spectra by colour alone"
         catalog = dataclasses.replace(catalog, notes=(*catalog.notes, note))
-    flux = star_flux(config, folder)(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind)
+    through = star_flux(config, folder)
+    flux, by_bv = through(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind), None
+    if flux.shape[1] > 1:
+        by_bv = total_and_colours(through(0 * BV_MAG, BV_MAG, np.full_like(BV_MAG, np.nan))).colours
     if config.site is not None and moving is not None:  # the air takes of each star by its own spectrum
         moving.air = site_air(config, folder, catalog, kind)
-    return make_stars(catalog, vectors, temperature_k, flux)
+    return dataclasses.replace(make_stars(catalog, vectors, temperature_k, flux), colours_by_bv=by_bv)
 
 
 def site_air(config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArray | None = None) -> SiteAir:
@@ -404,8 +407,9 @@ def bench_colours(config: BenchConfig, folder: Path, catalog: Catalog) -> Colour
             ' [monitor.primaries] file, or xy_r to xy_b; or colour = "white"'
         )
     places_px = [orientation_of(monitor).in_image(*place) for place in monitor.primaries.places_px]
-    rates_by = partial(channel_rates, config.sky)
-    return mixed_for(primaries, named_channels(config.tracker, folder), places_px, rates_by, star_kinds(config, catalog))
+    channels, rates_by = named_channels(config.tracker, folder), partial(channel_rates, config.sky)
+    psf = before_detector(config, folder, bench_camera(config, folder)) if len(channels) == 1 else None
+    return mixed_for(primaries, channels, places_px, rates_by, star_kinds(config, catalog), psf).for_stars(catalog)
 
 
 def primary_panels(

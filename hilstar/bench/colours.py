@@ -5,9 +5,11 @@ Three channels: the mixture has the star's electrons in each, or is the nearest 
 One channel has one number of electrons, and three primaries to make it of. The mixture is the one with the star's own mean
 wavelength of detected photons, so that lateral colour acts as in the sky; of those, the one whose cumulative spectrum of
 detected photons is nearest to the star's (Cramer's distance, which is finite for the lines of a laser too). Its sum is held.
+Of a lens whose lateral colour is known, that comes first: see `Lateral`.
 Both ask the same of a star: its electrons through some curves of wavelength, which the tables of its rates give.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,23 +19,72 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.errors import InputError
+from hilstar.frame.truth import with_columns
 from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
+from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.scene.extended import shifted
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites, by_share, shares_at
+from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
-from hilstar.sky.stars import Stars
+from hilstar.sky.stars import BV_MAG, Stars
 
 STEP_NM = 0.25  # of the spectra of primaries
 KNOT_STEPS = 8
 MEAN_WEIGHT = 1e3  # per nm: a mean wavelength within reach is met to 1e-3 nm
+LATERAL_WEIGHT = 1e3  # times that, of a lens's lateral colour against as much of the mean wavelength
+LEAST_PX, LEAST_PART = 1e-5, 1e-2  # of lateral colour, and of its first part, that counts
+ASIDE_STARS, ASIDE_COST = 500, 1e-3  # stars by colour, and a square px of all against one of those that are out of reach
+MOVED = 1 + len(PRIMARIES)  # the first column of what is wanted that is a lens's
 UNSEEN = 1e-6  # share of white
 TINY = 1e-30  # electrons per second
-WITHIN, WITHIN_NM = 1e-6, 0.1  # within the gamut: of a star's electrons, and of its mean wavelength
+# Within the gamut: of a star's electrons, of its mean wavelength, and of its place through a lens
+WITHIN, WITHIN_NM, WITHIN_PX = 1e-6, 0.1, 1e-4
 SCALE_K = np.geomspace(1500.0, 60_000.0, 400)
 
 # The electrons (n,) of stars of V = 0, B-V (n,), V-I (n,) and types through some optics.
 RatesBy = Callable[[Optics], Callable[..., FloatArray]]
+
+
+@dataclass(frozen=True, slots=True)
+class Lateral:
+    """A lens's lateral colour: by how much wavelengths `nm` (L,) move light, px rms over the field, in parts `px` (L, k).
+
+    All stars together may be shown `aside` (k,) of their places, by a pattern over the field that is the same for all, as a
+    distortion is: then more of what parts them is within the primaries' reach. `by_primary` (3, k) is a primary's, and
+    `weight` that of a square px.
+    """
+
+    nm: FloatArray
+    px: FloatArray
+    by_primary: FloatArray
+    aside: FloatArray
+    weight: float
+
+    @classmethod
+    def of(cls, psf: GlassPsf, nm: FloatArray, density: FloatArray) -> "Lateral | None":
+        """That of a glass to the primaries' light; None where it moves none of it by LEAST_PX."""
+        moved = psf.moved_px - psf.moved_px.mean(axis=1, keepdims=True)
+        _, size, parts = np.linalg.svd(
+            moved.transpose(0, 2, 1).reshape(-1, moved.shape[1]) / np.sqrt(len(moved)), full_matrices=False
+        )
+        px = (parts.T * size)[:, size > max(LEAST_PX, LEAST_PART * size[0])]
+        by_primary = density @ NodeSpline(psf.wavelengths_nm)(nm) @ px
+        spread = float(np.square(by_primary - by_primary.mean(axis=0)).sum())
+        if spread < LEAST_PX**2:
+            return None
+        weight = LATERAL_WEIGHT * MEAN_WEIGHT * float(np.square(density @ nm - (density @ nm).mean()).sum()) / spread
+        return cls(psf.wavelengths_nm, px, by_primary, np.zeros(px.shape[1]), weight)
+
+    def curves(self, nm: FloatArray) -> FloatArray:
+        """What moves light of wavelengths (n,), (k, n), none of it below 0: a part of all light is `lifted` off it again."""
+        return np.asarray((NodeSpline(self.nm)(nm) @ self.px).T + self.lifted[:, None])
+
+    @property
+    def lifted(self) -> FloatArray:
+        """By how much `curves` lie over the lens's own, px (k,)."""
+        return np.asarray(2 * np.abs(self.px).max(axis=0))  # a spline passes its nodes by less
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +105,7 @@ class Colours:
     _curves: tuple[Callable[..., FloatArray], ...]
     _kinds: FloatArray | None
     _scale: FloatArray
+    lateral: Lateral | None = None
     _kept: list[Any] = field(default_factory=list)  # the last frame's extended light, and each primary's of it
 
     @property
@@ -77,9 +129,10 @@ class Colours:
         return len(self.matrix.channels) == 1
 
     def wanted(self, stars: Stars, which: IntArray | None = None) -> FloatArray:
-        """What the mixtures of stars are made for: shares of channels (n, channels), or the means of a star's photons (n, 4).
+        """What the mixtures of stars are made for: shares of channels (n, channels), or means of a star's photons (n, 4 + k).
 
-        Those are wavelength and the cumulative spectra's products with the primaries'. Bodies count by their B-V.
+        Those are wavelength, the cumulative spectra's products with the primaries', and where a lens moves them. Bodies count
+        by their B-V.
         """
         which = np.arange(len(stars)) if which is None else which
         if stars.colours is not None:
@@ -90,8 +143,33 @@ class Colours:
         kind = None
         if self._kinds is not None:
             kind = np.where(listed[:, None], self._kinds[np.maximum(row, 0)], np.nan)
-        flux = [one(np.zeros(len(which)), stars.bv_mag[which], vi, kind) for one in self._curves]
-        return np.stack(flux[1:], axis=1) / flux[0][:, None]
+        return self._means(stars.bv_mag[which], vi, kind)
+
+    def _means(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
+        flux = [one(np.zeros(len(bv_mag)), bv_mag, vi_mag, kind) for one in self._curves]
+        means = np.stack(flux[1:], axis=1) / flux[0][:, None]
+        if self.lateral is not None:
+            means[:, MOVED:] -= self.lateral.lifted
+        return np.asarray(means)
+
+    def for_stars(self, catalog: Catalog) -> "Colours":
+        """The same with the place aside by which a catalogue's stars part by colour as their lens parts them."""
+        if self.lateral is None or not len(catalog):
+            return self
+        some = np.argsort(catalog.bv_mag)[:: math.ceil(len(catalog) / ASIDE_STARS)]
+        wanted = self._means(catalog.bv_mag[some], catalog.vi_mag[some], None if self._kinds is None else self._kinds[some])
+        from scipy.optimize import minimize  # 0.2 s of every command that needs none of it
+
+        lens, size_px = self.lateral, float(np.abs(self.lateral.px).max())
+
+        def left(aside: FloatArray) -> tuple[float, FloatArray]:  # the mean square of what is out of reach, and its gradient
+            tried = replace(lens, aside=aside * size_px)
+            rest = replace(self, lateral=tried).shares(wanted) @ lens.by_primary - wanted[:, MOVED:] - tried.aside
+            square = np.square(rest / size_px).sum(axis=1).mean() + ASIDE_COST * aside @ aside
+            return float(square), 2 * (ASIDE_COST * aside - rest.mean(axis=0) / size_px)
+
+        found = minimize(left, lens.aside, jac=True, method="BFGS", options={"gtol": 1e-6}).x * size_px
+        return replace(self, lateral=replace(lens, aside=found))
 
     def shares(self, wanted: FloatArray) -> FloatArray:
         """The light of each primary (n, 3) for what is `wanted`, as shares of a star's electrons."""
@@ -99,13 +177,21 @@ class Colours:
             return nearest_mixtures(self._gram, wanted @ self.by_primary)
         away = self.mean_nm - self.mean_nm.mean()
         gram = self._gram + MEAN_WEIGHT * np.outer(away, away)
-        mean = (wanted[:, :1] - self.mean_nm.mean()) * away
-        found = nearest_mixtures(gram, wanted[:, 1:] + MEAN_WEIGHT * mean, whole=True)
+        near = wanted[:, 1:MOVED] + MEAN_WEIGHT * (wanted[:, :1] - self.mean_nm.mean()) * away
+        if (lens := self.lateral) is not None:
+            gram = gram + lens.weight * lens.by_primary @ lens.by_primary.T
+            near = near + lens.weight * (wanted[:, MOVED:] + lens.aside) @ lens.by_primary.T
+        found = nearest_mixtures(gram, near, whole=True)
         return np.asarray(found / found.sum(axis=1, keepdims=True))  # of 1e-11
 
     def on(self, stars: Stars) -> Stars:
         """The stars with the light of each primary."""
-        return stars if stars.primaries is not None else replace(stars, primaries=self.shares(self.wanted(stars)))
+        if stars.primaries is not None:
+            return stars
+        by_bv, unknown = stars.colours_by_bv, np.full_like(BV_MAG, np.nan)
+        if by_bv is None:
+            by_bv = self._means(BV_MAG, unknown, None if self._kinds is None else np.full((len(BV_MAG), 2), np.nan))
+        return replace(stars, primaries=self.shares(self.wanted(stars)), primaries_by_bv=self.shares(by_bv))
 
     def drive(self, shares: FloatArray) -> FloatArray:
         """How much of white stars of so much light of each primary (n, 3) ask for, relative to a white star, (n,)."""
@@ -116,13 +202,18 @@ class Colours:
         return np.asarray(shares @ (self.mean_nm[:, None] if self.mono else self.by_primary.T))
 
     def off(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
-        """How far off mixtures are (n,): the share of a star's electrons in the wrong channel, or the mean wavelength's nm."""
+        """How far off mixtures are (n,): the share of a star's electrons in the wrong channel, or the mean wavelength's nm.
+
+        Before a lens of known lateral colour, px rms over the field.
+        """
+        if (lens := self.lateral) is not None:
+            return np.asarray(np.linalg.norm(shares @ lens.by_primary - wanted[:, MOVED:] - lens.aside, axis=1))
         shown = self.shown(shares)
         return np.asarray(np.abs(shown - wanted[:, : shown.shape[1]]).sum(axis=1))
 
     def in_gamut(self, off: FloatArray) -> BoolArray:
         """Whether stars that are so far `off` have their colour."""
-        return np.asarray(off < (WITHIN_NM if self.mono else WITHIN))
+        return np.asarray(off < (WITHIN if not self.mono else WITHIN_NM if self.lateral is None else WITHIN_PX))
 
     def temperature_factor(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
         """The colour temperatures of mixtures (n,) over those of their stars, by black bodies of the same colour.
@@ -156,16 +247,7 @@ class Colours:
             for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
                 added |= {f"{name}_{one}_per_s": rate * kind[:, k] for k, one in enumerate(PRIMARIES)}
             added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
-        known = [*(truth.dtype.names or ()), "in_gamut"]
-        kinds = [*truth.dtype.descr, *((name, "f8") for name in added if name not in known), ("in_gamut", "?")]
-        found = np.zeros(len(truth), dtype=kinds)
-        for name in truth.dtype.names or ():
-            found[name] = truth[name]
-        for name, values in added.items():
-            found[name] = np.nan
-            found[name][own] = values
-        found["in_gamut"][own] = self.in_gamut(off)
-        return found
+        return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, own)
 
     def parts(self, sprites: Sprites, stars: Stars) -> tuple[Sprites, ...]:
         """The sprites of each primary, each light where that primary has to be drawn for it to lie in its place."""
@@ -173,7 +255,7 @@ class Colours:
             raise AssertionError("the stars of a bench that drives its primaries apart have their shares")
         bias = 0.5 if sprites.footprint_px % 2 else 0.0  # as in pack_sprites
         found, places = [], self.places_px.tolist()
-        each = by_share(sprites, stars, stars.primaries)
+        each = by_share(sprites, stars, stars.primaries, stars.primaries_by_bv)
         extended: list[Any] = [()] * len(each)
         if sprites.extended:
             if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
@@ -213,8 +295,9 @@ def mixed_for(
     places_px: npt.ArrayLike,
     rates_by: RatesBy,
     kinds: FloatArray | None = None,
+    psf: Psf | None = None,
 ) -> Colours:
-    """The colours of a monitor's primaries before a tracker of these channels.
+    """The colours of a monitor's primaries before a tracker of these channels, and a lens with a `psf`.
 
     `kinds` (catalogue, 2) are the types by which `rates_by` counts, if it does. Raises InputError where the tracker sees
     nothing of a primary.
@@ -243,9 +326,11 @@ def mixed_for(
     plain = optics.quantum_efficiency
     edge_nm = plain.wavelength_nm if len(plain.wavelength_nm) else np.array(optics.range_nm)
     knots = np.unique(np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm]))
+    lateral = Lateral.of(psf, nm, density) if isinstance(psf, GlassPsf) else None
     weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, one) for one in above)]
+    weights += [] if lateral is None else [*lateral.curves(knots)]
     curves = tuple(rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * one))) for one in weights)
-    return Colours(matrix, places, nm, density, gram, curves, kinds, _scale(channels, False))
+    return Colours(matrix, places, nm, density, gram, curves, kinds, _scale(channels, False), lateral)
 
 
 def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:

@@ -314,18 +314,28 @@ def calibrate_photometric(
         output, head, columns, noise, NotesTable(drift=drift_note, text=text), identity=identity, errors=errors_of(fits)
     )
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
-    additivity, crosstalk = None, None  # r + g + b against w, above black: at white, and at codes decades below it
+    additivity, crosstalk, unsure = None, None, None  # r + g + b against w, above black: at white and codes decades below it
     if len(fits) == len(CHANNELS):
         together = np.sum([fits[name].white * fits[name].light for name in PRIMARIES], axis=0)
         more = 100 * (together / np.maximum(fits["w"].white * fits["w"].light, 1e-300) - 1)
         additivity = float(more[-1])
-        crosstalk = {f"1e-{decade}": float(more[place]) for decade, place in _decades(fits["w"]).items()}
+        decades = {f"1e-{decade}": place for decade, place in _decades(fits["w"]).items()}
+        crosstalk = {decade: float(more[place]) for decade, place in decades.items()}
+        at = [*decades.values()]
+        # A channel's errors are relative to its white, which is as well known as its readings are many.
+        off = {
+            name: np.hypot(one.error[at], one.noise_relative / math.sqrt(one.levels.count[-1])) for name, one in fits.items()
+        }
+        errors = [fits[name].white * fits[name].light[at] / together[at] * off[name] for name in PRIMARIES]
+        error = np.sqrt(np.square([*errors, off["w"]]).sum(axis=0))
+        unsure = dict(zip(decades, (100 * error).tolist(), strict=True))
     return channels[next(iter(columns))] | {
         "bits": data.bits,
         "channels": channels,
         "noise_relative": noise,
         "additivity_percent": additivity,
         "crosstalk_percent": crosstalk,
+        "crosstalk_error_percent": unsure,
         "drift_percent": None if math.isnan(drift) else 100 * drift,
         "written": [str(output), str(table)],
         "sha256": load_calibration(output, data.bits).sha256,

@@ -265,6 +265,12 @@ def photometric(
         f"{'held-out levels':20}{held['rms_percent']:.2f} / {held['p95_percent']:.2f} / {held['max_percent']:.2f} %"
         f" (rms / 95 % / max), {held['max_mag']:.4f} mag maximum"
     )
+    for name, one in found["channels"].items() if len(found["channels"]) > 1 else ():
+        rms, under = one["holdout"]["rms_percent"], one["black_level"]["relative"]
+        typer.echo(f"{'channel ' + name:20}{one['shape']}, held-out levels {rms:.2f} % rms, black {under:.3e} of its white")
+    for decade, percent in (found["crosstalk_percent"] or {}).items():
+        unsure = found["crosstalk_error_percent"][decade]
+        typer.echo(f"{'crosstalk at ' + decade:20}r + g + b is {percent:+.2f} +- {unsure:.2f} % from w")
     typer.echo(f"{'written':20}{', '.join(found['written'])}")
     typer.echo(f"{'in the bench file':20}[monitor] calibration = {json.dumps(output.name)}")
 

@@ -1,5 +1,6 @@
 """hilstar compare: two frames, star by star."""
 
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -41,10 +42,11 @@ def compare(
             typer.echo(f"{'in common':20}{comparison.common.line()}")
         rest = f"{summary['blends']} of them blends, {summary['unmeasured']} more with too little light of their own in view"
         typer.echo(f"{'stars compared':20}{summary['stars']}, {rest}")
-        for name, unit in (("flux", "mag"), ("centroid", "px")):
-            errors, limit = summary[f"{name}_error_{unit}"], summary["limits"][f"{name}_{unit}"]
-            three = " / ".join("-" if value is None else f"{value:.2g}" for value in errors.values())
-            typer.echo(f"{name + ' error':20}{three} {unit} (rms / 95 % / max; limit {limit:g})")
+        each = {"": summary} | {f", {name}": one for name, one in summary["channels"].items()}
+        for (name, unit), (channel, figures) in product((("flux", "mag"), ("centroid", "px")), each.items()):
+            limit = summary["limits"][f"{name}_{unit}"]
+            three = " / ".join("-" if value is None else f"{value:.2g}" for value in figures[f"{name}_error_{unit}"].values())
+            typer.echo(f"{f'{name} error{channel}':20}{three} {unit} (rms / 95 % / max; limit {limit:g})")
         if summary["widened"]:
             why = "for rounding of the light around them or the image's edge"
             typer.echo(f"{'wider limits':20}{summary['widened']} stars, {why}")

@@ -12,6 +12,7 @@ from msgspec import UNSET
 from hilstar.arrays import FloatArray
 from hilstar.bench.cameras import tracker_camera
 from hilstar.console.protocol import GridLine, SkyMap, SkyPlace, StarMark, Truth
+from hilstar.monitor.primaries import PRIMARIES
 from hilstar.render.aids import AidLevels
 from hilstar.rotation import direction_of, from_rotation_vector, to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
@@ -22,7 +23,7 @@ from hilstar.units import ARCSEC_PER_RAD
 if TYPE_CHECKING:
     from hilstar.bench.frame import Bench
 
-MAX_STARS = 400  # the brightest of a picture
+MAX_STARS, MAX_COLOURS = 400, 5000  # the brightest of a picture, and those whose colour is written
 SKY_FAINTEST_MAG = 5.5
 SIDE_PLACES = 9  # points along each side of the tracker's outline, which a lens bends
 LINE_PLACES = 49  # points on a line of the grid
@@ -221,6 +222,7 @@ class OverlayScene:
 
     `hip` and `v_mag` (n,) are those of the bench's shown stars, `names` what those without a HIP number are called, by place,
     and `sky` is the map of the whole sky. `aids_in_levels` says that levels have the operator's aids in them already.
+    `colours` says of stars, by place, what the tracker sees of them and what a display that drives its primaries apart shows.
     """
 
     marks: CameraMarks
@@ -230,7 +232,26 @@ class OverlayScene:
     sky: SkyMap
     aids: AidLevels
     aids_in_levels: bool
+    colours: dict[int, str]
 
     def label(self, star: int) -> str:
         """What is written beside a star."""
         return self.names.get(star) or label_of(int(self.hip[star]))
+
+
+def colour_notes(bench: "Bench") -> dict[int, str]:
+    """The colours of a bench's brightest shown stars, where its primaries are driven apart: by channel, or mean wavelength."""
+    colours, stars = bench.colours, bench.shown_stars
+    if colours is None:
+        return {}
+    which = np.argsort(stars.v_mag[: len(stars.rates_e_per_s)], kind="stable")[:MAX_COLOURS]
+    wanted, shares = colours.wanted(stars, which), colours.shares_of(stars, which)
+    notes = []
+    for own, shown in zip(wanted.tolist(), colours.shown(shares).tolist(), strict=True):
+        if colours.mono:
+            notes.append(f"{own[0]:.0f} nm" + ("" if abs(own[0] - shown[0]) < 1 else f", shown {shown[0]:.0f} nm"))
+        else:
+            notes.append(" ".join(f"{name} {share:.0%}" for name, share in zip(PRIMARIES, own, strict=True)))
+    reached = colours.in_gamut(colours.off(wanted, shares)).tolist()
+    said = (note if inside else f"{note}, out of gamut" for note, inside in zip(notes, reached, strict=True))
+    return dict(zip(which.tolist(), said, strict=True))

@@ -166,7 +166,7 @@ class EventLine(msgspec.Struct, frozen=True):
 
 
 class StarMark(msgspec.Struct, frozen=True, array_like=True):
-    """A star of a picture, as an array; `clipped` is 0 or 1."""
+    """A star of a picture, as an array; `clipped` is 0 or 1, and `colour` what a coloured display shows of it."""
 
     x_px: float
     y_px: float
@@ -174,6 +174,7 @@ class StarMark(msgspec.Struct, frozen=True, array_like=True):
     hip: int
     label: str
     clipped: int
+    colour: str = ""
 
 
 class GridLine(msgspec.Struct, frozen=True):

@@ -37,7 +37,7 @@ from hilstar.console.messages import (
     Setup,
     SharedMemory,
 )
-from hilstar.console.overlay import OverlayScene, overlay_of
+from hilstar.console.overlay import OverlayScene, colour_notes, overlay_of
 from hilstar.console.page_process import Listeners, PageProcess
 from hilstar.console.protocol import (
     SWITCHES,
@@ -425,6 +425,7 @@ def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
         sky=overlay.sky(),
         aids=aid_levels_of(bench),
         aids_in_levels=aids_in_levels,
+        colours=colour_notes(bench),
     )
 
 

@@ -98,7 +98,7 @@ class DiffuseLayer:
             if taken is not None:
                 part.keep(face.holds(x, y), taken)
             image = map_coordinates(face.image.image, [y, x], order=1, mode="grid-constant", output=np.float32)
-            found.append(LightMap(image * sr * part.own, part.corner_px))
+            found.append(LightMap(image * sr * part.own, part.corner_px, bv_mag=face.image.bv_mag))
         return found
 
     def _part(self, box: tuple[slice, ...], around: tuple[slice, ...], own: BoolArray) -> "_Part":

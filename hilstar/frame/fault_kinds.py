@@ -28,6 +28,8 @@ Electrons = Annotated[float, Meta(gt=0, le=MAX_LIGHT_E)]
 Pixel = Annotated[float, Meta(ge=-MAX_PLACE_PX, le=MAX_PLACE_PX)]
 Component = Annotated[float, Meta(ge=-1.001, le=1.001)]
 PixelPair = tuple[Pixel, Pixel]
+SUN_BV_MAG = 0.65
+Bv = Annotated[float, Meta(ge=-1, le=6)]
 Hip = Annotated[int, Meta(ge=1, le=2**31 - 1)]
 Name = Annotated[str, Meta(min_length=1, max_length=32)]  # as long as a name in the truth table
 Share = Annotated[float, Meta(gt=0, le=1)]
@@ -90,7 +92,7 @@ class PointLight(PlacedFault, frozen=True, kw_only=True):
     electrons_per_s: Electrons | None = None
     electrons: Electrons | None = None
     v_mag: Annotated[float, Meta(ge=-30, le=30)] | None = None
-    bv_mag: Annotated[float, Meta(ge=-1, le=6)] = 0.65  # the Sun's
+    bv_mag: Bv = SUN_BV_MAG
 
 
 class FalseStar(PointLight, frozen=True, kw_only=True):
@@ -161,6 +163,7 @@ class Gradient(Fault, frozen=True, kw_only=True):
     electrons_per_s: Electrons | None = None
     electrons: Electrons | None = None
     towards_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
+    bv_mag: Bv = SUN_BV_MAG
 
 
 class Glow(PlacedFault, frozen=True, kw_only=True):
@@ -177,6 +180,7 @@ class Glow(PlacedFault, frozen=True, kw_only=True):
     electrons: Electrons | None = None
     scale_deg: Annotated[float, Meta(ge=1e-3, le=180)] = 1.0
     exponent: Annotated[float, Meta(gt=0, le=20)] = 2.0
+    bv_mag: Bv = SUN_BV_MAG
 
 
 class MeasuredMap(Fault, frozen=True, kw_only=True):
@@ -193,6 +197,7 @@ class MeasuredMap(Fault, frozen=True, kw_only=True):
     frame: Literal["tracker", "screen"] = "tracker"
     electrons_per_s: Electrons | None = None
     electrons: Electrons | None = None
+    bv_mag: Bv = SUN_BV_MAG
 
     def check(self) -> None:
         """Refuse (InputError) light said twice."""

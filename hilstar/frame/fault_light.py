@@ -140,7 +140,7 @@ class FaultView:
                 if fault.electrons_per_s is not None or fault.electrons is not None:
                     values = values / values.max()
                 image = map_image(values, fault, camera, by.tracker if fault.frame == "tracker" else by.monitor)
-            known = extended.LightMap(image, times=self.light_e_per_s(fault))
+            known = extended.LightMap(image, times=self.light_e_per_s(fault), bv_mag=fault.bv_mag)
         with self._lock:
             self._maps.pop(fault, None)
             self._maps[fault] = known  # the last used is the last to go
@@ -275,7 +275,7 @@ class FaultView:
         covered = (by.tracker.focal_length_px / by.canvas.camera.focal_length_px) ** 2
         peak = self.light_e_per_s(fault) * share * covered
         unit = direction / np.linalg.norm(direction)
-        made = extended.GlowLight(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera)
+        made = extended.GlowLight(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera, fault.bv_mag)
         if fixed:
             self._glow_kept = fault, share, made
         return made

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.recfunctions import append_fields
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.frame.bodies import disc_stars
@@ -69,15 +70,31 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
     return truth
 
 
+def with_columns(
+    truth: npt.NDArray[np.void], added: Mapping[str, npt.NDArray[Any]], rows: IntArray | None = None
+) -> npt.NDArray[np.void]:
+    """Rows (n,) with columns more, of values of all rows or of `rows` (k,); others have NaN or False."""
+    where = np.arange(len(truth)) if rows is None else rows
+    found = np.zeros(len(truth), dtype=[*truth.dtype.descr, *((name, values.dtype) for name, values in added.items())])
+    for name in truth.dtype.names or ():
+        found[name] = truth[name]
+    for name, values in added.items():
+        found[name] = False if values.dtype == np.bool_ else np.nan
+        found[name][where] = values
+    return found
+
+
 def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> npt.NDArray[np.void]:
-    """Rows (n,) with the electrons per second of each channel of a tracker of three, by its shares (n, 3) or (3,) of a star's.
+    """Rows (n,) with the electrons per second of each channel of a tracker of three, by its shares (n, 3) of a star's.
 
     `colours` None, of a tracker with one channel: the rows themselves.
     """
-    if colours is None:
-        return truth
-    light = [truth["electrons_per_s"] * share for share in np.moveaxis(colours, -1, 0)]
-    return np.asarray(append_fields(truth, CHANNEL_COLUMNS, light, usemask=False))
+    light = (
+        None
+        if colours is None
+        else dict(zip(CHANNEL_COLUMNS, (truth["electrons_per_s"] * part for part in colours.T), strict=True))
+    )
+    return truth if light is None else with_columns(truth, light)
 
 
 def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float) -> npt.NDArray[np.void]:

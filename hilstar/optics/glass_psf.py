@@ -308,7 +308,7 @@ class GlassPsf(SampledPsf):
         return np.asarray((1 - y) * above + y * below)
 
     @cached_property
-    def _centroids_px(self) -> FloatArray:
+    def moved_px(self) -> FloatArray:
         """The centroid of each PSF from its chief ray (F, L, 2), px."""
         _, height, width = self.optics.basis.shape
         x, y = np.arange(width) - width // 2, np.arange(height) - height // 2
@@ -324,7 +324,7 @@ class GlassPsf(SampledPsf):
         falls = optics.illumination * optics.inside
         total = ((by_field @ falls) * shares).sum(axis=1)
         lit = total > 0
-        off = [((by_field @ (falls * off)) * shares).sum(axis=1) for off in np.moveaxis(self._centroids_px, 2, 0)]
+        off = [((by_field @ (falls * off)) * shares).sum(axis=1) for off in np.moveaxis(self.moved_px, 2, 0)]
         x, y = (
             place + np.where(lit, first / np.where(lit, total, 1), 0) for place, first in zip((x_px, y_px), off, strict=True)
         )
@@ -452,7 +452,7 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
     y, x = np.indices((height, width))
     place = np.stack([x.ravel() - width // 2, y.ravel() - height // 2], axis=1) / psf.per_px
     images = []
-    for stamp, centroid in zip(stamps, psf._centroids_px.reshape(-1, 2), strict=True):
+    for stamp, centroid in zip(stamps, psf.moved_px.reshape(-1, 2), strict=True):
         off, spread = pixel - centroid, np.eye(2)
         for _ in range(WIDTH_ROUNDS):  # as `SampledPsf.width_px`
             light = stamp * np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off))

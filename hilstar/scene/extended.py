@@ -33,7 +33,7 @@ class LightMap:
     """An image of light, float32 (height, width), `times` a factor, its first pixel at `corner_px` (x, y) of the image.
 
     `cover`, of the same shape, is the share of what was drawn before that each pixel hides; None hides nothing. `name` is the
-    body's whose disc it is.
+    body's whose disc it is; other light has the colour of its `bv_mag`, None: of the stars.
 
     Keep one array for as long as the light is the same, and do not write to it: it is uploaded once. What a single frame has is
     not `lasting`.
@@ -45,6 +45,7 @@ class LightMap:
     cover: Float32Array | None = None
     name: str = ""
     lasting: bool = True
+    bv_mag: float | None = None
 
     def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
         """The part of an image that it lights, None where that is nothing."""
@@ -65,6 +66,7 @@ class GlowLight:
     scale_rad: float
     exponent: float
     camera: Camera
+    bv_mag: float | None = None
 
     def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
         """The whole image."""

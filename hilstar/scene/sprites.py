@@ -16,7 +16,7 @@ from hilstar.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import ExtendedLight, GlowLight, times
 from hilstar.scene.psf import Psf
-from hilstar.sky.stars import Stars
+from hilstar.sky.stars import BV_MAG, Stars
 
 # How far the field may turn before its stars are looked for again. A frame's work grows with it by the stars around the image.
 KEPT_TURN_RAD = math.radians(1.0)
@@ -232,7 +232,7 @@ def by_channel(sprites: Sprites, stars: Stars) -> list[Sprites]:
 
     `stars` are those among which `sprites.star` has its places.
     """
-    return [sprites] if stars.colours is None else by_share(sprites, stars, stars.colours)
+    return [sprites] if stars.colours is None else by_share(sprites, stars, stars.colours, stars.colours_by_bv)
 
 
 def mean_share(shares: FloatArray, stars: Stars) -> FloatArray:
@@ -250,15 +250,30 @@ def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
     return found
 
 
-def by_share(sprites: Sprites, stars: Stars, shares: FloatArray) -> list[Sprites]:
+def shares_by_bv(by_bv: FloatArray, bv_mag: FloatArray | float) -> FloatArray:
+    """Shares (n, columns) of light of colours (n,), by those of BV_MAG."""
+    return np.stack([np.interp(bv_mag, BV_MAG, column) for column in by_bv.T], axis=-1)
+
+
+def by_share(sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None) -> list[Sprites]:
     """The sprites once for each column of `shares` (stars, columns): every light times its star's or body's share.
 
-    Light that is neither a star's nor a body's, as a fault's, has the mean share of the stars.
+    Light that is neither a star's nor a body's, as a fault's, has that of its B-V, `by_bv`; without one the mean of the stars.
     """
     bodies = {name: len(stars.rates_e_per_s) + k for k, name in enumerate(stars.bodies)}
-    lights = [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended]
-    of_sprites = shares_at(shares, stars, sprites.star).astype(np.float32)
-    of_extended = shares_at(shares, stars, np.array(lights, dtype=np.intp))
+    lights = np.array(
+        [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended], np.intp
+    )
+    of_sprites, of_extended = (shares_at(shares, stars, places) for places in (sprites.star, lights))
+    if by_bv is not None:
+        added = sprites.star < 0
+        if added.any():
+            own_mag = np.array([light.bv_mag for light in sprites.added])
+            of_sprites[added] = shares_by_bv(by_bv, own_mag[-1 - sprites.star[added]])
+        for place in np.flatnonzero(lights < 0).tolist():
+            if (bv_mag := getattr(sprites.extended[place], "bv_mag", None)) is not None:
+                of_extended[place] = shares_by_bv(by_bv, bv_mag)
+    of_sprites = of_sprites.astype(np.float32)
     parts = []
     for share, wide in zip(of_sprites.T, of_extended.T, strict=True):
         data = sprites.data.copy()

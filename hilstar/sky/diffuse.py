@@ -46,6 +46,7 @@ class TangentImage:
     axes: FloatArray
     px_per_tangent: float
     max_tangent: float = math.inf
+    bv_mag: float | None = None
 
     def places_px(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Columns and rows of directions (..., 3), ICRS; NaN behind the plane."""

@@ -91,6 +91,9 @@ def tell(told: set[str], key: str, text: str, *values: object) -> None:
         log.warning(text, *values)
 
 
+BV_MAG = np.linspace(-0.4, 2.4, 57)  # for light that is no star's
+
+
 @dataclass(frozen=True, slots=True)
 class Stars:
     """Stars in the order of `grid`; `vectors` (n, 3) are ICRS unit vectors, the rest has shape (n,).
@@ -104,8 +107,8 @@ class Stars:
 
     `colours` (n, channels) are the shares of `electrons_per_s` that each channel of the tracker has, which sum to 1; None where
     it has one channel. `primaries` (n, 3) are the light that each of a monitor's primaries gives of it, as shares of
-    `electrons_per_s`; None where they are not driven apart. Through `air` directions are bent, and `near`
-    finds none below the horizon.
+    `electrons_per_s`; None where they are not driven apart. `colours_by_bv` and `primaries_by_bv` (k, columns) are the same of
+    light of BV_MAG (k,). Through `air` directions are bent, and `near` finds none below the horizon.
     """
 
     hip: npt.NDArray[np.int32]
@@ -121,6 +124,8 @@ class Stars:
     bodies: tuple[str, ...] = ()
     colours: FloatArray | None = None
     primaries: FloatArray | None = None
+    colours_by_bv: FloatArray | None = None
+    primaries_by_bv: FloatArray | None = None
     air: AirAbove | None = None
 
     def __len__(self) -> int:
@@ -193,6 +198,8 @@ def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
         row=stars.row[order],
         colours=None if stars.colours is None else stars.colours[order],
         primaries=None if stars.primaries is None else stars.primaries[order],
+        colours_by_bv=stars.colours_by_bv,
+        primaries_by_bv=stars.primaries_by_bv,
     )
 
 
@@ -264,6 +271,7 @@ def with_bodies(
         colours=None
         if stars.colours is None or colours is None
         else np.vstack([stars.colours, np.broadcast_to(colours, (count, colours.shape[-1]))]),
+        colours_by_bv=stars.colours_by_bv,
     )
 
 

@@ -32,7 +32,8 @@ from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import GaussianPsf
 from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s, load_library
-from hilstar.sky.spectral_types import CLASSES, LETTERS, class_shares, read_types
+from hilstar.sky.spectral_types import CLASSES, LETTERS, class_shares, read_types, star_types
+from hilstar.sky.spectrum import load_curve
 from hilstar.sky.stars import Stars
 from hilstar.study.settings import GLASS, Isolation, bench_text, centroid_px, lone_windows
 from hilstar.study.sweep import OtherWork, busy_line, in_turn, is_busy
@@ -59,7 +60,12 @@ SENSORS: dict[str, tuple[Lobes, ...]] = {
         ((460, 40, 0.6), (850, 75, 0.3)),
     ),
 }
-MONO = ("ccd47-20", "kai-4021")
+# Mono sensors, the quantum efficiency of each: one that no light from CUT_NM on reaches is as any panel has light for it.
+CUT_NM = 700.0
+MONO_SENSOR = "ccd47-20"
+MONO = {"ccd47-20": "ccd47-20", "kai-4021": "kai-4021", "ccd47-20 to 700 nm": "ccd47-20 to 700 nm.csv"}
+TRACKERS = {"mono": MONO_SENSOR, "Bayer": "Bayer, wide dyes", "mono to 700 nm": f"{MONO_SENSOR} to {CUT_NM:g} nm"}
+MARKERS = {"mono": "o", "Bayer": "s", "mono to 700 nm": "^"}
 INKS = {"white": MUTED, "star": BLUE, "depth": ORANGE}
 FRAME_PX = (800, 600)
 FIELDS, QUICK_FIELDS, ROUNDS, QUICK_ROUNDS = 40, 3, 15, 3
@@ -71,6 +77,8 @@ SIGMAS_PX, STARS_K, PHASES, TILE_PX = (0.55, 0.8, 1.0, 1.5), (3500.0, 6000.0, 12
 Row = tuple[str | float, ...]
 # Stars to V = 7 without codes: share of electrons in a wrong channel, of one channel nm of the mean wavelength, and subtypes.
 GAMUT = ("panel", "sensor", "condition", "out_share", "off_median", "off_95", "off_percent_k", "subtypes", "subtypes_white")
+# The same of a mono sensor by spectral class: stars to V = 7, their mean wavelength and how far it is off, and subtypes.
+BY_CLASS = ("panel", "sensor", "class", "stars", "mean_nm", "off_nm", "subtypes", "subtypes_white")
 # Lone stars of V = 1 to 5.5 as codes show them: mean errors of colour, 95 % of light, a channel's light [%] and place; time.
 CHOICE = ("tracker", "colour", "method", "stars", "wall_ms", "cpu_ms", "subtypes", "off_percent_k", "mag", "channel", "px")
 # Places through a lens against a star's like the Sun: of the sky, and shown minus sky. "linear": 1 px for 100 nm of the mean.
@@ -93,12 +101,15 @@ def write_spectra(folder: Path) -> None:
         for one, lobes in zip(CHANNELS, three, strict=True):
             lines = ["wavelength_nm,value", *(f"{nm:g},{value:.6g}" for nm, value in zip(NM, curve_of(lobes), strict=True))]
             (folder / f"{name} {one}.csv").write_text("\n".join(lines))
+    whole = load_curve(MONO_SENSOR, "quantum_efficiency")
+    cut = (f"{nm:g},{value:.6g}" for nm, value in zip(NM[CUT_NM > NM], whole(NM[CUT_NM > NM]), strict=True))
+    (folder / MONO[f"{MONO_SENSOR} to {CUT_NM:g} nm"]).write_text("\n".join(["wavelength_nm,value", *cut]))
 
 
 def file_of(folder: Path, panel: str, sensor: str, faintest_v_mag: float = 7.0, **render: str | float) -> BenchFile:
     """The bench of a panel with vertical stripes and a sensor, in the folder of the spectra."""
     three = {f"quantum_efficiency_{one}": f"{sensor} {one}.csv" for one in CHANNELS}
-    own = {"quantum_efficiency": sensor} if sensor in MONO else three
+    own = {"quantum_efficiency": MONO[sensor]} if sensor in MONO else three
     text = bench_text(
         {
             "tracker": {**own, "transmission": GLASS, "resolution_px": (1024, 1024)},
@@ -147,8 +158,8 @@ def colours_of(file: BenchFile, stars: Stars) -> Colours:
     return colours
 
 
-def study_gamut(folder: Path) -> Iterator[Row]:
-    """Every panel before every sensor: rows of GAMUT."""
+def study_gamut(folder: Path, by_class: list[Row]) -> Iterator[Row]:
+    """Every panel before every sensor: rows of GAMUT; those of BY_CLASS are appended."""
     for panel, sensor in product(PANELS, (*MONO, *SENSORS)):
         file = file_of(folder, panel, sensor)
         stars = bench_stars(file.config, folder)
@@ -156,9 +167,14 @@ def study_gamut(folder: Path) -> Iterator[Row]:
         wanted = colours.wanted(stars)
         shares, own = colours.shares(wanted), subtypes(wanted[:, : 1 if colours.mono else 3])
         off, warmer = colours.off(wanted, shares), np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
-        by_star, by_white = (np.abs(subtypes(colours.shown(one)) - own).mean() for one in (shares, colours.of_white[None]))
+        by_star, by_white = (np.abs(subtypes(colours.shown(one)) - own) for one in (shares, colours.of_white[None]))
         out, condition = (~colours.in_gamut(off)).mean(), colours.matrix.condition or math.nan
-        yield (panel, sensor, *map(float, (condition, out, *np.percentile(off, (50, 95)), 100 * warmer, by_star, by_white)))
+        at_off, kinds = np.percentile(off, (50, 95)), np.floor(star_types(stars.catalog)[:, 0] / 10)
+        for number, letter in enumerate(LETTERS if colours.mono else ""):
+            some = np.flatnonzero(kinds[stars.row] == number)
+            figures = (float(one[some].mean()) for one in (wanted[:, 0], off, by_star, by_white))
+            by_class.append((panel, sensor, letter, len(some), *figures))
+        yield (panel, sensor, *map(float, (condition, out, *at_off, 100 * warmer, by_star.mean(), by_white.mean())))
 
 
 def shown_stars(bench: Bench, colours: Colours, fields: int) -> Iterator[tuple[FloatArray, ...]]:
@@ -187,9 +203,9 @@ def frame_of(bench: Bench, number: int) -> Levels:
     return bench.draw(from_radec_roll_deg(84.0 + number, 0.0, 0.0)).levels
 
 
-def study_choices(folder: Path, fields: int, rounds: int) -> Iterator[Row]:
-    """Each choice before a mono and a Bayer tracker, on the LCD; frames of all are timed in turn: rows of CHOICE."""
-    for sensor in (MONO[0], "Bayer, wide dyes"):
+def study_choices(folder: Path, trackers: Mapping[str, str], fields: int, rounds: int) -> Iterator[Row]:
+    """Each choice before trackers by their sensors, on the LCD; frames of all are timed in turn: rows of CHOICE."""
+    for tracker, sensor in trackers.items():
         with ExitStack() as stack:
             benches = {
                 key: stack.enter_context(open_bench(file_of(folder, "sRGB LCD", sensor, colour=key[0], quantisation=key[1])))
@@ -209,7 +225,7 @@ def study_choices(folder: Path, fields: int, rounds: int) -> Iterator[Row]:
                 off_k = 100 * np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
                 at_95 = (np.percentile(one, 95) for one in (flux_mag, 100 * channels, off))
                 figures = (*np.min(times[" ".join(key)], axis=0), off_kind, off_k, *at_95)
-                yield ("mono" if colours.mono else "Bayer", *key, len(flux), *map(float, figures))
+                yield (tracker, *key, len(flux), *map(float, figures))
 
 
 def study_lateral(folder: Path) -> Iterator[Row]:
@@ -223,7 +239,7 @@ def study_lateral(folder: Path) -> Iterator[Row]:
     if not isinstance(psf, GlassPsf):
         raise AssertionError("the file has a glass")
     for panel in PANELS:
-        file = file_of(folder, panel, MONO[0], FAINTEST_V_MAG)
+        file = file_of(folder, panel, MONO_SENSOR, FAINTEST_V_MAG)
         file = replace(file, config=replace_keys(file.config, tracker=tracker))
         stars = bench_stars(file.config, folder)
         try:
@@ -234,9 +250,10 @@ def study_lateral(folder: Path) -> Iterator[Row]:
         own, wanted = StarGlass(file, psf).shares(stars, np.arange(len(stars))), colours.wanted(stars)
         solar = int(np.abs(stars.bv_mag - SOLAR_BV).argmin())
         places = np.random.default_rng(1).uniform(-0.5, (width - 0.5, height - 0.5), (len(stars), 2)).T
-        for colour, shares in (("white", colours.of_white + 0 * wanted[:, :1]), ("star", colours.shares(wanted))):
-            glass = [moved_px(psf, places, one, solar) for one in (own, shares @ by_primary)]
-            means = [(one - one[solar]).T / 100 for one in (wanted[:, :1], colours.shown(shares))]
+        white, plain = colours.of_white + 0 * wanted[:, :1], replace(colours, lateral=None)  # as for a lens that is not known
+        for colour, known, unknown in (("white", white, white), ("star", colours.shares(wanted), plain.shares(wanted))):
+            glass = [moved_px(psf, places, one, solar) for one in (own, known @ by_primary)]
+            means = [(one - one[solar]).T / 100 for one in (wanted[:, :1], plain.shown(unknown))]
             for lens, (sky, shown) in (("planar-1897", glass), ("linear", means)):
                 sky_px, off_px = (float(np.sqrt((one**2).sum(axis=0).mean())) for one in (sky, shown - sky))
                 yield lens, panel, colour, sky_px, off_px, off_px / sky_px
@@ -278,12 +295,13 @@ def draw(path: Path, rows: Sequence[Row]) -> str:
     finding = (
         f"Each star's own mixture is {star['subtypes']:.2g} subtypes off before a Bayer tracker, white {white['subtypes']:.0f}"
     )
-    note = "Full: exact; open: round. Circles: mono; squares: Bayer. Lone stars from V = 1 to 5.5 on an sRGB LCD of 8 bits."
+    note = "Full: exact; open: round. Circles: mono; triangles: mono to 700 nm; squares: Bayer. Lone stars of"
+    note += " V = 1 to 5.5 on an sRGB LCD of 8 bits."
     labels = {"subtypes": "colour, mean\n[subtypes]", "mag": "flux, 95 %\n[mag]", "px": "place, 95 %\n[px]"}
     with chart(path, finding, 3, note=note) as axes:
         for axis, (name, label) in zip(axes, labels.items(), strict=True):
             for one in choices:
-                ink, marker = INKS[str(one["colour"])], "o" if one["tracker"] == "mono" else "s"
+                ink, marker = INKS[str(one["colour"])], MARKERS[str(one["tracker"])]
                 face = ink if one["method"] == "exact" else "none"
                 axis.loglog(one["cpu_ms"], one[name], marker, ms=7, color=ink, markerfacecolor=face)
             axis.set_ylabel(label)
@@ -296,17 +314,19 @@ def draw(path: Path, rows: Sequence[Row]) -> str:
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Write colour.csv and its chart, colour_gamut.csv, colour_lateral.csv, colour_red.csv and colour_mosaic.csv; findings."""
+    """Write colour.csv and its chart, and the tables colour_gamut, _class, _lateral, _red and _mosaic; findings."""
     others = OtherWork()
     with TemporaryDirectory() as name:
         folder = Path(name)
         write_spectra(folder)
-        gamut, lateral = list(study_gamut(folder)), list(study_lateral(folder))
-        choices = list(study_choices(folder, *((QUICK_FIELDS, QUICK_ROUNDS) if quick else (FIELDS, ROUNDS))))
+        by_class: list[Row] = []
+        gamut, lateral = list(study_gamut(folder, by_class)), list(study_lateral(folder))
+        before = dict([*TRACKERS.items()][: 2 if quick else None])
+        choices = list(study_choices(folder, before, *((QUICK_FIELDS, QUICK_ROUNDS) if quick else (FIELDS, ROUNDS))))
         trackers = {sensor: file_of(folder, "OLED", sensor).config.tracker for sensor in (*MONO, *SENSORS)}
         red = [(name, *class_shares(bench_optics(one, folder), RED_NM).values()) for name, one in trackers.items()]
         mosaic = list(study_mosaic(bench_channels(trackers["Bayer, wide dyes"], folder)))
-    three = (("", CHOICE, choices), ("_gamut", GAMUT, gamut), ("_lateral", LATERAL, lateral))
+    three = (("", CHOICE, choices), ("_gamut", GAMUT, gamut), ("_class", BY_CLASS, by_class), ("_lateral", LATERAL, lateral))
     for table, columns, rows in (*three, ("_red", ("sensor", *LETTERS), red), ("_mosaic", PLACES, mosaic)):
         write_csv(directory / f"colour{table}.csv", columns, rows)
     lines = [draw(directory / "colour", choices)]

@@ -51,25 +51,33 @@ def compare(
 ) -> SkyComparison:
     """Compare two skies star by star: each a Frame, a linear image (height, width), or a FITS of `hilstar frame`.
 
+    Light of three channels (3, height, width) is compared as a sum and by channel, and with light of one as a sum.
+
     Stars have HIP numbers by `truth` (a Frame's table, or the CSV of `hilstar frame --truth`), else by the Frames' own.
     Raises InputError for limits that are not above 0, images of different size or without a star, and files of another kind.
     """
-    light, golden_light = _image(frame), _image(golden)
+    images = _image(frame), _image(golden)
+    same = images[0].ndim == images[1].ndim
+    light, golden_light = (image if same else _together(image) for image in images)
     check_skies(light, golden_light)
     own = frame.truth if isinstance(frame, Frame) else None
     if isinstance(truth, str | Path):
         truth = read_truth_csv(Path(truth))
     elif truth is None and isinstance(golden, Frame):
         truth = golden.truth
-    elif truth is None and own is not None and describes(own, golden_light):
+    elif truth is None and own is not None and describes(own, _together(golden_light)):
         truth = own
     return compare_skies(light, golden_light, Limits(flux_mag, centroid_px), truth, own)
+
+
+def _together(image: FloatArray) -> FloatArray:
+    return image.sum(axis=0) if image.ndim == 3 else image
 
 
 def _image(sky: Sky) -> FloatArray:
     if isinstance(sky, str | Path):
         return read_frame_fits(Path(sky))
-    image = sky.linear if isinstance(sky, Frame) else np.asarray(sky)
+    image = (sky.light if len(sky.light) > 1 else sky.linear) if isinstance(sky, Frame) else np.asarray(sky)
     if image.dtype.kind != "f":
         raise InputError(f"compare: an image of type {image.dtype}; give a Frame, or its linear image (float), not its codes")
     return np.asarray(image, dtype=np.float64)

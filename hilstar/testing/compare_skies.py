@@ -10,6 +10,7 @@ import io
 import math
 import warnings
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ MAX_ERROR = 0.25  # a star whose relative error by rounding of brighter light is
 MISSING_SHARE = 0.01  # share of its flux: a star 5 mag fainter is gone
 MOVE_STEPS, SMALL_MOVE_PX = 4, 0.003  # a shift of this is first order within 1e-5 of the star's flux
 MAX_MOVE_SIGMAS = 3.0  # a star that moved farther is missing here and extra there
-UNIT = "electron/s"
+UNIT, CHANNELS = "electron/s", "rgb"
 MAX_E_PER_S = 1e30  # whose square is still a number
 TRUTH_COLUMNS = ("hip", "x_px", "y_px", "electrons_per_s")
 MAX_TRUTH_BYTES = 50_000_000
@@ -60,10 +61,15 @@ def compare_skies(
 ) -> SkyComparison:
     """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE), `truth` the golden one's.
 
-    Raises InputError for images of different size or with a pixel that is not finite, for a golden one without a star, and
-    for a `truth` of another sky.
+    Of cubes (3, height, width) the sum of the channels, and then each. Raises InputError for images of different size or
+    with a pixel that is not finite, for a golden one without a star, and for a `truth` of another sky.
     """
     check_skies(frame, golden)
+    if frame.ndim == 3:
+        tables = truth, frame_truth
+        pairs = zip(CHANNELS, frame, golden, strict=True)
+        each = {name: compare_skies(one, other, limits, *tables) for name, one, other in pairs}
+        return replace(compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables), channels=each)
     psf = star_psf(golden)
     seeds, unmeasured = _measurable(golden, find_seeds(golden, truth, psf), psf)
     if not seeds.hip:
@@ -84,12 +90,12 @@ def compare_skies(
 def check_skies(frame: FloatArray, golden: FloatArray) -> None:
     """Raise InputError where two images cannot be compared, as `compare_skies` does."""
     for name, image in (("frame", frame), ("golden", golden)):
-        if image.ndim != 2 or min(image.shape) < 2:
+        if not (image.ndim == 2 or image.shape[:-2] == (len(CHANNELS),)) or min(image.shape) < 2:
             raise InputError(f"compare: the {name} image has the shape {image.shape}; give a linear image (height, width)")
         if not np.isfinite(image).all():
             raise InputError(f"compare: the {name} image has a pixel that is NaN or infinite; give finite numbers")
     if frame.shape != golden.shape:
-        (height, width), (golden_height, golden_width) = frame.shape, golden.shape
+        (height, width), (golden_height, golden_width) = frame.shape[-2:], golden.shape[-2:]
         raise InputError(
             f"compare: {width} x {height} px against {golden_width} x {golden_height} px; give images of one monitor"
         )
@@ -171,7 +177,10 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
 
 
 def read_frame_fits(path: Path) -> FloatArray:
-    """The linear image (height, width), electrons/s, of a FITS of `hilstar frame`. Raises InputError for another file."""
+    """The linear image (height, width), or of three channels (3, height, width), electrons/s, of a FITS of `hilstar frame`.
+
+    Raises InputError for another file.
+    """
     from astropy.io import fits
 
     wanted = "give the FITS that `hilstar frame -o OUT.fits` writes"
@@ -182,7 +191,7 @@ def read_frame_fits(path: Path) -> FloatArray:
             image, header = fits.getdata(io.BytesIO(raw), header=True)
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: not a FITS image; {wanted}") from error
-    if header.get("BUNIT") != UNIT or image is None or image.ndim != 2 or image.dtype.kind != "f":
+    if header.get("BUNIT") != UNIT or image is None or image.ndim not in (2, 3) or image.dtype.kind != "f":
         raise InputError(f"{path}: not a linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")
     light = np.asarray(image, dtype=np.float64)
     if (np.abs(light[np.isfinite(light)]) > MAX_E_PER_S).any():

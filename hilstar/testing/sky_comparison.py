@@ -6,7 +6,7 @@ matched with extra ones first: after a shift by more than a star's width no star
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -31,6 +31,7 @@ CENTROID_PX = 1e-3
 MIN_STARS, MIN_STAR_SHARE = 4, 0.5  # that must differ alike
 MAX_VOTERS, VOTE_PX, PAIR_PX = 80, 2.0, 3.0  # the brightest missing and extra ones; displacements closer than this are one
 PAIR_ROUNDS = 3
+CHANNEL_KEYS = ("stars", "flux_error_mag", "centroid_error_px", "missing", "extra", "same")
 EDGE_PX = 5.0  # a star so near to the edge, or beyond it, may come into view or leave it by a common shift
 
 
@@ -302,13 +303,15 @@ def _worst_first(stars: list[StarDifference]) -> list[StarDifference]:
 class SkyComparison:
     """Every star compared, the missing and the extra ones; `unmeasured` stars have too little light of their own in view.
 
-    `common` is the difference that most stars share, None without one.
+    `common` is the difference that most stars share, None without one. Of light of several channels this is their sum, and
+    `channels` has each by its name.
     """
 
     stars: list[StarDifference]
     limits: Limits
     unmeasured: int
     common: CommonChange | None = None
+    channels: "dict[str, SkyComparison]" = field(default_factory=dict)
 
     def of(self, *kinds: str) -> list[StarDifference]:
         """The stars of these kinds."""
@@ -326,8 +329,8 @@ class SkyComparison:
 
     @property
     def same(self) -> bool:
-        """Whether both images are one sky."""
-        return not self.bad
+        """Whether both images are one sky, in every channel."""
+        return not self.bad and all(one.same for one in self.channels.values())
 
     @property
     def star_count(self) -> int:
@@ -368,18 +371,31 @@ class SkyComparison:
                 for star in self.bad
             ],
             "same": self.same,
+            "channels": {
+                name: {key: value for key, value in one.summary().items() if key in CHANNEL_KEYS}
+                for name, one in self.channels.items()
+            },
         }
 
 
 def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str]:
     """A line for each star that differs beyond the common difference, `max_lines` of them; `rest` says where more are."""
+    if not comparison.bad and (other := _other_channel(comparison)):
+        return star_lines(comparison.channels[other], max_lines, rest)
     stars = comparison.differing
     lines = [star.line() for star in stars[:max_lines]]
     return [*lines, f"and {len(stars) - max_lines} more{rest}"] if len(stars) > max_lines else lines
 
 
+def _other_channel(comparison: SkyComparison) -> str | None:
+    """The first channel that is not the same; None where all are."""
+    return next((name for name, one in comparison.channels.items() if not one.same), None)
+
+
 def finding(comparison: SkyComparison) -> str:
     """The verdict in one sentence."""
+    if not comparison.bad and (other := _other_channel(comparison)):
+        return f"In channel {other}: {finding(comparison.channels[other])}"
     if comparison.same:
         largest = comparison.flux_error_mag.max, comparison.centroid_error_px.max
         return f"The same sky: {comparison.star_count} stars, at most {largest[0]:.2g} mag and {largest[1]:.2g} px off"

@@ -48,7 +48,7 @@ def luminance(image: npt.NDArray[Any]) -> FloatArray:
     return np.asarray(correlate1d(smooth, SUPERPIXEL, axis=1, mode="mirror"))
 
 
-def software_image(dn: npt.NDArray[np.uint16], detector: DetectorSettings) -> npt.NDArray[Any]:
+def software_image(dn: npt.NDArray[Any], detector: DetectorSettings) -> npt.NDArray[Any]:
     """The image of an exposure in which a tracker's software finds stars: its DN, or the luminance of its superpixels."""
     return luminance(dn) if detector.takes_superpixels else dn
 

@@ -21,9 +21,8 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_stars, star_rates
+from hilstar.bench.build import bench_stars, star_flux, star_rates
 from hilstar.bench.cameras import tracker_camera, tracker_psf
-from hilstar.bench.glass import say_once
 from hilstar.charts import BLUE, ORANGE, chart, label_ends, two_digits, write_csv
 from hilstar.errors import InputError
 from hilstar.frame.truth import truth_table
@@ -35,7 +34,8 @@ from hilstar.sky.stars import Stars
 from hilstar.tracker.centroiders import FAMILY, Centroider, star_places
 from hilstar.tracker.centroids import CentroidSettings
 from hilstar.tracker.detector import Detector
-from hilstar.tracker.settings import DetectorSettings
+from hilstar.tracker.mosaic import CHANNELS, SUPERPIXEL, in_pixels, of_colour, software_image, software_psf_px
+from hilstar.tracker.settings import DetectorSettings, PixelNoise
 from hilstar.twin.budget import SOLAR_BV, STEP_MAG, USUAL
 from hilstar.twin.simulator import TrackerBackground, full_e
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio
@@ -68,22 +68,58 @@ NOISE_DTYPE = np.dtype(
 Table = npt.NDArray[np.void]
 
 
-class NoisyStar:
-    """A tracker's star at a grid of places within a pixel: its shares of light, their slopes, and the detector's noise."""
+@dataclass(frozen=True, slots=True)
+class Mosaic:
+    """What pixels of red, green and blue (3,) have of a star's electrons, and of the mean pixel's background."""
 
-    def __init__(self, psf: Psf, detector: DetectorSettings, exposure_s: float, phases: int = PHASES) -> None:
-        self.psf, self.detector, self.exposure_s = psf, detector, exposure_s
+    star: FloatArray
+    sky: FloatArray
+
+    def pixels(self, bayer: str, height: int, width: int) -> FloatArray:
+        """Both in an image of pixels (2, height, width)."""
+        even = np.ones((height, width))
+        return np.array([in_pixels([even * one for one in each], bayer) for each in (self.star, self.sky)])
+
+    def only(self, channel: int) -> "Mosaic":
+        """The same of a star that one channel alone sees."""
+        return Mosaic(self.star * (np.arange(len(CHANNELS)) == channel), self.sky)
+
+
+class NoisyStar:
+    """A tracker's star at a grid of places within a pixel: its shares of light, their slopes, and the detector's noise.
+
+    Of a `mosaic` within its four pixels, of light of one colour.
+    """
+
+    def __init__(
+        self, psf: Psf, detector: DetectorSettings, exposure_s: float, phases: int = PHASES, mosaic: Mosaic | None = None
+    ) -> None:
+        self.psf, self.detector, self.exposure_s, self.mosaic = psf, detector, exposure_s, mosaic
         self.side_px = max(psf.footprint_px | 1, 7)
         phase = (np.arange(phases) + 0.5) / phases - 0.5
         y_px, x_px = (grid.ravel() for grid in np.meshgrid(phase, phase))
-        step, count = SLOPE_STEP_PX, phases**2
-        self.shares = self.stamps(x_px, y_px).reshape(count, -1)
+        step = SLOPE_STEP_PX
+        seen, sky = self._patterns()
         by_x, by_y = (
-            (self.stamps(x_px + dx, y_px + dy) - self.stamps(x_px - dx, y_px - dy)).reshape(count, -1) / (2 * step)
+            (self.stamps(x_px + dx, y_px + dy) - self.stamps(x_px - dx, y_px - dy)) / (2 * step)
             for dx, dy in ((step, 0.0), (0.0, step))
         )
-        slopes = np.stack([by_x, by_y, self.shares, np.ones_like(by_x)])  # by x, y, flux, background; of one electron
-        self._pairs = np.einsum("ifp,jfp->fpij", slopes, slopes).reshape(count, -1, 16)
+        even, count = np.ones_like(by_x), phases**2 * len(seen)
+        self.shares, *slopes = (
+            (pattern[:, None] * one).reshape(count, -1)
+            for pattern, one in ((seen, self.stamps(x_px, y_px)), (seen, by_x), (seen, by_y), (sky, even))
+        )
+        self._sky = slopes[2] if mosaic is not None else np.ones((1, 1))
+        by = np.stack([*slopes[:2], self.shares, slopes[2]])  # by x, y, flux, background; of one electron
+        self._pairs = np.einsum("ifp,jfp->fpij", by, by).reshape(count, -1, 16)
+
+    def _patterns(self) -> FloatArray:
+        """What pixels have of star and background (2, n, side, side) where a star is before each of a mosaic's n pixels."""
+        if self.mosaic is None or self.detector.bayer is None:
+            return np.ones((2, 1, 1, 1))
+        side = self.side_px
+        whole = self.mosaic.pixels(self.detector.bayer, side + 1, side + 1)
+        return np.stack([whole[:, y : y + side, x : x + side] for y in (0, 1) for x in (0, 1)], axis=1)
 
     def stamps(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Shares (n, side, side) of stars so far (n,) from the middle of their square."""
@@ -105,17 +141,20 @@ class NoisyStar:
         return np.asarray(unit * scale.transpose(0, 2, 1)[:, None] * scale[:, None])
 
     def _fill(self, found: Table, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings) -> None:
-        shares, light_e = self.shares, star_e * self.shares + background_e
-        noise, sky = (self.detector.noise(one, self.exposure_s) for one in (light_e, background_e))
+        shares, under_e = self.shares, background_e * self._sky
+        light_e = star_e * shares + under_e
+        noise, sky = (self.detector.noise(one, self.exposure_s) for one in (light_e, under_e))
         unclipped = light_e + noise.dark_e2 <= full_e(self.detector)
         weight = unclipped / noise.total_e2
         by_flux = weight * shares
         by_flux /= np.maximum((by_flux * shares).sum(axis=-1, keepdims=True), NO_INFORMATION)
         squared = by_flux**2
         effective_px = squared.sum(axis=-1, keepdims=True)
-        even = (background_e, sky.dark_e2, sky.read_e2, sky.reset_e2, sky.quantisation_e2)
-        shot, prnu = ((squared * e2).sum(axis=-1, keepdims=True) for e2 in (star_e * shares, noise.prnu_e2))
-        variances = (shot, *(effective_px * e2 for e2 in even), prnu, effective_px * sky.dsnu_e2)
+        even = (sky.dark_e2, sky.read_e2, sky.reset_e2, sky.quantisation_e2)
+        shot, background, prnu = (
+            (squared * e2).sum(axis=-1, keepdims=True) for e2 in (star_e * shares, under_e, noise.prnu_e2)
+        )
+        variances = (shot, background, *(effective_px * e2 for e2 in even), prnu, effective_px * sky.dsnu_e2)
         for source, e2 in zip(SOURCES, variances, strict=True):
             found[f"{source}_e"] = np.sqrt(e2.mean(axis=(1, 2)))
         found["total_e"] = np.sqrt(np.sum([found[f"{source}_e"] ** 2 for source in SOURCES], axis=0))
@@ -131,13 +170,40 @@ class NoisyStar:
         found[~unclipped.any(axis=-1).all(axis=-1)] = np.nan  # somewhere within a pixel nothing is left of them
         found["star_e"], found["clipped_px"] = star_e[:, 0, 0], (~unclipped).sum(axis=-1).mean(axis=-1)
         found["snr"] = found["star_e"] / found["total_e"]
+        found["detection"] = found_share(self._above(star_e, under_e, (noise, sky), finder), finder.minimum_pixels)
+
+    def _above(
+        self, star_e: FloatArray, under_e: FloatArray, noises: "tuple[PixelNoise, PixelNoise]", finder: CentroidSettings
+    ) -> FloatArray:
+        """The probability (n, phases, pixels) that a pixel is above the threshold, by its noise with a star and without.
+
+        Noise of superpixels is that of their neighbours: of every second one along both axes, which tells the most.
+        """
+        noise, sky = noises
+        if self.detector.takes_superpixels:
+            light, variance, dark = (
+                superpixels(np.broadcast_to(one, noise.total_e2.shape).reshape(-1, self.side_px, self.side_px), squared=k > 0)
+                for k, one in enumerate((star_e * self.shares, noise.total_e2, sky.total_e2))
+            )
+            limit_e = finder.threshold_sigma * np.sqrt(dark.mean(axis=(1, 2), keepdims=True))
+            above = np.pad(ndtr((light - limit_e) / np.sqrt(variance)), ((0, 0), (0, 1), (0, 1)))
+            each = np.stack([above[:, y::2, x::2].reshape(len(above), -1) for y in (0, 1) for x in (0, 1)], axis=1)
+            best = each[np.arange(len(each)), np.prod(1 - each, axis=2).argmin(axis=1)]
+            return np.asarray(best.reshape(*noise.total_e2.shape[:2], -1))
         # The first code over the threshold begins half a step below it, and rounding is no noise of its own.
         step_e = self.detector.gain_e_per_dn
-        level_dn = (background_e + sky.dark_e2) / step_e + self.detector.offset_dn
+        level_dn = (under_e + sky.dark_e2) / step_e + self.detector.offset_dn
         first_dn = np.floor(level_dn + finder.threshold_sigma * np.sqrt(sky.total_e2) / step_e) + 0.5
         sigma_e = np.sqrt(np.maximum(noise.total_e2 - step_e**2 / 12, NO_NOISE_E2))
-        above = ndtr((star_e * shares - (first_dn - level_dn) * step_e) / sigma_e)
-        found["detection"] = found_share(above, finder.minimum_pixels)
+        return np.asarray(ndtr((star_e * self.shares - (first_dn - level_dn) * step_e) / sigma_e))
+
+
+def superpixels(images: npt.NDArray[np.floating[Any]], *, squared: bool = False) -> FloatArray:
+    """The luminance of images (n, h, w), or its variance by theirs."""
+    from scipy.ndimage import correlate1d
+
+    weights = SUPERPIXEL**2 if squared else SUPERPIXEL
+    return np.asarray(correlate1d(correlate1d(images, weights, axis=1), weights, axis=2))
 
 
 def found_share(above: FloatArray, minimum_pixels: int) -> FloatArray:
@@ -163,16 +229,26 @@ def measured_px(star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSe
     plain = {"hot_pixel_fraction": 0.0, "dead_pixel_fraction": 0.0, "false_stars": 0, "cosmic_rays_per_cm2_s": 0.0}
     device = Detector(structs.replace(star.detector, blooming=False, **plain), shape)
     place_px = rng.uniform(-0.5, 0.5, (2, TRIALS**2))
-    tiles = star_e * star.stamps(*place_px) + sky_e
-    dn = device.expose(tiles.reshape(TRIALS, TRIALS, side, side).swapaxes(1, 2).reshape(shape), star.exposure_s, rng)
+    light_e, under_e = (
+        (star_e * star.stamps(*place_px)).reshape(TRIALS, TRIALS, side, side).swapaxes(1, 2).reshape(shape),
+        sky_e,
+    )
+    bayer, superpixel = star.detector.bayer, star.detector.takes_superpixels
+    if star.mosaic is not None and bayer is not None:
+        seen, sky = star.mosaic.pixels(bayer, *shape)
+        light_e, under_e = light_e * seen, sky_e * sky
+    dn = device.expose(light_e + under_e, star.exposure_s, rng)
     noise = star.detector.noise(sky_e, star.exposure_s)
-    seen_e = (dn - star.detector.offset_dn) * star.detector.gain_e_per_dn - sky_e - noise.dark_e2
+    seen_e = (dn - star.detector.offset_dn) * star.detector.gain_e_per_dn - under_e - noise.dark_e2
     stamps = seen_e.reshape(TRIALS, side, TRIALS, side).swapaxes(1, 2).reshape(-1, side, side)
-    above = stamps > finder.threshold_sigma * math.sqrt(noise.total_e2)
+    stamps = superpixels(stamps) if superpixel else stamps
+    threshold_e = finder.threshold_sigma * math.sqrt(noise.total_e2) * (float(np.sum(SUPERPIXEL**2)) if superpixel else 1.0)
+    above = stamps > threshold_e
     found = above.sum(axis=(1, 2)) >= finder.minimum_pixels
     if found.sum() < MIN_FOUND:
         return np.full(len(FAMILY), np.nan)
-    off = [np.stack(star_places(stamps[found], kind, star.psf.width_px)) - place_px[:, found] for kind in FAMILY]
+    width_px = software_psf_px(star.psf.width_px, star.detector)
+    off = [np.stack(star_places(stamps[found], kind, width_px)) - place_px[:, found] for kind in FAMILY]
     return np.asarray(np.sqrt(np.var(off, axis=2).mean(axis=1)))  # an offset of all, as by coma, is the calibration's
 
 
@@ -230,6 +306,18 @@ class NoiseBudget:
     stars: list[dict[str, Any]] | None
     nea: list[dict[str, Any]]
     nea_arcsec: dict[str, dict[str, float]]
+    channels: dict[str, dict[str, float]]
+
+
+def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -> NoisyStar:
+    """A star on a bench's tracker, of a mosaic one of the Sun's colour before a sky (h, w), whole or as a channel sees it."""
+    tracker, mosaic, bayer = file.config.tracker, None, file.config.tracker.detector.bayer
+    if bayer is not None:
+        of_star = star_flux(file.config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]
+        levels = [np.mean([sky_e[part].mean() for part in of_colour(bayer, one)]) for one in CHANNELS]
+        mosaic = Mosaic(of_star / of_star.sum(), np.array(levels) / (sky_e.mean() or 1.0))
+        mosaic = mosaic if channel is None else mosaic.only(channel)
+    return NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s, mosaic=mosaic)
 
 
 def noise_budget(
@@ -240,15 +328,12 @@ def noise_budget(
     Magnitudes are those of stars of the Sun's colour; simulated stars and fields come from `rng`. Raises InputError.
     """
     config, tracker = file.config, file.config.tracker
-    if tracker.detector.bayer is not None:
-        say_once("--noise is of a pixel that adds up all channels; a mosaic's has its own alone", "[tracker.detector] bayer")
     camera, stars = tracker_camera(tracker, file.folder), bench_stars(config, file.folder)
     if not tracker.exposure_s:
         raise InputError("[tracker] exposure_s = 0: no light is collected; write a longer exposure")
     if not len(stars):
         raise InputError(f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger magnitude")
-    star = NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s)
-    background = TrackerBackground(config, file.folder, camera, mosaic=False)
+    background = TrackerBackground(config, file.folder, camera)
     sights, levels_e = [], []
     for q in rng.standard_normal((SKY_FIELDS, 4)) if q_icrs_to_cam is None else q_icrs_to_cam[None]:
         try:
@@ -260,13 +345,21 @@ def noise_budget(
         levels_e.append(float(sky_e.mean()))
         sights.append(field_stars(stars, camera, normalise(q)))
     middle_e = float(np.median(levels_e))
+    star = noisy_star(file, sky_e)
     brightest = float((stars.v_mag if q_icrs_to_cam is None or not len(sights[0]) else sights[0]["v_mag"]).min())
     zero_e = float(star_rates(config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]) * tracker.exposure_s
     v_mag: FloatArray = math.floor(brightest / STEP_MAG) * STEP_MAG + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
-    noise = star.noise(zero_e * flux_ratio(v_mag), np.full(len(v_mag), middle_e), finder)
+    all_e, under_e = zero_e * flux_ratio(v_mag), np.full(len(v_mag), middle_e)
+    noise = star.noise(all_e, under_e, finder)
     shown = slice(0, int((noise["detection"][::BETWEEN] >= UNSEEN).sum()) * BETWEEN + 1, BETWEEN)
     measured = np.array([measured_px(star, one, middle_e, finder, rng) for one in noise["star_e"][shown].tolist()]).T
     reached = {f"{kind}_px": one for kind, one in zip(FAMILY, measured, strict=True)}
+    channels = {}
+    if star.mosaic is not None:
+        for number, (name, share, sky) in enumerate(zip(CHANNELS, star.mosaic.star, star.mosaic.sky, strict=True)):
+            alone = noisy_star(file, sky_e, number).noise(all_e[shown], under_e[shown], finder)
+            reached[f"snr_{name}"] = alone["snr"]
+            channels[name] = {"star_share": float(share), "background_e_per_px": float(sky * middle_e)}
     listed = None
     curves: list[FloatArray] = []  # NEA of each field by who finds its stars: (WHO, 2, n)
     for field in sights:
@@ -274,7 +367,7 @@ def noise_budget(
         bounds = between(noise, star_e)
         if q_icrs_to_cam is not None:
             pixels = np.ceil(np.stack([field["y_px"], field["x_px"]]) - 0.5).astype(np.intp)
-            own = star.noise(star_e, sky_e[tuple(pixels)], finder)
+            own = star.noise(star_e, software_image(sky_e, tracker.detector)[tuple(pixels)], finder)
             bounds = np.stack([own["bound_x_px"], own["bound_y_px"], own["detection"]])
             listed = _rows({name: field[name] for name in ("hip", "name", "x_px", "y_px", "v_mag")}, own, {})
         turns = turns_of(camera, field["x_px"], field["y_px"])
@@ -292,6 +385,7 @@ def noise_budget(
         stars=listed,
         nea=nea,
         nea_arcsec={kind: {way: nea[-1][f"{kind}_{way}_arcsec"] for way in ("across", "about")} for kind in WHO},
+        channels=channels,
     )
 
 
@@ -302,14 +396,15 @@ def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatA
     """
     tracker = file.config.tracker
     camera, stars = tracker_camera(tracker, file.folder), bench_stars(file.config, file.folder)
-    star = NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s)
-    background = TrackerBackground(file.config, file.folder, camera, mosaic=False)
+    background, star = TrackerBackground(file.config, file.folder, camera), None
     found = np.full((len(q_icrs_to_cam), 2), np.inf)
     for k, q in enumerate(q_icrs_to_cam):
         field = field_stars(stars, camera, q)
         with contextlib.suppress(InputError):
-            sky_e = float(background.of_view_e(View.exposure(q, STILL, tracker.exposure_s)).mean())
-            own = star.noise(field["electrons_per_s"] * tracker.exposure_s, np.full(len(field), sky_e), CentroidSettings())
+            sky_e = background.of_view_e(View.exposure(q, STILL, tracker.exposure_s))
+            star = star or noisy_star(file, sky_e)
+            under_e = np.full(len(field), float(sky_e.mean()))
+            own = star.noise(field["electrons_per_s"] * tracker.exposure_s, under_e, CentroidSettings())
             bounds = np.stack([own["bound_x_px"], own["bound_y_px"]])
             nea = nea_arcsec(turns_of(camera, field["x_px"], field["y_px"]), bounds, own["detection"])
             found[k] = nea[:, -1:].ravel() if nea.size else np.inf
@@ -378,15 +473,21 @@ def noise_lines(found: NoiseBudget) -> Iterator[str]:
     own = found.centroider
     threshold = f"{found.minimum_pixels} px above {found.threshold_sigma:g} sigma"
     yield f"{'found':22}{threshold} of a background of {found.background_e_per_px:.4g} e- in a pixel"
+    for name, one in found.channels.items():
+        figures = f"{one['star_share']:.1%} of a star of the Sun's colour, background {one['background_e_per_px']:.4g} e-"
+        yield f"{'pixels of ' + name:22}{figures}"
     for kind, nea in found.nea_arcsec.items():
         told = f"{nea['across']:.3g} arcsec across, {nea['about']:.3g} about the boresight"
         told = told if math.isfinite(nea["about"]) else f"none: fewer than {MIN_STARS} stars with a place"
         yield f"{'NEA, ' + kind:22}{told}"
     yield ""
-    yield f"{'V':>6}{'star e-':>12}{'noise e-':>11}{'SNR':>8}{'detection':>11}{'bound px':>10}{own + ' px':>12}"
+    snr = [f"snr_{name}" for name in found.channels]
+    titles = "".join(f"{'SNR ' + name:>8}" for name in found.channels)
+    yield f"{'V':>6}{'star e-':>12}{'noise e-':>11}{'SNR':>8}{titles}{'detection':>11}{'bound px':>10}{own + ' px':>12}"
     for row in found.rows:
         reached = row[f"{own}_px"]
         yield (
-            f"{row['v_mag']:6.1f}{row['star_e']:12.4g}{row['total_e']:11.4g}{row['snr']:8.1f}{row['detection']:11.4f}"
+            f"{row['v_mag']:6.1f}{row['star_e']:12.4g}{row['total_e']:11.4g}"
+            f"{''.join(f'{row[name]:8.1f}' for name in ('snr', *snr))}{row['detection']:11.4f}"
             f"{row['bound_px']:10.4g}{'-' if math.isnan(reached) else f'{reached:.4f}':>12}"
         )

@@ -39,7 +39,7 @@ from hilstar.scene.camera import Camera, linear_shares
 from hilstar.scene.exposure_motion import MIDDLE_S, own_row_s
 from hilstar.scene.frame_motion import EVERY, Scan
 from hilstar.scene.paths import Paths
-from hilstar.scene.sprites import Sprites, by_channel, join_sprites, mean_share, without_stars
+from hilstar.scene.sprites import Sprites, by_channel, join_sprites, shares_by_bv, without_stars
 from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.sky.zodiacal import ZodiacalLight, sunward, tabled_light
@@ -201,8 +201,8 @@ class Simulator(Closing):
         dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self.glass)
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
-        mean = None if stars.colours is None else mean_share(stars.colours, stars)  # as `by_channel` has light of faults
-        added = with_channels(_exposed(faults.added_truth()), mean)
+        added, by_bv = _exposed(faults.added_truth()), stars.colours_by_bv
+        added = with_channels(added, None if by_bv is None else shares_by_bv(by_bv, added["bv"]))
         truth = np.concatenate([truth, added])
         return Exposure(view, dn, mean_e, truth, light.capped, faults.names)
 

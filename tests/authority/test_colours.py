@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from hilstar import load
+from hilstar.optics.psf_file import Stack, glass_of, write_glass
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.unit.monitor.test_primaries import NM, PANELS, bump, written
@@ -35,6 +36,7 @@ BITS = 14
 P95, MEDIAN = 0.02, 0.005  # each channel's electrons where the gamut allows: the issue's aims
 RATE = 5e-5  # the tables of rates between their knots, and codes of 14 bits
 PLACE_PX = 0.005
+LATERAL = 0.1  # of the sky's own, the issue's aim
 
 
 def saved(path, values):
@@ -153,3 +155,32 @@ def test_a_mono_tracker_has_a_stars_electrons_and_its_mean_wavelength(tmp_path, 
         np.testing.assert_allclose(drive @ white, rows["electrons_per_s"], rtol=P95)
         inside = np.abs(reach - means[1]) < 1e-6
         print(f"{panel}, {sensor}: {1 - inside.mean():.1%} of stars beyond the primaries' mean wavelengths")
+
+
+@pytest.mark.gpu
+def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_sky(tmp_path):
+    """A parabola about 560 nm, of which the mean wavelength says little: within the issue's 10 %."""
+    nm, at, side = np.linspace(420.0, 700.0, 6), np.arange(-8, 9) / 2, 1023
+    places = [(x, y, one, 0.0) for x in (0, side / 2, side) for y in (0, side / 2, side) for one in nm]
+    lateral = [(1.0, 0.0, *(0.2 * moved(one) * (2 * place / side - 1) for place in (x, y))) for x, y, one, _ in places]
+    dot = np.exp(-(at**2 + at[:, None] ** 2) / 0.5)
+    write_glass(tmp_path / "glass.fits", glass_of(Stack(np.array([dot] * len(places)), np.array(places), np.array(lateral), 2)))
+    sensor = np.where((SENSOR_NM > 420) & (SENSOR_NM < 700), MONO["visible"], 0.0)
+    without, curves = bench(tmp_path, "lcd", sensor)
+    path = tmp_path / "bench.toml"
+    path.write_text(path.read_text() + '\n[tracker.optics]\npsf = "glass.fits"\n')
+    with without, load(path) as opened:
+        stars, shares = opened.stars, opened.stars.primaries
+        assert opened.colours.in_gamut(opened.colours.off(opened.colours.wanted(stars), shares)).mean() > 0.9
+    _, of_primaries = photons_of_panel("lcd", curves)
+    _, of_stars = photons_of_stars(stars.temperature_k, curves)
+    primaries, sky = (one @ moved(GRID_NM) / one.sum(axis=1) for one in (of_primaries, of_stars))
+    spread, off, plain = (np.std(one) for one in (sky, shares @ primaries - sky, without.stars.primaries @ primaries - sky))
+    assert off < LATERAL * spread < plain
+    means = of_primaries @ GRID_NM / of_primaries.sum(axis=1), of_stars @ GRID_NM / of_stars.sum(axis=1)
+    assert np.abs(shares @ means[0] - means[1]).max() < 60  # nm: the rest of the freedom stays near the star's colour
+
+
+def moved(nm):
+    """By how much light of a wavelength is moved at the edge of the field."""
+    return ((nm - 560) / 100) ** 2 - 0.3 * (nm - 560) / 100

@@ -16,6 +16,7 @@ from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.scene.psf import Psf
+from hilstar.tracker.mosaic import software_image
 from hilstar.twin.optics import BenchGeometry
 
 MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
@@ -125,12 +126,16 @@ class StepContext:
 
     def looked(self, path: Path, dark: FloatArray) -> DarkSubtracted:
         """An image of the tracker above its dark frame. Raises InputError for one that cannot be read."""
-        raw = self.read(path)
-        cold = dark < HOT_FILL * self.full_dn
-        return DarkSubtracted(path, raw - dark, float(raw[cold].max(initial=0.0)), float(np.median(dark)))
+        pixels, cold = self.pixels(path), dark < HOT_FILL * self.full_dn
+        seen = software_image(pixels, self.file.config.tracker.detector)
+        return DarkSubtracted(path, seen - dark, float(pixels[cold].max(initial=0.0)), float(np.median(dark)))
 
     def read(self, path: Path) -> FloatArray:
-        """An image of the tracker (h, w), DN."""
+        """An image of the tracker (h, w), DN, of a mosaic its superpixels."""
+        return np.asarray(software_image(self.pixels(path), self.file.config.tracker.detector))
+
+    def pixels(self, path: Path) -> FloatArray:
+        """The pixels (h, w) of an image of the tracker, DN."""
         return read_image(path, self.file.config.tracker.resolution_px)
 
     @property

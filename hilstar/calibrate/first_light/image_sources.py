@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_optics, open_bench, orientation_of
+from hilstar.bench.build import open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.bench.measured_on import check_monitor
@@ -40,8 +40,8 @@ from hilstar.run.screen.gate import Timing, pass_gate
 from hilstar.run.screen.screen import Screen, marker_light
 from hilstar.scene.frame_motion import Orientation
 from hilstar.tracker.detector import Detector
-from hilstar.twin.optics import BenchGeometry, TwinOptics
-from hilstar.twin.simulator import background_e
+from hilstar.twin.optics import BenchGeometry, DisplayColours, TwinOptics, seen_primaries
+from hilstar.twin.simulator import TrackerBackground
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -494,12 +494,14 @@ class VirtualBench(ImageSource):
         config = truth.config
         with open_bench(truth) as real:
             self._panel, camera, psf = real.panel, real.camera, real.tracker_psf
+            self._mosaic, self._primaries_seen = DisplayColours.of(real), seen_primaries(real)
         tracker = config.tracker
         self.geometry = BenchGeometry(camera, tracker_camera(tracker, truth.folder))
         self._optics = TwinOptics(self.geometry, psf)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
-        self._glow_e_per_s: FloatArray = self._optics.glow_e_per_s(self._panel)
-        self._sky_e_per_s: FloatArray = background_e(config, bench_optics(tracker, truth.folder)) / tracker.exposure_s
+        self._glow_e_per_s: FloatArray = self._mosaic.grey(self._optics.glow_e_per_s(self._panel))
+        background = TrackerBackground(config, truth.folder, self.geometry.tracker, refuse=False)
+        self._sky_e_per_s: FloatArray = background.steady_e / tracker.exposure_s
         uniformity = 1.0 if self._panel.uniformity is None else self._panel.uniformity.astype(np.float64)
         self._white_e_per_s: FloatArray = np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
         self._units: dict[bytes, FloatArray] = {}
@@ -551,25 +553,35 @@ class VirtualBench(ImageSource):
         return path
 
     def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:
-        """Mean electrons per second (h, w) of frames. A pattern with one level is drawn once and scaled for others."""
-        light = np.mean([self._light(codes) for codes in frames], axis=0)
-        lit, brightest = light > 0, float(light.max())
+        """Mean electrons per second (h, w) of frames."""
+        lights = np.mean([self._lights(codes) for codes in frames], axis=0)
+        return self._mosaic.shown(np.array([self._primary_image(light, number) for number, light in enumerate(lights)]))
+
+    def _primary_image(self, light: FloatArray, number: int) -> FloatArray:
+        """The light of a primary on the detector. A pattern with one level is drawn once and scaled for others."""
+        lit, brightest, primary = light > 0, float(light.max()), self._primaries_seen[number]
         if not brightest:
             return np.zeros_like(self._glow_e_per_s)
         if not (light[lit] == brightest).all():
-            return self._optics.image_e_per_s(light * self._white_e_per_s)
-        key = np.packbits(lit).tobytes()
+            return self._optics.image_e_per_s(light * self._white_e_per_s, primary)
+        key = np.packbits(lit).tobytes() + bytes([number])
         if key not in self._units:
-            if len(self._units) == MASKS_KEPT:
+            if len(self._units) == MASKS_KEPT * len(self._primaries_seen):
                 del self._units[next(iter(self._units))]
-            self._units[key] = self._optics.image_e_per_s(lit * self._white_e_per_s)
+            self._units[key] = self._optics.image_e_per_s(lit * self._white_e_per_s, primary)
         return self._units[key] * brightest
 
-    def _light(self, codes: CodeImage) -> FloatArray:
-        """Light above black (h, w) of codes (h, w) or (h, w, 3), relative to white at the screen's brightest place."""
-        if codes.ndim == 2:
-            return np.asarray(self._panel.response.light[codes])
-        return np.asarray(sum(self._primaries[place][codes[..., place]] for place in range(3)))
+    def _lights(self, codes: CodeImage) -> FloatArray:
+        """Light above black of codes (h, w) or (h, w, 3), relative to white at the screen's brightest place.
+
+        Shape (1, h, w), or (3, h, w) where the truth drives its primaries apart.
+        """
+        apart = len(self._primaries_seen) > 1
+        if codes.ndim == 2 and not apart:
+            return np.asarray(self._panel.response.light[codes])[None]
+        each = np.broadcast_to(codes[..., None], (*codes.shape, 3)) if codes.ndim == 2 else codes
+        lights = np.array([self._primaries[place][each[..., place]] for place in range(3)])
+        return lights if apart else lights.sum(axis=0, keepdims=True)
 
     @cached_property
     def _primaries(self) -> FloatArray:

@@ -12,6 +12,8 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_primaries, named_channels
+from hilstar.bench.config.bench_config import drives_apart
 from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.calibrate.first_light.records import Figure, StepNumber, StepOutcome
@@ -21,7 +23,15 @@ from hilstar.calibrate.plan import Patch, PlanSettings, in_channel, plan_patches
 from hilstar.charts import INK, MUTED, chart
 from hilstar.errors import InputError
 from hilstar.files import write_whole
-from hilstar.monitor.calibration import BUILT_IN, Calibration, add_uniformity, load_calibration, primary_lights
+from hilstar.monitor.calibration import (
+    BUILT_IN,
+    Calibration,
+    add_uniformity,
+    load_calibration,
+    primary_lights,
+    primary_responses,
+)
+from hilstar.monitor.primaries import channel_matrix
 from hilstar.monitor.response import Response
 from hilstar.twin.optics import BenchGeometry
 from hilstar.units import MAG_PER_RELATIVE, magnitude
@@ -285,7 +295,7 @@ class Photometer:
         return self.images[-1]
 
     def _part(self, path: Path) -> FloatArray:
-        return self.context.read(path)[self.field.rows, self.field.columns]
+        return self.context.pixels(path)[self.field.rows, self.field.columns]
 
 
 SEED = 0
@@ -302,10 +312,15 @@ def photometry(context: StepContext) -> StepOutcome:
         return StepOutcome("skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}")
     assumed = calibration_of(context)
     sigma_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.tracker_psf.width_px)))
-    channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing else "w"
+    apart = drives_apart(context.file.config)
+    channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing or apart else "w"
     planned = plan_for(monitor.bits, context.patches, channels)
     by_channel = {"w": assumed.response.light}
-    if channels != "w":
+    if apart:
+        responses = primary_responses(calibration_source(context.file), monitor.bits)
+        shares = shares_of_white(context.file)
+        by_channel = {name: share * one.light for name, share, one in zip(channels, shares, responses, strict=True)}
+    elif channels != "w":
         by_channel = dict(zip(channels, primary_lights(calibration_source(context.file), monitor.bits), strict=True))
     readings = Photometer(context, sigma_px, Assumed(by_channel, assumed.response.black)).read(planned)
     measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
@@ -343,6 +358,15 @@ def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
     if len(plans[0]) > patches:
         raise InputError(f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for none")
     return [planned for planned in plans if len(planned) <= patches][-1]
+
+
+def shares_of_white(file: BenchFile) -> FloatArray:
+    """Each primary's share (3,) of the electrons of white, by the spectra of a bench file. Raises InputError."""
+    primaries = bench_primaries(file.config.monitor, file.folder)
+    if primaries is None:
+        raise InputError("[monitor.primaries] file: first-light measures each primary's light; write it, or xy_r to xy_b")
+    matrix = channel_matrix(primaries, named_channels(file.config.tracker, file.folder), 1.0)
+    return np.asarray(matrix.e_per_s.sum(axis=0))
 
 
 def calibration_of(context: StepContext) -> Calibration:

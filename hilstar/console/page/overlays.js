@@ -259,7 +259,7 @@ export class Overlays {
     }
   }
 
-  // The star under the pointer, whatever else is written: its name, V, and whether it clips.
+  // The star under the pointer, whatever else is written: its name, V, colour, and whether it clips.
   drawPointed(stars, pointer) {
     if (!pointer) return;
     const { unit, view, context } = this;
@@ -289,7 +289,7 @@ function nameOf([, , , hip, label]) {
 
 function labelAll(star) {
   const magnitude = star[STAR.v_mag] === null ? "" : `V ${star[STAR.v_mag].toFixed(2).replace("-", "\u2212")}`;
-  return [nameOf(star), magnitude, star[STAR.clipped] ? "clipped" : ""].filter(Boolean).join("  ");
+  return [nameOf(star), magnitude, star[STAR.colour], star[STAR.clipped] ? "clipped" : ""].filter(Boolean).join("  ");
 }
 
 // The names of the stars in the part of the picture that is seen, the brightest first.
@@ -302,7 +302,8 @@ export function seenStars(truth, picture) {
 // Where every pixel has its code in it, names stand below the picture.
 export function pictureText(truth, picture, zoom) {
   const named = picture.hasValues ? seenStars(truth, picture).slice(0, 3).join(", ") : "";
-  return `frame ${picture.frame}  ${zoom}\u00a0%${named ? `  ${named}` : ""}`;
+  const out = (truth?.stars || []).filter((star) => star[STAR.colour]?.includes("out of gamut")).length;
+  return `frame ${picture.frame}  ${zoom}\u00a0%${named ? `  ${named}` : ""}${out ? `  ${out} out of gamut` : ""}`;
 }
 
 // Whether a line from a to b goes through a box (Liang and Barsky 1984).

@@ -333,7 +333,6 @@ def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) ->
         star, v_mag = int(stars[k]), float(scene.v_mag[stars[k]])
         hip, label = int(scene.hip[star]), scene.label(star)
         known_mag = round(v_mag, 2) if math.isfinite(v_mag) else None
-        marks.append(
-            StarMark(round(float(x_px[k]), 2), round(float(y_px[k]), 2), known_mag, hip, label, int((hip or label) in clipped))
-        )
+        place, over = (round(float(x_px[k]), 2), round(float(y_px[k]), 2)), int((hip or label) in clipped)
+        marks.append(StarMark(*place, known_mag, hip, label, over, scene.colours.get(star, "")))
     return marks

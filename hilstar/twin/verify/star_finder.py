@@ -12,6 +12,7 @@ from hilstar.bench.frame import Bench
 from hilstar.scene.psf import GaussianPsf, Psf
 from hilstar.tracker.centroiders import Centroider, psf_places, star_places
 from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground, find_stars
+from hilstar.tracker.mosaic import software_psf_px
 from hilstar.twin.glass import told_psf
 from hilstar.units import magnitude
 
@@ -21,6 +22,7 @@ MATCH_PX = 3.0
 # 0.02, a neighbour 0.1 mag off adds 0.002 mag.
 CROWDED_SHARE = 0.02
 WING_SIGMAS = 6.0  # how far a neighbour's light reaches: 1e-9 of it, and Sirius is 4e3 times a star of the seventh magnitude
+MOSAIC_SHARE = 0.25  # of a star's light that a mosaic has: at least that of red alone
 MIN_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
 
 
@@ -102,6 +104,7 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     psf = seen_psf(bench, monitor_px_per_px)
     settings = CentroidSettings(window_sigma_px=max(1.0, *psf.width_px))
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * psf.peak_share
+    peak_e *= 1.0 if bench.config.tracker.detector.bayer is None else MOSAIC_SHARE
     under = LocalBackground(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
     told = None
     if bench.config.verify.centroider == "psf" and not isinstance(bench.tracker_psf, GaussianPsf):
@@ -113,7 +116,7 @@ def seen_psf(bench: Bench, monitor_px_per_px: float) -> Psf:
     """The Gaussian nearest to a star on the tracker, in its pixels: sprite, monitor pixel and the tracker's own PSF."""
     spread = _shown_px2(bench, monitor_px_per_px)
     x, y = (math.sqrt(a + own**2) for a, own in zip(spread, bench.tracker_psf.width_px, strict=True))
-    return GaussianPsf((x, y))
+    return GaussianPsf(software_psf_px((x, y), bench.config.tracker.detector))
 
 
 def _shown_px2(bench: Bench, monitor_px_per_px: float) -> list[float]:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +29,10 @@ from hilstar.monitor.response import Response, table_response
 from hilstar.process.closing import Closing
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
+from hilstar.scene.sprites import shares_at
 from hilstar.tracker.detector import Detector
-from hilstar.twin.optics import BenchGeometry, TwinOptics, seen_primaries
+from hilstar.tracker.mosaic import CHANNELS, in_pixels, software_image
+from hilstar.twin.optics import BenchGeometry, DisplayColours, TwinOptics, seen_primaries
 from hilstar.twin.simulator import TrackerBackground
 
 PHASES = 4  # frames of a sequence with which an exposure may begin
@@ -101,8 +104,10 @@ def levels_of(assumed: Response, true: Response) -> Response:
 class TwinField:
     """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
 
-    `shown_e` is what the monitor as it is makes, `assumed_e` what it would make if everything were as assumed (the same
-    array where nothing differs), and `sky_e` what the stars themselves make. `by_channel` has shown and sky of each channel,
+    Images are those in which the tracker's software finds stars: of a mosaic its superpixels, or itself, and stars have the
+    electrons of an average pixel of it. `pixels_e` are the detector's own of what is shown. `shown_e` is what the monitor as
+    it is makes, `assumed_e` what it would make if everything were as assumed (the same array where nothing differs), and
+    `sky_e` what the stars themselves make. `by_channel` has shown and sky of each channel,
     where primaries are driven apart for several. `under_e` lies under them all. `truth` has the rows of TRUTH_DTYPE of stars
     and points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more
     than points.
@@ -114,6 +119,7 @@ class TwinField:
     truth: npt.NDArray[np.void]
     x_px: FloatArray
     y_px: FloatArray
+    pixels_e: FloatArray
     discs: tuple[tuple[FloatArray, float], ...] = ()
     under_e: FloatArray | float = 0.0
     by_channel: tuple[tuple[FloatArray, FloatArray], ...] = ()
@@ -152,38 +158,46 @@ class Twin(Closing):
         self.true_optics = TwinOptics(true, self.bench.tracker_psf)
         self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
         self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
-        self.primaries = seen_primaries(self.bench)
-        self._background = TrackerBackground(
-            self.config, file.folder, self.camera, refuse=False, mosaic=False, moving=self.bench.moving
-        )
+        self.primaries, self._mosaic = seen_primaries(self.bench), DisplayColours.of(self.bench)
+        self._background = TrackerBackground(self.config, file.folder, self.camera, refuse=False, moving=self.bench.moving)
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
         """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""
         frame = self.bench.frame(q_icrs_to_cam, first_frame)
         exposure_s = self.config.tracker.exposure_s
-        sky = self.sky_optics.image_e_per_s(frame.linear.astype(np.float64)) * exposure_s
+        skies = [self.sky_optics.image_e_per_s(light.astype(np.float64)) * exposure_s for light in frame.light]
         panels = [self.true_panel, self.bench.panel] if self.differs else [self.true_panel]
         lights = exposure_lights(self.bench, frame, first_frame, panels)
         by_primary = self.true_optics.images_e_per_s(lights[0], self.primaries) * exposure_s
-        shown = assumed = by_primary.sum(axis=0)
+        pixels_e, bayer = self._mosaic.shown(by_primary), self._mosaic.bayer
+        sky = self._found_in(np.array(skies).sum(axis=0) if bayer is None else in_pixels(skies, bayer))
+        shown = assumed = self._found_in(pixels_e)
         if self.differs:
-            assumed = self.sky_optics.images_e_per_s(lights[1], self.primaries).sum(axis=0) * exposure_s
+            as_assumed = self.sky_optics.images_e_per_s(lights[1], self.primaries) * exposure_s
+            assumed = self._found_in(self._mosaic.shown(as_assumed))
         by_channel: tuple[tuple[FloatArray, FloatArray], ...] = ()
         if (colours := self.bench.colours) is not None and not colours.mono:
-            skies = (self.sky_optics.image_e_per_s(light.astype(np.float64)) * exposure_s for light in frame.light)
             by_channel = tuple(zip(np.tensordot(colours.by_primary, by_primary, 1), skies, strict=True))
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
-        discs, under_e = self.bench.discs(view), self.glow_e_per_s * exposure_s + self._background.of_view_e(view)
+        glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s
+        discs, under_e = self.bench.discs(view), glow_e + self._background.of_view_e(view)
         points = ~np.isin(frame.truth["name"], [disc.name for disc in discs])
         x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
         found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
-        return TwinField(shown, assumed, sky, frame.truth[points], x_px, y_px, found, under_e, by_channel)
+        truth = frame.truth[points]
+        if bayer is not None and self.bench.stars.colours is not None:
+            of_channels = shares_at(self.bench.stars.colours, self.bench.stars, frame.star[points])
+            truth["electrons_per_s"] *= of_channels @ [bayer.count(channel) / len(bayer) for channel in CHANNELS]
+        return TwinField(shown, assumed, sky, truth, x_px, y_px, pixels_e, found, under_e, by_channel)
+
+    def _found_in(self, pixels_e: npt.NDArray[np.floating[Any]]) -> FloatArray:
+        return np.asarray(software_image(pixels_e, self.config.tracker.detector))
 
     def detected_e(self, seen: TwinField, rng: np.random.Generator) -> FloatArray:
         """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted."""
-        dn = self.detector.expose(seen.shown_e + seen.under_e, self.config.tracker.exposure_s, rng)
-        return np.asarray(dn * self.config.tracker.detector.gain_e_per_dn - seen.under_e)
+        dn = self.detector.expose(seen.pixels_e + seen.under_e, self.config.tracker.exposure_s, rng)
+        return self._found_in(dn * self.config.tracker.detector.gain_e_per_dn - seen.under_e)
 
     @property
     def monitor_px_per_px(self) -> float:

@@ -1,5 +1,6 @@
 """A tracker of three channels against three trackers of one, and against quadrature that is not the package's."""
 
+import json
 from contextlib import ExitStack
 from dataclasses import replace
 
@@ -12,13 +13,17 @@ from scipy.integrate import trapezoid
 
 from hilstar import load
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import bench_channels, bench_optics, bench_stars
+from hilstar.bench.build import bench_channels, bench_optics, bench_stars, star_flux
 from hilstar.bench.frame_files import write_frame_fits
 from hilstar.errors import InputError
 from hilstar.render.backend import linear_light
 from hilstar.rotation import direction_of, from_radec_roll_deg
+from hilstar.scene.extended import GlowLight, LightMap
+from hilstar.scene.sprites import AddedLight
 from hilstar.sky.spectrum import load_curve
+from hilstar.testing import compare
 from tests.support.benches import ORION_Q, bench_text
+from tests.support.commands import run_hilstar_here
 
 # A Gaussian passband each, in percent at 25 nm from 350 to 1000 nm; the red one sees the near infrared, as silicon does.
 NM = np.arange(350.0, 1001.0, 25.0)
@@ -91,14 +96,23 @@ def test_bodies_have_colours_of_their_own_as_points_and_as_discs(curves):
 
 
 @pytest.mark.gpu
-def test_light_that_a_fault_adds_has_the_mean_colour_of_the_stars(curves):
-    """Where it fails: a fault of its own B-V keeps its electrons of all channels together, and no colour."""
+def test_light_that_is_no_stars_has_the_colour_of_its_own_bv(curves):
+    """False stars, stray and diffuse light; without a B-V the mean colour of the stars."""
     with bench_with(curves, "rgb", {"sky": {"faintest_v_mag": 5.0}}) as bench:
-        sprites = bench.sprites(np.array(ORION_Q))
-        added = replace(sprites, star=np.full(len(sprites), -1))
-        light = linear_light(bench.renderer, added, bench.stars).sum(axis=(1, 2))
-        of_all = bench.stars.electrons_per_s @ bench.stars.colours
-    np.testing.assert_allclose(light / light.sum(), of_all / of_all.sum(), rtol=1e-5)
+        sprites, file = bench.sprites(np.array(ORION_Q)), bench.file
+        one = np.ones(1)
+        red, sun = (star_flux(file.config, file.folder)(0 * one, bv * one, np.nan * one)[0] for bv in (1.5, 0.65))
+        glow = GlowLight(np.array([0.0, 0, 1]), 10.0, 0.1, 2.0, bench.camera, 0.65)
+        spread = LightMap(np.ones((9, 9), np.float32), (20, 20), bv_mag=1.5)
+        none, of_all = sprites.data[:0], bench.stars.electrons_per_s @ bench.stars.colours
+        for lights, wanted in (
+            ({"star": np.full(len(sprites), -1), "added": (AddedLight("", 2.0, 1.5, 1e4),)}, red),
+            ({"data": none, "star": sprites.star[:0], "extended": (glow,)}, sun),
+            ({"data": none, "star": sprites.star[:0], "extended": (spread,)}, red),
+            ({"data": none, "star": sprites.star[:0], "extended": (replace(spread, bv_mag=None),)}, of_all),
+        ):
+            light = linear_light(bench.renderer, replace(sprites, **lights), bench.stars).sum(axis=(1, 2), dtype=np.float64)
+            np.testing.assert_allclose(light / light.sum(), wanted / wanted.sum(), rtol=2e-4)
 
 
 def test_a_stars_electrons_by_channel_are_those_of_a_quadrature(curves):
@@ -145,6 +159,19 @@ def test_the_fits_of_three_channels_is_a_cube_with_the_skys_own_axes(curves, tmp
     ra_deg, dec_deg, channel = cube.all_pix2world(first["x_px"], first["y_px"], 1, 0)
     np.testing.assert_allclose(direction_of(ra_deg, dec_deg), bench.stars.vectors[frame.star[0]], atol=1e-7)
     assert channel == 2
+    # `compare` sees what the sum of the channels does not have: red light that has become blue.
+    both = [tmp_path / "cube.fits", tmp_path / "bluer.fits"]
+    bluer = frame.light * np.array([0.9, 1.0, 1.0], np.float32)[:, None, None]
+    bluer[2] += 0.1 * frame.light[0]
+    with fits.open(both[0]) as (hdu,):
+        fits.PrimaryHDU(bluer, hdu.header).writeto(both[1])
+    found = [json.loads(run_hilstar_here("compare", one, both[0], "--json").stdout) for one in both]
+    assert [one["same"] for one in found] == [True, False] and found[1]["flux_error_mag"]["max"] < 1e-3
+    off = {name: (one["flux_error_mag"]["rms"], one["same"]) for name, one in found[1]["channels"].items()}
+    assert off["g"] == (pytest.approx(0, abs=1e-6), True) and off["r"] == (pytest.approx(0.1144, abs=1e-3), False)
+    said = run_hilstar_here("compare", both[1], both[0])
+    assert said.returncode == 1 and "flux error, r       0.11" in said.stdout and "star at" in said.stdout
+    assert compare(frame, frame.linear).same and compare(frame, both[0]).channels["b"].star_count > 10
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Primaries that are driven apart: a stripe panel by a twin of sub-pixels, files of primaries, and what is refused."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,12 +9,14 @@ import pytest
 from hilstar import load
 from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.console.overlay import colour_notes
 from hilstar.errors import InputError
 from hilstar.monitor.primaries import chromatic_primaries, nearest_mixtures, read_primaries
 from hilstar.monitor.quantise import primary_lights
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.extended import LightMap, shifted
 from hilstar.scene.frame_motion import Orientation
+from hilstar.tracker.mosaic import luminance
 from hilstar.twin.live_exposure import LiveTracker
 from hilstar.twin.verify.twin import Twin
 from tests.support.benches import ORION_Q, TWIN, bench_text
@@ -109,14 +112,20 @@ def test_the_twin_sees_the_stars_electrons_at_their_places(tmp_path):
     path = bench_path(tmp_path, TWIN, change, mosaic)
     with Twin(read_bench_file(path)) as twin:
         seen = twin.field(np.array(ORION_Q), 0)
-        y, x = np.indices(seen.sky_e.shape)
-        for image in (seen.shown_e, seen.sky_e):
-            assert image.sum() == pytest.approx(seen.sky_e.sum(), rel=0.005)
-            middle = [(image * at).sum() / image.sum() for at in (x, y)]
-            np.testing.assert_allclose(middle, [(seen.sky_e * at).sum() / seen.sky_e.sum() for at in (x, y)], atol=CENTROID_PX)
+        shown, sky = np.sum(seen.by_channel, axis=0)
+        y, x = np.indices(sky.shape)
+        assert shown.sum() == pytest.approx(sky.sum(), rel=0.005)
+        middles = [[(image * at).sum() / image.sum() for at in (x, y)] for image in (shown, sky)]
+        np.testing.assert_allclose(*middles, atol=CENTROID_PX)
+        # The tracker's software sees superpixels of the mosaic: a quarter of red, half of green and a quarter of blue.
+        by_channel = np.array([one[0] for one in seen.by_channel])
+        assert seen.shown_e.sum() == pytest.approx(by_channel.sum(axis=(1, 2)) @ [0.25, 0.5, 0.25], rel=0.01)
+        np.testing.assert_array_equal(seen.pixels_e[1::2, 1::2], by_channel[2, 1::2, 1::2])
+        np.testing.assert_allclose(seen.shown_e, luminance(seen.pixels_e))
     found = json.loads(run_hilstar_here("verify", path, "--fields", "2", "--json").stdout)
     assert list(found["channels_mag"]) == [f"quantum_efficiency_{name}" for name in "rgb"]
     assert all(0 < errors["p95"] < CHANNEL_MAG for errors in found["channels_mag"].values()) and found["stars"] > 5
+    assert found["estimator_floor"]["centroid_px"]["rms"] > 2 * found["centroid_error_px"]["rms"]  # the mosaic's own
     with load(path) as bench:
         frame = bench.frame(ORION_Q)
         lights = np.array(primary_lights(frame.levels, bench.panel))
@@ -246,10 +255,16 @@ def test_a_star_redder_than_the_red_primary_is_named(tmp_path):
     with load(bench_path(tmp_path, channels="v")) as bench:
         rows = bench.frame(from_radec_roll_deg(86.5, 3.0, 0.0)).truth
         alnilam, betelgeuse = (rows[rows["hip"] == hip][0] for hip in (26311, 27989))
+        notes = {bench.shown_stars.hip[star]: note for star, note in colour_notes(bench).items()}
     assert alnilam["in_gamut"] and alnilam["wavelength_nm"] == pytest.approx(alnilam["wavelength_shown_nm"], abs=0.01)
     assert not betelgeuse["in_gamut"] and betelgeuse["wavelength_nm"] > betelgeuse["wavelength_shown_nm"] + 50
     assert betelgeuse["temperature_shown_k"] > 1.2 * betelgeuse["temperature_k"]
     assert betelgeuse["electrons_shown_per_s"] == pytest.approx(betelgeuse["electrons_per_s"], rel=1e-12)
+    assert notes[26311] == f"{alnilam['wavelength_nm']:.0f} nm"  # on the operator's page
+    wanted, shown = betelgeuse["wavelength_nm"], betelgeuse["wavelength_shown_nm"]
+    assert notes[27989] == f"{wanted:.0f} nm, shown {shown:.0f} nm, out of gamut"
+    with load(bench_path(tmp_path)) as bench:
+        assert re.fullmatch(r"r \d+% g \d+% b \d+%(, out of gamut)?", next(iter(colour_notes(bench).values())))
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,14 @@ from hilstar.calibrate.first_light.photometry import (
 from hilstar.calibrate.first_light.stars import scale, trend
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, primary_lights, write_calibration
+from hilstar.monitor.calibration import (
+    CalibrationHead,
+    NotesTable,
+    load_calibration,
+    primary_lights,
+    primary_responses,
+    write_calibration,
+)
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.twin.optics import BenchGeometry
@@ -204,6 +211,32 @@ def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):
     shown = wanted >= 1e-3 * wanted[:, -1:]
     assert found[shown] / wanted[shown] == pytest.approx(np.ones(shown.sum()), abs=0.01)
     assert load_calibration(tmp_path / "response.toml", 8, bit_stealing=True).response.rgb is not None
+
+
+def test_a_mosaic_before_a_coloured_panel_finds_the_response_of_each_primary(tmp_path):
+    """Three powers, of a panel whose primaries the channels see as they do here: a channel's light is of one of them."""
+    nm, powers = np.arange(400.0, 701.0, 10.0), {"r": 2.1, "g": 2.35, "b": 2.5}
+    peaks = {"r": 620, "g": 540, "b": 460}
+    bumps = np.array([np.exp(-(((nm - peak) / 30) ** 2)) for peak in peaks.values()])
+    rows = "".join(f"{at:g},{','.join(f'{x:.6f}' for x in three)}\n" for at, three in zip(nm, bumps.T, strict=True))
+    (tmp_path / "panel.csv").write_text(f"wavelength_nm,r,g,b\n{rows}")
+    for name, one in zip(peaks, bumps, strict=True):
+        (tmp_path / f"{name}.csv").write_text(
+            "wavelength_nm,value\n" + "".join(f"{a:g},{b:.6f}\n" for a, b in zip(nm, one, strict=True))
+        )
+    head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
+    light = {name: gamma_response(8, power).light for name, power in powers.items()}
+    columns = {name: 0.001 + share * light[name] for name, share in zip(powers, (0.3, 0.5, 0.2), strict=True)}
+    write_calibration(tmp_path / "true-response.toml", head, columns, 0.0, NotesTable())
+    keys = {"quantum_efficiency": None} | {f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks}
+    bench = {"tracker": keys, "tracker.detector": {"bayer": "rggb", "gain_e_per_dn": 2.0, "bits": 16}, "monitor": {"bits": 8}}
+    bench |= {"monitor.primaries": {"file": "panel.csv", "layout": "rgb-stripe"}}
+    truth = bench | {"monitor": {"bits": 8, "calibration": "true-response.toml"}}
+    outcome = on_the_twin(tmp_path, photometry, bench, truth)
+    assert outcome.verdict == "done", outcome.line
+    for found, wanted in zip(primary_responses(tmp_path / "response.toml", 8), light.values(), strict=True):
+        shown = wanted >= 1e-3
+        assert found.light[shown] / wanted[shown] == pytest.approx(np.ones(shown.sum()), abs=0.01)
 
 
 def test_stars_of_temporal_frames_are_seen_over_their_whole_turn(tmp_path):

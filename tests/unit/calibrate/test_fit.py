@@ -10,8 +10,9 @@ from hilstar.calibrate.measurements import drift_over_run, read_measurements
 from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration, fit_channel, strictly_rising
 from hilstar.calibrate.plan import PlanSettings, plan_patches, planned_codes
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import load_calibration
+from hilstar.monitor.calibration import load_calibration, primary_responses
 from hilstar.monitor.response import srgb_light
+from tests.support.commands import run_hilstar_here
 
 NOISE = 0.01
 # The aim, over three decades below white.
@@ -180,10 +181,13 @@ def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rn
 
 
 def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
-    shares = {"w": 1.02, "r": 0.2, "g": 0.7, "b": 0.1}
+    shares, powers = {"r": 0.2, "g": 0.7, "b": 0.1}, {"r": 2.1, "g": 2.2, "b": 2.4}
 
     def light(code, channel):  # primaries add to each other's light, more at dark codes
-        return shares[channel] * (code / 255) ** 2.2 * (1 + 0.1 * (channel == "w") * (1 - code / 255)) + 1e-3
+        if channel != "w":
+            return shares[channel] * (code / 255) ** powers[channel] + 1e-3
+        together = sum(light(code, name) - 1e-3 for name in shares)
+        return 1.02 * together * (1 + 0.1 * (1 - code / 255)) + 1e-3
 
     rows = [
         (p.code, p.channel, light(p.code, p.channel) * (1 + 0.005 * rng.standard_normal()))
@@ -192,7 +196,19 @@ def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
     summary = calibrate_photometric(write(tmp_path / "m.csv", rows), tmp_path / "monitor.toml")
     assert summary["additivity_percent"] == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)  # four whites to 0.2 % each
     assert summary["crosstalk_percent"]["1e-0"] == summary["additivity_percent"]
-    assert summary["crosstalk_percent"]["1e-1"] == pytest.approx(100 * (1 / (1.02 * 1.065) - 1), abs=1.2)  # at code 90 of 255
+    assert list(summary["crosstalk_percent"]) == [f"1e-{decade}" for decade in range(4)]
+    for code, decade in ((255, "1e-0"), (90, "1e-1"), (31, "1e-2")):
+        planted = 100 * (1 / (1.02 * (1 + 0.1 * (1 - code / 255))) - 1)
+        assert summary["crosstalk_percent"][decade] == pytest.approx(
+            planted, abs=3 * summary["crosstalk_error_percent"][decade]
+        )
+        assert summary["crosstalk_error_percent"][decade] < 2
+    for found, (name, power) in zip(primary_responses(tmp_path / "monitor.toml", 8), powers.items(), strict=True):
+        for code, decade in ((90, "1e-1"), (31, "1e-2")):
+            error = summary["channels"][name]["error_percent"][decade]
+            assert found.light[code] == pytest.approx((code / 255) ** power, rel=3 * error / 100)
+    said = run_hilstar_here("calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "again.toml").stdout
+    assert "channel b" in said and "crosstalk at 1e-1" in said
     calibration = load_calibration(tmp_path / "monitor.toml", 8, bit_stealing=True)
     assert calibration.weights == pytest.approx((0.2, 0.7, 0.1), rel=0.01)
     assert len(calibration.response.light) == 1786

@@ -29,7 +29,7 @@ def test_truth_has_the_stars_of_the_frame_at_their_places(bench):
     places = {int(row["hip"]): (row["x_px"], row["y_px"]) for row in drawn}
     inside = {hip for hip, (x, y) in places.items() if abs(x - 159.5) < 159 and abs(y - 119.5) < 119}
     assert inside <= {star[3] for star in told} <= set(places)
-    for x, y, v_mag, hip, label, clipped in told:
+    for x, y, v_mag, hip, label, clipped, _ in told:
         assert places[hip] == pytest.approx((x, y), abs=ROUNDED_PX)
         assert label == {26311: "ε Ori", 25930: "δ Ori", 26727: "ζ Ori"}.get(hip, label)
         assert clipped == (hip == 26311)

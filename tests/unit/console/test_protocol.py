@@ -79,4 +79,4 @@ def test_a_message_has_only_what_it_says_and_no_number_that_json_lacks():
         "point": dict.fromkeys(names_of(ChartPoint)) | {"t_s": 1.5, "missed": 0, "refused": 0, "wrong": 0},
     }
     truth = PageText(truth=Truth(frame=3, stars=[StarMark(1.0, 2.0, None, 26311, "\u03b5 Ori", 1)]))
-    assert json.loads(truth.json()) == {"truth": {"frame": 3, "stars": [[1.0, 2.0, None, 26311, "\u03b5 Ori", 1]]}}
+    assert json.loads(truth.json()) == {"truth": {"frame": 3, "stars": [[1.0, 2.0, None, 26311, "\u03b5 Ori", 1, ""]]}}

@@ -7,6 +7,7 @@ import pytest
 
 from hilstar.errors import InputError
 from hilstar.monitor.primaries import channel_matrix, read_primaries
+from hilstar.resources import resource_path
 from hilstar.sky.electrons import Optics
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 from tests.support.benches import bench_text
@@ -60,6 +61,12 @@ def test_the_matrix_is_that_of_a_sum_over_a_fine_grid(tmp_path, panel, passbands
     singular = np.sqrt(np.linalg.eigvalsh(wanted @ wanted.T))
     assert found.condition == pytest.approx(singular[-1] / singular[0], rel=1e-3)
     assert found.channels == tuple(passbands)
+
+
+@pytest.mark.parametrize("name", ["lcd", "crt", "oled", "laser"])
+def test_the_shipped_primaries_are_red_green_and_blue_to_a_mosaic(name):
+    found = channel_matrix(read_primaries(resource_path("configs", f"primaries-{name}.csv")), optics_of(PASSBANDS), 1.0)
+    assert (found.e_per_s.argmax(axis=0) == [0, 1, 2]).all() and found.condition < 10
 
 
 def test_a_primary_beyond_a_channels_passband_gives_it_nothing(tmp_path):

@@ -84,7 +84,7 @@ def test_a_chain_of_stars_is_not_one_blend(twin):
     x_px, y_px = 100 + 0.9 * BLEND_SIGMAS * psf.width_px[0] * np.arange(n), np.full(n, 100.0)
     y_px[-1] = np.nan
     seen.truth["electrons_per_s"] = np.arange(n, 0, -1)
-    chain = TwinField(seen.shown_e, seen.assumed_e, seen.sky_e, seen.truth, x_px, y_px)
+    chain = TwinField(seen.shown_e, seen.assumed_e, seen.sky_e, seen.truth, x_px, y_px, seen.pixels_e)
     summed = with_blends_as_one(chain, psf)
     assert len(summed.truth) == n // 2 + 1
     assert np.isnan(summed.y_px).sum() == 1

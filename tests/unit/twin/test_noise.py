@@ -12,12 +12,24 @@ from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import GaussianPsf, SampledPsf
 from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
+from hilstar.tracker.mosaic import in_pixels, luminance
 from hilstar.tracker.settings import DetectorSettings
-from hilstar.twin.noise import NoisyStar, Table, between, measured_px, nea_arcsec, turns_of
+from hilstar.twin.noise import (
+    NoiseBudget,
+    NoisyStar,
+    Table,
+    between,
+    measured_px,
+    nea_arcsec,
+    noise_lines,
+    noisy_star,
+    turns_of,
+)
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
@@ -278,6 +290,37 @@ def test_budget_noise_without_a_field_has_the_median_of_fields_all_over_the_sky(
     spoken = run_hilstar_here("budget", bench_file, "--noise")
     assert spoken.returncode == 0 and "NEA, limit" in spoken.stdout and "1 px above 5 sigma" in spoken.stdout
     assert spoken.stdout == run_hilstar_here("budget", bench_file, "--noise").stdout
+
+
+def test_a_mosaics_channels_have_their_own_noise_and_its_superpixels_find_what_they_do(tmp_path):
+    """Information adds up: the squares of the channels' SNR are that of all. Shares are Gaussians' of width 0.55 px."""
+    nm, peaks = np.arange(400.0, 721.0, 20.0), {"r": 620.0, "g": 540.0, "b": 460.0}
+    for name, peak in peaks.items():
+        rows = "".join(f"{at:g},{math.exp(-(((at - peak) / 60) ** 2)):.6f}\n" for at in nm)
+        (tmp_path / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
+    keys = {"quantum_efficiency": None} | {f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks}
+    detector = {"bayer": "rggb", "read_noise_e": 9, "dark_e_per_s": 50, "offset_dn": 20, "gain_e_per_dn": 1.0}
+    changes = {
+        "tracker": keys | {"psf_sigma_px": [1.0, 1.0]},
+        "tracker.detector": detector,
+        "background": {"electrons_per_px": 30},
+    }
+    (tmp_path / "bench.toml").write_text(bench_text(changes, {"sky": {"faintest_v_mag": 5.0}}))
+    found = json.loads(run_hilstar_here("budget", tmp_path / "bench.toml", "--noise", "--radec", "84,-1,0", "--json").stdout)
+    assert any("SNR r   SNR g   SNR b" in line for line in noise_lines(NoiseBudget(**found)))
+    assert sum(one["star_share"] for one in found["channels"].values()) == pytest.approx(1)
+    assert {one["background_e_per_px"] for one in found["channels"].values()} == {30.0}
+    for row in found["rows"][4:]:
+        assert sum(row[f"snr_{name}"] ** 2 for name in peaks) == pytest.approx(row["snr"] ** 2, rel=0.02)
+    row = next(one for one in found["rows"] if one["detection"] < 0.97)
+    star = noisy_star(read_bench_file(tmp_path / "bench.toml"), np.full((4, 4), 30.0))
+    place, side = np.random.default_rng(1).uniform(-0.5, 0.5, (2, TILES**2)), star.side_px
+    image = np.zeros((TILES, TILE_PX + 1, TILES, TILE_PX + 1))
+    image[:, :side, :, :side] = (row["star_e"] * star.stamps(*place)).reshape(TILES, TILES, side, side).swapaxes(1, 2)
+    image = image.reshape(TILES * (TILE_PX + 1), -1)
+    light = 30.0 + in_pixels([image * one["star_share"] for one in found["channels"].values()], "rggb")
+    dn = Detector(star.detector, image.shape).expose(light, star.exposure_s, np.random.default_rng(2))
+    assert len(find_stars(luminance(dn), CentroidSettings())) / TILES**2 == pytest.approx(row["detection"], abs=0.1)
 
 
 def test_a_field_without_stars_says_so(bench_file, tmp_path):

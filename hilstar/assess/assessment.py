@@ -1,6 +1,6 @@
 """A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and the bench's own errors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +10,8 @@ import numpy as np
 from hilstar.answers.judge import TO_MIDDLE, AnswerRules, Stamp
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.assess.bench_effects import (
+    FILE,
+    Centroids,
     DisplayCost,
     GlassCost,
     Slice,
@@ -18,6 +20,7 @@ from hilstar.assess.bench_effects import (
     field_magnitudes,
     glass_cost,
     noise_limit,
+    seen_cost,
     slices_of,
 )
 from hilstar.assess.budget import Axes, Decomposed, DecomposedRun, assess_run, axes_of_variance
@@ -31,7 +34,7 @@ from hilstar.bench.certificate import Certificate, bench_certificate
 from hilstar.bench.config import BenchConfig
 from hilstar.calibrate.attitude_pairs import COMMANDED, Pairs, refuse_conventions
 from hilstar.errors import HilstarError, InputError
-from hilstar.rotation import to_matrix, to_rotation_vector
+from hilstar.rotation import from_rotation_vector, multiply, to_matrix, to_rotation_vector
 from hilstar.run.record.commanded import NOT_SHOWN, Commanded, CommandedRun, read_commanded
 from hilstar.run.record.ledger_records import answer_records, config_of, read_head
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
@@ -135,11 +138,15 @@ class Assessment:
 
 
 class LedgerAnswers(NamedTuple):
-    """A ledger's own answers: where in an exposure their times are, and how far these are ahead of the run's, as known live."""
+    """A ledger's own answers: where in an exposure their times are, and how far these are ahead of the run's, as known live.
+
+    `centroids` are the stars that each of them holds.
+    """
 
     telemetry: Telemetry
     stamp: Stamp
     ahead_ns: int
+    centroids: Sequence[Centroids]
 
 
 def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
@@ -160,8 +167,8 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
     valid = np.array([record.valid and record.q is not None for record in kept], dtype=np.bool_)
     q = np.array([NOT_SHOWN if record.q is None else record.q for record in kept], dtype=np.float64)
     numbers = np.flatnonzero(rising) + 1
-    ahead_ns = int(np.median(t_ns - on_run_ns))
-    return LedgerAnswers(Telemetry(ledger, t_ns[rising], q, valid, numbers, of_lines=False), stamp, ahead_ns)
+    ahead_ns, centroids = int(np.median(t_ns - on_run_ns)), [record.centroids for record in kept]
+    return LedgerAnswers(Telemetry(ledger, t_ns[rising], q, valid, numbers, of_lines=False), stamp, ahead_ns, centroids)
 
 
 def _rising(t_ns: IntArray) -> BoolArray:
@@ -175,8 +182,9 @@ def assess_files(
     """Assess telemetry, or the ledger's own answers, against a ledger. Raises InputError for a fault of either."""
     run = read_ledger(ledger)
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
+    centroids: Sequence[Centroids] = ()
     if telemetry is None:
-        answers, stamp, ahead_ns = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
+        answers, stamp, ahead_ns, centroids = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
         base_ns, telemetry = zero_ns + ahead_ns, ledger
     else:
         answers, stamp = read_telemetry(telemetry), settings.stamp or "middle"
@@ -212,7 +220,8 @@ def assess_files(
         say("the field's stars")
         by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
         limit = noise_limit(file, found.commanded_q)
-        glass = glass_cost(file, found.commanded_q)
+        glass, told_by = _glass_of(file, found, [centroids[row] for row in valid[found.row]] if any(centroids) else ())
+        notes += told_by
         if settings.display_attitudes:
             say("the display's own error")
             some = np.unique(np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int))
@@ -242,6 +251,16 @@ def assess_files(
         notes=(*notes, *said),
         certificate=certificate,
     )
+
+
+def _glass_of(file: BenchFile, found: DecomposedRun, centroids: Sequence[Centroids]) -> tuple[GlassCost | None, list[str]]:
+    """What the glass costs, by the stars of the right answers where these have enough; a note where the PSF file tells it."""
+    turned = multiply(from_rotation_vector(found.bias_arcsec / ARCSEC_PER_RAD), found.commanded_q)
+    cost = seen_cost(file, turned, centroids) or glass_cost(file, found.commanded_q)
+    if cost is None or cost.source != FILE:
+        return cost, []
+    has = "name too few stars" if centroids else "hold only attitudes, which cannot tell colour from distortion"
+    return cost, [f"the answers {has}: what the glass costs is told by the PSF file"]
 
 
 def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArray) -> CoarseClock:

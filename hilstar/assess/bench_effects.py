@@ -7,6 +7,7 @@ weighted by their light.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,9 @@ BINS, MIN_IN_BIN = 5, 20
 FIELDS = 400  # attitudes at which the field's light is summed; other answers take the nearest of them
 LIMIT_FIELDS = 12  # attitudes whose stars tell the limit of the noise
 MIN_STARS = 3
+Centroids = Sequence[tuple[float, float, float | None, int | None]]
+FILE = "PSF file"
+SEEN_FIELDS, WRONG_SHARE = 400, 5.0
 GLASS_FIELDS, GLASS_STARS = 40, 20  # attitudes, and the brightest stars of each, that tell a glass's part
 SURE = 3.0
 
@@ -144,12 +148,13 @@ def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> Floa
 
 @dataclass(frozen=True, slots=True)
 class GlassCost:
-    """What the bench's glass does to the places of a field's brightest stars, by its file and not by the answers.
+    """What glass does to the places of stars, by the centroids that answers hold (`source`), or else by the bench's PSF file.
 
     `rms_px` and `fov_arcsec` have all of it (`total`), and what each correction would leave: a distortion file, one by
     catalogue colour, both. `fov_arcsec` is the attitude's error about its mean over `attitudes`, one sigma.
     """
 
+    source: str
     centroider: str
     stars: int
     attitudes: int
@@ -160,7 +165,7 @@ class GlassCost:
         """For a person."""
         left = {name: f"{axes.cross or 0.0:.2g}" for name, axes in self.fov_arcsec.items()}
         return (
-            f"{left['total']} arcsec across by the PSF file, as `{self.centroider}` finds {self.stars} stars; distortion"
+            f"{left['total']} arcsec across by the {self.source}, as `{self.centroider}` finds {self.stars} stars; distortion"
             f" corrected {left['without_distortion']}, colour {left['without_colour']}, both {left['without_both']}"
         )
 
@@ -183,6 +188,35 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
         lit = stamps.sum(axis=(1, 2)) > 0  # a corner may be dark
         if lit.sum() >= MIN_STARS:
             fields.append((rows[lit], (found - true)[lit]))
+    return _cost(FILE, kind, camera, fields)
+
+
+def seen_cost(file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Centroids]) -> GlassCost | None:
+    """The same by the stars that answers name, [x_px, y_px, dn, hip], against the bench's camera at their attitudes (n, 4).
+
+    The tracker's noise is in it. None for too few stars.
+    """
+    camera, stars, fields = tracker_camera(file.config.tracker, file.folder), bench_stars(file.config, file.folder), []
+    named = [k for k, own in enumerate(centroids) if sum(bool(star[3]) for star in own) >= MIN_STARS]
+    for k in (named[j] for j in np.unique(np.linspace(0, len(named) - 1, SEEN_FIELDS).astype(int)) if named):
+        at = {star[3]: star[:2] for star in centroids[k] if star[3]}
+        rows = field_stars(stars, camera, q_icrs_to_cam[k])
+        rows = rows[np.isin(rows["hip"], list(at))]
+        seen = np.array([at[hip] for hip in rows["hip"].tolist()]).reshape(-1, 2)
+        fields.append((rows, seen - np.stack([rows["x_px"], rows["y_px"]], axis=1)))
+    if not fields:
+        return None
+    far_px = np.concatenate([np.hypot(*off.T) for _, off in fields])
+    usual_px = max(WRONG_SHARE * float(np.median(far_px)), 1.0)  # a star by another's name is no error of places
+    near = [np.hypot(*off.T) < usual_px for _, off in fields]
+    kept = [(rows[good], off[good]) for (rows, off), good in zip(fields, near, strict=True) if good.sum() >= MIN_STARS]
+    return _cost("answers' stars", "tracker", camera, kept)
+
+
+def _cost(
+    source: str, kind: str, camera: Camera, fields: Sequence[tuple[npt.NDArray[np.void], FloatArray]]
+) -> GlassCost | None:
+    """By stars of fields, rows of TRUTH_DTYPE, and errors of their places (n, 2), px; None for too few stars."""
     if sum(len(rows) for rows, _ in fields) < MIN_SPLIT_STARS:
         return None
     rows, errors = (np.concatenate(parts) for parts in zip(*fields, strict=True))
@@ -199,7 +233,7 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
         turns = np.array([_field_turn(camera, each, px) for (each, _), px in zip(fields, np.split(off, ends), strict=True)])
         fov[name] = axes_of_variance(turns.var(axis=0))
     rms_px = {name: float(np.sqrt((off**2).sum(axis=1).mean())) for name, off in parts.items()}
-    return GlassCost(kind, len(rows), len(fields), rms_px, fov)
+    return GlassCost(source, kind, len(rows), len(fields), rms_px, fov)
 
 
 def _field_turn(camera: Camera, rows: npt.NDArray[np.void], off_px: FloatArray) -> FloatArray:

@@ -121,16 +121,16 @@ def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
     own = read_psf(folder / tracker.optics.psf) if glass is None else bench_glass_psf(glass, tracker, folder)
     if tracker.effort == "full":
         return own
-    return _least(own, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px))
+    found, choice = least_tracker_psf(own, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px))
+    say_once(choice.line(), "[tracker] effort")
+    return found
 
 
 @lru_cache(maxsize=4)
-def _least(own: SampledPsf, size_px: tuple[int, int], tolerance: tuple[float, float]) -> Psf:
-    """The least PSF that `[tracker] effort = "auto"` allows, which a notice names."""
+def least_tracker_psf(own: SampledPsf, size_px: tuple[int, int], tolerance: tuple[float, float]) -> tuple[Psf, Choice]:
+    """The least PSF that `[tracker] effort = "auto"` allows, and why."""
     columns, rows = np.meshgrid(*(np.linspace(0, size - 1, FIELD_PLACES) for size in size_px))
-    found, choice = least_psf(own, np.stack([columns.ravel(), rows.ravel()], axis=1), tolerance)
-    say_once(choice.line(), "[tracker] effort")
-    return found
+    return least_psf(own, np.stack([columns.ravel(), rows.ravel()], axis=1), tolerance)
 
 
 def real_monitor(config: BenchConfig, folder: Path, path: str) -> Camera:

@@ -16,7 +16,7 @@ from hilstar.monitor.quantise import primary_lights
 from hilstar.rotation import propagate
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import DisplayColours, TwinOptics, seen_primaries
-from hilstar.twin.shutter import RowBeat, rolled
+from hilstar.twin.shutter import rolled, rolling_light
 from hilstar.twin.simulator import Exposure, TrackerBackground, detector_canvas, exposure_truth
 from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
@@ -114,32 +114,10 @@ class DisplayTracker:
 
     def _rolling_e_per_s(self, view: View, rng: np.random.Generator | None) -> tuple[FloatArray, FloatArray]:
         """The mean light (primaries, H, W) of the display over each place's own exposure, and that of the glow (h, w)."""
-        config, screen, geometry = self.config, self._bench.scan, self._optics.geometry
-        period_s, free = 1 / config.monitor.refresh_hz, config.tracker.trigger == "free" and rng is not None
+        period_s, free = 1 / self.config.monitor.refresh_hz, self.config.tracker.trigger == "free" and rng is not None
         phase_s = rng.uniform(0, period_s) if free and rng is not None else -view.exposure_s / 2
-        beat = RowBeat(view.scan, screen, period_s, phase_s)
-        sizes, turn, moving = (config.monitor.resolution_px, config.tracker.resolution_px), view.turn, self._bench.moving
-        changes = bool(turn.rate_cam_rad_s.any()) or len(self._bench.quantiser.exposure(0, len(beat.frames))) > 1
-        changes |= moving is not None and moving.satellites is not None
-        compensated = config.render.motion == "on"
-        total, shown = np.zeros((len(self._primaries), *sizes[0][::-1])), None
-        y, x = (part.ravel().astype(np.float64) for part in np.indices(sizes[1][::-1]))
-        glow_late_s = np.nan_to_num(screen.late_s(*geometry.shown_at(*geometry.to_monitor(x, y)), sizes[0]))
-        glow_rows_s, glow = view.scan.late_s(x, y, sizes[1]), np.zeros(x.shape)
-        for number, frame in enumerate(beat.frames):
-            if changes or shown is None:
-                seconds = beat.begin_s(frame) + (0.0 if compensated else beat.hold_s / 2)
-                q = propagate(view.q_icrs_to_cam, turn.rate_cam_rad_s, seconds)
-                t_ns = None if view.t_ns is None else view.t_ns + round(seconds * NS_PER_S)
-                rate = turn.rate_cam_rad_s if compensated else None
-                shown = np.array(primary_lights(self._bench.draw(q, number, rate, t_ns=t_ns).levels, self._panel))
-                rows, columns = np.nonzero(shown.any(axis=0))
-                places = columns.astype(np.float64), rows.astype(np.float64)
-                screen_late_s = screen.late_s(*places, sizes[0])
-                row_late_s = np.nan_to_num(view.scan.late_s(*geometry.to_tracker(*places), sizes[1]))
-            total[:, rows, columns] += shown[:, rows, columns] * beat.shares(frame, screen_late_s, row_late_s)
-            glow += beat.shares(frame, glow_late_s, glow_rows_s)
-        return total, self._glow_e_per_s * glow.reshape(self._glow_e_per_s.shape)
+        light, glow = rolling_light(self._bench, self._optics.geometry, self._panel, view, phase_s)
+        return light, self._glow_e_per_s * glow
 
     def close(self) -> None:
         """Free the GL contexts."""

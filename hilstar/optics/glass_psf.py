@@ -180,6 +180,12 @@ class Focused:
     inside: FloatArray
 
 
+class _Measured(SampledPsf):
+    """An image whose width is wanted, and which no star is drawn by."""
+
+    max_negative = 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class GlassPsf(SampledPsf):
     """A glass at one focus: stars are drawn each by place and spectrum, all else by the mean PSF in the field's middle.
@@ -211,7 +217,7 @@ class GlassPsf(SampledPsf):
         flat = self.optics.weights.reshape(-1, len(self.optics.basis))
         peak = (flat @ self.optics.basis.reshape(len(self.optics.basis), -1)).max(axis=1)
         sharpest = np.tensordot(flat[peak.argmax()], self.optics.basis, axes=1).clip(min=0)
-        widths = [SampledPsf(samples, self.per_px, self.pixel_integrated).width_px for samples in (self.samples, sharpest)]
+        widths = [_Measured(samples, self.per_px, self.pixel_integrated).width_px for samples in (self.samples, sharpest)]
         x, y = np.min(widths, axis=0).tolist()
         return x, y
 
@@ -350,6 +356,20 @@ class GlassPsf(SampledPsf):
         scale = electrons_per_s * light / np.where(whole > 0, whole, np.inf)
         squares = (parts * scale.astype(np.float32)[:, None]) @ self._stamps.stamps
         return np.asarray(squares.reshape(-1, self.footprint_px, self.footprint_px))
+
+    def unreduced(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> FloatArray:
+        """The same of stars of 1 electron per second, by the whole basis: exact, and some hundred times as slow."""
+        side = self.footprint_px
+        at_px = np.arange(side) - side // 2
+        found = np.empty((len(x_px), side, side))
+        for own, weights, x, y in zip(found, self._mixed(x_px, y_px, shares), x_px, y_px, strict=True):
+            image = np.tensordot(weights.astype(np.float64), self.optics.basis, axes=1)
+            down, across = (
+                _pixels_of(size, self.per_px, at_px - (place - np.floor(place + 0.5)), self.pixel_integrated)
+                for size, place in zip(image.shape, (y, x), strict=True)
+            )
+            own[:] = down @ image @ across.T
+        return found
 
     def image(self, sprites: Sprites, shares: FloatArray, resolution_px: tuple[int, int]) -> Float32Array:
         """The light of sprites (n,) in all pixels (height, width), electrons per second; `shares` as in `of_stars`."""

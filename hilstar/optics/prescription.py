@@ -4,14 +4,20 @@ Each ray is a plane wave behind the lens: the light's field in the image is the 
 M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid angle of each (the angular spectrum, Goodman,
 Fourier Optics, section 3.10). Where the pupil would need too many rays, because what diffraction spreads is far finer than
 the aberrations, rays are counted as they fall.
+
+Surfaces may be tilted and decentred. The detector lies in the prescription's image surface, its middle on the chief ray of the
+field's middle, its axes the surface's own.
 """
 
 import contextlib
 import io
 import math
+import re
+import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +31,12 @@ from hilstar.scene.camera import Lens
 CAN_INSTALL = "pip install 'hilstar[lens]'"
 ADVICE = "give a lens file that optiland reads: .zmx of Zemax, .seq of CODE V, or .json of optiland"
 POINTS = 5  # field points along each side
-MIN_RAYS, MAX_RAYS, GEOMETRIC_RAYS = 96, 288, 400  # across the pupil
+MIN_RAYS, MAX_RAYS, GEOMETRIC_RAYS = 96, 384, 400  # across the pupil
 MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does not say
-PERIOD_MARGIN = 1.5  # the sum of plane waves repeats after so many stamps
-CHIEF_ROUNDS, DISTORTION_RAYS = 12, 24
+PERIOD_MARGIN = 2.0  # the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
+FINER = 8  # parts of a ray's share of the pupil along each axis, at its edge
+CHIEF_ROUNDS, DISTORTION_RAYS, DISTORTION_SPOKES = 12, 24, 12
+EDGE = 0.05  # share of the field from whose chief ray to the axis's the scale is taken
 MIN_LIT = 1e-3  # share of a pupil below which a field point is dark
 
 
@@ -44,11 +52,12 @@ class Plate:
 
 @dataclass(frozen=True, slots=True)
 class Traced:
-    """The glass of a prescription, its focal length and its F-number."""
+    """The glass of a prescription, its focal length and F-number, and where its image surface's axis meets the detector."""
 
     glass: Glass
     focal_length_mm: float
     f_number: float
+    axis_px: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +86,11 @@ def _read(path: Path) -> Any:
             from optiland import fileio
     except ImportError as error:
         raise MachineError(f"hilstar optics lens needs optiland: {CAN_INSTALL}") from error
-    readers = {".zmx": fileio.load_zemax_file, ".seq": fileio.load_codev_file, ".json": fileio.load_optiland_file}
+    readers = {
+        ".zmx": partial(_zemax, fileio.load_zemax_file),
+        ".seq": fileio.load_codev_file,
+        ".json": fileio.load_optiland_file,
+    }
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: no lens file by its name; {ADVICE}")
@@ -86,8 +99,46 @@ def _read(path: Path) -> Any:
     try:
         with _quiet():
             return reader(str(path))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     except Exception as error:  # optiland raises whatever a broken file causes in its layers
         raise InputError(f"{path}: optiland cannot read it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}") from error
+
+
+def _zemax(read: Callable[[str], Any], path: str) -> Any:
+    """Read a file of Zemax's whose coordinate breaks have one turn each: optiland turns about z first, and in one order."""
+    raw = Path(path).read_bytes()
+    text = raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1")
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "lens.zmx"
+        plain.write_text(one_turn_a_break(text), encoding="utf-8")
+        return read(str(plain))
+
+
+def one_turn_a_break(text: str) -> str:
+    """The text of a .zmx file with each COORDBRK as up to four of one turn or shift each, in Zemax's order.
+
+    That is: shift, then turns about x, the new y and the newer z; with the order flag all of it backwards. Raises InputError
+    for lengths that are not in mm, which optiland would take for mm.
+    """
+    head, *surfaces = re.split(r"(?m)^SURF +\d+.*\n", text.replace("\r\n", "\n"))
+    unit = re.search(r"(?m)^UNIT +(\w+)", head)
+    if unit is not None and unit[1].upper() != "MM":
+        raise InputError(f"its lengths are in {unit[1]} (UNIT); write them in MM")
+    found: list[str] = []
+    for surface in surfaces:
+        if not re.search(r"(?m)^ *TYPE +COORDBRK", surface):
+            found.append(surface)
+            continue
+        given = {int(k): float(value) for k, value in re.findall(r"(?m)^ *PARM +(\d+) +(\S+)", surface)}
+        steps = [(1, 2), (3,), (4,), (5,)]
+        kept = [step for step in (steps[::-1] if given.get(6) else steps) if any(given.get(k) for k in step)] or steps[:1]
+        far = re.search(r"(?m)^ *DISZ +(\S+)", surface)
+        for step in kept:
+            last = step is kept[-1] and far is not None
+            parts = [f"  PARM {k} {given.get(k, 0.0)!r}" for k in step]
+            found.append("\n".join(["  TYPE COORDBRK", *parts, f"  DISZ {far[1] if last and far else 0}", ""]))
+    return head + "".join(f"SURF {number}\n{surface}" for number, surface in enumerate(found))
 
 
 @contextlib.contextmanager
@@ -129,31 +180,49 @@ class _LensRays:
         self.f_number = abs(float(np.asarray(optic.paraxial.FNO()).ravel()[0]))
         if not math.isfinite(self.focal_length_mm) or not self.wavelengths_um:
             raise InputError("it has no focal length or no wavelength; write a lens that forms an image")
+        frame = optic.image_surface.geometry.cs
+        self._image_mm, self._to_image = (np.asarray(part, dtype=np.float64) for part in frame.get_effective_transform())
+        self.centre_mm, self.sign = np.zeros(2), 1.0
+        edge = np.array([[0.0, 0.0], [0.0, EDGE]])
+        tangents, places = self.chiefs(edge, self.primary_um)
+        if not np.isfinite(places).all():
+            raise InputError(
+                "the chief ray of its field's middle is lost; is a surface tilted too far, or its aperture beside it?"
+            )
+        self.sign = float(np.sign((tangents[1] - tangents[0]) @ (places[1] - places[0])))
+        self.centre_mm = places[0]
+
+    def at_image(self, rays: Any) -> tuple[FloatArray, FloatArray]:
+        """Places (2, n), mm from the detector's middle, and direction cosines (3, n) of rays, by the image surface's axes."""
+        places, cosines = (
+            self._to_image.T @ np.stack([np.asarray(part) for part in parts])
+            for parts in ((rays.x, rays.y, rays.z - self._image_mm[2]), (rays.L, rays.M, rays.N))
+        )
+        moved = self._to_image.T @ np.array([*self._image_mm[:2], 0.0])
+        return places[:2] - moved[:2, None] - self.centre_mm[:, None], cosines
 
     def chiefs(self, fields: FloatArray, um: float) -> tuple[FloatArray, FloatArray]:
         """Tangents of field angles (n, 2), and the chief rays' places (n, 2), mm, at fields (n, 2) relative to the largest."""
         none = np.zeros(len(fields))
         starts = self.optic.ray_tracer.ray_generator.generate_rays(fields[:, 0], fields[:, 1], none, none, um)
-        tangents = np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
-        rays = self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um)
-        return tangents, np.stack([rays.x, rays.y], axis=1)
+        tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
+        return tangents, self.at_image(self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um))[0].T
 
-    def fields_at(self, places_mm: FloatArray) -> FloatArray:
-        """The fields (n, 2) whose chief rays meet the image at places (n, 2) from the axis's, at the primary wavelength."""
-        edge = np.array([[0.0, 0.0], [0.0, 0.05]])
-        slope_mm = float(np.linalg.norm(np.diff(self.chiefs(edge, self.primary_um)[1], axis=0))) / 0.05
-        sign = np.sign(np.diff(self.chiefs(edge, self.primary_um)[1], axis=0)[0, 1])
-        fields = places_mm / slope_mm * sign
+    def fields_at(self, places_mm: FloatArray, camera: "_Chiefs") -> FloatArray:
+        """The fields (n, 2) whose stars a camera has at places (n, 2), mm."""
+        tangents = self.chiefs(np.array([[0.0, 0.0], [0.0, EDGE]]), self.primary_um)[0]
+        slope_mm = camera.focal_length_mm * float(tangents[1, 1] - tangents[0, 1]) / EDGE
+        fields = places_mm / slope_mm
         for _ in range(CHIEF_ROUNDS):
             fields = np.clip(fields, -1.5, 1.5)
-            fields = fields + (places_mm - self.chiefs(fields, self.primary_um)[1]) / slope_mm * sign
+            fields = fields + (places_mm - camera.places_mm(self.chiefs(fields, self.primary_um)[0])) / slope_mm
         return np.asarray(fields)
 
     def bundle(self, field: FloatArray, um: float, rays: int) -> _Bundle:
         """The rays of a pupil's grid at a field."""
         at = (np.arange(rays) + 0.5) / rays * 2 - 1
         across, down = np.meshgrid(at, at)
-        inside = across**2 + down**2 <= 1
+        filled = _filled(rays)
         radius = float(np.hypot(*field))
         vx, vy = (np.interp(radius * self.max_field, self._vignetting[0], part) for part in self._vignetting[1:])
         turn = field / radius if radius else np.array([0.0, 1.0])  # the field's direction is the factors' y
@@ -166,14 +235,20 @@ class _LensRays:
         first = generate(hx, hy, px.ravel(), py.ravel(), um)
         x0, y0, z0, l0, m0, n0 = (np.array(getattr(first, name)).reshape(px.shape) for name in ("x", "y", "z", "L", "M", "N"))
         found = self.optic.trace_generic(hx, hy, px.ravel(), py.ravel(), um)
-        x, y, *cosines, path, light = (
-            np.array(getattr(found, name)).reshape(px.shape) for name in ("x", "y", "L", "M", "N", "opd", "i")
-        )
-        good = inside & np.isfinite(x + y + path) & (light > 0)
+        (x, y), cosines = (np.array(part).reshape(-1, *px.shape) for part in self.at_image(found))
+        path, light = (np.array(getattr(found, name)).reshape(px.shape) for name in ("opd", "i"))
+        good = (filled > 0) & np.isfinite(x + y + path) & (light > 0)
         # A plane wave's path up to where its rays start, and the area of the beam that each ray stands for.
         path = path + l0 * x0 + m0 * y0 + n0 * z0
         area = np.abs(_determinant(x0, y0)) * np.abs(n0)
-        return _Bundle(x, y, np.stack(cosines), path, np.where(good, np.nan_to_num(light) * area, 0.0))
+        return _Bundle(x, y, cosines, path, np.where(good, np.nan_to_num(light) * area * filled, 0.0))
+
+
+@lru_cache(maxsize=4)
+def _filled(rays: int) -> FloatArray:
+    """How much of each cell of a pupil's grid (n, n) lies within the pupil."""
+    fine = (np.arange(rays * FINER) + 0.5) / (rays * FINER) * 2 - 1
+    return np.asarray((fine**2 + fine[:, None] ** 2 <= 1).reshape(rays, FINER, rays, FINER).mean(axis=(1, 3)))
 
 
 def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -185,34 +260,32 @@ def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
 def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
     pitch_mm, (width, height) = plate.pitch_um * 1e-3, plate.resolution_px
     middle = (np.array([width, height]) - 1) / 2
+    camera = _Chiefs.of(lens)
     places = _field_points(lens, plate)
-    fields = lens.fields_at(places * pitch_mm)
+    fields = lens.fields_at(places * pitch_mm, camera)
     finest_um = lens.wavelengths_um[0] * lens.f_number / 2
     samples = per_px or min(MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(plate.pitch_um / finest_um)))
     grid = 2 * plate.half_px * samples + 1, pitch_mm / samples
     images, at, facts = [], [], []
-    primary = lens.chiefs(fields, lens.primary_um)[1]
     axis_light: dict[float, float] = {}
     for um in lens.wavelengths_um:
         axis_light[um] = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
-        lateral = (lens.chiefs(fields, um)[1] - primary) / pitch_mm
-        for place, field, chief, shift in zip(places, fields, primary, lateral, strict=True):
+        for place, field, chief in zip(places, fields, lens.chiefs(fields, um)[1], strict=True):
             slopes = _slopes(lens, field, um)
             light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light[um]
             for focus_um in sorted(set(plate.focuses_um)):
                 if light > MIN_LIT:
-                    centre = chief + shift * pitch_mm + slopes * focus_um * 1e-3
-                    image, outside = _psf(lens, (field, um, focus_um * 1e-3), centre, grid)
+                    image, outside = _psf(lens, (field, um, focus_um * 1e-3), chief + slopes * focus_um * 1e-3, grid)
                 else:
                     image, outside = _dark(grid[0]), 0.0
                 images.append(image)
                 at.append((*(middle + place), um * 1e3, focus_um))
-                moved = shift + slopes * focus_um * 1e-3 / pitch_mm
+                moved = (chief + slopes * focus_um * 1e-3) / pitch_mm - place
                 facts.append((min(light, 2.0) if light > MIN_LIT else 0.0, outside, *moved))
     stack = Stack(np.array(images), np.array(at), np.array(facts), samples)
-    focal_mm, distortion = _distortion(lens)
-    history = (made_by, f"focal length {focal_mm:.6g} mm, F-number {lens.f_number:.4g}")
-    return Traced(glass_of(stack, tolerance, distortion, history=history), focal_mm, lens.f_number)
+    history = (made_by, f"focal length {camera.focal_length_mm:.6g} mm, F-number {lens.f_number:.4g}")
+    x_px, y_px = (-lens.centre_mm / pitch_mm).tolist()
+    return Traced(glass_of(stack, tolerance, camera.lens, history=history), camera.focal_length_mm, lens.f_number, (x_px, y_px))
 
 
 def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
@@ -228,7 +301,8 @@ def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
 
 def _slopes(lens: _LensRays, field: FloatArray, um: float) -> FloatArray:
     rays = lens.optic.trace_generic(np.array([field[0]]), np.array([field[1]]), np.zeros(1), np.zeros(1), um)
-    return np.array([float(rays.L[0] / rays.N[0]), float(rays.M[0] / rays.N[0])])
+    cosines = lens.at_image(rays)[1][:, 0]
+    return np.asarray(cosines[:2] / cosines[2])
 
 
 def _dark(side: int) -> FloatArray:
@@ -259,7 +333,8 @@ def _waves(
     at_mm = (np.arange(side * finer) - (side * finer) // 2) * step_mm / finer
     wave = 2 * np.pi / (um * 1e-3)
     cos_x, cos_y, cos_z = rays.cosines
-    angle = np.nan_to_num(np.abs(_determinant(cos_x, cos_y)))  # solid angle times its cosine
+    # Solid angle times its cosine; of a cell at the pupil's edge both light and angle are a part.
+    angle = np.nan_to_num(np.abs(_determinant(cos_x, cos_y))) * _filled(len(rays.x))
     lit = rays.light > 0
     path = rays.path + cos_z * defocus_mm - cos_x * (rays.x - centre[0]) - cos_y * (rays.y - centre[1])
     path = path[lit] - np.median(path[lit])
@@ -298,16 +373,34 @@ def _counted(rays: _Bundle, defocus_mm: float, centre: FloatArray, side: int, st
     return image, float(np.clip(1 - image.sum() / light.sum(), 0, 0.999))
 
 
-def _distortion(lens: _LensRays) -> tuple[float, Lens | None]:
-    """The focal length, mm, that the chief rays at the primary wavelength have, and k1 to k3 relative to it."""
-    if lens.max_field == 0:
-        return lens.focal_length_mm, None
-    fields = np.stack([np.zeros(DISTORTION_RAYS), np.linspace(0, 1, DISTORTION_RAYS + 1)[1:]], axis=1)
-    tangents, places = lens.chiefs(fields, lens.primary_um)
-    tangent = np.abs(tangents[:, 1])
-    off = np.abs(places[:, 1] - lens.chiefs(np.zeros((1, 2)), lens.primary_um)[1][0, 1])
-    largest = tangent[-1]
-    powers = (tangent[:, None] / largest) ** np.array([1, 3, 5, 7])
-    focal, *bent = np.linalg.lstsq(powers, off / largest, rcond=None)[0].tolist()
-    k1, k2, k3 = (part / focal / largest ** (2 * order) for order, part in enumerate(bent, start=1))
-    return focal, Lens((k1, k2, k3))
+@dataclass(frozen=True, slots=True)
+class _Chiefs:
+    """The camera that the chief rays at the primary wavelength have: focal length, mm, and Brown-Conrady relative to it."""
+
+    focal_length_mm: float
+    lens: Lens | None
+
+    def places_mm(self, tangents: FloatArray) -> FloatArray:
+        """Where it has directions (n, 2)."""
+        bent = tangents if self.lens is None else np.stack(self.lens.bent(*tangents.T), axis=1)
+        return np.asarray(self.focal_length_mm * bent)
+
+    @classmethod
+    def of(cls, lens: _LensRays) -> "_Chiefs":
+        """Least squares over the field."""
+        if lens.max_field == 0:
+            return cls(lens.focal_length_mm, None)
+        turn = np.linspace(0, 2 * np.pi, DISTORTION_SPOKES, endpoint=False)
+        radius = np.linspace(0, 1, DISTORTION_RAYS + 1)[1:]
+        fields = (radius[:, None, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)).reshape(-1, 2)
+        tangents, places = lens.chiefs(fields, lens.primary_um)
+        known = np.isfinite(places).all(axis=1)
+        largest = float(np.hypot(*tangents.T).max())
+        (u, v), places = tangents[known].T / largest, places[known] / largest
+        r2 = u * u + v * v
+        radial = [np.concatenate([part * r2**power for part in (u, v)]) for power in range(4)]
+        sides = [np.concatenate(part) for part in ((2 * u * v, r2 + 2 * v * v), (r2 + 2 * u * u, 2 * u * v))]
+        found = np.linalg.lstsq(np.stack([*radial, *sides], axis=1), places.T.ravel(), rcond=None)[0].tolist()
+        focal, *bent = found
+        k1, k2, k3, p1, p2 = (part / focal / largest**power for part, power in zip(bent, (2, 4, 6, 1, 1), strict=True))
+        return cls(focal, Lens((k1, k2, k3), (p1, p2)))

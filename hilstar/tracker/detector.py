@@ -139,7 +139,7 @@ class Detector:
         MAX_E.
         """
         settings = self.settings
-        light_e = self._light_e(mean_e, exposure_s)
+        light_e = self.collected_e(mean_e, exposure_s)
         if settings.false_stars and exposure_s > 0:
             light_e = light_e + false_stars_e(settings, self.shape, exposure_s, rng)
         if settings.noise_version == 1:
@@ -202,13 +202,14 @@ class Detector:
         No fixed pattern, no strays. The mean of noisy frames differs where a well or the ADC clips the noise.
         """
         settings = self.settings
-        light_e = self._light_e(mean_e, exposure_s)
+        light_e = self.collected_e(mean_e, exposure_s)
         self._check_light(light_e)
         expected_e = light_e.astype(np.float64) + settings.dark_e_per_s * settings.dark_factor * exposure_s
         self._check_largest(expected_e)
         return self._convert(self._fill_wells(expected_e))
 
-    def _light_e(self, mean_e: npt.ArrayLike, exposure_s: float) -> FloatArray:
+    def collected_e(self, mean_e: npt.ArrayLike, exposure_s: float) -> FloatArray:
+        """The same electrons with the smear of a frame transfer. Refuses what `expose` refuses of shape and exposure."""
         light_e = np.asarray(mean_e)
         if light_e.dtype.kind not in "fiu" or light_e.shape != self.shape:
             raise InputError(f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}")

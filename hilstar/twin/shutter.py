@@ -7,9 +7,14 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import Tracker
+from hilstar.bench.frame import Bench
 from hilstar.frame.view import View
+from hilstar.monitor.quantise import Panel, primary_lights
+from hilstar.rotation import propagate
 from hilstar.run.sync import SHORTEST_LIT
 from hilstar.scene.frame_motion import Scan
+from hilstar.twin.optics import BenchGeometry
+from hilstar.units import NS_PER_S
 
 S_PER_US = 1e-6
 
@@ -63,3 +68,36 @@ class RowBeat:
         begin, exposed = self.begin_s(frame) + screen_late_s, row_late_s - self.rows.hold_s / 2
         lit = np.minimum(begin + self.hold_s, exposed + self.rows.hold_s) - np.maximum(begin, exposed)
         return np.asarray(np.maximum(lit, 0.0) * (self.period_s / (self.hold_s * self.rows.hold_s)))
+
+
+def rolling_light(
+    bench: Bench, geometry: BenchGeometry, panel: Panel, view: View, phase_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """The mean light (primaries, H, W) of a display over each place's own exposure, and the glow's share of its mean (h, w).
+
+    Frames begin at the view's time, at `phase_s` as in `RowBeat`.
+    """
+    config, screen, moving, turn = bench.config, bench.scan, bench.moving, view.turn
+    beat = RowBeat(view.scan, screen, 1 / config.monitor.refresh_hz, phase_s)
+    sizes = config.monitor.resolution_px, config.tracker.resolution_px
+    changes = bool(turn.rate_cam_rad_s.any()) or len(bench.quantiser.exposure(0, len(beat.frames))) > 1
+    changes |= moving is not None and moving.satellites is not None
+    compensated = config.render.motion == "on"
+    total, shown = np.zeros((len(panel.primaries) or 1, *sizes[0][::-1])), None
+    y, x = (part.ravel().astype(np.float64) for part in np.indices(sizes[1][::-1]))
+    glow_late_s = np.nan_to_num(screen.late_s(*geometry.shown_at(*geometry.to_monitor(x, y)), sizes[0]))
+    glow_rows_s, glow = view.scan.late_s(x, y, sizes[1]), np.zeros(x.shape)
+    for number, frame in enumerate(beat.frames):
+        if changes or shown is None:
+            seconds = beat.begin_s(frame) + (0.0 if compensated else beat.hold_s / 2)
+            q = propagate(view.q_icrs_to_cam, turn.rate_cam_rad_s, seconds)
+            t_ns = None if view.t_ns is None else view.t_ns + round(seconds * NS_PER_S)
+            rate = turn.rate_cam_rad_s if compensated else None
+            shown = np.array(primary_lights(bench.draw(q, number, rate, t_ns=t_ns).levels, panel))
+            rows, columns = np.nonzero(shown.any(axis=0))
+            places = columns.astype(np.float64), rows.astype(np.float64)
+            screen_late_s = screen.late_s(*places, sizes[0])
+            row_late_s = np.nan_to_num(view.scan.late_s(*geometry.to_tracker(*places), sizes[1]))
+        total[:, rows, columns] += shown[:, rows, columns] * beat.shares(frame, screen_late_s, row_late_s)
+        glow += beat.shares(frame, glow_late_s, glow_rows_s)
+    return total, glow.reshape(sizes[1][::-1])

@@ -39,6 +39,7 @@ from hilstar.scene.camera import Camera, linear_shares
 from hilstar.scene.exposure_motion import MIDDLE_S, own_row_s
 from hilstar.scene.frame_motion import EVERY, Scan
 from hilstar.scene.paths import Paths
+from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites, by_channel, join_sprites, shares_by_bv, without_stars
 from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
@@ -102,11 +103,13 @@ class Simulator(Closing):
     """A bench's tracker looking at the sky itself, drawn in a GL context of its own or in another renderer's.
 
     Free it with `close`, or use it as a context manager; one in another's context ends with that. One that
-    does not `refuse` views goes on near the Sun (see `TrackerBackground`).
+    does not `refuse` views goes on near the Sun (see `TrackerBackground`). `psf` stands for the bench's own.
     """
 
-    def __init__(self, file: BenchFile, context: "Context | None" = None, *, refuse: bool = True) -> None:
-        self.file, self._refuse = file, refuse
+    def __init__(
+        self, file: BenchFile, context: "Context | None" = None, *, refuse: bool = True, psf: Psf | None = None
+    ) -> None:
+        self.file, self._refuse, self._psf = file, refuse, psf
         self.config = file.config
         self._load_sky()
         self._load_tracker()
@@ -121,7 +124,7 @@ class Simulator(Closing):
     def _load_tracker(self) -> None:
         tracker = self.config.tracker
         self.camera = tracker_camera(tracker, self.file.folder)
-        self.canvas = detector_canvas(self.file, self.camera)
+        self.canvas = detector_canvas(self.file, self.camera, self._psf)
         psf = self.canvas.psf
         self.glass = StarGlass(self.file, psf) if isinstance(psf, GlassPsf) else None
         self._glasses = [self.glass]
@@ -363,10 +366,10 @@ def simulator_view(simulator: Simulator, scenario: Scenario) -> FaultView:
     return tracker_view(simulator.file, simulator.canvas, simulator.stars, simulator.moving, scenario)
 
 
-def detector_canvas(file: BenchFile, camera: Camera) -> Canvas:
-    """The detector of a bench's tracker as layers draw on it. Raises InputError (see `tracker_psf`)."""
+def detector_canvas(file: BenchFile, camera: Camera, psf: Psf | None = None) -> Canvas:
+    """The detector of a bench's tracker as layers draw on it, by its own PSF or `psf`. Raises InputError as `tracker_psf`."""
     tracker = file.config.tracker
-    return Canvas(camera, tracker_psf(tracker, file.folder), full_e=full_e(tracker.detector))
+    return Canvas(camera, psf or tracker_psf(tracker, file.folder), full_e=full_e(tracker.detector))
 
 
 def exposure_truth(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -13,15 +14,20 @@ import pytest
 
 from hilstar import charts
 from hilstar.bench.bench_file import bench_file_of
+from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.study import predictors
 from hilstar.study.chain import choices, run
-from hilstar.study.chain.choices import Combination, Parts, five_scenes, lead_ns
+from hilstar.study.chain import glass as chain_glass
+from hilstar.study.chain.choices import ChainScene, Combination, Parts, five_scenes, lead_ns
+from hilstar.study.chain.glass import draw_glass, glass_rows
 from hilstar.study.chain.measuring import Rounds, SceneMeasurement, error_budget
 from hilstar.study.chain.run import NOT_JUDGED, CombinationRow, beating, front
 from hilstar.study.chain.tracker import MATCH_PX, StudyTracker, off
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
+from tests.support.benches import ORION_Q
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
+from tests.support.glass import stack
 from tests.support.pictures import assert_drawn, table
 
 SMALL = """
@@ -111,6 +117,28 @@ def test_auto_and_default_are_each_one_point_of_each_scene(study):
     assert {row["bit_stealing"] for row in rows} == {"true", "false"}
     for name in ("chain", "chain_budget"):
         assert_drawn(out / f"{name}.png")
+
+
+def test_the_psf_of_a_glass_is_an_axis_of_the_chain(tmp_path, monkeypatch):
+    """Each PSF that may stand for it, the more components the nearer, and the whole is right to 1e-3 px."""
+    monkeypatch.setattr(chain_glass, "QUICK_TIME_S", 0.1)
+    write_glass(tmp_path / "psf.fits", glass_of(stack(3)))
+    tracker = "[tracker]\nfocal_length_mm = 12\nresolution_px = [256, 256]"
+    text = re.sub(r"focal_length_mm = 70\n|resolution_px = \[320, 320\]\n", "", SMALL).replace("[tracker]", tracker, 1)
+    file = small_file(tmp_path, text.replace("[sky]", '[tracker.optics]\npsf = "psf.fits"\n[sky]').replace("= 9", "= 6"))
+    rows = glass_rows(file, ChainScene("Orion", "", np.array(ORION_Q)), quick=True)
+    names = ["a Gaussian", "one PSF for all stars", "Gaussians by field", "a basis of 3", "a basis of 6", "a basis of 12"]
+    assert [row.psf for row in rows] == [*names, "each star by its place and spectrum"]
+    gaussian, *_, third, sixth, twelfth, whole = rows
+    assert gaussian.error_arcsec > third.error_arcsec > sixth.error_arcsec > twelfth.error_arcsec > whole.error_arcsec > 0
+    assert whole.error_arcsec < 1e-3 * 13e-3 / 12 * ARCSEC_PER_RAD and whole.error_percent < 0.02 < gaussian.error_percent
+    assert [row.chosen for row in rows].count("auto") == 1 and gaussian.stars > 10 and all(row.time_ms > 0 for row in rows)
+    assert [row.on_front == "true" for row in rows] == front(rows, "error_arcsec")
+    with charts.panels_of("A finding", 2, share_x=False) as (place, light):
+        draw_glass(place, light, rows)
+    assert_legible(place.figure)
+    bare = small_file(tmp_path)
+    assert glass_rows(bare, ChainScene("Orion", "", np.array(ORION_Q)), quick=True) == []
 
 
 def test_the_budget_adds_up_to_the_whole_error_of_auto(study):

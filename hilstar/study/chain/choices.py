@@ -41,6 +41,7 @@ SPRITES: tuple[Sprite, ...] = ("full", "cut", "coarse")
 COARSER = 10.0
 SHALLOWER_MAG = 1.0
 FIELDS = 200
+DENSE = 1  # the place of the densest field among the scenes
 SEED = 1
 ENOUGH = 0.5  # a faint field has at most this share of an average field's stars
 # The pixels that a frame lights, as places in its flattened image (n,), and the light of each, electrons per second.

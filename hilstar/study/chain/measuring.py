@@ -326,10 +326,11 @@ def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[l
                 stages += [chain.stages_ms() for _ in range(FRAMES_A_VISIT)]
             else:
                 taken[k] += [chain.frame_ms() for _ in range(FRAMES_A_VISIT)]
-    return [_times(np.array(one)) for one in taken], np.median(stages, axis=0).tolist()
+    return [times_of(np.array(one)) for one in taken], np.median(stages, axis=0).tolist()
 
 
-def _times(taken: FloatArray) -> Times:
+def times_of(taken: FloatArray) -> Times:
+    """The times of a work by what its frames took (n, 2), `Spent`."""
     low, middle, high = np.percentile(taken[:, 0], (25, 50, 75))
     noise = ERROR_OF_MEDIAN * (high - low) / SIGMAS_IN_IQR / math.sqrt(len(taken))
     time_ms, iqr_ms, noise_ms, cpu_ms = (

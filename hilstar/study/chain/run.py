@@ -28,7 +28,8 @@ from hilstar.charts import (
 )
 from hilstar.errors import InputError
 from hilstar.files import make_directory
-from hilstar.study.chain.choices import QUANTISATIONS, Parts, five_scenes, shortened_line
+from hilstar.study.chain.choices import DENSE, QUANTISATIONS, Parts, five_scenes, shortened_line
+from hilstar.study.chain.glass import GlassRow, draw_glass, glass_line, glass_rows
 from hilstar.study.chain.measuring import (
     AUTO,
     DEFAULT,
@@ -62,6 +63,7 @@ OUTPUTS = (
     "chain.csv",
     "chain_budget.csv",
     "chain_time.csv",
+    "chain_psf.csv",
 )
 
 
@@ -210,17 +212,20 @@ def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
     return kept
 
 
-def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str) -> None:
-    """Error against time, a panel for each scene that differs. Raises InputError where it cannot be written."""
+def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str, glass: list[GlassRow]) -> None:
+    """Error against time, a panel for each scene that differs, two for a glass. Raises InputError where it cannot write."""
     scenes = differing(rows)
     note = f"The line is the front: nothing else is as right and as fast. Pale: all other choices. {capital(machine)}."
-    with chart(path, finding, len(scenes), note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * len(scenes)) as grid:
-        for axes, (scene, alike) in zip(grid, scenes.items(), strict=True):
+    count = len(scenes) + (2 if glass else 0)
+    with chart(path, finding, count, note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * count) as grid:
+        for axes, (scene, alike) in zip(grid, scenes.items(), strict=False):
             own = [row for row in rows if row.scene == scene]
             axes.set_title(f"{scene}, {own[0].stars} stars" + (f" (the same in: {', '.join(alike)})" if alike else ""))
             axes.set(xscale="log", yscale="log", ylabel="star's place, rms [arcsec]")
             _scatter(axes, own)
-        grid[-1].set_xlabel("median time of a frame [ms]")
+        grid[len(scenes) - 1].set_xlabel("median time of a frame [ms]")
+        if glass:
+            draw_glass(grid[-2], grid[-1], glass)
 
 
 def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
@@ -305,7 +310,8 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
     stages: list[StageTime] = []
     lines, judged, others = [], [], OtherWork()
     with Parts(file) as parts, StudyTracker(parts.own) as tracker:
-        for number, scene in enumerate(five_scenes(parts.own)):
+        scenes = five_scenes(parts.own)
+        for number, scene in enumerate(scenes):
             measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Rounds())
             if not measurement.star_count:
                 lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
@@ -316,16 +322,17 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
             rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
             advance(number + 1)
         machine = f"{parts.own.renderer.gl_renderer}, {os.cpu_count()} cores"
-        shortened = shortened_line(parts.own)
+        shortened, glass = shortened_line(parts.own), glass_rows(file, scenes[DENSE], quick)
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
     others_cores = others.cores()
     busy = is_busy(others_cores)
-    lines = [*(scene_line(*scene, busy) for scene in judged), *lines]
+    lines = [*(scene_line(*scene, busy) for scene in judged), *lines, *([glass_line(glass)] if glass else [])]
     make_directory(directory)
-    for name, records in (("chain", rows), ("chain_budget", budget), ("chain_time", stages)):
-        write_records(directory / f"{name}.csv", records)
+    for name, records in (("chain", rows), ("chain_budget", budget), ("chain_time", stages), ("chain_psf", glass)):
+        if records:
+            write_records(directory / f"{name}.csv", records)
     notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([busy_line(others_cores)] if busy else [])]
-    draw(directory / "chain", rows, headline(rows, busy), "; ".join(notes))
+    draw(directory / "chain", rows, headline(rows, busy), "; ".join(notes), glass)
     draw_budget(directory / "chain_budget", rows, budget, stages)
     return [*lines, *notes], None if busy else not any(beating(own, as_filed=True)[0] for own, _, _ in judged)

@@ -3,7 +3,6 @@
 The twin of a bench: from an attitude to what falls on the tracker's detector, and what that reads out.
 """
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from hilstar.bench.config import Verify
 from hilstar.bench.frame import Bench, Frame
 from hilstar.errors import InputError
 from hilstar.frame.faults import FaultLayer
+from hilstar.frame.view import STILL, View
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.quantise import Panel, primary_lights
@@ -33,12 +33,11 @@ from hilstar.scene.sprites import shares_at
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.mosaic import CHANNELS, in_pixels, software_image
 from hilstar.twin.optics import BenchGeometry, DisplayColours, TwinOptics, seen_primaries
+from hilstar.twin.shutter import rolled, rolling_light
 from hilstar.twin.simulator import TrackerBackground
 
+GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a period most evenly
 PHASES = 4  # frames of a sequence with which an exposure may begin
-
-
-log = logging.getLogger(__name__)
 
 
 def exposure_lights(
@@ -144,10 +143,6 @@ class Twin(Closing):
         self.bench = open_bench(file)
         self.config = self.bench.config
         tracker = self.config.tracker
-        if tracker.detector.shutter != "global":
-            log.warning(
-                '[tracker.detector] shutter: verify exposes all rows at once; `campaign` with through = "bench" does not'
-            )
         self.camera = tracker_camera(tracker, file.folder)
         self.differs = any(name.startswith("true_") for name in changed_keys(self.config.verify))
         self.true_panel = true_panel(self.bench)
@@ -167,7 +162,15 @@ class Twin(Closing):
         exposure_s = self.config.tracker.exposure_s
         skies = [self.sky_optics.image_e_per_s(light.astype(np.float64)) * exposure_s for light in frame.light]
         panels = [self.true_panel, self.bench.panel] if self.differs else [self.true_panel]
-        lights = exposure_lights(self.bench, frame, first_frame, panels)
+        view = rolled(self._exposure_at(frame), self.config.tracker)
+        glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s
+        if view.scan.scanout_s and exposure_s:
+            phase_s = self._phase_s(first_frame)
+            seen = zip((self.true_optics, self.sky_optics), panels, strict=False)
+            parts = [rolling_light(self.bench, optics.geometry, panel, view, phase_s) for optics, panel in seen]
+            lights, glow_e = [light for light, _ in parts], glow_e * parts[0][1]
+        else:
+            lights = exposure_lights(self.bench, frame, first_frame, panels)
         by_primary = self.true_optics.images_e_per_s(lights[0], self.primaries) * exposure_s
         pixels_e, bayer = self._mosaic.shown(by_primary), self._mosaic.bayer
         sky = self._found_in(np.array(skies).sum(axis=0) if bayer is None else in_pixels(skies, bayer))
@@ -180,7 +183,6 @@ class Twin(Closing):
             by_channel = tuple(zip(np.tensordot(colours.by_primary, by_primary, 1), skies, strict=True))
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
-        glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s
         discs, under_e = self.bench.discs(view), glow_e + self._background.of_view_e(view)
         points = ~np.isin(frame.truth["name"], [disc.name for disc in discs])
         x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
@@ -194,10 +196,24 @@ class Twin(Closing):
     def _found_in(self, pixels_e: npt.NDArray[np.floating[Any]]) -> FloatArray:
         return np.asarray(software_image(pixels_e, self.config.tracker.detector))
 
+    def _exposure_at(self, frame: Frame) -> View:
+        return View.exposure(frame.q_icrs_to_cam, STILL, self.config.tracker.exposure_s, frame.t_ns)
+
+    def _phase_s(self, first_frame: int) -> float:
+        """When the screen begins a frame after the middle of an exposure: of a free tracker each exposure at another moment."""
+        if self.config.tracker.trigger != "free":
+            return -self.config.tracker.exposure_s / 2
+        return (first_frame * GOLDEN % 1.0) / self.config.monitor.refresh_hz
+
     def detected_e(self, seen: TwinField, rng: np.random.Generator) -> FloatArray:
-        """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted."""
-        dn = self.detector.expose(seen.pixels_e + seen.under_e, self.config.tracker.exposure_s, rng)
-        return self._found_in(dn * self.config.tracker.detector.gain_e_per_dn - seen.under_e)
+        """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted.
+
+        A frame transfer's smear is in these alone: in images without noise, sky and display would have the same.
+        """
+        exposure_s, under_e = self.config.tracker.exposure_s, np.broadcast_to(seen.under_e, seen.pixels_e.shape)
+        dn = self.detector.expose(seen.pixels_e + under_e, exposure_s, rng)
+        collected_e = self.detector.collected_e(under_e, exposure_s)
+        return self._found_in(dn * self.config.tracker.detector.gain_e_per_dn - collected_e)
 
     @property
     def monitor_px_per_px(self) -> float:

@@ -17,10 +17,14 @@ from hilstar.arrays import FloatArray
 from hilstar.assess import report
 from hilstar.assess.bench_effects import display_cost, slices_of, turn_between
 from hilstar.assess.lock import lock_of
+from hilstar.bench.bench_file import bench_file_of
+from hilstar.bench.build import bench_stars
+from hilstar.bench.cameras import tracker_camera
 from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.run.record.commanded import Commanded
 from hilstar.run.record.ledger_records import AnswerRecord
 from hilstar.twin.glass import split_errors
+from hilstar.twin.noise import field_stars
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
@@ -113,6 +117,34 @@ def test_a_bench_with_a_glass_is_told_what_each_correction_would_leave(tmp_path:
     assert px["without_colour"] < px["total"]
     assert glass["fov_arcsec"]["total"]["cross"] > glass["fov_arcsec"]["without_both"]["cross"] > 0
     assert "glass without colour,roll," in (tmp_path / "out" / "budget.csv").read_text()
+    assert glass["source"] == "PSF file" and "hold only attitudes" in (tmp_path / "out" / "budget.html").read_text()
+    # Answers that name their stars tell it by these, whatever the file says: here 0.3 px of distortion and 0.1 px a mag of B-V.
+    bench = bench_file_of(tmp_path / "bench.toml", bench_text({"tracker": tracker, "tracker.optics": {"psf": "psf.fits"}}))
+    stars, camera, rng = (
+        bench_stars(bench.config, tmp_path),
+        tracker_camera(bench.config.tracker, tmp_path),
+        np.random.default_rng(3),
+    )
+    records, whole = [], field_stars(stars, camera, planted.reported[0])
+    for number, (tau_s, q) in enumerate(zip(planted.tau_s.tolist(), planted.reported.tolist(), strict=True)):
+        rows = whole[:0] if number % 20 else field_stars(stars, camera, np.array(q))[:20]
+        u = (rows["x_px"] - SIDE_PX / 2) / (SIDE_PX / 2)
+        x = rows["x_px"] + 0.3 * u**3 + 0.1 * rows["bv"] + rng.normal(0, 0.02, len(rows))
+        named = [
+            (*place, 1.0, hip) for *place, hip in zip(x.tolist(), rows["y_px"].tolist(), rows["hip"].tolist(), strict=True)
+        ]
+        at_ns = round((tau_s + 5) * 1e9)
+        records.append(
+            AnswerRecord(host_ns=at_ns, raw="", t_ns=at_ns, q=tuple(q), middle_ns=at_ns, light_ns=at_ns, centroids=named)
+        )
+    ledger = write_ledger(tmp_path / "own.mcap", planted.frames_s, planted.frames_q, bench=bench.text, records=records)
+    run = run_hilstar_here("assess", ledger, "-o", tmp_path / "own", "--json", "--display-attitudes", "0")
+    glass = json.loads(run.stdout)["glass"]
+    assert glass["source"] == "answers' stars" and glass["stars"] > 200
+    px = glass["rms_px"]
+    assert 0.02 < px["without_both"] < 0.04  # the noise, and the planted attitudes' own error of 6 arcsec
+    assert px["total"] > 1.3 * px["without_distortion"] > 2 * px["without_both"]
+    assert glass["fov_arcsec"]["total"]["cross"] > glass["fov_arcsec"]["without_both"]["cross"]
 
 
 def test_a_split_finds_what_was_put_together() -> None:

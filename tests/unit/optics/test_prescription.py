@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.errors import InputError
+from hilstar.optics.prescription import one_turn_a_break
 from hilstar.optics.psf_file import Glass, read_glass
 from hilstar.resources import resource_path
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -16,6 +20,22 @@ from tests.support.commands import assert_refused, run_hilstar_here
 SIZE, PITCH_UM = "101,81", 20.0
 # Measured: 0.002 px and 0.7 %; diffraction's wings beyond the stamp are what is left.
 CENTROID_PX, SECOND = 0.01, 0.03
+# A doublet and a tilted, decentred singlet with a conic and an asphere, before a tilted image. A surface: radius, thickness,
+# glass, conic and the coefficient of r^4; a break: shifts, turns about x, y and z, order flag, thickness.
+TILTED = [
+    (42.0, 6.0, "N-BK7", 0.0, -4e-7), (-34.0, 2.0, "N-F2", 0.0, 0.0), (-160.0, 8.0, "", 0.0, 0.0),
+    (0.3, -0.25, 1.3, -0.9, 7.0, 0, 1.0),
+    (36.0, 4.0, "N-BK7", -0.4, 0.0), (-300.0, 1.0, "", 0.0, 0.0),
+    (-0.2, 0.3, -1.0, 0.8, -7.0, 1, 27.75), (0.0, 0.0, 0.3, -0.2, 0.0, 0, 0.0),
+    (np.inf, 0.0, "", 0.0, 0.0),
+]  # fmt: skip
+EPD_MM, WAVES_UM = 9.0, (0.48, 0.55)
+# Sellmeier's coefficients by Schott's data sheets.
+SCHOTT = {
+    "N-BK7": ((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653)),
+    "N-F2": ((1.39757037, 0.159201403, 1.2686543), (0.00995906143, 0.0546931752, 119.248346)),
+}
+CHIEF_PX, RAY_CENTROID_PX, RMS = 5e-4, 0.003, 0.01  # the issue's limits; measured 3e-4 px of 10 um
 
 
 def made(folder: Path, *options: object):
@@ -76,3 +96,112 @@ def test_the_ready_lens_is_a_bench_s_glass():
     assert glass.lens is not None
     focal_mm = float(" ".join(glass.history).split("focal length ")[1].split()[0])
     assert file.config.tracker.focal_length_mm == pytest.approx(focal_mm, rel=1e-3)
+
+
+def zemax(folder: Path) -> Path:
+    """TILTED as a file of Zemax's."""
+    lines = ["MODE SEQ", "UNIT MM X W X CM MR CPMM", f"ENPD {EPD_MM}", "FTYP 0 0 3 2 0 0 0", "GCAT SCHOTT", "XFLN 0 0 0",
+             "YFLN 0 5 8", *(f"WAVM {k} {um} 1" for k, um in enumerate(WAVES_UM, 1)), "PWAV 2",
+             "SURF 0", "  TYPE STANDARD", "  CURV 0.0", "  DISZ INFINITY"]  # fmt: skip
+    for number, part in enumerate(TILTED, 1):
+        lines += [f"SURF {number}", *(["  STOP"] if number == 1 else [])]
+        if len(part) == 7:
+            lines += ["  TYPE COORDBRK", *(f"  PARM {k} {value}" for k, value in enumerate(part[:6], 1)), f"  DISZ {part[6]}"]
+        else:
+            radius, thickness, glass, conic, fourth = part
+            lines += ["  TYPE EVENASPH", f"  CURV {1 / radius}", f"  CONI {conic}", f"  PARM 2 {fourth}", f"  DISZ {thickness}"]
+            lines += [f"  GLAS {glass} 0 0 1.5 60" if glass else ""]
+    (folder / "tilted.zmx").write_text("\n".join(lines) + "\n")
+    return folder / "tilted.zmx"
+
+
+def frames(parts):
+    """The rotation, origin and surface of each surface; Zemax turns about x, the new y, the newer z, or backwards."""
+    turn, origin = np.eye(3), np.zeros(3)
+    for part in parts:
+        if len(part) == 7:
+            dx, dy, x, y, z, backwards, _ = part
+            if backwards:
+                turn = turn @ Rotation.from_euler("ZYX", [z, y, x], degrees=True).as_matrix()
+                origin = origin + turn @ [dx, dy, 0]
+            else:
+                origin = origin + turn @ [dx, dy, 0]
+                turn = turn @ Rotation.from_euler("XYZ", [x, y, z], degrees=True).as_matrix()
+        else:
+            yield turn, origin, part
+        origin = origin + turn @ [0, 0, part[6] if len(part) == 7 else part[1]]
+
+
+def snell(at, along, um):
+    """Places and directions (3, n) at the image, by Snell's law in vectors."""
+    index = 1.0
+    for turn, origin, (radius, _, glass, conic, fourth) in frames(TILTED):
+        at, along = turn.T @ (at - origin[:, None]), turn.T @ along
+        far = -at[2] / along[2]
+        for _ in range(20):  # Newton
+            x, y, z = at + along * far
+            r2, c = x * x + y * y, 1 / radius
+            root = np.sqrt(1 - (1 + conic) * c * c * r2)
+            slope = c / root + 4 * fourth * r2
+            normal = np.stack([-slope * x, -slope * y, np.ones_like(x)])
+            far = far - (z - c * r2 / (1 + root) - fourth * r2**2) / (normal * along).sum(axis=0)
+        at, normal = at + along * far, normal / np.linalg.norm(normal, axis=0)
+        if not np.isfinite(radius):
+            return at, along
+        b, c = np.array(SCHOTT.get(glass, ((0.0,), (1.0,))))
+        after = float(np.sqrt(1 + (b * um**2 / (um**2 - c)).sum()))
+        ratio, cosine = index / after, (normal * along).sum(axis=0)
+        along = ratio * along + (np.sqrt(1 - ratio**2 * (1 - cosine**2)) - ratio * cosine) * normal
+        at, along, index = turn @ at + origin[:, None], turn @ along, after
+    raise AssertionError
+
+
+def test_breaks_keep_zemax_s_order(tmp_path):
+    """Each break of the file made for optiland has one turn or shift, and all surfaces stand where they stood."""
+    text = one_turn_a_break(zemax(tmp_path).read_text())
+    found = []
+    for surface in re.split(r"SURF \d+\n", text)[2:]:
+        value = {int(k): float(number) for k, number in re.findall(r"PARM (\d) (\S+)", surface)}
+        thickness = float(re.search(r"DISZ (\S+)", surface)[1])
+        if "COORDBRK" in surface:
+            assert sum(bool(value.get(k)) for k in (3, 4, 5)) <= 1 and 6 not in value
+            found.append((*(value.get(k, 0.0) for k in range(1, 6)), 0, thickness))
+        else:
+            found.append((0.0, thickness, "", 0.0, 0.0))
+    for (turn, origin, _), (turn_too, origin_too, _) in zip(frames(TILTED), frames(found), strict=True):
+        assert turn_too == pytest.approx(turn, abs=1e-12) and origin_too == pytest.approx(origin, abs=1e-12)
+    with pytest.raises(InputError, match=r"in IN \(UNIT\); write them in MM"):
+        one_turn_a_break(text.replace("UNIT MM", "UNIT IN"))
+
+
+def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path):
+    """Chief rays, centroids and widths over field, colour and focus; counted rays, for so wide a stamp."""
+    pytest.importorskip("optiland", reason="hilstar[lens] is 0.8 GB: no test environment has it")
+    options = ["--pitch-um", 10, "--resolution", "401,301", "--half-px", 60, "--oversampling", 2, "--focuses-um", "-40,40"]
+    result = run_hilstar_here("optics", "lens", zemax(tmp_path), "-o", tmp_path / "psf.fits", *options)
+    assert result.returncode == 0, result.stderr
+    glass = read_glass(tmp_path / "psf.fits")
+    focal_mm = float(" ".join(glass.history).split("focal length ")[1].split()[0])
+    grid = np.array(np.meshgrid(*[(np.arange(120) + 0.5) / 60 - 1] * 2)).reshape(2, -1)
+    pupil = np.concatenate([np.zeros((2, 1)), grid[:, (grid**2).sum(axis=0) <= 1]], axis=1) * EPD_MM / 2  # the chief ray first
+    start = np.concatenate([pupil, np.zeros((1, pupil.shape[1]))])
+    zero = snell(start[:, :1], np.array([[0.0], [0.0], [1.0]]), 0.55)[0][:2]
+    at = (np.arange(glass.basis.shape[1]) - glass.basis.shape[1] // 2) / glass.per_px
+    for point in (0, 8, 12, 24):
+        place_px = glass.places_px[point] - [200, 150]
+        tangent = place_px * 0.01 / focal_mm
+        for _ in range(20):
+            tangent = tangent + place_px * 0.01 / focal_mm - np.concatenate(glass.lens.bent(*tangent[:, None]))
+        way = np.array([*tangent, 1.0]) / np.linalg.norm([*tangent, 1.0])
+        for colour, um in enumerate(WAVES_UM):
+            places, along = snell(start, np.repeat(way[:, None], pupil.shape[1], axis=1), um)
+            for focus, defocus_um in enumerate((-40, 40)):
+                off_px = ((places + along / along[2] * defocus_um * 1e-3)[:2] - zero) / 0.01 - place_px[:, None]
+                lateral = glass.lateral_px[point, colour, focus]
+                assert lateral == pytest.approx(off_px[:, 0], abs=CHIEF_PX)
+                image = glass.images[point, colour, focus]
+                for axis in (0, 1):
+                    line, rays = image.sum(axis=axis), off_px[axis, 1:]
+                    assert line @ at + lateral[axis] == pytest.approx(rays.mean(), abs=RAY_CENTROID_PX)
+                    shared = rays.var() + 1 / 8 / glass.per_px**2  # by the samples among which a ray is shared out
+                    assert line @ at**2 - (line @ at) ** 2 == pytest.approx(shared, rel=RMS, abs=0.02)

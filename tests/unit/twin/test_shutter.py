@@ -21,6 +21,7 @@ from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 from hilstar.twin.shutter import rolled
 from hilstar.twin.simulator import Simulator
+from hilstar.twin.verify.twin import Twin
 from tests.support.benches import ORION_Q, TWIN, bench_text
 from tests.support.commands import run_hilstar_here
 from tests.support.stars import stars_at
@@ -132,6 +133,17 @@ def test_a_scanning_display_makes_the_stripes_of_the_closed_form(tmp_path):
     wanted = seen_at(Exposures(60.0, 0.04, lit_s=4e-3), late_s * 60.0).light
     assert wanted.max() > 1.2 and wanted.min() < 0.9
     assert means["rolling"][:, 2] / means["global"][:, 2] == pytest.approx(wanted, abs=1e-6)
+    # verify's twin has the same rows: triggered as that exposure, free at another phase each time.
+    for trigger, alike in (("external", True), ("free", False)):
+        path = tmp_path / f"{trigger}.toml"
+        tracked = {**tables["tracker"], "trigger": trigger}
+        path.write_text(bench_text({**tables, "tracker": tracked, **ROLLING}))
+        with Twin(read_bench_file(path)) as twin:
+            first, second = (twin.field(np.array(ORION_Q), number) for number in (0, 1))
+        for field, same in ((first, alike), (second, alike)):
+            assert np.allclose(field.shown_e + field.under_e, means["rolling"], rtol=1e-5) == same
+        assert np.allclose(first.under_e, second.under_e, rtol=1e-5) == alike
+        assert first.sky_e == pytest.approx(second.sky_e)
 
 
 def test_a_moving_star_behind_a_rolling_shutter_sees_the_frames_of_its_own_rows(tmp_path):
@@ -163,6 +175,13 @@ def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
     assert seen[40, 7] == 12
     plain = Detector(DetectorSettings(gain_e_per_dn=1.0, bits=16), (40, 50))
     assert (plain.expose_noiseless(light, 0.01) == np.rint(light)).all()
+    tables = {"tracker.detector": {"shutter": "frame-transfer", "row_shift_us": 5.0}, "background": {"electrons_per_px": 3000}}
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN, tables))
+    with Twin(read_bench_file(tmp_path / "bench.toml")) as twin:
+        seen = twin.detected_e(twin.field(np.array(ORION_Q), 0), np.random.default_rng(1))
+        rows, exposure_s = seen.shape[0], twin.config.tracker.exposure_s
+    smeared_e = 3000 * rows * 5e-6 / exposure_s  # 60 e- that the mean background's smear would leave
+    assert abs(np.median(seen)) < 0.2 * smeared_e
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@
 // The pass runs after the linear image and its nearest levels are drawn, and changes those levels. A pixel belongs to the star that
 // gives more than half of its light, so no pixel is written by two stars.
 // With TEMPORAL a star begins with the errors that it left in the frame before (hilstar/monitor/temporal.py).
-// Defined before this text: LEVELS (r8ui or r16ui); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
+// With TOGETHER it begins with what it left in the planes that were chosen before.
+// Defined before this text: LEVELS and LINEAR, formats; PLANE; NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
 // FIRST, its first pixel relative to the star's own; and exact/inputs.glsl, exact/stars.glsl, exact/pixels.glsl, exact/choices.glsl.
 // On a CPU memory reads cost most: a pixel's place is one word, read once, and images are read faster than textures. A branch costs
 // both its sides there, because eight stars run in one vector: no decision depends on a pixel's number, and loops end with the star.
@@ -64,12 +65,21 @@ Choice turn_one(Near near, Choice best) {
     return best;
 }
 
+#ifdef APART
+#define SHOWN(at) uvec4 shown = imageLoad(levels, at);
+#else
+#define SHOWN(at) uvec4 shown = uvec4(0u);
+#endif
+
 // Write only the pixels whose level is not the nearest one.
 void store(Near near, BITS up) {
 #define STORE(BITS_OF, FROM) \
     for (uint turned = up BITS_OF ^ near.rounded_up BITS_OF; turned != 0u; turned &= turned - 1u) { \
         int k = findLSB(turned) + FROM; \
-        imageStore(levels, near.star.pixel + offset_of(PLACE(k)), uvec4((step_of[k] >> 16) + uint(has_bit(up, k)))); }
+        ivec2 at = near.star.pixel + offset_of(PLACE(k)); \
+        SHOWN(at) \
+        shown[PLANE] = (step_of[k] >> 16) + uint(has_bit(up, k)); \
+        imageStore(levels, at, shown); }
 #if NEAR <= 32
     STORE(, 0)
 #else
@@ -110,13 +120,18 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
 }
 
 #ifdef TEMPORAL
+#define BEFORE before
+#else
+#define BEFORE left_sums
+#endif
+#if defined(TEMPORAL) || defined(TOGETHER)
 Sums sums_before(int i) {
     if (i < 0) return Sums(vec4(0.0), vec4(0.0), vec2(0.0));
     i *= 10;
     return Sums(
-        vec4(before[i], before[i + 1], before[i + 2], before[i + 3]),
-        vec4(before[i + 4], before[i + 5], before[i + 6], before[i + 7]),
-        vec2(before[i + 8], before[i + 9]));
+        vec4(BEFORE[i], BEFORE[i + 1], BEFORE[i + 2], BEFORE[i + 3]),
+        vec4(BEFORE[i + 4], BEFORE[i + 5], BEFORE[i + 6], BEFORE[i + 7]),
+        vec2(BEFORE[i + 8], BEFORE[i + 9]));
 }
 
 void leave(int i, Sums sums) {
@@ -131,6 +146,7 @@ void leave(int i, Sums sums) {
 void main() {
     int i = int(gl_GlobalInvocationID.x);
     if (i >= count) return;
+    is_alone = i < alone;
 #ifndef PATHS
     i = turn[i];
 #endif
@@ -140,6 +156,15 @@ void main() {
 #else
     Sums sums = Sums(vec4(0.0), vec4(0.0), vec2(0.0));
     float phase = 0.0;
+#endif
+#ifdef TOGETHER
+    for (int k = 0; k < PLANES; k++) {
+        if (makes_up[k] == 0.0) continue;  // it is not chosen yet
+        Sums left = sums_before(PLANES * i + k);
+        sums.a += makes_up[k] * left.a;
+        sums.b += makes_up[k] * left.b;
+        sums.c += makes_up[k] * left.c;
+    }
 #endif
 #ifdef PATHS
     ivec4 of = stretch[i];
@@ -158,5 +183,7 @@ void main() {
 #endif
 #ifdef TEMPORAL
     leave(i, sums);
+#elif defined(TOGETHER)
+    leave(PLANES * i + PLANE, sums);
 #endif
 }

@@ -19,7 +19,7 @@ from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, nearest_mixtures
 from hilstar.scene.extended import shifted
-from hilstar.scene.sprites import Sprites, by_share, shares_at
+from hilstar.scene.sprites import Sprites, extended_by_share, shares_at
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
 from hilstar.sky.stars import Stars
@@ -28,7 +28,7 @@ STEP_NM = 0.25  # of the spectra of primaries
 KNOT_STEPS = 8
 MEAN_WEIGHT = 1e3  # per nm: a mean wavelength within reach is met to 1e-3 nm
 UNSEEN = 1e-6  # share of white
-TINY = 1e-30  # electrons per second
+TINY = 1e-30  # electrons per second: a primary that a star has nothing of is chosen with the others all the same
 WITHIN, WITHIN_NM = 1e-6, 0.1  # within the gamut: of a star's electrons, and of its mean wavelength
 SCALE_K = np.geomspace(1500.0, 60_000.0, 400)
 
@@ -105,7 +105,7 @@ class Colours:
 
     def on(self, stars: Stars) -> Stars:
         """The stars with the light of each primary."""
-        return stars if stars.primaries is not None else replace(stars, primaries=self.shares(self.wanted(stars)))
+        return replace(stars, primaries=self._all(stars))
 
     def drive(self, shares: FloatArray) -> FloatArray:
         """How much of white stars of so much light of each primary (n, 3) ask for, relative to a white star, (n,)."""
@@ -134,10 +134,10 @@ class Colours:
 
     def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
         """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where light is none's, their mean."""
-        shares = self.on(stars).primaries
-        if shares is None:
-            raise AssertionError("made above")
-        return shares_at(shares, stars, star)
+        return shares_at(self._all(stars), stars, star)
+
+    def _all(self, stars: Stars) -> FloatArray:
+        return self.shares(self.wanted(stars)) if stars.primaries is None else stars.primaries
 
     def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.
@@ -167,36 +167,16 @@ class Colours:
         found["in_gamut"][own] = self.in_gamut(off)
         return found
 
-    def parts(self, sprites: Sprites, stars: Stars) -> tuple[Sprites, ...]:
-        """The sprites of each primary, each light where that primary has to be drawn for it to lie in its place."""
-        if stars.primaries is None:
-            raise AssertionError("the stars of a bench that drives its primaries apart have their shares")
-        bias = 0.5 if sprites.footprint_px % 2 else 0.0  # as in pack_sprites
-        found, places = [], self.places_px.tolist()
-        each = by_share(sprites, stars, stars.primaries)
-        extended: list[Any] = [()] * len(each)
-        if sprites.extended:
-            if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
-                moved = zip(each, places, strict=True)
-                self._kept[:] = [sprites.extended, [[shifted(one, -x, -y) for one in part.extended] for part, (x, y) in moved]]
-            extended = self._kept[1]
-        for light, (right, down), lights in zip(each, places, extended, strict=True):
-            x_px, y_px = light.x_px - right, light.y_px - down
-            for column, place_px in enumerate((x_px, y_px)) if right or down else ():
-                pixel = np.floor(place_px + bias)
-                light.data["pixel"][:, column], light.data["fraction_px"][:, column] = pixel, place_px - pixel
-            found.append(replace(light, x_px=x_px, y_px=y_px, extended=tuple(lights)))
-        return tuple(found)
-
-
-def lit_alone(sprites: Sprites, faintest_e_per_s: float) -> Sprites:
-    """The sprites of a primary without those of stars that have less of its light than a pixel can show, or none."""
-    rates = np.ascontiguousarray(sprites.data["electrons_per_s"])
-    lit = np.flatnonzero(rates >= max(faintest_e_per_s / sprites.per_star, TINY))
-    if len(lit) == len(sprites):
-        return sprites
-    x_px, y_px = sprites.x_px[lit], sprites.y_px[lit]
-    return replace(sprites, data=sprites.data[lit], star=sprites.star[lit], x_px=x_px, y_px=y_px)
+    def driven(self, sprites: Sprites, stars: Stars) -> Sprites:
+        """Sprites with the light of each primary; `sprites.star` has places among `stars`."""
+        shares = self.shares_of(stars, sprites.star)
+        light = np.maximum(sprites.data["electrons_per_s"][:, None] * shares, TINY).astype(np.float32)
+        if not sprites.extended:
+            return replace(sprites, primaries=light)
+        if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
+            each = zip(extended_by_share(sprites, stars, self._all(stars)), self.places_px.tolist(), strict=True)
+            self._kept[:] = [sprites.extended, tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in each)]
+        return replace(sprites, primaries=light, lights=self._kept[1])
 
 
 def _index(colour: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ In the straight foot of sRGB all steps are equal, so a star of N steps cannot ha
 This is the oracle of shaders/exact.comp, and what draws where that cannot run.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -97,6 +97,9 @@ class ExactQuantiser(Quantiser):
     weights: ClassVar[Weights] = IN_A_FRAME
     remembers: ClassVar[bool] = False
     left: Left | None = None
+    # For so much of what these quantisers of other primaries left in the same frame each star makes up, in steps of both.
+    given: "Sequence[tuple[float, ExactQuantiser]]" = ()
+    over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
 
     def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
         super().__init__(panel, resolution_px, psf, seen)
@@ -190,8 +193,12 @@ class ExactQuantiser(Quantiser):
         return np.maximum(order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order))
 
     def _carried(self, sprites: Sprites) -> Carried:
-        """The errors that each sprite begins with: none, in a frame that is right by itself."""
-        return nothing_carried(len(sprites))
+        """The errors that each sprite begins with: what its light in other primaries left, or none."""
+        carried = nothing_carried(len(sprites))
+        for part, other in self.given if sprites.per_star == 1 else ():
+            if part and other.over is not None:
+                np.add(carried.error, np.float32(part) * other.over, out=carried.error)
+        return carried
 
     def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
         """The errors (SUMS, n) that stars whose pixels have these steps (near, n) are given to make up for."""
@@ -199,6 +206,7 @@ class ExactQuantiser(Quantiser):
 
     def _keep(self, sprites: Sprites, left: Float32Array) -> None:
         """Take notice of the errors (SUMS, n) that a frame's sprites leave."""
+        self.over = left
 
     def _choose(self, found: Footprints, carried: Carried, reach: IntArray) -> tuple[IntArray, Float32Array]:
         """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried` leave, (SUMS, n).

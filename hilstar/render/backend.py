@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array
+from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 from hilstar.monitor.balance import AS_USUAL, Seen
-from hilstar.monitor.exact import COMPUTE_VERSION
-from hilstar.monitor.quantise import LevelCost, Panel, Quantiser
-from hilstar.monitor.quantisers import Quantisation
+from hilstar.monitor.exact import COMPUTE_VERSION, ExactQuantiser
+from hilstar.monitor.quantise import LevelCost, Panel, Quantiser, level_dtype
+from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.monitor.response import Levels, Response
 from hilstar.optics.glass_psf import GlassPsf
 from hilstar.scene.extended import LightMap
 from hilstar.scene.frame_motion import Orientation
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import Sprites, by_channel, without_stars
+from hilstar.scene.sprites import Sprites, by_channel, by_primary, without_stars
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -51,7 +51,8 @@ class Target:
 
     `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere). `sides` are those
     of fainter stars' sprites, by falling rates, of the same parity as the footprint. `seen` is how the tracker sees the
-    monitor, for `exact` and `temporal`. Where the `primaries` are driven apart, each has its own target.
+    monitor, for `exact` and `temporal`. Where the `primaries` are driven apart, each has its panel, and its light lies at its
+    place of `places_px` (3, 2) within a pixel; `together` (3, 3) are products of two primaries' electrons over the channels.
     """
 
     resolution_px: tuple[int, int]
@@ -62,14 +63,41 @@ class Target:
     uniformity: Float32Array | None = None
     sides: SpriteSides = ()
     seen: Seen = AS_USUAL
-    primaries: "tuple[Target, ...]" = ()
+    primaries: tuple[Panel, ...] = ()
+    places_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
+    together: FloatArray = field(default_factory=lambda: np.eye(1))
 
-    def of_primary(self, panel: Panel) -> "Target":
-        """The target of a primary with the light of a panel: sprites are as large as those of a white star as bright."""
-        share = panel.flux_at_white_e_per_s / self.flux_at_white_e_per_s
-        sides = tuple(SpriteSide(side.below_e_per_s * share, side.side_px) for side in self.sides)
-        white_e_per_s = panel.flux_at_white_e_per_s
-        return replace(self, response=panel.response, flux_at_white_e_per_s=white_e_per_s, sides=sides, primaries=())
+    def in_turn(self) -> list[tuple[int, list[float]]]:
+        """The order in which `exact` chooses the primaries' levels: by falling electrons a step, for the last leave least.
+
+        With each goes for how much of what the stars left in each primary, in its steps, they make up in this one's steps: of
+        those before it, by the light of the channels. `temporal` has each primary make up for its own light alone.
+        """
+        panels = self.primaries
+        if not panels:
+            return [(0, [0.0])]
+        step = np.array([panel.response.light[1] * panel.flux_at_white_e_per_s for panel in panels])
+        order, alone = np.argsort(-step, kind="stable").tolist(), getattr(QUANTISERS[self.quantisation], "remembers", False)
+        share = self.together / self.together.diagonal() * step[:, None] / step
+        # What a primary leaves has in it what it began with: `own` (3, 3) are its own errors by what each leaves.
+        own, found = np.zeros_like(share), []
+        for k in order:
+            makes_up = np.zeros(len(panels)) if alone else share[:, k] @ own
+            own[k] = -makes_up
+            own[k, k] += 1
+            found.append((k, makes_up.tolist()))
+        return found
+
+    def levels_by(self, quantisers: Sequence[ExactQuantiser], sprites: Sprites | None, floor: Levels | None) -> Levels:
+        """The levels of a frame by the quantisers of each panel, on those of extended light."""
+        if not self.primaries:
+            return quantisers[0].levels(sprites, floor)
+        found = np.empty((*self.resolution_px[::-1], len(quantisers)), level_dtype(self.primaries[0].response))
+        for k, makes_up in self.in_turn():
+            quantisers[k].given = list(zip(makes_up, quantisers, strict=True))
+            light = None if sprites is None else by_primary(sprites, self.places_px, k)
+            found[..., k] = quantisers[k].levels(light, None if floor is None else Levels(floor[..., k]))
+        return Levels(found)
 
     def panel(self) -> Panel | None:
         """The monitor, None without a response. Raises InputError for a map that does not fit."""
@@ -115,7 +143,7 @@ class Backend(ABC):
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw the linear image and the levels of `sprites` (None: blank); read them with `linear` and `levels`.
 
-        A target of `primaries` takes those of `sprites.primaries`, and has no linear image then.
+        A target of `primaries` takes `sprites.primaries` and `sprites.lights`, and has no linear image then.
 
         `frame` counts the frames shown, for `temporal` alone: a number not above the last one's begins a new sequence.
         """
@@ -141,11 +169,8 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def show_on(self, view: ScreenView, beside: "Sequence[Backend]" = ()) -> None:
-        """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in.
-
-        Its levels are red's codes where those `beside` it, of the same context, have green's and blue's.
-        """
+    def show_on(self, view: ScreenView) -> None:
+        """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in."""
 
     @abstractmethod
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
@@ -197,6 +222,10 @@ def as_maps(sprites: Sprites | None, target: Target) -> Sprites | None:
     psf = target.psf
     if sprites is None or sprites.spectra is None or not isinstance(psf, GlassPsf):
         return sprites
+    if sprites.primaries is not None:
+        parts = (as_maps(by_primary(sprites, target.places_px, k), target) for k in range(len(target.primaries)))
+        lights = tuple(() if part is None else part.extended for part in parts)
+        return replace(without_stars(sprites), extended=lights[0], lights=lights)
     image = np.ascontiguousarray(psf.image(sprites, sprites.spectra, target.resolution_px))
     return replace(without_stars(sprites), extended=(*sprites.extended, LightMap(image, lasting=False)))
 

@@ -5,39 +5,46 @@
 // gives more than half of its light, so no pixel is written by two stars.
 // With TEMPORAL a star begins with the errors that it left in the frame before (hilstar/monitor/temporal.py).
 // With TOGETHER it begins with what it left in the planes that were chosen before.
-// Defined before this text: LEVELS and LINEAR, formats; PLANE; NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
+// Defined before this text: LEVELS and LINEAR, formats; PLANE; KEPT (8 or 4); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
 // FIRST, its first pixel relative to the star's own; and exact/inputs.glsl, exact/stars.glsl, exact/pixels.glsl, exact/choices.glsl.
 // On a CPU memory reads cost most: a pixel's place is one word, read once, and images are read faster than textures. A branch costs
 // both its sides there, because eight stars run in one vector: no decision depends on a pixel's number, and loops end with the star.
 
 layout(local_size_x = 32) in;
 
-// Decide the star's pixels one after another, with eight choices side by side, and return the best. The sums begin with `error` for
+// Decide the star's pixels one after another, with KEPT choices side by side, and return the best. The sums begin with `error` for
 // light and moments, and with `carried` for the rest.
 Choice decide(Near near, vec3 error, Sums carried) {
     vec3 begin = error * vec3(near.light_weight, weights.yy);
     float begin_square = dot(begin, begin) + carried.a.w * carried.a.w + dot(carried.b, carried.b) + dot(carried.c, carried.c);
     Choice kept[KEPT];
 #define BEGIN(M) kept[M] = Choice(vec4(begin, carried.a.w), carried.b, carried.c, M == 0 ? begin_square : NONE, BITS(0u));
-    EIGHT(BEGIN)
-    // Three pixels at a time. The last two may be padding, which changes nothing.
+    EACH(BEGIN)
+    // A round of pixels at a time. The last of them may be padding, which changes nothing.
     for (int k = near.pixels; k < near.pixels + 2; k++) {
 #ifdef PATHS
         place[k] = 0u;
 #endif
         step_of[k] = NO_STEP;
     }
+#if KEPT == 8
     for (int k = 0; k < near.pixels; k += 3) {
         DECIDE(k, NEXT_TO_EACH)
         DECIDE(k + 1, TWO_APART)
         DECIDE(k + 2, FOUR_APART)
     }
+#else
+    for (int k = 0; k < near.pixels; k += 2) {
+        DECIDE(k, NEXT_TO_EACH)
+        DECIDE(k + 1, TWO_APART)
+    }
+#endif
     Choice best = kept[0];
     best.square += (last_light * last_light - 1.0) * best.a.x * best.a.x;
 #define BEST(M) \
     kept[M].square += (last_light * last_light - 1.0) * kept[M].a.x * kept[M].a.x; \
     best = pick(kept[M].square < best.square, kept[M], best);
-    SEVEN(BEST)
+    OTHERS(BEST)
     return best;
 }
 

@@ -4,7 +4,7 @@ Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -14,8 +14,8 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 from hilstar.monitor.balance import AS_USUAL, Seen
-from hilstar.monitor.exact import COMPUTE_VERSION, ExactQuantiser
-from hilstar.monitor.quantise import LevelCost, Panel, Quantiser, level_dtype
+from hilstar.monitor.exact import COMPUTE_VERSION, KEPT_APART, ExactQuantiser
+from hilstar.monitor.quantise import LevelCost, Panel, Quantiser
 from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.monitor.response import Levels, Response
 from hilstar.optics.glass_psf import GlassPsf
@@ -88,16 +88,23 @@ class Target:
             found.append((k, makes_up.tolist()))
         return found
 
-    def levels_by(self, quantisers: Sequence[ExactQuantiser], sprites: Sprites | None, floor: Levels | None) -> Levels:
-        """The levels of a frame by the quantisers of each panel, on those of extended light."""
-        if not self.primaries:
-            return quantisers[0].levels(sprites, floor)
-        found = np.empty((*self.resolution_px[::-1], len(quantisers)), level_dtype(self.primaries[0].response))
-        for k, makes_up in self.in_turn():
-            quantisers[k].given = list(zip(makes_up, quantisers, strict=True))
-            light = None if sprites is None else by_primary(sprites, self.places_px, k)
-            found[..., k] = quantisers[k].levels(light, None if floor is None else Levels(floor[..., k]))
-        return Levels(found)
+    def quantisers(self) -> dict[int, Quantiser]:
+        """NumPy's quantiser of each panel, in the order in which they choose; none without a response."""
+        panel, made = self.panel(), QUANTISERS[self.quantisation]
+        panels = self.primaries or (() if panel is None else (panel,))
+        found = {k: made(panels[k], self.resolution_px, self.psf, self.seen) for k, _ in self.in_turn() if panels}
+        for k, makes_up in self.in_turn() if self.primaries else ():
+            if isinstance(one := found[k], ExactQuantiser):
+                one.kept, one.given = KEPT_APART, [(part, found[j]) for j, part in enumerate(makes_up)]
+        return found
+
+    def by_plane(self, sprites: Sprites | None, levels: Callable[[int, Sprites | None], Levels]) -> Levels:
+        """The levels of a frame by those of each primary, if primaries are driven apart, chosen in their order."""
+        if not self.primaries or sprites is None:
+            found = {k: levels(k, sprites) for k, _ in self.in_turn()}
+        else:
+            found = {k: levels(k, by_primary(sprites, self.places_px, k)) for k, _ in self.in_turn()}
+        return found[0] if not self.primaries else Levels(np.stack([found[k] for k in range(len(found))], -1))
 
     def panel(self) -> Panel | None:
         """The monitor, None without a response. Raises InputError for a map that does not fit."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import IntArray
 from hilstar.monitor.balance import SUMS, Balance
-from hilstar.monitor.exact import CARRIED, ExactQuantiser, Left
+from hilstar.monitor.exact import CARRIED, KEPT, KEPT_APART, ExactQuantiser, Left
 from hilstar.monitor.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.render.backend import Target
@@ -78,7 +78,12 @@ class ExactPass:
             return self._programs[paths, summed]
         order, panel, balance, together = self._pixels, self._panel, self._balance, self._together is not None and not paths
         defines = [f"NEAR {order.near}", f"LEVELS {self._format}", f"LINEAR {linear_format(self._planes)}"]
-        defines += [f"PLANE {self.plane}", *self._planes.defines, *["TOGETHER"] * together]
+        defines += [
+            f"PLANE {self.plane}",
+            f"KEPT {KEPT_APART if self._planes.apart else KEPT}",
+            *self._planes.defines,
+            *["TOGETHER"] * together,
+        ]
         defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.psf.width_px) < NARROW_PX)
         defines += self._shares.defines
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)

@@ -13,15 +13,13 @@ import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import MachineError
-from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import FrameLight
-from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.aids import LINE_SHARE, lay_over
 from hilstar.render.backend import EGL_LIBRARY, NO_FRAME, Backend, ScreenView, Target, as_maps
 from hilstar.render.reference import add_stars, extended_image
 from hilstar.scene.extended import ExtendedLight
-from hilstar.scene.sprites import Sprites, by_primary
+from hilstar.scene.sprites import Sprites
 
 if TYPE_CHECKING:
     from moderngl import Context
@@ -76,9 +74,7 @@ class NumpyBackend(Backend):
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        panel, made = target.panel(), QUANTISERS[target.quantisation]
-        panels = target.primaries or (() if panel is None else (panel,))
-        self._quantisers = [made(one, target.resolution_px, target.psf, target.seen) for one in panels]
+        self._quantisers = target.quantisers()
         self._last_frame = NO_FRAME
         self._linear: Float32Array | None = None  # that of `_sprites`, once somebody asks
         self._sprites: Sprites | None = None
@@ -91,17 +87,12 @@ class NumpyBackend(Backend):
             self.begin_anew()
         self._last_frame = frame
         self._sprites, self._linear = sprites, None
-        found, apart = {}, bool(self.target.primaries)
-        for k, makes_up in self.target.in_turn() if self._quantisers else ():
-            one, light = self._quantisers[k], sprites
-            if isinstance(one, ExactQuantiser):
-                one.given = [(part, other) for part, other in zip(makes_up, self._quantisers, strict=True) if part]  # type: ignore[misc]
-            if apart and sprites is not None:
-                light = by_primary(sprites, self.target.places_px, k)
-            image, alone = partial(self._image, light, True, k), partial(self._image, light, False, k, stars=False)
-            found[k] = one.draw(FrameLight(light, image, alone, frame))
-        if found:
-            self._levels = Levels(np.stack([found[k] for k in sorted(found)], -1)) if apart else found[0]
+        if self._quantisers:
+            self._levels = self.target.by_plane(sprites, partial(self._plane, frame))
+
+    def _plane(self, frame: int, k: int, light: Sprites | None) -> Levels:
+        image, alone = partial(self._image, light, True, k), partial(self._image, light, False, k, stars=False)
+        return self._quantisers[k].draw(FrameLight(light, image, alone, frame))
 
     def draw_linear(self, sprites: Sprites) -> None:
         """Draw the linear image of `sprites` alone; see `Backend.draw_linear`."""
@@ -146,7 +137,7 @@ class NumpyBackend(Backend):
     def begin_anew(self) -> None:
         """The next frame is the first of a sequence."""
         self._last_frame = NO_FRAME
-        for one in self._quantisers:
+        for one in self._quantisers.values():
             one.begin_anew()
 
     def finish(self) -> None:

@@ -115,7 +115,7 @@ class Renderer(Backend):
         self._passes: StarPasses | None = None
         self._unit_splat: moderngl.Program | None = None  # where points are in units
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
-        self._exact: list[ExactQuantiser] = []
+        self._exact: dict[int, ExactQuantiser] = {}
         self._floor_encoder: Encoder | None = None
         self._floor_key: tuple[object, float] = ((), 0.0)
         self._floor_levels: Levels | None = None
@@ -229,7 +229,7 @@ class Renderer(Backend):
     def begin_anew(self) -> None:
         """See `Backend.begin_anew`."""
         self._last_frame = NO_FRAME
-        for quantiser in self._exact:
+        for quantiser in self._exact.values():
             quantiser.left = None
         for one in self._exact_passes:
             one.left = None
@@ -280,12 +280,13 @@ class Renderer(Backend):
         if levels is None or by_star is None:
             return
         if not self._exact:
-            self._exact = [by_star(one, target.resolution_px, target.psf, target.seen) for one in self._planes.panels]
+            self._exact = {k: one for k, one in target.quantisers().items() if isinstance(one, ExactQuantiser)}
         for one in self._exact_passes:
             if (left := one.left) is not None:
                 self._exact[one.plane].left, one.left = left, None
         floor = None if sprites is None or not sprites.extended else self._floor(sprites, by_star.floor_turn(frame), levels)
-        self._exact_levels = target.levels_by(self._exact, sprites, floor)
+        on = [None] * len(self._exact) if floor is None else np.atleast_3d(floor).transpose(2, 0, 1)
+        self._exact_levels = target.by_plane(sprites, lambda k, light: self._exact[k].levels(light, on[k]))
         levels.write(self._exact_levels)
 
     def _floor(self, sprites: Sprites, turn: float, levels: LevelTexture) -> Levels:

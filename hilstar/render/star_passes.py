@@ -35,7 +35,7 @@ MAX_ERASED = 0.1
 MAX_ERASED_KEPT = 0.1  # with the sums, and all pixels among which `exact` chooses
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
 RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # runs of stars are sorted by light; runs times half octaves fill 16 bits
-STRIP_PX = 64  # more than two stars' reach
+STRIP_PX = 64.0
 PHASE_PX = 0.1  # a star is at most so far from the middle of its phase
 
 
@@ -185,16 +185,16 @@ class StarPasses:
         """Those that stand alone come first, stars of alike light one after another."""
         rates = np.ascontiguousarray(sprites.data["electrons_per_s"])
         crowded = np.ones(len(sprites), dtype=np.bool_)
-        if sprites.per_star == 1:
+        if sprites.per_star == 1 and len(sprites) * self._footprint_px**2 < math.prod(self._size_px):  # else few do
             squares = np.maximum(np.log(np.maximum(reach_per_e * rates, 1e-30)), self._least_reach) * max(self._units.axes_px2)
-            reach_px = np.sqrt(squares) + max(self._planes.margin_px)
-            crowded = crowded_at(sprites.x_px, sprites.y_px, np.minimum(reach_px, self._footprint_px / 2 + 1))
-        parts = [np.flatnonzero(crowded == which) for which in (False, True)]
-        order = np.concatenate([one[turns_of(rates[one], self._units.lit_e_per_s)] for one in parts]).astype(np.int32)
+            crowded = crowded_at(sprites.x_px, sprites.y_px, np.sqrt(squares) + math.hypot(*self._planes.margin_px))
+        order = turns_of(rates, self._units.lit_e_per_s)
+        last = crowded[order]
+        order = np.concatenate([order[~last], order[last]]).astype(np.int32)
         if self._order.size < order.nbytes:
             self._order.orphan(2 * order.nbytes)
         self._order.write(order)
-        self._alone = len(parts[0])
+        self._alone = len(order) - int(np.count_nonzero(last))
         for program in self._programs:
             program["alone"], program["reach_of_alone_per_e"] = self._alone, self._units.reach_per_e(sprites, alone=True)
 
@@ -250,21 +250,24 @@ def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
 
 
 def crowded_at(x_px: FloatArray, y_px: FloatArray, reach_px: FloatArray) -> BoolArray:
-    """Whether the square of a star, `reach_px` (n,) about it, meets another's, (n,): sought in strips of the image."""
-    strip_px = max(STRIP_PX, 2 * float(reach_px.max(initial=0.0)))
-    long = float(np.ptp(y_px)) + 2 * strip_px if len(y_px) else 1.0
-    key = np.floor(x_px / strip_px) * long + y_px
-    order = np.argsort(key)
-    x, y, reach, key = x_px[order], y_px[order], reach_px[order], key[order]
-    crowded = np.zeros(len(key), dtype=np.bool_)
-    far = reach + reach.max(initial=0.0)
-    for first, strip in ((np.arange(1, len(key) + 1), 0.0), (np.searchsorted(key, key + long - far), long)):
-        count = np.maximum(np.searchsorted(key, key + strip + far, side="right") - first, 0)
+    """Whether the circle of a star, `reach_px` (n,) about it, meets another's, (n,): sought in strips of the image."""
+    if not len(x_px):
+        return np.zeros(0, dtype=np.bool_)
+    low, high = y_px.min(), y_px.max()
+    most_px = 2 * float(reach_px.max())  # by which two stars may be apart
+    strip, long = np.floor(x_px / max(most_px, STRIP_PX)), high - low + 2 * most_px
+    key = strip * long + (y_px - low)
+    order = key.argsort()
+    x, y, reach, key, crowded = x_px[order], y_px[order], reach_px[order], key[order], np.zeros(len(x_px), dtype=np.bool_)
+    count = key.searchsorted(key + (reach + most_px / 2)) - np.arange(1, len(key) + 1)
+    pairs = [(np.arange(1, len(key) + 1), np.maximum(count, 0))]
+    if strip.max() > strip.min():
+        first = key.searchsorted(key + long - most_px)
+        pairs.append((first, key.searchsorted(key + long + most_px) - first))
+    for first, count in pairs:
+        end = count.cumsum()
         one = np.repeat(np.arange(len(key)), count)
-        other = np.arange(len(one)) + np.repeat(first - (np.cumsum(count) - count), count)
-        both = reach[one] + reach[other]
-        meet = (np.abs(x[one] - x[other]) <= both) & (np.abs(y[one] - y[other]) <= both)
+        other = np.arange(end[-1]) + np.repeat(first - (end - count), count)
+        meet = (x[one] - x[other]) ** 2 + (y[one] - y[other]) ** 2 <= (reach[one] + reach[other]) ** 2
         crowded[one[meet]] = crowded[other[meet]] = True
-    found = np.empty_like(crowded)
-    found[order] = crowded
-    return found
+    return np.asarray(crowded[order.argsort()])

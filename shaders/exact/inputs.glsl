@@ -70,7 +70,6 @@ uniform float few_steps;
 uniform float last_light;
 
 const int PHASES = 8;
-const int KEPT = 8;
 const float NONE = 1e30;
 const float SAME_STEP = 1e-4;
 const float OFF = 0.6;  // of a step, where steps are equal: then one more pixel is turned

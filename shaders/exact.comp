@@ -164,7 +164,7 @@ void main() {
     Sums sums = Sums(vec4(0.0), vec4(0.0), vec2(0.0));
     float phase = 0.0;
 #endif
-#ifdef TOGETHER
+#if defined(TOGETHER) && defined(MAKES_UP)
     for (int k = 0; k < PLANES; k++) {
         if (makes_up[k] == 0.0) continue;  // it is not chosen yet
         Sums left = sums_before(PLANES * i + k);
@@ -190,7 +190,7 @@ void main() {
 #endif
 #ifdef TEMPORAL
     leave(i, sums);
-#elif defined(TOGETHER)
+#elif defined(TOGETHER) && defined(LEAVES)
     leave(PLANES * i + PLANE, sums);
 #endif
 }

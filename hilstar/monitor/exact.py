@@ -35,7 +35,7 @@ from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 KEPT = 8  # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
-KEPT_APART = 4  # of each primary that is driven apart
+KEPT_BEFORE = 4  # where another primary makes up for what these leave
 CHUNK = 256  # stars at a time: their arrays stay in a core's cache
 OFF = 0.6  # in steps, where steps are equal: beyond it one more pixel is turned
 SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal

@@ -6,7 +6,7 @@ Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 from hilstar.monitor.balance import AS_USUAL, Seen
-from hilstar.monitor.exact import COMPUTE_VERSION, KEPT_APART, ExactQuantiser
+from hilstar.monitor.exact import COMPUTE_VERSION, KEPT, KEPT_BEFORE, ExactQuantiser
 from hilstar.monitor.quantise import LevelCost, Panel, Quantiser
 from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.monitor.response import Levels, Response
@@ -45,6 +45,14 @@ class SpriteSide:
 SpriteSides = tuple[SpriteSide, ...]
 
 
+class Turn(NamedTuple):
+    """One of a target's panels: for how much of what stars left in each, in its steps, they make up here; choices kept."""
+
+    plane: int
+    makes_up: list[float]
+    kept: int = KEPT
+
+
 @dataclass(frozen=True, slots=True)
 class Target:
     """The image that a backend draws: its pixels, its sprites, and a monitor's response where codes are wanted.
@@ -67,15 +75,14 @@ class Target:
     places_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     together: FloatArray = field(default_factory=lambda: np.eye(1))
 
-    def in_turn(self) -> list[tuple[int, list[float]]]:
+    def in_turn(self) -> list[Turn]:
         """The order in which `exact` chooses the primaries' levels: by falling electrons a step, for the last leave least.
 
-        With each goes for how much of what the stars left in each primary, in its steps, they make up in this one's steps: of
-        those before it, by the light of the channels. `temporal` has each primary make up for its own light alone.
+        Each makes up for those before it, by the light of the channels; in `temporal` for its own light alone.
         """
         panels = self.primaries
         if not panels:
-            return [(0, [0.0])]
+            return [Turn(0, [0.0])]
         step = np.array([panel.response.light[1] * panel.flux_at_white_e_per_s for panel in panels])
         order, alone = np.argsort(-step, kind="stable").tolist(), getattr(QUANTISERS[self.quantisation], "remembers", False)
         share = self.together / self.together.diagonal() * step[:, None] / step
@@ -85,25 +92,25 @@ class Target:
             makes_up = np.zeros(len(panels)) if alone else share[:, k] @ own
             own[k] = -makes_up
             own[k, k] += 1
-            found.append((k, makes_up.tolist()))
+            found.append(Turn(k, makes_up.tolist(), KEPT if alone or k == order[-1] else KEPT_BEFORE))
         return found
 
     def quantisers(self) -> dict[int, Quantiser]:
         """NumPy's quantiser of each panel, in the order in which they choose; none without a response."""
         panel, made = self.panel(), QUANTISERS[self.quantisation]
         panels = self.primaries or (() if panel is None else (panel,))
-        found = {k: made(panels[k], self.resolution_px, self.psf, self.seen) for k, _ in self.in_turn() if panels}
-        for k, makes_up in self.in_turn() if self.primaries else ():
+        found = {k: made(panels[k], self.resolution_px, self.psf, self.seen) for k, *_ in self.in_turn() if panels}
+        for k, makes_up, kept in self.in_turn() if self.primaries else ():
             if isinstance(one := found[k], ExactQuantiser):
-                one.kept, one.given = KEPT_APART, [(part, found[j]) for j, part in enumerate(makes_up)]
+                one.kept, one.given = kept, [(part, found[j]) for j, part in enumerate(makes_up)]
         return found
 
     def by_plane(self, sprites: Sprites | None, levels: Callable[[int, Sprites | None], Levels]) -> Levels:
         """The levels of a frame by those of each primary, if primaries are driven apart, chosen in their order."""
         if not self.primaries or sprites is None:
-            found = {k: levels(k, sprites) for k, _ in self.in_turn()}
+            found = {k: levels(k, sprites) for k, *_ in self.in_turn()}
         else:
-            found = {k: levels(k, by_primary(sprites, self.places_px, k)) for k, _ in self.in_turn()}
+            found = {k: levels(k, by_primary(sprites, self.places_px, k)) for k, *_ in self.in_turn()}
         return found[0] if not self.primaries else Levels(np.stack([found[k] for k in range(len(found))], -1))
 
     def panel(self) -> Panel | None:

@@ -12,10 +12,10 @@ import numpy.typing as npt
 
 from hilstar.arrays import IntArray
 from hilstar.monitor.balance import SUMS, Balance
-from hilstar.monitor.exact import CARRIED, KEPT, KEPT_APART, ExactQuantiser, Left
+from hilstar.monitor.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left
 from hilstar.monitor.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
-from hilstar.render.backend import Target
+from hilstar.render.backend import Target, Turn
 from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, linear_format
 from hilstar.render.star_passes import StarPasses, turns_of
 from hilstar.scene.psf import PIXEL_VARIANCE
@@ -36,8 +36,8 @@ SUMS_BYTES = 4 * SUMS
 class ExactPass:
     """Chooses the levels of sprites anew on a plane of a LevelTexture that has the nearest ones.
 
-    `turn` is the plane, and for how much of what each plane left a star makes up in this one (see `Target.in_turn`); `left` has
-    room for what all planes leave. It lives in its renderer's context.
+    `turn` says on which, and for what stars make up there; `left` has room for what all planes leave. It lives in its
+    renderer's context.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class ExactPass:
         quantiser: type[ExactQuantiser],
         target: Target,
         planes: Planes,
-        turn: tuple[int, list[float]],
+        turn: Turn,
         *,
         linear: moderngl.Texture,
         levels: LevelTexture,
@@ -53,7 +53,7 @@ class ExactPass:
         left: "StarSums | None",
     ) -> None:
         ctx = self._ctx = linear.ctx
-        self.plane, self._makes_up = turn
+        self.plane, self._makes_up, self._kept = turn
         panel = planes.panels[self.plane]
         self._planes, self._together = planes, left
         self._format = levels.format
@@ -80,7 +80,9 @@ class ExactPass:
         defines = [f"NEAR {order.near}", f"LEVELS {self._format}", f"LINEAR {linear_format(self._planes)}"]
         defines += [
             f"PLANE {self.plane}",
-            f"KEPT {KEPT_APART if self._planes.apart else KEPT}",
+            f"KEPT {self._kept}",
+            *["MAKES_UP"] * any(self._makes_up),
+            *["LEAVES"] * (self._kept == KEPT_BEFORE),
             *self._planes.defines,
             *["TOGETHER"] * together,
         ]

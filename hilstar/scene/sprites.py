@@ -258,6 +258,8 @@ def by_primary(sprites: Sprites, places_px: FloatArray, k: int) -> Sprites:
     if sprites.primaries is not None:
         data["electrons_per_s"] = sprites.primaries[:, k]
     for column, away_px in enumerate(places_px[k]):
+        if not away_px:
+            continue
         part = data["fraction_px"][:, column] - np.float32(away_px)  # as in shaders/exact/stars.glsl
         whole = np.floor(part + bias)
         data["pixel"][:, column] += whole.astype(np.int32)

@@ -167,5 +167,5 @@ void main() {
         Sight there = sight(seen + vec3(slopes * (off * vec2((k & 1) * 2 - 1, (k & 2) - 1)), 0.0));
         found.x += shaded(there, 1.0 - there.impact) / float(rays);
     }
-    light = vec4(times * normal_e_per_s_sr * sr * found.x, 0.0, 0.0, covers * clamp(found.y, 0.0, 1.0));
+    light = vec4(vec3(times * normal_e_per_s_sr * sr * found.x), covers * clamp(found.y, 0.0, 1.0));
 }

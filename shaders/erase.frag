@@ -2,15 +2,15 @@
 // Black under each sprite: faster than clearing an image that is mostly black. With LEVELS the image holds levels.
 
 #ifdef LEVELS
-out uint nothing;
+out uvec4 nothing;
 #else
-out float nothing;
+out vec4 nothing;
 #endif
 
 void main() {
 #ifdef LEVELS
-    nothing = 0u;
+    nothing = uvec4(0u);
 #else
-    nothing = 0.0;
+    nothing = vec4(0.0);
 #endif
 }

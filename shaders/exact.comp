@@ -4,39 +4,47 @@
 // The pass runs after the linear image and its nearest levels are drawn, and changes those levels. A pixel belongs to the star that
 // gives more than half of its light, so no pixel is written by two stars.
 // With TEMPORAL a star begins with the errors that it left in the frame before (hilstar/monitor/temporal.py).
-// Defined before this text: LEVELS (r8ui or r16ui); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
+// With TOGETHER it begins with what it left in the planes that were chosen before.
+// Defined before this text: LEVELS and LINEAR, formats; PLANE; KEPT (8 or 4); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
 // FIRST, its first pixel relative to the star's own; and exact/inputs.glsl, exact/stars.glsl, exact/pixels.glsl, exact/choices.glsl.
 // On a CPU memory reads cost most: a pixel's place is one word, read once, and images are read faster than textures. A branch costs
 // both its sides there, because eight stars run in one vector: no decision depends on a pixel's number, and loops end with the star.
 
 layout(local_size_x = 32) in;
 
-// Decide the star's pixels one after another, with eight choices side by side, and return the best. The sums begin with `error` for
+// Decide the star's pixels one after another, with KEPT choices side by side, and return the best. The sums begin with `error` for
 // light and moments, and with `carried` for the rest.
 Choice decide(Near near, vec3 error, Sums carried) {
     vec3 begin = error * vec3(near.light_weight, weights.yy);
     float begin_square = dot(begin, begin) + carried.a.w * carried.a.w + dot(carried.b, carried.b) + dot(carried.c, carried.c);
     Choice kept[KEPT];
 #define BEGIN(M) kept[M] = Choice(vec4(begin, carried.a.w), carried.b, carried.c, M == 0 ? begin_square : NONE, BITS(0u));
-    EIGHT(BEGIN)
-    // Three pixels at a time. The last two may be padding, which changes nothing.
+    EACH(BEGIN)
+    // A round of pixels at a time. The last of them may be padding, which changes nothing.
     for (int k = near.pixels; k < near.pixels + 2; k++) {
 #ifdef PATHS
         place[k] = 0u;
 #endif
         step_of[k] = NO_STEP;
     }
+#if KEPT == 8
     for (int k = 0; k < near.pixels; k += 3) {
         DECIDE(k, NEXT_TO_EACH)
         DECIDE(k + 1, TWO_APART)
         DECIDE(k + 2, FOUR_APART)
     }
+#else
+    for (int k = 0; k < near.pixels; k += 2) {
+        DECIDE(k, NEXT_TO_EACH)
+        DECIDE(k + 1, TWO_APART)
+    }
+#endif
     Choice best = kept[0];
     best.square += (last_light * last_light - 1.0) * best.a.x * best.a.x;
 #define BEST(M) \
     kept[M].square += (last_light * last_light - 1.0) * kept[M].a.x * kept[M].a.x; \
     best = pick(kept[M].square < best.square, kept[M], best);
-    SEVEN(BEST)
+    OTHERS(BEST)
     return best;
 }
 
@@ -64,12 +72,21 @@ Choice turn_one(Near near, Choice best) {
     return best;
 }
 
+#ifdef APART
+#define SHOWN(at) uvec4 shown = imageLoad(levels, at);
+#else
+#define SHOWN(at) uvec4 shown = uvec4(0u);
+#endif
+
 // Write only the pixels whose level is not the nearest one.
 void store(Near near, BITS up) {
 #define STORE(BITS_OF, FROM) \
     for (uint turned = up BITS_OF ^ near.rounded_up BITS_OF; turned != 0u; turned &= turned - 1u) { \
         int k = findLSB(turned) + FROM; \
-        imageStore(levels, near.star.pixel + offset_of(PLACE(k)), uvec4((step_of[k] >> 16) + uint(has_bit(up, k)))); }
+        ivec2 at = near.star.pixel + offset_of(PLACE(k)); \
+        SHOWN(at) \
+        shown[PLANE] = (step_of[k] >> 16) + uint(has_bit(up, k)); \
+        imageStore(levels, at, shown); }
 #if NEAR <= 32
     STORE(, 0)
 #else
@@ -110,13 +127,18 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
 }
 
 #ifdef TEMPORAL
+#define BEFORE before
+#else
+#define BEFORE left_sums
+#endif
+#if defined(TEMPORAL) || defined(TOGETHER)
 Sums sums_before(int i) {
     if (i < 0) return Sums(vec4(0.0), vec4(0.0), vec2(0.0));
     i *= 10;
     return Sums(
-        vec4(before[i], before[i + 1], before[i + 2], before[i + 3]),
-        vec4(before[i + 4], before[i + 5], before[i + 6], before[i + 7]),
-        vec2(before[i + 8], before[i + 9]));
+        vec4(BEFORE[i], BEFORE[i + 1], BEFORE[i + 2], BEFORE[i + 3]),
+        vec4(BEFORE[i + 4], BEFORE[i + 5], BEFORE[i + 6], BEFORE[i + 7]),
+        vec2(BEFORE[i + 8], BEFORE[i + 9]));
 }
 
 void leave(int i, Sums sums) {
@@ -131,6 +153,7 @@ void leave(int i, Sums sums) {
 void main() {
     int i = int(gl_GlobalInvocationID.x);
     if (i >= count) return;
+    is_alone = i < alone;
 #ifndef PATHS
     i = turn[i];
 #endif
@@ -140,6 +163,15 @@ void main() {
 #else
     Sums sums = Sums(vec4(0.0), vec4(0.0), vec2(0.0));
     float phase = 0.0;
+#endif
+#if defined(TOGETHER) && defined(MAKES_UP)
+    for (int k = 0; k < PLANES; k++) {
+        if (makes_up[k] == 0.0) continue;  // it is not chosen yet
+        Sums left = sums_before(PLANES * i + k);
+        sums.a += makes_up[k] * left.a;
+        sums.b += makes_up[k] * left.b;
+        sums.c += makes_up[k] * left.c;
+    }
 #endif
 #ifdef PATHS
     ivec4 of = stretch[i];
@@ -158,5 +190,7 @@ void main() {
 #endif
 #ifdef TEMPORAL
     leave(i, sums);
+#elif defined(TOGETHER) && defined(LEAVES)
+    leave(PLANES * i + PLANE, sums);
 #endif
 }

@@ -11,5 +11,5 @@ out vec4 light;
 void main() {
     vec3 seen = ray(vec2(ivec2(gl_FragCoord.xy)));
     float angle = atan(length(cross(direction, seen)), dot(direction, seen)) / scale_rad;
-    light = vec4(peak_e_per_s * pow(1.0 + angle * angle, -0.5 * exponent), 0.0, 0.0, 0.0);
+    light = vec4(vec3(peak_e_per_s * pow(1.0 + angle * angle, -0.5 * exponent)), 0.0);
 }

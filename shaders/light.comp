@@ -1,17 +1,24 @@
 #version 430 core
 // Draws a frame's stars, one per lane, each within the ellipse that it lights. With LIGHT a star adds its light to the sums of its
 // pixels; with LEVELS the sums become the nearest levels; with neither the levels become black again.
-// On llvmpipe this takes a quarter of the time of rasterised and blended points (hilstar/render/star_passes.py).
+// On llvmpipe this takes a quarter of the time of rasterised and blended points (hilstar/render/star_passes.py). Most of it is stores:
+// the planes of an image are beside each other in sums and levels.
 // splat.frag repeats this arithmetic operation by operation, so that points make the same levels.
-// Defined before this text: LEVELS_FORMAT (r8ui or r16ui), FOOTPRINT. With KEEP the sums stay for exact.comp, else they are set to 0
-// when they become levels. It comes after shares.glsl and sums.glsl.
+// Defined before this text: LEVELS_FORMAT, FOOTPRINT. With KEEP the sums stay until the levels become black, for exact.comp and where
+// two stars may not share out the planes of a pixel; else they are set to 0 when they become levels. With ORDER stars are taken in an
+// order, first those whose pixels no other star lights: their light becomes levels without sums.
+// It comes after planes.glsl, shares.glsl and sums.glsl, and before levels.glsl.
 
 layout(local_size_x = 32) in;
 
-layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };  // five words each, as SPRITE_DTYPE
+layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };  // WORDS each, as SPRITE_DTYPE, and each plane's light
+#ifdef ORDER
+layout(std430, binding = 2) readonly buffer Order { int order[]; };
+uniform int alone;
+uniform float reach_of_alone_per_e;  // beyond it no pixel is lit
+#endif
 layout(LEVELS_FORMAT, binding = 0) writeonly uniform uimage2D levels;
 #ifdef LEVELS
-// As in encode.frag.
 #ifdef STEPS
 layout(std140, binding = 1) uniform Steps { uvec4 steps[STEPS]; };
 #define STEP(bin) steps[(bin) >> 2][(bin) & 3]
@@ -19,8 +26,7 @@ layout(std140, binding = 1) uniform Steps { uvec4 steps[STEPS]; };
 layout(std430, binding = 1) readonly buffer Steps { uint steps[]; };
 #define STEP(bin) steps[bin]
 #endif
-uniform int lowest;
-uniform int highest;
+uint level_of(float light, int k);
 #ifdef UNIFORMITY
 uniform sampler2D gain;
 #endif
@@ -28,57 +34,76 @@ uniform sampler2D gain;
 
 uniform int count;
 uniform ivec2 resolution_px;
-uniform float most_e_per_s;  // maximum light of one star in one pixel: more is white in any case
+uniform float most_e_per_s[PLANES];  // maximum light of one star in one pixel: more is white in any case
 uniform float reach_per_e;   // a star lights an ellipse: the logarithm of this times its rate, times these squares of its axes
 uniform vec2 reach_px2;
 uniform float least_reach;   // minimum of that logarithm
+uniform vec2 margin_px;      // as in star.vert
 
+const float LEAST_PX = 1e-6;
 const int FIRST = -((FOOTPRINT - 1) / 2);
 
-#ifdef LEVELS
-uint level_of(float light) {
-    int bits = clamp(floatBitsToInt(light), lowest, highest);
-    uint found = STEP((bits - lowest) >> BIN_SHIFT);
-    uint lower = uint(bits) & ((1u << BIN_SHIFT) - 1u);
-    return (found >> (BIN_SHIFT + 1)) + uint(lower >= (found & ((2u << BIN_SHIFT) - 1u)));
-}
-#endif
+// The light of the star in plane k, in units.
+#define UNITS(k) \
+    int(min(of_plane[k] * share_at(vec2(x, y) - fraction OFF(k)), most_e_per_s[k]) / unit_e_per_s[k] + 0.5)
 
 void main() {
     int i = int(gl_GlobalInvocationID.x);
+#if defined(ORDER) && defined(LIGHT)
+    i += alone;
+#endif
     if (i >= count) return;
-    ivec2 pixel = ivec2(sprite[5 * i], sprite[5 * i + 1]);
-    vec2 fraction = vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3]));
-    float e_per_s = intBitsToFloat(sprite[5 * i + 4]);
-    vec2 reach_px = sqrt(max(log(reach_per_e * e_per_s), least_reach) * reach_px2);
+    float reached_per_e = reach_per_e;
+#ifdef ORDER
+    bool is_alone = i < alone;
+    if (is_alone) reached_per_e = reach_of_alone_per_e;
+    i = order[i];
+#else
+    const bool is_alone = false;
+#endif
+    ivec2 pixel = ivec2(sprite[WORDS * i], sprite[WORDS * i + 1]);
+    vec2 fraction = vec2(intBitsToFloat(sprite[WORDS * i + 2]), intBitsToFloat(sprite[WORDS * i + 3]));
+    float e_per_s = intBitsToFloat(sprite[WORDS * i + 4]);
+    float of_plane[PLANES];
+    for (int k = 0; k < PLANES; k++) of_plane[k] = intBitsToFloat(sprite[WORDS * i + WORDS - PLANES + k]);
+    vec2 reach_px = sqrt(max(log(reached_per_e * e_per_s), least_reach) * reach_px2);
+    vec2 all_px = reach_px + margin_px;  // in any plane
     int first_x = max(FIRST, -pixel.x), end_x = min(FIRST + FOOTPRINT, resolution_px.x - pixel.x);
-    int y = max(max(FIRST, -pixel.y), int(ceil(fraction.y - reach_px.y)));
-    int end_y = min(min(FIRST + FOOTPRINT, resolution_px.y - pixel.y), int(floor(fraction.y + reach_px.y)) + 1);
+    int y = max(max(FIRST, -pixel.y), int(ceil(fraction.y - all_px.y)));
+    int end_y = min(min(FIRST + FOOTPRINT, resolution_px.y - pixel.y), int(floor(fraction.y + all_px.y)) + 1);
     for (; y < end_y; y++) {
-        float up = (float(y) - fraction.y) / reach_px.y;
-        float wide = reach_px.x * sqrt(max(1.0 - up * up, 0.0));
+        float up = max(abs(float(y) - fraction.y) - margin_px.y, 0.0) / max(reach_px.y, LEAST_PX);
+        float wide = reach_px.x * sqrt(max(1.0 - up * up, 0.0)) + margin_px.x;
         int end = min(end_x, int(floor(fraction.x + wide)) + 1);
         for (int x = max(first_x, int(ceil(fraction.x - wide))); x < end; x++) {
             ivec2 at = pixel + ivec2(x, y);
-            int here = at.y * resolution_px.x + at.x;
+            int here = PLANES * (at.y * resolution_px.x + at.x);
 #if defined(LIGHT)
-            float light = min(e_per_s * share_at(vec2(x, y) - fraction), most_e_per_s);
-            atomicAdd(sums[here], int(light / unit_e_per_s + 0.5));
+            for (int k = 0; k < PLANES; k++) atomicAdd(sums[here + k], UNITS(k));
 #elif defined(LEVELS)
+            int sum[PLANES];
 #ifdef KEEP
-            int sum = sums[here];
+            if (is_alone) {
+                for (int k = 0; k < PLANES; k++) sum[k] = UNITS(k);
+            } else {
+                for (int k = 0; k < PLANES; k++) sum[k] = sums[here + k];
+            }
 #else
-            int sum = atomicExchange(sums[here], 0);
-            if (sum == 0) continue;  // shared with another star, and already done
+            sum[0] = atomicExchange(sums[here], 0);  // there is one plane
+            if (sum[0] == 0) continue;  // shared with another star, and already done
 #endif
-            float light = float(sum) * unit_e_per_s;
+            uvec4 shown = uvec4(0u);
+            for (int k = 0; k < PLANES; k++) {
+                float light = float(sum[k]) * unit_e_per_s[k];
 #ifdef UNIFORMITY
-            light *= texelFetch(gain, at, 0).r;
+                light *= texelFetch(gain, at, 0).r;
 #endif
-            imageStore(levels, at, uvec4(level_of(light)));
+                shown[k] = level_of(light, k);
+            }
+            imageStore(levels, at, shown);
 #else
 #ifdef KEEP
-            sums[here] = 0;
+            for (int k = 0; k < PLANES && !is_alone; k++) sums[here + k] = 0;
 #endif
             imageStore(levels, at, uvec4(0u));
 #endif

@@ -12,7 +12,7 @@ out vec4 light;
 
 void main() {
     ivec2 texel = ivec2(gl_FragCoord.xy) - corner_px;
-    light = vec4(times * texelFetch(light_e_per_s, texel, 0).r, 0.0, 0.0, 0.0);
+    light = vec4(vec3(times * texelFetch(light_e_per_s, texel, 0).r), 0.0);
 #ifdef COVER
     light.a = texelFetch(cover, texel, 0).r;
 #endif

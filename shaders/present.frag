@@ -2,10 +2,8 @@
 // Levels to the screen: their codes, turned as the optics need them, and aids for aligning the bench.
 // Compiled for each orientation: on llvmpipe every branch costs at every pixel. QUARTER_TURNS, FLIP_X, FLIP_Y, STEALING, APART, AIDS.
 
-uniform usampler2D levels;
+uniform usampler2D levels;   // with APART those of red, green and blue, else one for all
 uniform usampler2D triples;  // with bit stealing the codes of each level, in rows of TABLE_WIDTH
-uniform usampler2D green;    // levels of primaries that are driven apart; red's are `levels`
-uniform usampler2D blue;
 uniform float white;         // the largest code
 uniform ivec2 size_px;       // of the image
 uniform ivec2 screen_px;
@@ -38,9 +36,10 @@ ivec2 image_pixel(ivec2 screen) {
 }
 
 uvec3 codes_of(ivec2 pixel) {
-    uint level = texelFetch(levels, pixel, 0).r;
+    uvec4 shown = texelFetch(levels, pixel, 0);
+    uint level = shown.r;
 #ifdef APART
-    return uvec3(level, texelFetch(green, pixel, 0).r, texelFetch(blue, pixel, 0).r);
+    return shown.rgb;
 #elif defined(STEALING)
     return texelFetch(triples, ivec2(int(level) % TABLE_WIDTH, int(level) / TABLE_WIDTH), 0).rgb;
 #else

@@ -8,5 +8,5 @@ in vec2 here;
 out vec4 light;
 
 void main() {
-    light = vec4(here.x, 0.0, 0.0, covers * here.y);
+    light = vec4(here.xxx, covers * here.y);
 }

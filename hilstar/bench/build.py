@@ -140,7 +140,8 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
             seen=light.seen,
         )
         if colours is not None:
-            target = dataclasses.replace(target, primaries=tuple(target.of_primary(one) for one in panels))
+            together = colours.by_primary.T @ colours.by_primary
+            target = dataclasses.replace(target, primaries=panels, places_px=colours.places_px, together=together)
         faintest = QUANTISERS[codes].faintest_e_per_s(light.panel, psf)
         shown, faint = split_by_rate(stars, faintest, drive)
         return Bench(

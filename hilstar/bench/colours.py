@@ -24,7 +24,7 @@ from hilstar.monitor.primaries import PRIMARIES, ChannelMatrix, channel_matrix, 
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.scene.extended import shifted
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import Sprites, by_share, shares_at
+from hilstar.scene.sprites import Sprites, extended_by_share, shares_at, shares_of_sprites
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
@@ -38,7 +38,7 @@ LEAST_PX, LEAST_PART = 1e-5, 1e-2  # of lateral colour, and of its first part, t
 ASIDE_STARS, ASIDE_COST = 500, 1e-3  # stars by colour, and a square px of all against one of those that are out of reach
 MOVED = 1 + len(PRIMARIES)  # the first column of what is wanted that is a lens's
 UNSEEN = 1e-6  # share of white
-TINY = 1e-30  # electrons per second
+TINY = 1e-30  # electrons per second: a primary that a star has nothing of is chosen with the others all the same
 # Within the gamut: of a star's electrons, of its mean wavelength, and of its place through a lens
 WITHIN, WITHIN_NM, WITHIN_PX = 1e-6, 0.1, 1e-4
 SCALE_K = np.geomspace(1500.0, 60_000.0, 400)
@@ -225,10 +225,10 @@ class Colours:
 
     def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
         """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where light is none's, their mean."""
-        shares = self.on(stars).primaries
-        if shares is None:
-            raise AssertionError("made above")
-        return shares_at(shares, stars, star)
+        return shares_at(self._all(stars), stars, star)
+
+    def _all(self, stars: Stars) -> FloatArray:
+        return self.shares(self.wanted(stars)) if stars.primaries is None else stars.primaries
 
     def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.
@@ -249,36 +249,20 @@ class Colours:
             added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
         return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, own)
 
-    def parts(self, sprites: Sprites, stars: Stars) -> tuple[Sprites, ...]:
-        """The sprites of each primary, each light where that primary has to be drawn for it to lie in its place."""
+    def driven(self, sprites: Sprites, stars: Stars) -> Sprites:
+        """Sprites with the light of each primary; `sprites.star` has places among `stars`."""
+        stars = self.on(stars)
         if stars.primaries is None:
-            raise AssertionError("the stars of a bench that drives its primaries apart have their shares")
-        bias = 0.5 if sprites.footprint_px % 2 else 0.0  # as in pack_sprites
-        found, places = [], self.places_px.tolist()
-        each = by_share(sprites, stars, stars.primaries, stars.primaries_by_bv)
-        extended: list[Any] = [()] * len(each)
-        if sprites.extended:
-            if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
-                moved = zip(each, places, strict=True)
-                self._kept[:] = [sprites.extended, [[shifted(one, -x, -y) for one in part.extended] for part, (x, y) in moved]]
-            extended = self._kept[1]
-        for light, (right, down), lights in zip(each, places, extended, strict=True):
-            x_px, y_px = light.x_px - right, light.y_px - down
-            for column, place_px in enumerate((x_px, y_px)) if right or down else ():
-                pixel = np.floor(place_px + bias)
-                light.data["pixel"][:, column], light.data["fraction_px"][:, column] = pixel, place_px - pixel
-            found.append(replace(light, x_px=x_px, y_px=y_px, extended=tuple(lights)))
-        return tuple(found)
-
-
-def lit_alone(sprites: Sprites, faintest_e_per_s: float) -> Sprites:
-    """The sprites of a primary without those of stars that have less of its light than a pixel can show, or none."""
-    rates = np.ascontiguousarray(sprites.data["electrons_per_s"])
-    lit = np.flatnonzero(rates >= max(faintest_e_per_s / sprites.per_star, TINY))
-    if len(lit) == len(sprites):
-        return sprites
-    x_px, y_px = sprites.x_px[lit], sprites.y_px[lit]
-    return replace(sprites, data=sprites.data[lit], star=sprites.star[lit], x_px=x_px, y_px=y_px)
+            raise AssertionError("stars that the bench's colours are on have their shares")
+        shares = shares_of_sprites(sprites, stars, stars.primaries, stars.primaries_by_bv)
+        light = np.maximum(sprites.data["electrons_per_s"][:, None] * shares, TINY).astype(np.float32)
+        if not sprites.extended:
+            return replace(sprites, primaries=light)
+        if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
+            each = extended_by_share(sprites, stars, stars.primaries, stars.primaries_by_bv)
+            moved = zip(each, self.places_px.tolist(), strict=True)
+            self._kept[:] = [sprites.extended, tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved)]
+        return replace(sprites, primaries=light, lights=self._kept[1])
 
 
 def _index(colour: FloatArray) -> FloatArray:

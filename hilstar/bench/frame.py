@@ -14,7 +14,7 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.colours import Colours, lit_alone
+from hilstar.bench.colours import Colours
 from hilstar.bench.config import BenchConfig, Vector
 from hilstar.bench.effort import Effort
 from hilstar.bench.least_psf import Choice
@@ -36,7 +36,7 @@ from hilstar.scene.camera import Camera
 from hilstar.scene.extended import LightMap
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import CLIP_TOLERANCE, Sprites, clipped_sprites
+from hilstar.scene.sprites import CLIP_TOLERANCE, Sprites, by_primary, clipped_sprites
 from hilstar.sky.stars import Stars, split_by_rate
 from hilstar.units import magnitude
 
@@ -256,30 +256,16 @@ class Bench:
 
     def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
-        parts = self._parts(sprites, self.shown_stars)
-        sprites = self._driven(sprites, parts)
+        sprites = self._driven(sprites, self.shown_stars)
         self.renderer.draw(sprites, frame)
-        clipped = None if sprites is None else self._clipped(sprites, parts)
+        clipped = None if sprites is None else self._clipped(sprites)
         if sprites is None or clipped is None or not len(clipped):
             return Drawn(self.renderer, sprites, () if sprites is None else sprites.over_white)
         return Drawn(self.renderer, sprites, (*designations(self.shown_stars, sprites, clipped), *sprites.over_white))
 
-    def _parts(self, sprites: Sprites | None, stars: Stars) -> tuple[Sprites, ...]:
-        """The sprites of each primary, where those are driven apart, else none; `sprites.star` has places among `stars`."""
-        return () if sprites is None or self.colours is None else self.colours.parts(sprites, stars)
-
-    def _driven(self, sprites: Sprites | None, parts: tuple[Sprites, ...]) -> Sprites | None:
-        """Sprites with those of each primary that can light a pixel."""
-        if sprites is None or not parts:
-            return sprites
-        each = zip(parts, self._faintest_e_per_s, strict=True)
-        return replace(sprites, primaries=tuple(lit_alone(*part) for part in each))
-
-    @cached_property
-    def _faintest_e_per_s(self) -> list[float]:
-        """What a star needs of each primary's light to light a pixel of it, where the screen is darkest."""
-        panels = (replace(one, flux_at_white_e_per_s=one.flux_at_white_e_per_s * self.darkest) for one in self.panel.primaries)
-        return [self.quantiser.faintest_e_per_s(one, self.psf) for one in panels]
+    def _driven(self, sprites: Sprites | None, stars: Stars) -> Sprites | None:
+        """Sprites with the light of each primary, where those are driven apart; `sprites.star` has places among `stars`."""
+        return sprites if sprites is None or self.colours is None else self.colours.driven(sprites, stars)
 
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
         """How many stars in view at an attitude are too faint for the monitor."""
@@ -292,7 +278,7 @@ class Bench:
             lights = (*lights, LightMap(np.zeros((1, 1), dtype=np.float32), lasting=False))
         if lights:
             sprites = replace(self.sprites(WARM_UP_ATTITUDE), extended=lights)
-            self.renderer.draw(self._driven(sprites, self._parts(sprites, self.shown_stars)))
+            self.renderer.draw(self._driven(sprites, self.shown_stars))
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
         self.renderer.begin_anew()
@@ -315,12 +301,13 @@ class Bench:
         sprites = self._light(self._all_layers, self.stars, view, faults)
         shown = self.light(view, faults)
         self.renderer.begin_anew()
-        self.renderer.draw(self._driven(shown, self._parts(shown, self.shown_stars)), number)
+        self.renderer.draw(self._driven(shown, self.shown_stars), number)
         levels = Levels(self.renderer.levels().copy())
         drawn = len(sprites) == len(shown) and not (len(self.faint_stars) or self.renderer.target.sides)
         drawn &= self.colours is None
         light = linear_light(self.renderer, sprites, self.stars, drawn)
-        truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites, self._parts(sprites, self.stars)))
+        driven = sprites if self.colours is None else self.colours.driven(sprites, self.stars)
+        truth, star = sprite_truth(self.stars, sprites, self._clipped(driven))
         if sprites.discs:
             discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
             found = disc_stars(self.stars, (disc.name for disc in discs))
@@ -368,8 +355,8 @@ class Bench:
             return levels
         return np.asarray(rgb[levels], dtype=code_dtype(self.calibration.response.bits))
 
-    def _clipped(self, sprites: Sprites, parts: tuple[Sprites, ...]) -> IntArray:
-        """Places of the sprites that are over white: of light as a whole, or of any primary's `parts`."""
+    def _clipped(self, sprites: Sprites) -> IntArray:
+        """Places of the sprites that are over white: of light as a whole, or of any primary."""
         psf, spectra = self.psf, sprites.spectra
         if isinstance(psf, GlassPsf) and spectra is not None:  # as bright as the mean PSF's stars with the same peaks
             data, half_white = sprites.data.copy(), 0.5 * self.flux_at_white_e_per_s * self.darkest
@@ -378,11 +365,15 @@ class Bench:
             stamps = psf.of_stars(x_px, y_px, spectra[bright] if spectra.ndim == 2 else spectra, rate)
             data["electrons_per_s"][bright] = stamps.max(axis=(1, 2)) / psf.shares(np.rint(x_px) - x_px, np.rint(y_px) - y_px)
             sprites = replace(sprites, data=data)
-        over = [
-            clipped_sprites(part, psf, one.flux_at_white_e_per_s, self.camera.resolution_px, self.uniformity, self.darkest)
-            for part, one in zip(parts or (sprites,), self.panel.primaries or (self.panel,), strict=True)
-        ]
-        return over[0] if len(over) == 1 else np.unique(np.concatenate(over))
+        screen = self.camera.resolution_px, self.uniformity, self.darkest
+        if sprites.primaries is None:
+            return clipped_sprites(sprites, psf, self.flux_at_white_e_per_s, *screen)
+        over, places_px = [np.empty(0, dtype=np.intp)], self.renderer.target.places_px
+        most_e_per_s = sprites.primaries.max(axis=0, initial=0.0) * (sprites.per_star * psf.peak_share)
+        for k, one in enumerate(self.panel.primaries):
+            if most_e_per_s[k] > 0.5 * one.flux_at_white_e_per_s * self.darkest:  # as in `clipped_sprites`
+                over.append(clipped_sprites(by_primary(sprites, places_px, k), psf, one.flux_at_white_e_per_s, *screen))
+        return np.unique(np.concatenate(over))
 
     def close(self) -> None:
         """Free the GL context."""

@@ -9,7 +9,7 @@ In the straight foot of sRGB all steps are equal, so a star of N steps cannot ha
 This is the oracle of shaders/exact.comp, and what draws where that cannot run.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -35,6 +35,7 @@ from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 KEPT = 8  # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
+KEPT_BEFORE = 4  # where another primary makes up for what these leave
 CHUNK = 256  # stars at a time: their arrays stay in a core's cache
 OFF = 0.6  # in steps, where steps are equal: beyond it one more pixel is turned
 SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal
@@ -97,6 +98,10 @@ class ExactQuantiser(Quantiser):
     weights: ClassVar[Weights] = IN_A_FRAME
     remembers: ClassVar[bool] = False
     left: Left | None = None
+    # For so much of what these quantisers of other primaries left in the same frame each star makes up, in steps of both.
+    given: Sequence[tuple[float, Quantiser]] = ()
+    kept = KEPT
+    over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
 
     def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
         super().__init__(panel, resolution_px, psf, seen)
@@ -190,8 +195,12 @@ class ExactQuantiser(Quantiser):
         return np.maximum(order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order))
 
     def _carried(self, sprites: Sprites) -> Carried:
-        """The errors that each sprite begins with: none, in a frame that is right by itself."""
-        return nothing_carried(len(sprites))
+        """The errors that each sprite begins with: what its light in other primaries left, or none."""
+        carried = nothing_carried(len(sprites))
+        for part, other in self.given if sprites.per_star == 1 else ():
+            if part and isinstance(other, ExactQuantiser) and other.over is not None:
+                np.add(carried.error, np.float32(part) * other.over, out=carried.error)
+        return carried
 
     def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
         """The errors (SUMS, n) that stars whose pixels have these steps (near, n) are given to make up for."""
@@ -199,6 +208,7 @@ class ExactQuantiser(Quantiser):
 
     def _keep(self, sprites: Sprites, left: Float32Array) -> None:
         """Take notice of the errors (SUMS, n) that a frame's sprites leave."""
+        self.over = left
 
     def _choose(self, found: Footprints, carried: Carried, reach: IntArray) -> tuple[IntArray, Float32Array]:
         """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried` leave, (SUMS, n).
@@ -226,7 +236,7 @@ class ExactQuantiser(Quantiser):
         error[0] -= hidden
         weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(weights.moments))])
         error[:3] *= weight
-        up, left = _decide(short, step, arm, error, weights.last_light)
+        up, left = _decide(short, step, arm, error, weights.last_light, self.kept)
         _turn_one_more(step, arm, up, left, grid)
         left[:3] /= weight
         left[0] += hidden
@@ -305,7 +315,7 @@ def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites:
 
 
 def _decide(
-    short: Float32Array, step: Float32Array, arm: Float32Array, error: Float32Array, last_light: float
+    short: Float32Array, step: Float32Array, arm: Float32Array, error: Float32Array, last_light: float, choices: int
 ) -> tuple[npt.NDArray[np.bool_], Float32Array]:
     """Which near pixels of n stars take the upper level, (near, n), and the sums that leaves, (SUMS, n).
 
@@ -314,9 +324,9 @@ def _decide(
     `error` (SUMS, n), of which that of light counts `last_light` times at the end.
     """
     near, count = step.shape
-    kept = np.repeat(error[:, None], KEPT, axis=1)
-    up = np.zeros((near, KEPT, count), dtype=np.bool_)
-    missing = np.zeros((KEPT, count), dtype=np.float32)
+    kept = np.repeat(error[:, None], choices, axis=1)
+    up = np.zeros((near, choices, count), dtype=np.bool_)
+    missing = np.zeros((choices, count), dtype=np.float32)
     missing[1:] = NONE
     for pixel in range(near):
         weight, by = arm[:, pixel, None], step[pixel]
@@ -326,7 +336,7 @@ def _decide(
         rise[:, by == 0] = NONE
         # Of the four choices that two of those kept lead to keep two, in their places. Where both of one lead to less than
         # either of the other, the other's place takes the second.
-        other = np.arange(KEPT) ^ (1 << (pixel % (KEPT.bit_length() - 1)))
+        other = np.arange(choices) ^ (1 << (pixel % (choices.bit_length() - 1)))
         better, worse = down + np.minimum(rise, 0), down + np.maximum(rise, 0)
         taken = worse[other] < better
         place, star = np.nonzero(taken)

@@ -4,25 +4,25 @@ Nothing here imports moderngl, so a bench can be planned, and drawn by NumPy, on
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array
+from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 from hilstar.monitor.balance import AS_USUAL, Seen
-from hilstar.monitor.exact import COMPUTE_VERSION
+from hilstar.monitor.exact import COMPUTE_VERSION, KEPT, KEPT_BEFORE, ExactQuantiser
 from hilstar.monitor.quantise import LevelCost, Panel, Quantiser
-from hilstar.monitor.quantisers import Quantisation
+from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.monitor.response import Levels, Response
 from hilstar.optics.glass_psf import GlassPsf
 from hilstar.scene.extended import LightMap
 from hilstar.scene.frame_motion import Orientation
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import Sprites, by_channel, without_stars
+from hilstar.scene.sprites import Sprites, by_channel, by_primary, without_stars
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -45,13 +45,22 @@ class SpriteSide:
 SpriteSides = tuple[SpriteSide, ...]
 
 
+class Turn(NamedTuple):
+    """One of a target's panels: for how much of what stars left in each, in its steps, they make up here; choices kept."""
+
+    plane: int
+    makes_up: list[float]
+    kept: int = KEPT
+
+
 @dataclass(frozen=True, slots=True)
 class Target:
     """The image that a backend draws: its pixels, its sprites, and a monitor's response where codes are wanted.
 
     `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere). `sides` are those
     of fainter stars' sprites, by falling rates, of the same parity as the footprint. `seen` is how the tracker sees the
-    monitor, for `exact` and `temporal`. Where the `primaries` are driven apart, each has its own target.
+    monitor, for `exact` and `temporal`. Where the `primaries` are driven apart, each has its panel, and its light lies at its
+    place of `places_px` (3, 2) within a pixel; `together` (3, 3) are products of two primaries' electrons over the channels.
     """
 
     resolution_px: tuple[int, int]
@@ -62,14 +71,47 @@ class Target:
     uniformity: Float32Array | None = None
     sides: SpriteSides = ()
     seen: Seen = AS_USUAL
-    primaries: "tuple[Target, ...]" = ()
+    primaries: tuple[Panel, ...] = ()
+    places_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
+    together: FloatArray = field(default_factory=lambda: np.eye(1))
 
-    def of_primary(self, panel: Panel) -> "Target":
-        """The target of a primary with the light of a panel: sprites are as large as those of a white star as bright."""
-        share = panel.flux_at_white_e_per_s / self.flux_at_white_e_per_s
-        sides = tuple(SpriteSide(side.below_e_per_s * share, side.side_px) for side in self.sides)
-        white_e_per_s = panel.flux_at_white_e_per_s
-        return replace(self, response=panel.response, flux_at_white_e_per_s=white_e_per_s, sides=sides, primaries=())
+    def in_turn(self) -> list[Turn]:
+        """The order in which `exact` chooses the primaries' levels: by falling electrons a step, for the last leave least.
+
+        Each makes up for those before it, by the light of the channels; in `temporal` for its own light alone.
+        """
+        panels = self.primaries
+        if not panels:
+            return [Turn(0, [0.0])]
+        step = np.array([panel.response.light[1] * panel.flux_at_white_e_per_s for panel in panels])
+        order, alone = np.argsort(-step, kind="stable").tolist(), getattr(QUANTISERS[self.quantisation], "remembers", False)
+        share = self.together / self.together.diagonal() * step[:, None] / step
+        # What a primary leaves has in it what it began with: `own` (3, 3) are its own errors by what each leaves.
+        own, found = np.zeros_like(share), []
+        for k in order:
+            makes_up = np.zeros(len(panels)) if alone else share[:, k] @ own
+            own[k] = -makes_up
+            own[k, k] += 1
+            found.append(Turn(k, makes_up.tolist(), KEPT if alone or k == order[-1] else KEPT_BEFORE))
+        return found
+
+    def quantisers(self) -> dict[int, Quantiser]:
+        """NumPy's quantiser of each panel, in the order in which they choose; none without a response."""
+        panel, made = self.panel(), QUANTISERS[self.quantisation]
+        panels = self.primaries or (() if panel is None else (panel,))
+        found = {k: made(panels[k], self.resolution_px, self.psf, self.seen) for k, *_ in self.in_turn() if panels}
+        for k, makes_up, kept in self.in_turn() if self.primaries else ():
+            if isinstance(one := found[k], ExactQuantiser):
+                one.kept, one.given = kept, [(part, found[j]) for j, part in enumerate(makes_up)]
+        return found
+
+    def by_plane(self, sprites: Sprites | None, levels: Callable[[int, Sprites | None], Levels]) -> Levels:
+        """The levels of a frame by those of each primary, if primaries are driven apart, chosen in their order."""
+        if not self.primaries or sprites is None:
+            found = {k: levels(k, sprites) for k, *_ in self.in_turn()}
+        else:
+            found = {k: levels(k, by_primary(sprites, self.places_px, k)) for k, *_ in self.in_turn()}
+        return found[0] if not self.primaries else Levels(np.stack([found[k] for k in range(len(found))], -1))
 
     def panel(self) -> Panel | None:
         """The monitor, None without a response. Raises InputError for a map that does not fit."""
@@ -115,7 +157,7 @@ class Backend(ABC):
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw the linear image and the levels of `sprites` (None: blank); read them with `linear` and `levels`.
 
-        A target of `primaries` takes those of `sprites.primaries`, and has no linear image then.
+        A target of `primaries` takes `sprites.primaries` and `sprites.lights`, and has no linear image then.
 
         `frame` counts the frames shown, for `temporal` alone: a number not above the last one's begins a new sequence.
         """
@@ -141,11 +183,8 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def show_on(self, view: ScreenView, beside: "Sequence[Backend]" = ()) -> None:
-        """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in.
-
-        Its levels are red's codes where those `beside` it, of the same context, have green's and blue's.
-        """
+    def show_on(self, view: ScreenView) -> None:
+        """Present frames on this screen from now on: by OpenGL that of the window whose context it draws in."""
 
     @abstractmethod
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
@@ -197,6 +236,10 @@ def as_maps(sprites: Sprites | None, target: Target) -> Sprites | None:
     psf = target.psf
     if sprites is None or sprites.spectra is None or not isinstance(psf, GlassPsf):
         return sprites
+    if sprites.primaries is not None:
+        parts = (as_maps(by_primary(sprites, target.places_px, k), target) for k in range(len(target.primaries)))
+        lights = tuple(() if part is None else part.extended for part in parts)
+        return replace(without_stars(sprites), extended=lights[0], lights=lights)
     image = np.ascontiguousarray(psf.image(sprites, sprites.spectra, target.resolution_px))
     return replace(without_stars(sprites), extended=(*sprites.extended, LightMap(image, lasting=False)))
 

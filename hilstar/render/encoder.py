@@ -1,50 +1,128 @@
-"""Programs of shaders/, a PSF for them, and the pass that makes levels of a linear image by counting thresholds."""
+"""Programs of shaders/, a PSF for them, and the pass that makes levels of a linear image by counting thresholds.
 
+Primaries that are driven apart are planes of one image, whose pixels and sprites have the light of each (`Planes`).
+"""
+
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import moderngl
 import numpy as np
 import numpy.typing as npt
 
+from hilstar.arrays import Float32Array
 from hilstar.errors import InputError
 from hilstar.monitor.quantise import Panel, PixelQuantiser, code_table, level_dtype
 from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
-from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides
+from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, Target
 from hilstar.render.context import is_software
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import Sprites
+from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 TABLE_WIDTH = 1024  # that of encode.frag
 TABLE_UNIT = 15  # the last texture unit that every OpenGL has: nothing else takes it
 
 
 def build_program(
-    ctx: moderngl.Context, vertex: str, fragment: str, defines: tuple[str, ...] = (), include: str = "", last: str = ""
+    ctx: moderngl.Context,
+    vertex: str,
+    fragment: str,
+    defines: Sequence[str] = (),
+    include: Sequence[str] = (),
+    last: Sequence[str] = (),
 ) -> moderngl.Program:
-    """A program from two files of shaders/; the fragment shader stands between its `defines`, `include` and the file `last`."""
-    version, body = resource_path("shaders", fragment).read_text().split("\n", 1)
-    before = [resource_path("shaders", include).read_text()] if include else []
-    after = [resource_path("shaders", last).read_text()] if last else []
-    lines = [version, *(f"#define {name}" for name in defines), *before, body, *after]
+    """A program from two files of shaders/; the fragment shader stands between the files `include` and `last`."""
     with held():  # moderngl makes a program's members by Python, and an exception there ends the process
-        return ctx.program(
-            vertex_shader=resource_path("shaders", vertex).read_text(),
-            fragment_shader="\n".join(lines),
-        )
+        return ctx.program(_source(vertex, defines), fragment_shader=_source(fragment, defines, include, last))
 
 
 def build_compute(
-    ctx: moderngl.Context, main: str, defines: Sequence[str], parts: Sequence[str] = ()
+    ctx: moderngl.Context, main: str, defines: Sequence[str], parts: Sequence[str] = (), last: Sequence[str] = ()
 ) -> moderngl.ComputeShader:
-    """A compute program from a file of shaders/, after `defines` and the parts of it that are in files of their own."""
-    version, body = resource_path("shaders", main).read_text().split("\n", 1)
-    before = [resource_path("shaders", f"{part}.glsl").read_text() for part in parts]
+    """A compute program from a file of shaders/, between the files `parts` and `last`."""
     with held():  # as for any program
-        return ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), *before, body]))
+        return ctx.compute_shader(_source(main, defines, parts, last))
+
+
+def _source(main: str, defines: Sequence[str], before: Sequence[str] = (), after: Sequence[str] = ()) -> str:
+    """A file of shaders/ after `defines`, between others."""
+    version, body = resource_path("shaders", main).read_text().split("\n", 1)
+    first, last = ([resource_path("shaders", name).read_text() for name in names] for names in (before, after))
+    return "\n".join([version, *(f"#define {name}" for name in defines), *first, body, *last])
+
+
+@dataclass(frozen=True, slots=True)
+class Planes:
+    """The planes of an image: one, or one for each of the primaries that a target drives apart.
+
+    `panels` are theirs, `share` (planes,) what of white's light each has, and `footprint_px` the side of sprites that hold the
+    light of all: it lies up to `margin_px` from the star.
+    """
+
+    panels: tuple[Panel, ...]
+    share: tuple[float, ...]
+    footprint_px: int
+    margin_px: tuple[float, float]
+    defines: tuple[str, ...]
+    places_px: list[tuple[float, float]]
+
+    @classmethod
+    def of(cls, target: Target) -> "Planes":
+        """Those of a target."""
+        white_e_per_s, panel = target.flux_at_white_e_per_s, target.panel()
+        panels = target.primaries or (() if panel is None else (panel,))
+        away = np.abs(np.array(target.places_px)).max(axis=0) if target.primaries else np.zeros(2)
+        defines = ["APART"] * bool(target.primaries) + ["OFFSETS"] * bool(away.any())
+        share = tuple(one.flux_at_white_e_per_s / white_e_per_s for one in panels)
+        margin_px = float(away[0]), float(away[1])
+        side_px = target.psf.footprint_px + 2 * math.ceil(max(margin_px))
+        return cls(panels, share, side_px, margin_px, tuple(defines), [(float(x), float(y)) for x, y in target.places_px])
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """A sprite's: SPRITE_DTYPE, with the light of each primary after it."""
+        return APART_DTYPE if self.apart else SPRITE_DTYPE
+
+    @property
+    def apart(self) -> bool:
+        """Whether there is a plane for each primary."""
+        return len(self.panels) > 1
+
+    @property
+    def texel(self) -> int:
+        """Components of a texel."""
+        return 4 if self.apart else 1
+
+    @property
+    def lit(self) -> Panel:
+        """A grey panel whose first level takes as little light as that of any plane."""
+        first = min(self.panels, key=lambda one: float(one.response.threshold[0]))
+        return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / self.share[self.panels.index(first)])
+
+    def packed(self, sprites: Sprites) -> Sprites:
+        """Sprites with `dtype`; their rate is then that of the white that they need for the primary that needs most."""
+        if not self.apart or sprites.primaries is None:
+            return sprites
+        data = np.empty(len(sprites), dtype=APART_DTYPE)
+        words = data.view(np.int32).reshape(len(sprites), -1)
+        words[:, :5] = sprites.data.view(np.int32).reshape(-1, 5)
+        data["primaries_e_per_s"] = sprites.primaries
+        data["electrons_per_s"] = (sprites.primaries / np.array(self.share, dtype=np.float32)).max(axis=1)
+        return replace(sprites, data=data)
+
+    def set(self, program: moderngl.Program | moderngl.ComputeShader, **values: Sequence[Any]) -> None:
+        """Set the uniforms of a program: `values` by plane, and where planes lie; compilers drop what it does not need."""
+        for name, each in (values | {"places_px": self.places_px}).items():
+            if name in program:  # an array ends with its last element that is used
+                length = getattr(program[name], "array_length", 1)
+                program[name] = list(each[:length]) if length > 1 else each[0]
+        if "margin_px" in program:
+            program["margin_px"] = self.margin_px
 
 
 class Shares:
@@ -73,18 +151,28 @@ class Shares:
 
 
 def splat_program(
-    ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares, in_units: bool = False
+    ctx: moderngl.Context, resolution_px: tuple[int, int], shares: Shares, planes: Planes, in_units: bool = False
 ) -> moderngl.Program:
     """The program of star.vert and splat.frag; `in_units` draws light in the whole units of a LightUnits."""
-    program = build_program(ctx, "star.vert", "splat.frag", (*shares.defines, *["UNITS"] * in_units), "shares.glsl")
+    defines = (*planes.defines, *shares.defines, *["UNITS"] * in_units)
+    program = build_program(ctx, "star.vert", "splat.frag", defines, ("planes.glsl", "shares.glsl"))
     shares.set(program)
+    planes.set(program)
     program["resolution_px"] = resolution_px
     program["footprint_px"] = shares.footprint_px
     return program
 
 
+def sprites_array(program: moderngl.Program, buffer: moderngl.Buffer, planes: Planes) -> moderngl.VertexArray:
+    """A vertex array of what a program of star.vert asks of sprites in a buffer."""
+    inputs = {name: INPUTS[name] for name in planes.dtype.names or ()}
+    layout = (form if name in program else f"{4 * int(form[0])}x" for name, form in inputs.items())
+    return program.ctx.vertex_array(program, [(buffer, " ".join(layout), *(name for name in inputs if name in program))])
+
+
 MAX_RATE = 3e38  # in float32
-PLACES = "2i 8x 1f"  # SPRITE_DTYPE's places and rates
+APART_DTYPE = np.dtype([*SPRITE_DTYPE.descr, ("primaries_e_per_s", "<f4", 3)])
+INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}  # of star.vert
 SPRITE_PIXEL_COST = 4  # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
 # Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
 MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
@@ -145,14 +233,15 @@ class Eraser:
     On llvmpipe a clear of 1920 x 1080 takes 0.7 ms of two cores, as long as 1000 stars. It lives in its renderer's context.
     """
 
-    def __init__(self, ctx: moderngl.Context, size_px: tuple[int, int], of_levels: bool) -> None:
-        self._ctx = ctx
+    def __init__(self, ctx: moderngl.Context, size_px: tuple[int, int], planes: Planes, of_levels: bool) -> None:
+        self._ctx, self._planes = ctx, planes
         self._size_px = size_px
         on_processor = MAX_ERASED_LEVELS if of_levels else MAX_ERASED_LIGHT
         self._most_px = size_px[0] * size_px[1] * (on_processor if is_software(ctx) else MAX_ERASED_BY_CARD)
-        self._program = build_program(ctx, "star.vert", "erase.frag", ("LEVELS",) if of_levels else ())
+        defines = ("LEVELS",) if of_levels else ()
+        self._program = build_program(ctx, "star.vert", "erase.frag", defines)
         self._program["resolution_px"] = size_px
-        self._triangle = ctx.vertex_array(build_program(ctx, "full.vert", "erase.frag", ("LEVELS",) if of_levels else ()), [])
+        self._triangle = ctx.vertex_array(build_program(ctx, "full.vert", "erase.frag", defines), [])
         self._vao: moderngl.VertexArray | None = None
         self._footprint_px = 0
 
@@ -169,10 +258,10 @@ class Eraser:
             self._triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
-        """Read the places of sprites from a buffer of SPRITE_DTYPE."""
+        """Read the places of sprites from a buffer."""
         if self._vao is not None:
             self._vao.release()
-        self._vao = self._ctx.vertex_array(self._program, [(buffer, PLACES, "pixel", "electrons_per_s")])
+        self._vao = sprites_array(self._program, buffer, self._planes)
         self._program["footprint_px"] = self._footprint_px = footprint_px
 
     def clears(self, count: int | None) -> bool:
@@ -194,25 +283,29 @@ class Eraser:
 class LevelTexture:
     """The levels of the last frame on the GPU, R8UI up to 256 levels and R16UI beyond; `texture` is what a window shows.
 
-    It lives in its renderer's context, which is current in every call.
+    Those of primaries have RGBA. It lives in its renderer's context, which is current in every call.
     """
 
-    def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int], panel: Panel) -> None:
+    def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int], planes: Planes) -> None:
         width, height = resolution_px
-        self._image = Levels(np.zeros((height, width), dtype=level_dtype(panel.response)))
+        kind, self._components = level_dtype(planes.panels[0].response), planes.texel
+        self._image = np.zeros((height, width, planes.texel), dtype=kind)
+        self._levels = Levels(self._image[..., : len(planes.panels)] if planes.apart else self._image[..., 0])
         self._dtype = f"u{self._image.itemsize}"
-        self.texture = ctx.texture(resolution_px, 1, dtype=self._dtype)
+        self.format = f"{'rgba' if planes.apart else 'r'}{8 * self._image.itemsize}ui"
+        self.texture = ctx.texture(resolution_px, planes.texel, dtype=self._dtype)
         self.fbo = ctx.framebuffer([self.texture])
         self.fbo.clear()
 
     def write(self, levels: Levels) -> None:
-        """Upload `levels` (height, width)."""
-        self.texture.write(levels, alignment=1)
+        """Upload levels."""
+        self._levels[...] = levels
+        self.texture.write(self._image, alignment=1)
 
     def read(self) -> Levels:
-        """The levels (height, width); the next call overwrites the same array."""
-        self.fbo.read_into(self._image, components=1, dtype=self._dtype, alignment=1)
-        return self._image
+        """The levels (height, width), or of primaries (height, width, 3); the next call overwrites the same array."""
+        self.fbo.read_into(self._image, components=self._components, dtype=self._dtype, alignment=1)
+        return self._levels
 
 
 class LookupTable:
@@ -232,6 +325,29 @@ class LookupTable:
             self.buffer.bind_to_storage_buffer(self._binding)
 
 
+def joined(tables: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], list[int]]:
+    """The tables of all planes end to end, and where each begins; several that are alike are one."""
+    begins, parts, size = [], dict[bytes, int](), 0
+    for one in tables:
+        begins.append(parts.setdefault(one.tobytes(), size))
+        size = max(size, begins[-1] + len(one))
+    return np.concatenate([one for k, one in enumerate(tables) if begins.index(begins[k]) == k]), begins
+
+
+def level_steps(edges: Sequence[Float32Array]) -> tuple[npt.NDArray[Any], list[tuple[int, int, int, int]]] | None:
+    """The table of levels.glsl for planes that count these edges, and its `bins`; None where a bin has several thresholds."""
+    tables = [code_table(one) for one in edges]
+    steps = [words for table in tables if (words := table.steps()) is not None]
+    if len(steps) < len(tables):
+        return None
+    found, begins = joined(steps)
+    bins = []
+    for one, begin in zip(tables, begins, strict=True):
+        first, end = one.first_bin - 1, one.first_bin + len(one.first_code)
+        bins.append((first << one.bin_shift, (end << one.bin_shift) - 1, one.bin_shift, begin))
+    return found, bins
+
+
 class Encoder:
     """Draws the levels of a linear image: only the sprites' footprints where that is less work than the whole image.
 
@@ -243,44 +359,45 @@ class Encoder:
         ctx: moderngl.Context,
         linear: moderngl.Texture,
         levels: LevelTexture,
-        panel: Panel,
+        planes: Planes,
         quantiser: type[PixelQuantiser],
     ) -> None:
-        self._ctx = ctx
+        self._ctx, self._planes = ctx, planes
         self._fbo = levels.fbo
         self._size_px = linear.size
         self._footprint_px = 0
-        gain, rises = panel.gain(), quantiser.shader
-        defines = (("RISES",) if rises else ()) + (("UNIFORMITY",) if gain is not None else ())
-        table = code_table(quantiser.edges_e_per_s(panel))
-        found = None if rises else table.steps()
-        steps = None if found is None else table_rows(found, ctx)
-        defines += () if steps is None else (f"STEPS {len(steps)}",)
+        gain, rises = planes.panels[0].gain(), quantiser.shader
+        defines = [*planes.defines, *["RISES"] * bool(rises), *["UNIFORMITY"] * (gain is not None)]
+        edges = [quantiser.edges_e_per_s(panel) for panel in planes.panels]
+        table = None if rises else level_steps(edges)
+        steps = None if table is None else table_rows(table[0], ctx)
+        defines += [] if steps is None else [f"STEPS {len(steps)}"]
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
-        defines += (f"BIN_SHIFT {table.bin_shift}", *(("IMAGES",) if self._linear_image is not None else ()))
+        defines += [f"IMAGES {linear_format(planes)}"] * (self._linear_image is not None)
+        last = ["levels.glsl"] * (steps is not None) + [rises] * bool(rises)
         self.sprite_program, self._whole = (
-            build_program(ctx, vertex, "encode.frag", defines, last=rises) for vertex in ("star.vert", "full.vert")
+            build_program(ctx, vertex, "encode.frag", defines, ("planes.glsl",), last) for vertex in ("star.vert", "full.vert")
         )
         self.sprite_program["resolution_px"] = linear.size
         self._whole_vao = ctx.vertex_array(self._whole, [])
         self._sprite_vao: moderngl.VertexArray | None = None
         self._textures = {"linear_e_per_s": linear}
         self._steps = None if steps is None else ctx.buffer(steps.tobytes())
-        if steps is None:
-            self._textures |= {"threshold_e_per_s": self._texture(_rows(table.threshold))}
-            self._textures |= {"first_code": self._texture(_rows(table.first_code))}
-        for program in (self.sprite_program, self._whole):
-            if steps is None:
-                program["first_bin"] = table.first_bin
-                program["last_bin"] = len(table.first_code) - 1
-                program["white"] = len(table.threshold)
-            else:
-                program["lowest"] = (table.first_bin - 1) << table.bin_shift
-                program["highest"] = ((table.first_bin + len(table.first_code)) << table.bin_shift) - 1
+        if table is None or steps is None:
+            tables = [code_table(one) for one in edges]
+            thresholds, first = joined([one.threshold for one in tables])
+            codes, begins = joined([one.first_code for one in tables])
+            self._textures |= {"threshold_e_per_s": self._texture(_rows(thresholds)), "first_code": self._texture(_rows(codes))}
+            each = zip(tables, begins, strict=True)
+            bins = [(one.first_bin, len(one.first_code) - 1, one.bin_shift, begin) for one, begin in each]
+            counts: list[Any] = [(begin, len(one)) for begin, one in zip(first, edges, strict=True)]
+        else:
+            bins, counts = table[1], []
         if gain is not None:
             self._textures["gain"] = self._texture(gain)
         self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}
         for program in (self.sprite_program, self._whole):
+            planes.set(program, bins=bins, thresholds=counts)
             for unit, name in enumerate(self._textures):
                 program[name] = unit
 
@@ -298,10 +415,10 @@ class Encoder:
         return [*textures, *([] if self._steps is None else [self._steps])]
 
     def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
-        """Read the places and rates of sprites from a buffer of SPRITE_DTYPE."""
+        """Read the places and rates of sprites from a buffer."""
         if self._sprite_vao is not None:
             self._sprite_vao.release()
-        self._sprite_vao = self._ctx.vertex_array(self.sprite_program, [(buffer, PLACES, "pixel", "electrons_per_s")])
+        self._sprite_vao = sprites_array(self.sprite_program, buffer, self._planes)
         self.sprite_program["footprint_px"] = self._footprint_px = footprint_px
 
     def draw(
@@ -341,6 +458,11 @@ class Encoder:
             margin = self._footprint_px
             self._fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
             self._sprite_vao.render(moderngl.POINTS, vertices=count)
+
+
+def linear_format(planes: Planes) -> str:
+    """GL's name of a linear image's texels."""
+    return "rgba32f" if planes.apart else "r32f"
 
 
 def _rows(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -4,20 +4,20 @@ With `temporal` what each star leaves is kept on the GPU from frame to frame.
 """
 
 import math
+from typing import Any
 
 import moderngl
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, IntArray
+from hilstar.arrays import IntArray
 from hilstar.monitor.balance import SUMS, Balance
-from hilstar.monitor.exact import CARRIED, ExactQuantiser, Left
+from hilstar.monitor.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left
 from hilstar.monitor.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
-from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
-from hilstar.render.backend import Target
-from hilstar.render.encoder import LevelTexture, LookupTable, Shares, build_compute
-from hilstar.render.star_passes import StarPasses
+from hilstar.render.backend import Target, Turn
+from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, linear_format
+from hilstar.render.star_passes import StarPasses, turns_of
 from hilstar.scene.psf import PIXEL_VARIANCE
 from hilstar.scene.sprites import Sprites
 
@@ -25,34 +25,38 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
 OVERRATED = 1.0001  # rounding
-RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # runs of stars are sorted by light; runs times half octaves fill 16 bits
-PARTS = (
-    "sums",
-    "exact/inputs",
-    "shares",
-    "exact/stars",
-    "exact/pixels",
-    "exact/choices",
-)  # the shader's parts before exact.comp
+PARTS = tuple(f"{one}.glsl" for one in ("exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices"))
 LOCAL_SIZE = 32  # as in exact.comp
+TURNS_BINDING = 3
 FIRST_BINDING = 4  # first binding of a Memory's buffers
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
 SUMS_BYTES = 4 * SUMS
 
 
 class ExactPass:
-    """Chooses the levels of sprites anew on a LevelTexture that has the nearest ones; it lives in its renderer's context."""
+    """Chooses the levels of sprites anew on a plane of a LevelTexture that has the nearest ones.
+
+    `turn` says on which, and for what stars make up there; `left` has room for what all planes leave. It lives in its
+    renderer's context.
+    """
 
     def __init__(
         self,
         quantiser: type[ExactQuantiser],
         target: Target,
-        panel: Panel,
+        planes: Planes,
+        turn: Turn,
+        *,
         linear: moderngl.Texture,
         levels: LevelTexture,
         shares: Shares,
+        left: "StarSums | None",
     ) -> None:
         ctx = self._ctx = linear.ctx
+        self.plane, self._makes_up, self._kept = turn
+        panel = planes.panels[self.plane]
+        self._planes, self._together = planes, left
+        self._format = levels.format
         balance = Balance(target.psf, target.seen, quantiser.weights)
         self._linear, self._levels = linear, levels.texture
         self._pixels = PixelOrder(balance.psf)
@@ -72,16 +76,26 @@ class ExactPass:
         """The program for stars or paths, whose light is summed or in the linear image; made when it is first asked for."""
         if (paths, summed) in self._programs:
             return self._programs[paths, summed]
-        order, panel, balance = self._pixels, self._panel, self._balance
-        defines = [f"NEAR {order.near}", f"LEVELS r{8 if self._levels.dtype == 'u1' else 16}ui"]
+        order, panel, balance, together = self._pixels, self._panel, self._balance, self._together is not None and not paths
+        defines = [f"NEAR {order.near}", f"LEVELS {self._format}", f"LINEAR {linear_format(self._planes)}"]
+        defines += [
+            f"PLANE {self.plane}",
+            f"KEPT {self._kept}",
+            *["MAKES_UP"] * any(self._makes_up),
+            *["LEAVES"] * (self._kept == KEPT_BEFORE),
+            *self._planes.defines,
+            *["TOGETHER"] * together,
+        ]
         defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.psf.width_px) < NARROW_PX)
         defines += self._shares.defines
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
         defines += ["TEMPORAL"] * (self._memory is not None) + ["SUMS"] * summed + [*self._order.define, *self._light.define]
-        program = build_compute(self._ctx, self._quantiser.shader, defines, PARTS if summed else PARTS[1:])
+        files = ("planes.glsl", *["sums.glsl"] * summed, *PARTS)
+        program = build_compute(self._ctx, self._quantiser.shader, defines, files)
         self._shares.set(program)
+        self._planes.set(program, makes_up=self._makes_up)
         window, weights = balance.window_px, balance.weights
-        values = {
+        values: dict[str, Any] = {
             "footprint": order.size**2,
             "overrated": overrated(balance.psf.width_px) if paths else OVERRATED,
             "reach_px2": order.area_px2,
@@ -122,22 +136,26 @@ class ExactPass:
 
     def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
-        paths, star = sprites.per_star > 1, sprites.star
+        paths, star, alone = sprites.per_star > 1, sprites.star, 0
         program = self._program(paths, passes is not None)
-        turns = stretches_of(star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
-        count = len(turns)
-        data = turns.astype(np.int32).tobytes()
-        if self._turns is None or self._turns.size < len(data):
-            if self._turns is not None:
-                self._turns.release()
-            self._turns = self._ctx.buffer(reserve=2 * len(data), dynamic=True)
-        self._turns.orphan()
-        self._turns.write(data)
-        self._turns.bind_to_storage_buffer(3)
+        if passes is not None and self._planes.apart and not paths:
+            count, alone = len(sprites), passes.bind_order(TURNS_BINDING)
+        else:
+            turns = stretches_of(star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
+            count, data = len(turns), turns.astype(np.int32).tobytes()
+            if self._turns is None or self._turns.size < len(data):
+                if self._turns is not None:
+                    self._turns.release()
+                self._turns = self._ctx.buffer(reserve=2 * len(data), dynamic=True)
+            self._turns.orphan()
+            self._turns.write(data)
+            self._turns.bind_to_storage_buffer(TURNS_BINDING)
         if self._memory is not None and paths:
             self._memory.bind(star[turns[:, 0]], turns[:, 0] != turns[:, 2])
         elif self._memory is not None:
             self._memory.bind(star, np.zeros(count, dtype=np.bool_))
+        elif self._together is not None:
+            self._together.bind(count * len(self._planes.panels))
         buffer.bind_to_storage_buffer(0)
         self._order.bind()
         self._light.bind()
@@ -149,8 +167,23 @@ class ExactPass:
         else:
             passes.bind_sums(program)
         program["count"] = count
+        if "alone" in program:
+            program["alone"] = alone
         program.run(-(-count // LOCAL_SIZE))
         self._ctx.memory_barrier()
+
+
+class StarSums:
+    """Room for what the stars of a frame leave in each plane; it lives in its renderer's context."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self._buffer = ctx.buffer(reserve=SUMS_BYTES, dynamic=True)
+
+    def bind(self, count: int) -> None:
+        """Bind it for a pass, with room for `count` stars; what it has stays where there was room before."""
+        if self._buffer.size < count * SUMS_BYTES:
+            self._buffer.orphan(2 * count * SUMS_BYTES)
+        self._buffer.bind_to_storage_buffer(FIRST_BINDING + 2)
 
 
 class Memory:
@@ -235,19 +268,6 @@ def _ratio(place: float, width_px: float) -> float:
     edges = [(place * wide + side) / (width_px * math.sqrt(2)) for side in (-0.5, 0.5)]
     light = (math.erf(edges[1]) - math.erf(edges[0])) / 2
     return math.exp(-(place**2) / 2) / (math.sqrt(math.tau) * wide * light)
-
-
-def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
-    """The order (n,) in which sprites go through the pass: in runs of near neighbours, each by light.
-
-    Eight stars go together on a CPU, for as long as the brightest of them needs. A run's own pixels stay in the cache.
-    """
-    count = len(electrons_per_s)
-    runs = max(1, min(count // RUN, MAX_RUNS))
-    # A float's exponent and the first bit of its mantissa: in half an octave a star's reach grows by a pixel or two.
-    half_octaves = (electrons_per_s.view(np.int32) >> 22) - (np.float32(step_e_per_s).view(np.int32) >> 22)
-    key = np.arange(count) * runs // max(count, 1) * HALF_OCTAVES + np.clip(half_octaves, 0, HALF_OCTAVES - 1)
-    return np.asarray(np.argsort(key.astype(np.uint16), kind="stable"))  # 16-bit keys are sorted by radix
 
 
 def stretches_of(star: IntArray) -> IntArray:

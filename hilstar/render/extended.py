@@ -187,7 +187,7 @@ class ExtendedLayer:
         triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def _draw_map(self, light: LightMap) -> None:
-        program, triangle = self._program("light_map.frag", "", *(() if light.cover is None else ("COVER",)))
+        program, triangle = self._program("light_map.frag", (), *(() if light.cover is None else ("COVER",)))
         own = []
         for unit, image in enumerate((light.image, light.cover)):
             if image is not None:
@@ -203,7 +203,7 @@ class ExtendedLayer:
             texture.release()
 
     def _draw_tiles(self, light: DiscLight, tiles: Tiles) -> None:
-        program, _ = self._program("tile.frag", "", vertex="tile.vert")
+        program, _ = self._program("tile.frag", vertex="tile.vert")
         program["covers"] = float(light.covers)
         self._draw_corners(program, tiles.linear)
         program, _ = self._with_rays("disc.frag", light.camera, "tile.vert")
@@ -227,7 +227,7 @@ class ExtendedLayer:
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """A program whose pixels know their directions through `camera`, whose image this is."""
         defines = () if camera.lens is None else ("LENS",)
-        program, triangle = self._program(fragment, "rays.glsl", *defines, vertex=vertex)
+        program, triangle = self._program(fragment, ("rays.glsl",), *defines, vertex=vertex)
         program["principal_px"] = camera.principal_point_px
         program["focal_px"] = camera.focal_length_px
         if camera.lens is not None:
@@ -237,10 +237,10 @@ class ExtendedLayer:
         return program, triangle
 
     def _program(
-        self, fragment: str, include: str = "", *defines: str, vertex: str = "full.vert"
+        self, fragment: str, include: tuple[str, ...] = (), *defines: str, vertex: str = "full.vert"
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """A program, and the triangle of `full.vert`; nothing is drawn by that with another vertex shader."""
-        key = (vertex, fragment, include, *defines)
+        key = (vertex, fragment, *include, *defines)
         if key not in self._programs:
             program = build_program(self._ctx, vertex, fragment, defines, include)
             self._programs[key] = program, self._ctx.vertex_array(program, [])

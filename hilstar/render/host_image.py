@@ -54,7 +54,7 @@ class HostImage:
         # A sprite's row here is that of its last pixels; its first are footprint - 1 rows before.
         self._first_row, self._end_row = edges_px[:-1], edges_px[1:] + footprint_px - 1
         named = [*shares.defines, f"FOOTPRINT {footprint_px}", f"BANDS {BANDS}"]
-        self._program = build_compute(ctx, "linear.comp", named, ["shares"])
+        self._program = build_compute(ctx, "linear.comp", named, ["shares.glsl"])
         shares.set(self._program)
         self._program["resolution_px"] = resolution_px
 

@@ -5,7 +5,6 @@ The linear image is that of `reference` in float32, and the quantisers are those
 
 import ctypes
 import logging
-from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
@@ -15,11 +14,9 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import MachineError
 from hilstar.monitor.quantise import FrameLight
-from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.aids import LINE_SHARE, lay_over
 from hilstar.render.backend import EGL_LIBRARY, NO_FRAME, Backend, ScreenView, Target, as_maps
-from hilstar.render.primaries_backend import PrimariesBackend
 from hilstar.render.reference import add_stars, extended_image
 from hilstar.scene.extended import ExtendedLight
 from hilstar.scene.sprites import Sprites
@@ -33,8 +30,6 @@ log = logging.getLogger(__name__)
 
 def open_backend(target: Target, context: "Context | None") -> Backend:
     """The backend of a target: OpenGL in a context, NumPy without one (see `headless_context`)."""
-    if target.primaries:
-        return PrimariesBackend(target, [open_backend(one, context) for one in target.primaries])
     if context is None:
         return NumpyBackend(target)
     from hilstar.render.renderer import Renderer  # moderngl, which nothing needs where NumPy draws
@@ -79,15 +74,12 @@ class NumpyBackend(Backend):
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        panel = target.panel()
-        made = QUANTISERS[target.quantisation]
-        self._quantiser = None if panel is None else made(panel, target.resolution_px, target.psf, target.seen)
+        self._quantisers = target.quantisers()
         self._last_frame = NO_FRAME
         self._linear: Float32Array | None = None  # that of `_sprites`, once somebody asks
         self._sprites: Sprites | None = None
         self._levels: Levels | None = None
-        self._lights: tuple[ExtendedLight, ...] = ()
-        self._lights_image: FloatArray | None = None
+        self._lights: dict[int, tuple[tuple[ExtendedLight, ...], FloatArray]] = {}  # the last of each primary, and its image
 
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw `sprites` (None: blank); see `Backend.draw`."""
@@ -95,10 +87,12 @@ class NumpyBackend(Backend):
             self.begin_anew()
         self._last_frame = frame
         self._sprites, self._linear = sprites, None
-        if self._quantiser is not None:
-            lights = () if sprites is None else sprites.extended
-            alone = lambda: self._extended(lights).astype(np.float32)  # noqa: E731
-            self._levels = self._quantiser.draw(FrameLight(sprites, partial(self._image, sprites, shrunk=True), alone, frame))
+        if self._quantisers:
+            self._levels = self.target.by_plane(sprites, partial(self._plane, frame))
+
+    def _plane(self, frame: int, k: int, light: Sprites | None) -> Levels:
+        image, alone = partial(self._image, light, True, k), partial(self._image, light, False, k, stars=False)
+        return self._quantisers[k].draw(FrameLight(light, image, alone, frame))
 
     def draw_linear(self, sprites: Sprites) -> None:
         """Draw the linear image of `sprites` alone; see `Backend.draw_linear`."""
@@ -116,17 +110,18 @@ class NumpyBackend(Backend):
             raise TypeError("this target has no monitor response, so no levels")
         return self._levels
 
-    def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
+    def show_on(self, view: ScreenView) -> None:
         """See `Backend.show_on`."""
-        self._screen, self._shown_with = view, (self, *beside)
+        self._screen = view
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
         """See `Backend.present`."""
         view = self._screen
         turn, (width, height) = view.orientation, view.orientation.screen_px(view.screen_px)
-        shown = [one.levels()[:height, :width] for one in self._shown_with]
+        shown = self.levels()[:height, :width]
+        shown = shown if view.triples is None else view.triples[shown]
         codes = np.zeros((height, width, 3), dtype=np.uint16)
-        codes[: len(shown[0]), : shown[0].shape[1]] = np.stack(shown, -1) if view.triples is None else view.triples[shown[0]]
+        codes[: shown.shape[0], : shown.shape[1]] = shown if shown.ndim == 3 else shown[..., None]
         cross_x, cross_y = map(round, view.cross_px)
         lay_over(codes, overlay, patch_code, int(LINE_SHARE * (2**view.bits - 1)), (cross_x, cross_y))
         codes = np.rot90(codes, -turn.quarter_turns)[:: -1 if turn.flip_y else 1, :: -1 if turn.flip_x else 1].copy()
@@ -142,8 +137,8 @@ class NumpyBackend(Backend):
     def begin_anew(self) -> None:
         """The next frame is the first of a sequence."""
         self._last_frame = NO_FRAME
-        if self._quantiser is not None:
-            self._quantiser.begin_anew()
+        for one in self._quantisers.values():
+            one.begin_anew()
 
     def finish(self) -> None:
         """Return at once: `draw` has drawn."""
@@ -151,23 +146,28 @@ class NumpyBackend(Backend):
     def close(self) -> None:
         """Do nothing."""
 
-    def _image(self, sprites: Sprites | None, shrunk: bool) -> Float32Array:
-        """The linear image; `shrunk` draws fainter stars within the target's `sides`, as their levels are."""
+    def _image(self, sprites: Sprites | None, shrunk: bool, plane: int = 0, stars: bool = True) -> Float32Array:
+        """The linear image of a plane, or its extended light; `shrunk` draws fainter stars within the target's `sides`."""
         width, height = self.target.resolution_px
-        sprites = as_maps(sprites, self.target)
+        sprites = as_maps(sprites, self.target) if stars else sprites
         if sprites is None:
             return np.zeros((height, width), dtype=np.float32)
-        image = self._extended(sprites.extended).copy()
+        image = self._extended(sprites.extended, plane)
+        if not stars:
+            return image.astype(np.float32)
+        image = image.copy()
         sides_px = np.full(len(sprites), self.target.psf.footprint_px)
         rate = sprites.data["electrons_per_s"] * sprites.per_star
+        if self.target.primaries:
+            rate = rate * (self.target.flux_at_white_e_per_s / self.target.primaries[plane].flux_at_white_e_per_s)
         for side in self.target.sides if shrunk else ():
             sides_px[rate < side.below_e_per_s] = side.side_px
         for side_px in np.unique(sides_px).tolist():
             add_stars(image, sprites, self.target.psf, side_px, np.flatnonzero(sides_px == side_px))
         return image.astype(np.float32)
 
-    def _extended(self, lights: tuple[ExtendedLight, ...]) -> FloatArray:
+    def _extended(self, lights: tuple[ExtendedLight, ...], plane: int) -> FloatArray:
         """The light of discs and stray light alone (height, width); the same lights again are not drawn again."""
-        if self._lights_image is None or lights != self._lights:
-            self._lights_image, self._lights = extended_image(lights, self.target.resolution_px), lights
-        return self._lights_image
+        if plane not in self._lights or self._lights[plane][0] != lights:
+            self._lights[plane] = lights, extended_image(lights, self.target.resolution_px)
+        return self._lights[plane][1]

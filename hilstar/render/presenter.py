@@ -1,6 +1,5 @@
 """The last pass: the levels of a renderer onto the window that its context belongs to."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import moderngl
@@ -63,11 +62,11 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
 class Presenter:
     """Draws a texture of levels on the screen of its context; `table` has the codes of each level.
 
-    With `others` the levels are red's codes, and theirs are green's and blue's.
+    Of primaries that are driven `apart` the levels of red, green and blue are their codes.
     """
 
-    def __init__(self, levels: moderngl.Texture, view: ScreenView, others: Sequence[moderngl.Texture] = ()) -> None:
-        self._texture, self._others = levels, others
+    def __init__(self, levels: moderngl.Texture, view: ScreenView, apart: bool = False) -> None:
+        self._texture, self._apart = levels, apart
         self._ctx = levels.ctx
         self._view = view
         with self._ctx:
@@ -81,14 +80,12 @@ class Presenter:
         """The program without or with crosshair, grid, blank and patch, for this orientation alone."""
         view, orientation = self._view, self._view.orientation
         flips = {"FLIP_X": orientation.flip_x, "FLIP_Y": orientation.flip_y}
-        wanted = flips | {"STEALING": view.triples is not None, "APART": bool(self._others), "AIDS": aids}
+        wanted = flips | {"STEALING": view.triples is not None, "APART": self._apart, "AIDS": aids}
         defines = (f"QUARTER_TURNS {orientation.quarter_turns % 4}", *(name for name, is_set in wanted.items() if is_set))
         program = build_program(self._ctx, "full.vert", "present.frag", defines)
         values: dict[str, Any] = {
             "levels": 0,
             "triples": 1,
-            "green": 2,
-            "blue": 3,
             "white": float(2**view.bits - 1),
             "size_px": view.resolution_px,
             "screen_px": view.screen_px,
@@ -131,8 +128,6 @@ class Presenter:
             self._ctx.viewport = (0, 0, *self._view.screen_px)
             self._texture.use(0)
             self.table.use(1)
-            for unit, other in enumerate(self._others, 2):
-                other.use(unit)
             program, vao = self._aided if overlay else self._plain
             if overlay:
                 program["overlay"], program["patch_code"] = overlay, patch_code

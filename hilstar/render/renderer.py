@@ -4,8 +4,8 @@ This room is the only user of moderngl.
 """
 
 import zlib
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property, partial
 from typing import Self
 
 import moderngl
@@ -13,10 +13,10 @@ import numpy as np
 
 from hilstar.arrays import Float32Array
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import DitherQuantiser, Panel
+from hilstar.monitor.quantise import DitherQuantiser
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
-from hilstar.render.backend import NO_FRAME, Backend, ScreenView, Target, as_maps
+from hilstar.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
 from hilstar.render.context import Context, check_limits, computes_in_software, create_context
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
@@ -25,19 +25,21 @@ from hilstar.render.encoder import (
     Encoder,
     Eraser,
     LevelTexture,
+    Planes,
     Shares,
     lit_sides,
     most_covered_px,
     set_sides,
     splat_program,
+    sprites_array,
 )
-from hilstar.render.exact_pass import ExactPass
+from hilstar.render.exact_pass import ExactPass, StarSums
 from hilstar.render.extended import ExtendedLayer
 from hilstar.render.host_image import HostImage
 from hilstar.render.presenter import Presenter, changed_codes
 from hilstar.render.star_passes import LightUnits, StarPasses
-from hilstar.scene.extended import ExtendedLight, Rectangle
-from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
+from hilstar.scene.extended import Rectangle
+from hilstar.scene.sprites import Sprites
 
 FIRST_CAPACITY = 4096
 UNTIMED = nullcontext()
@@ -51,7 +53,8 @@ class Renderer(Backend):
 
     def __init__(self, target: Target, context: Context | None = None) -> None:
         self.target = target
-        self.footprint_px = target.psf.footprint_px
+        self._planes = Planes.of(target)
+        self.footprint_px = self._planes.footprint_px
         self._undrawn: tuple[Sprites | None, bool] | None = None
         self._by_numpy = False
         quantiser = QUANTISERS[target.quantisation]
@@ -71,19 +74,19 @@ class Renderer(Backend):
             raise
 
     def _build(self) -> None:
-        ctx, target = self._ctx, self.target
+        ctx, target, planes = self._ctx, self.target, self._planes
         ctx.enable(moderngl.PROGRAM_POINT_SIZE)
         ctx.blend_func = (moderngl.ONE, moderngl.ONE)
-        self._linear = ctx.texture(target.resolution_px, 1, dtype="f4")
+        self._linear = ctx.texture(target.resolution_px, planes.texel, dtype="f4")
         self._linear.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._linear_fbo = ctx.framebuffer([self._linear])
-        self._shares = Shares(ctx, target.psf)
-        self._splat = splat_program(ctx, target.resolution_px, self._shares)
-        self._eraser = Eraser(ctx, target.resolution_px, of_levels=False)
-        self._level_eraser = Eraser(ctx, target.resolution_px, of_levels=True)
+        self._shares = Shares(ctx, target.psf, self.footprint_px)
+        self._splat = splat_program(ctx, target.resolution_px, self._shares, planes)
+        self._eraser = Eraser(ctx, target.resolution_px, planes, of_levels=False)
+        self._level_eraser = Eraser(ctx, target.resolution_px, planes, of_levels=True)
         self._extended = ExtendedLayer(ctx, target.resolution_px)
         self._regions: tuple[Rectangle, ...] = ()  # where extended light is on the images
-        self._cut_sides = target.sides
+        self._cut_sides = self._wider(target.sides)
         self._build_levels()
         set_sides(self._splat, self._cut_sides)
         self._reserve(FIRST_CAPACITY)
@@ -93,8 +96,13 @@ class Renderer(Backend):
         self._host = HostImage(ctx, target.resolution_px, self._shares) if on_host else None
         self._on_host = False  # where the last draw is
 
+    def _wider(self, sides: SpriteSides) -> SpriteSides:
+        """The sides of sprites that have the light of all planes."""
+        more_px = self.footprint_px - self.target.psf.footprint_px
+        return tuple(SpriteSide(side.below_e_per_s, side.side_px + more_px) for side in sides)
+
     def _build_levels(self) -> None:
-        target, panel = self.target, self.target.panel()
+        target, planes = self.target, self._planes
         # What turns light into codes; a window adds its own.
         self.tables: list[moderngl.Texture | moderngl.Buffer] = []
         self._checksums: list[tuple[moderngl.Texture | moderngl.Buffer, int]] = []
@@ -102,58 +110,65 @@ class Renderer(Backend):
         self._levels: LevelTexture | None = None
         self._levels_black = True  # but for the last frame
         self._encoder: Encoder | None = None
-        self._exact_pass: ExactPass | None = None
+        self._exact_passes: list[ExactPass] = []  # by plane, as those are chosen in turn
         self._units: LightUnits | None = None
         self._passes: StarPasses | None = None
         self._unit_splat: moderngl.Program | None = None  # where points are in units
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
-        self._exact: ExactQuantiser | None = None
+        self._exact: dict[int, ExactQuantiser] = {}
         self._floor_encoder: Encoder | None = None
-        self._floor_key: tuple[tuple[ExtendedLight, ...], float] = ((), 0.0)
+        self._floor_key: tuple[object, float] = ((), 0.0)
         self._floor_levels: Levels | None = None
-        if panel is None:
+        if not planes.panels:
             return
-        self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
-        if self._by_star is not None and self._by_star.takes(target.psf, self._ctx.version_code):
-            self._exact_pass = ExactPass(self._by_star, target, panel, self._linear, self._levels, self._shares)
-        if self._by_star is None or self._exact_pass is not None:
-            self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, self._by_pixel)
+        panel = planes.lit
+        self._levels = LevelTexture(self._ctx, target.resolution_px, planes)
+        by_star, ctx = self._by_star, self._ctx
+        if by_star is not None and by_star.takes(target.psf, ctx.version_code):
+            left = StarSums(ctx) if planes.apart and not by_star.remembers else None
+            chosen = partial(ExactPass, by_star, target, planes, linear=self._linear, levels=self._levels, shares=self._shares)
+            self._exact_passes = [chosen(turn, left=left) for turn in target.in_turn()]
+        if by_star is None or self._exact_passes:
+            self._encoder = Encoder(ctx, self._linear, self._levels, planes, self._by_pixel)
             lit_e_per_s = self._by_pixel.lit_from_e_per_s(panel)
-            self._lit_sides = () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
+            sides = () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
+            self._lit_sides = self._wider(sides)
             set_sides(self._encoder.sprite_program, self._lit_sides)
             if lit_e_per_s and not target.sides:
-                self._cut_sides = lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS)
+                self._cut_sides = self._wider(lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS))
             # The passes count thresholds alone.
-            if not self._by_pixel.shader and LightUnits.takes(panel, target.resolution_px, self.footprint_px):
-                self._build_units(self._levels, panel, self._encoder)
-        for made in (self._encoder, self._exact_pass, self._passes):
+            if not self._by_pixel.shader and LightUnits.takes(planes, target.resolution_px):
+                self._build_units(self._levels, self._encoder)
+        for made in (self._encoder, *self._exact_passes, self._passes):
             self.tables += [] if made is None else made.tables
-        if self._by_star is not None and self._exact_pass is None:
+        if by_star is not None and not self._exact_passes:
             self.path = "NumPy"
         elif self._passes is not None:
             self.path = "compute shaders"
-        elif self._exact_pass is not None:
+        elif self._exact_passes:
             self.path = "points, then compute shaders"
 
-    def _build_units(self, levels: LevelTexture, panel: Panel, encoder: Encoder) -> None:
+    def _build_units(self, levels: LevelTexture, encoder: Encoder) -> None:
         """Build what draws light in whole units: the passes of a software OpenGL, else sprites."""
-        target = self.target
-        units = self._units = LightUnits(panel, target.resolution_px, target.psf, target.sides)
+        target, planes = self.target, self._planes
+        units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
         if computes_in_software(self._ctx):  # a graphics card is left idle by a star a lane
-            self._passes = StarPasses(levels, panel, target.psf, self._shares, self._by_star is not None, units)
+            self._passes = StarPasses(levels, planes, target.psf, self._shares, self._by_star is not None, units)
             return
-        self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, in_units=True)
-        self._unit_splat["most_e_per_s"] = units.white_e_per_s
+        self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, planes, in_units=True)
+        planes.set(self._unit_splat, most_e_per_s=units.most_e_per_s)
+        planes.set(encoder.sprite_program)
         for program in (self._unit_splat, encoder.sprite_program):
             program["reach_px2"], program["largest_px"] = units.axes_px2, units.side_px
 
     def _reserve(self, sprites: int) -> None:
         """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
         self._capacity = sprites
-        self._buffer = self._ctx.buffer(reserve=sprites * SPRITE_DTYPE.itemsize, dynamic=True)
-        layout = [(self._buffer, "2i 2f 1f", "pixel", "fraction_px", "electrons_per_s")]
-        self._splat_vao = self._ctx.vertex_array(self._splat, layout)
-        self._unit_vao = None if self._unit_splat is None else self._ctx.vertex_array(self._unit_splat, layout)
+        self._buffer = self._ctx.buffer(reserve=sprites * self._planes.dtype.itemsize, dynamic=True)
+        self._splat_vao, self._unit_vao = (
+            None if program is None else sprites_array(program, self._buffer, self._planes)
+            for program in (self._splat, self._unit_splat)
+        )
         self._last_count: int | None = None  # sprites in the buffer and on the images
         for eraser in (self._eraser, self._level_eraser):
             eraser.take_places_from(self._buffer, self.footprint_px)
@@ -167,10 +182,11 @@ class Renderer(Backend):
                 self.begin_anew()
             self._last_frame = frame
             extended = sprites is not None and bool(sprites.extended)
-            self._by_numpy = self._by_star is not None and (self._exact_pass is None or extended)
+            self._by_numpy = self._by_star is not None and (not self._exact_passes or extended)
             if not self._by_numpy:
                 sprites = as_maps(sprites, self.target)
                 extended = sprites is not None and bool(sprites.extended)
+                sprites = None if sprites is None else self._planes.packed(sprites)
             units = None if self._by_numpy or extended else self._units
             unit_e_per_s = None if units is None else units.unit_for(sprites)
             passes = self._passes
@@ -199,17 +215,26 @@ class Renderer(Backend):
 
     def draw_linear(self, sprites: Sprites) -> None:
         """See `Backend.draw_linear`."""
+        if self._planes.apart:
+            self._white.draw_linear(sprites)
+            return
         with self._ctx:
             self._draw_linear(sprites, whole=True)
+
+    @cached_property
+    def _white(self) -> "Renderer":
+        """What draws linear images beside those of primaries."""
+        return Renderer(Target(self.target.resolution_px, self.target.psf), self._ctx)
 
     def begin_anew(self) -> None:
         """See `Backend.begin_anew`."""
         self._last_frame = NO_FRAME
-        for chooser in (self._exact, self._exact_pass):
-            if chooser is not None:
-                chooser.left = None
+        for quantiser in self._exact.values():
+            quantiser.left = None
+        for one in self._exact_passes:
+            one.left = None
 
-    def _draw_by_points(self, sprites: Sprites | None, unit_e_per_s: float | None) -> None:
+    def _draw_by_points(self, sprites: Sprites | None, unit_e_per_s: list[float] | None) -> None:
         """The linear image and its levels by rasterised sprites, in units where one is given."""
         few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
         sides = self._lit_sides if self._encoder is not None else ()
@@ -219,8 +244,9 @@ class Renderer(Backend):
         if units is not None and encoder is not None and splat is not None:
             reach_per_e = 0.0 if sprites is None or unit_e_per_s is None else units.reach_per_e(sprites)
             encoder.sprite_program["reach_per_e"] = reach_per_e
-            if in_units:
-                splat["reach_per_e"], splat["unit_e_per_s"] = reach_per_e, unit_e_per_s
+            if in_units and unit_e_per_s is not None:
+                splat["reach_per_e"] = reach_per_e
+                self._planes.set(splat, unit_e_per_s=unit_e_per_s)
         cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
         self._draw_linear(sprites, whole=not (self.target.sides or cut), in_units=in_units)
         if self._encoder is not None:
@@ -239,45 +265,54 @@ class Renderer(Backend):
 
     def _choose(self, sprites: Sprites | None, passes: StarPasses | None) -> None:
         """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last frame left."""
-        if self._exact_pass is None:
-            return
-        if self._exact is not None and self._exact.left is not None:
-            self._exact_pass.left, self._exact.left = self._exact.left, None
-        if sprites is None or not len(sprites):
-            self._exact_pass.left = None
-            return
-        with self._stage("choose"):
-            self._exact_pass.draw(self._buffer if passes is None else passes.sprites, sprites, passes)
+        for one in self._exact_passes:
+            if self._exact and (left := self._exact[one.plane].left) is not None:
+                one.left, self._exact[one.plane].left = left, None
+            if sprites is None or not len(sprites):
+                one.left = None
+                continue
+            with self._stage("choose"):
+                one.draw(self._buffer if passes is None else passes.sprites, sprites, passes)
 
     def _draw_by_numpy(self, sprites: Sprites | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
-        target, panel, levels, by_star = self.target, self.target.panel(), self._levels, self._by_star
-        if panel is None or levels is None or by_star is None:
+        target, levels, by_star = self.target, self._levels, self._by_star
+        if levels is None or by_star is None:
             return
-        if self._exact is None:
-            self._exact = by_star(panel, target.resolution_px, target.psf, target.seen)
-        if self._exact_pass is not None and (left := self._exact_pass.left) is not None:
-            self._exact.left, self._exact_pass.left = left, None
-        lights = () if sprites is None else sprites.extended
-        floor = self._floor(lights, by_star.floor_turn(frame), panel, levels) if lights else None
-        self._exact_levels = self._exact.levels(sprites, floor)
+        if not self._exact:
+            self._exact = {k: one for k, one in target.quantisers().items() if isinstance(one, ExactQuantiser)}
+        for one in self._exact_passes:
+            if (left := one.left) is not None:
+                self._exact[one.plane].left, one.left = left, None
+        floor = None if sprites is None or not sprites.extended else self._floor(sprites, by_star.floor_turn(frame), levels)
+        on = [None] * len(self._exact) if floor is None else np.atleast_3d(floor).transpose(2, 0, 1)
+        self._exact_levels = target.by_plane(sprites, lambda k, light: self._exact[k].levels(light, on[k]))
         levels.write(self._exact_levels)
 
-    def _floor(self, lights: tuple[ExtendedLight, ...], turn: float, panel: Panel, levels: LevelTexture) -> Levels:
+    def _floor(self, sprites: Sprites, turn: float, levels: LevelTexture) -> Levels:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
 
         The same lights and turn again give the same levels, which are kept.
         """
-        if (lights, turn) == self._floor_key and self._floor_levels is not None:
+        key = sprites.lights or sprites.extended, turn
+        if key == self._floor_key and self._floor_levels is not None:
             return self._floor_levels
         if self._floor_encoder is None:
-            self._floor_encoder = Encoder(self._ctx, self._linear, levels, panel, DitherQuantiser)
+            self._floor_encoder = Encoder(self._ctx, self._linear, levels, self._planes, DitherQuantiser)
         self._erase()
-        self._regions = self._extended.draw(self._linear_fbo, lights)
+        self._draw_extended(sprites)
         levels.fbo.clear()
         self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions)
-        self._floor_key, self._floor_levels = (lights, turn), levels.read().copy()
+        self._floor_key, self._floor_levels = key, Levels(levels.read().copy())
         return self._floor_levels
+
+    def _draw_extended(self, sprites: Sprites) -> None:
+        """Add extended light to the linear image, that of each primary to its plane alone."""
+        fbo, self._regions = self._linear_fbo, ()
+        for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
+            fbo.color_mask = tuple(plane == k or not self._planes.apart for k in range(4))  # type: ignore[assignment]
+            self._regions += self._extended.draw(fbo, lights)
+        fbo.color_mask = True, True, True, True
 
     def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
@@ -289,7 +324,7 @@ class Renderer(Backend):
         with self._stage("erase"):
             self._erase(levels)
         if sprites is not None and sprites.extended:
-            self._regions = self._extended.draw(self._linear_fbo, sprites.extended)
+            self._draw_extended(sprites)
         if sprites is not None and len(sprites):
             with self._stage("upload"):
                 if len(sprites) > self._capacity:
@@ -311,7 +346,8 @@ class Renderer(Backend):
                 self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
                 self._ctx.enable(moderngl.BLEND)
                 vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao
-                vao.render(moderngl.POINTS, vertices=len(sprites))
+                if vao is not None:
+                    vao.render(moderngl.POINTS, vertices=len(sprites))
                 self._ctx.disable(moderngl.BLEND)
 
     def _erase(self, levels: bool = True) -> None:
@@ -348,6 +384,8 @@ class Renderer(Backend):
         """See `Backend.linear`."""
         if self._host is not None and self._on_host:
             return self._host.image
+        if self._planes.apart:
+            return self._white.linear()
         with self._ctx:
             if self._undrawn is not None:
                 self._draw_linear(*self._undrawn, levels=self._by_numpy)
@@ -355,10 +393,9 @@ class Renderer(Backend):
             self._linear_fbo.read_into(self._linear_image, components=1, dtype="f4", alignment=1)
         return self._linear_image
 
-    def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
+    def show_on(self, view: ScreenView) -> None:
         """See `Backend.show_on`."""
-        others = [one.codes_texture for one in beside if isinstance(one, Renderer)]
-        self._screen, self._presenter = view, Presenter(self.codes_texture, view, others)
+        self._screen, self._presenter = view, Presenter(self.codes_texture, view, apart=self._planes.apart)
         self.tables.append(self._presenter.table)
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:

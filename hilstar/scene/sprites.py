@@ -100,7 +100,8 @@ class Sprites:
     `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that changes over the field; None draws all by its mean.
     `extended` is the frame's light other than stars, in the order in which it is drawn; `discs` names the bodies among it, and
     `over_white` those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for `star`.
-    `primaries` are the sprites of each of the monitor's primaries, where those are driven apart.
+    Where the monitor's primaries are driven apart, `primaries` float32 (n, 3) is the light of each, and `lights` the extended
+    light of each, moved to where that primary has to be drawn.
     """
 
     data: npt.NDArray[np.void]
@@ -116,7 +117,8 @@ class Sprites:
     added: tuple[AddedLight, ...] = ()
     discs: tuple[str, ...] = ()
     over_white: tuple[str, ...] = ()
-    primaries: "tuple[Sprites, ...]" = ()
+    primaries: Float32Array | None = None
+    lights: tuple[tuple[ExtendedLight, ...], ...] = ()
 
     def __len__(self) -> int:
         return len(self.data)
@@ -255,32 +257,57 @@ def shares_by_bv(by_bv: FloatArray, bv_mag: FloatArray | float) -> FloatArray:
     return np.stack([np.interp(bv_mag, BV_MAG, column) for column in by_bv.T], axis=-1)
 
 
+def shares_of_sprites(sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None) -> FloatArray:
+    """The shares (n, columns) of each sprite's light, by those of each star; see `by_share`."""
+    found, added = shares_at(shares, stars, sprites.star), sprites.star < 0
+    if by_bv is not None and added.any():
+        own_mag = np.array([light.bv_mag for light in sprites.added])
+        found[added] = shares_by_bv(by_bv, own_mag[-1 - sprites.star[added]])
+    return found
+
+
+def by_primary(sprites: Sprites, places_px: FloatArray, k: int) -> Sprites:
+    """The sprites of primary `k`, each where it is drawn so that its light, at its place (3, 2) within a pixel, lies there."""
+    data, bias = sprites.data.copy(), np.float32(0.5 if sprites.footprint_px % 2 else 0.0)  # as in pack_sprites
+    if sprites.primaries is not None:
+        data["electrons_per_s"] = sprites.primaries[:, k]
+    for column, away_px in enumerate(places_px[k]):
+        if not away_px:
+            continue
+        part = data["fraction_px"][:, column] - np.float32(away_px)  # as in shaders/exact/stars.glsl
+        whole = np.floor(part + bias)
+        data["pixel"][:, column] += whole.astype(np.int32)
+        data["fraction_px"][:, column] = part - whole
+    right, down = places_px[k]
+    x_px, y_px, lights = sprites.x_px - right, sprites.y_px - down, sprites.lights[k] if sprites.lights else ()
+    return replace(sprites, data=data, x_px=x_px, y_px=y_px, extended=lights, primaries=None, lights=())
+
+
 def by_share(sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None) -> list[Sprites]:
     """The sprites once for each column of `shares` (stars, columns): every light times its star's or body's share.
 
     Light that is neither a star's nor a body's, as a fault's, has that of its B-V, `by_bv`; without one the mean of the stars.
     """
-    bodies = {name: len(stars.rates_e_per_s) + k for k, name in enumerate(stars.bodies)}
-    lights = np.array(
-        [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended], np.intp
-    )
-    of_sprites, of_extended = (shares_at(shares, stars, places) for places in (sprites.star, lights))
-    if by_bv is not None:
-        added = sprites.star < 0
-        if added.any():
-            own_mag = np.array([light.bv_mag for light in sprites.added])
-            of_sprites[added] = shares_by_bv(by_bv, own_mag[-1 - sprites.star[added]])
-        for place in np.flatnonzero(lights < 0).tolist():
-            if (bv_mag := getattr(sprites.extended[place], "bv_mag", None)) is not None:
-                of_extended[place] = shares_by_bv(by_bv, bv_mag)
-    of_sprites = of_sprites.astype(np.float32)
+    of_sprites = shares_of_sprites(sprites, stars, shares, by_bv).astype(np.float32)
     parts = []
-    for share, wide in zip(of_sprites.T, of_extended.T, strict=True):
+    for share, lights in zip(of_sprites.T, extended_by_share(sprites, stars, shares, by_bv), strict=True):
         data = sprites.data.copy()
         data["electrons_per_s"] *= share
-        extended = tuple(times(light, float(part)) for light, part in zip(sprites.extended, wide, strict=True))
-        parts.append(replace(sprites, data=data, extended=extended))
+        parts.append(replace(sprites, data=data, extended=lights))
     return parts
+
+
+def extended_by_share(
+    sprites: Sprites, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None
+) -> list[tuple[ExtendedLight, ...]]:
+    """The extended light of sprites once for each column of `shares`, as `by_share`."""
+    bodies = {name: len(stars.rates_e_per_s) + k for k, name in enumerate(stars.bodies)}
+    lights = [-1 if isinstance(light, GlowLight) else bodies.get(light.name, -1) for light in sprites.extended]
+    wide = shares_at(shares, stars, np.array(lights, dtype=np.intp))
+    for place, (light, body) in enumerate(zip(sprites.extended, lights, strict=True)):
+        if by_bv is not None and body < 0 and (bv_mag := getattr(light, "bv_mag", None)) is not None:
+            wide[place] = shares_by_bv(by_bv, bv_mag)
+    return [tuple(times(light, float(part)) for light, part in zip(sprites.extended, one, strict=True)) for one in wide.T]
 
 
 def clipped_sprites(

@@ -45,11 +45,17 @@ Choice moved(Choice e, vec4 a, vec4 b, vec2 c, float by, float square, BITS bit)
 }
 
 // Indices are written out: a compiler that does not unroll the loop keeps the choices in memory, at ten times the time.
-#define EIGHT(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7)
-#define SEVEN(DO) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7)
+#if KEPT == 8
+#define OTHERS(DO) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7)
 #define NEXT_TO_EACH(DO) DO(0, 1) DO(2, 3) DO(4, 5) DO(6, 7)
 #define TWO_APART(DO) DO(0, 2) DO(1, 3) DO(4, 6) DO(5, 7)
 #define FOUR_APART(DO) DO(0, 4) DO(1, 5) DO(2, 6) DO(3, 7)
+#else
+#define OTHERS(DO) DO(1) DO(2) DO(3)
+#define NEXT_TO_EACH(DO) DO(0, 1) DO(2, 3)
+#define TWO_APART(DO) DO(0, 2) DO(1, 3)
+#endif
+#define EACH(DO) DO(0) OTHERS(DO)
 
 // The square of the sums where the lower level is taken, and what the step to the upper one adds to it.
 #define LOWER(M) { \
@@ -80,5 +86,5 @@ Choice moved(Choice e, vec4 a, vec4 b, vec2 c, float by, float square, BITS bit)
     float aa = dot(a, a) + dot(b, b) + dot(c, c); \
     BITS bit = bit_of(K); \
     float lower[KEPT], rise[KEPT]; \
-    EIGHT(LOWER) \
+    EACH(LOWER) \
     PAIRS(KEEP_THE_BETTER) }

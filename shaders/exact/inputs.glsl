@@ -1,4 +1,4 @@
-// What exact.comp reads and writes.
+// What exact.comp reads and writes, of one PLANE of the image. It comes after planes.glsl.
 
 #if NEAR <= 32
 #define BITS uint
@@ -8,7 +8,7 @@
 #define BITS uvec4
 #endif
 
-layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // five words each, as SPRITE_DTYPE
+layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // WORDS each, as in light.comp
 // A footprint's pixels by distance, for each phase, and the light of each level, white twice: in blocks where there is room for them,
 // which a CPU reads in half the time.
 #ifdef ORDER_ROWS
@@ -36,16 +36,20 @@ struct Begin {
 layout(std430, binding = 4) readonly buffer Begins { Begin begins[]; };
 layout(std430, binding = 5) readonly buffer Before { float before[]; };       // ten sums for each star, or stretch
 layout(std430, binding = 6) writeonly buffer Left { float left_sums[]; };
+#elif defined(TOGETHER)
+layout(std430, binding = 6) buffer Left { float left_sums[]; };               // ten for each plane of a star
+uniform float makes_up[PLANES];  // for how much of what each plane left the star makes up here, in steps of both
 #endif
 layout(LEVELS, binding = 0) uniform uimage2D levels;
 #ifndef SUMS
-layout(r32f, binding = 1) readonly uniform image2D linear_e_per_s;
+layout(LINEAR, binding = 1) readonly uniform image2D linear_e_per_s;
 #endif
 #ifdef UNIFORMITY
 uniform sampler2D gain;
 #endif
 
 uniform int count;
+uniform int alone;     // stars whose pixels no other star lights, the first in their order: there are no sums of them
 uniform int footprint;  // pixels in all
 uniform float reach_px2, reach_per_e; // how many of them are chosen: as PixelOrder.reach in footprints.py
 uniform int fewest;
@@ -66,7 +70,6 @@ uniform float few_steps;
 uniform float last_light;
 
 const int PHASES = 8;
-const int KEPT = 8;
 const float NONE = 1e30;
 const float SAME_STEP = 1e-4;
 const float OFF = 0.6;  // of a step, where steps are equal: then one more pixel is turned

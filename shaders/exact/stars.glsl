@@ -7,15 +7,21 @@ struct Star {
     float e_per_s;
 };
 
-ivec2 pixel_of(int i) {
-    return ivec2(sprite[5 * i], sprite[5 * i + 1]);
+Star star_of(int i) {
+    i *= WORDS;
+    ivec2 pixel = ivec2(sprite[i], sprite[i + 1]);
+    vec2 fraction = vec2(intBitsToFloat(sprite[i + 2]), intBitsToFloat(sprite[i + 3]));
+#ifdef OFFSETS
+    fraction -= places_px[PLANE];
+    vec2 whole = floor(fraction + odd);
+    pixel += ivec2(whole);
+    fraction -= whole;
+#endif
+    return Star(pixel, fraction, intBitsToFloat(sprite[i + WORDS - PLANES + PLANE]));
 }
 
-Star star_of(int i) {
-    return Star(
-        pixel_of(i),
-        vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3])),
-        intBitsToFloat(sprite[5 * i + 4]));
+ivec2 pixel_of(int i) {
+    return star_of(i).pixel;
 }
 
 ivec2 offset_of(uint place) {
@@ -112,13 +118,16 @@ float path_light_at(vec2 offset) {
 }
 #endif
 
+bool is_alone;
+
 // The light that a pixel should show, e-/s, negative where it is not this star's; `own` is what the star gives.
 float asked_of(ivec2 at, float own) {
     if (!on_image(at)) return -1.0;
 #ifdef SUMS
-    float drawn = float(sums[at.y * resolution_px.x + at.x]) * unit_e_per_s;
+    float drawn = 0.0;
+    if (!is_alone) drawn = float(sums[PLANES * (at.y * resolution_px.x + at.x) + PLANE]) * unit_e_per_s[PLANE];
 #else
-    float drawn = imageLoad(linear_e_per_s, at).r;
+    float drawn = imageLoad(linear_e_per_s, at)[PLANE];
 #endif
     // Two stars never own one pixel: `overrated` is the largest ratio of `own` to the star's true light in a pixel.
     // A faint star's sprite may end before its near pixels do.

@@ -86,7 +86,7 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
             found, wanted = gl.levels().copy(), oracle.levels(some)
             assert (found != wanted).sum() <= OTHER_PIXELS * (wanted > 0).sum() + 4
             with gl.context:
-                left = gl._exact_pass.left
+                left = gl._exact_passes[0].left
             same = tiles(np.roll(found == wanted, 11, axis=0)).all(axis=(1, 2))[some.star] & (some.star >= SIDE)  # and whole
             assert same.mean() > 0.5
             assert np.abs(left.error - oracle.left.error)[:, same].max() < LEFT

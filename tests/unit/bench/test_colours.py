@@ -16,6 +16,7 @@ from hilstar.monitor.quantise import primary_lights
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.extended import LightMap, shifted
 from hilstar.scene.frame_motion import Orientation
+from hilstar.scene.sprites import by_primary
 from hilstar.tracker.mosaic import luminance
 from hilstar.twin.live_exposure import LiveTracker
 from hilstar.twin.verify.twin import Twin
@@ -99,8 +100,8 @@ def test_each_quantisation_works_by_primary(tmp_path, quantisation):
             drawn = bench.draw(q, number)
             shown += [light.sum() / 8 for light in primary_lights(drawn.levels, bench.panel)]
         wanted = []
-        for part in drawn.sprites.primaries:
-            bench.renderer.draw_linear(part)
+        for k in range(3):
+            bench.renderer.draw_linear(by_primary(drawn.sprites, bench.renderer.target.places_px, k))
             wanted.append(bench.renderer.linear().sum(dtype=np.float64))
     np.testing.assert_allclose(shown, wanted, rtol=0.01)
 

@@ -292,17 +292,18 @@ def checks_in(folder: Path) -> int:
     return read_text(path, "", MAX_BYTES).count("\n") if exists(path) else 0
 
 
-def largest_change(folder: Path) -> tuple[float, str] | None:
-    """The largest change of brightness over all checks, relative, and its source; None without checks. Raises InputError."""
+def largest_changes(folder: Path) -> dict[str, float] | None:
+    """The largest change of each quantity over all checks, in its unit; None without checks. Raises InputError."""
     path = folder / CHECKS
     if not exists(path):
         return None
-    rows = csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES)))
+    found: dict[str, float] = {}
     try:
-        found = [abs(float(row["value"])) / 100 for row in rows if row["quantity"] == "brightness"]
+        for row in csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES))):
+            found[row["quantity"]] = max(abs(float(row["value"])), found.get(row["quantity"], 0.0))
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: is no table of checks ({shortened(error)}); move it away") from error
-    return (max(found), f"largest change over {len(found)} checks, {CHECKS}") if found else None
+    return found or None
 
 
 def watch(reader: Reader, white: int, longest_min: float, path: Path) -> WarmUp:

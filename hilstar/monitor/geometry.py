@@ -46,7 +46,8 @@ class LensTable(msgspec.Struct, frozen=True, kw_only=True):
 class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
     """[error]: of dots that were held out, and one sigma of a star's place: over the screen (-1 where unseen), rms and maximum.
 
-    An alignment adds the rms of what its rotation leaves, one axis.
+    `modes_arcsec` times its transpose is the covariance of places: a mode has x and then y of the map, row by row. An alignment
+    adds the rms of what its rotation leaves, one axis, and the covariance of the rotation about x, y and z with its freedom.
     """
 
     model: str = ""
@@ -56,8 +57,11 @@ class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
     rms_arcsec: float | None = None
     max_arcsec: float | None = None
     map_arcsec: list[list[float]] | None = None
+    modes_arcsec: list[list[float]] | None = None
     alignment_cross_arcsec: float | None = None
     alignment_roll_arcsec: float | None = None
+    alignment_covariance_arcsec2: list[list[float]] | None = None
+    alignment_dof: float | None = None
 
 
 class MadeTable(msgspec.Struct, frozen=True, kw_only=True):

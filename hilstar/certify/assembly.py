@@ -57,17 +57,6 @@ class Read:
     centroid_px: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Changes:
-    """What a bench was seen to change by: white in ten minutes, relative, and each quantity of its checks; None: not looked."""
-
-    warm_up: float | None = None
-    checked: dict[str, float] | None = None
-
-
-NO_CHANGES = Changes()
-
-
 def read_bench(file: BenchFile, reader: Reader) -> Read:
     """Read a bench for a certificate: its response, one pattern of dots, its delay. Raises InputError, MachineError."""
     certify, rng = file.config.certify, np.random.default_rng(SEED)
@@ -97,8 +86,13 @@ class Assembled:
     not_assessed: list[str]
 
 
-def assemble(file: BenchFile, read: Read | None, changes: Changes = NO_CHANGES) -> Assembled:
-    """The budget of a bench, which changes as it was seen to. Raises InputError."""
+def assemble(
+    file: BenchFile, read: Read | None, warm_up: float | None = None, checked: dict[str, float] | None = None
+) -> Assembled:
+    """The budget of a bench. Raises InputError.
+
+    White was seen to change by `warm_up` in ten minutes, relative, and its checks' figures by `checked`; None: not looked at.
+    """
     figures = Figures(file, reference_stars(file))
     count, lights = len(figures.stars), len(figures.log_light)
     value = Deviations(
@@ -112,7 +106,8 @@ def assemble(file: BenchFile, read: Read | None, changes: Changes = NO_CHANGES) 
         value, effects = _of_readings(file, figures, read, missing)
     effects += [
         *_of_settings(file, figures, missing),
-        *_of_changes(file, figures, changes, missing),
+        *_of_warm_up(file, count, warm_up, missing),
+        *_of_drift(figures, checked, missing),
         *_of_sky(file, figures, missing),
     ]
     names = [*figures.names, *((quantity, star, unit) for quantity, unit in SKY for star in range(count))]
@@ -146,7 +141,7 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
     place = read.place.terms(figures.x_px, figures.y_px)
     form = read.even.bowed(figures.x_px, figures.y_px) - read.even.bowed(*(np.array([side // 2]) * 1.0 for side in size))
     half = np.abs(form) / 2 / math.sqrt(3)
-    bent = light.bent(figures.log_light) / 2 / math.sqrt(3)
+    bent = light.bent(figures.log_light) / 2 / math.sqrt(6)  # the spline is the more likely of both
     late_ms = read.delays_ms
     delay = float(late_ms.mean()) if len(late_ms) > 1 else file.config.monitor.panel_delay_ms
     value = Deviations(
@@ -166,7 +161,7 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
             levels=dark,
         ),
         Effect(
-            Input("form of the response", "rectangular", "a spline, or straight between codes", 1, _rms(bent), "relative"),
+            Input("form of the response", "triangular", "a spline, or straight between codes", 1, _rms(bent), "relative"),
             levels=bent[None],
         ),
         Effect(
@@ -228,7 +223,9 @@ def _of_files(file: BenchFile, figures: Figures, value: Deviations, missing: lis
         missing.append(f"evenness: nothing was read, and {name} has no [uniformity] with its standard error")
     else:
         field = light_map.uniformity_relative
-        weights = _of_fields(light_map.uniformity, monitor.resolution_px, figures)
+        sides = zip((figures.y_px, figures.x_px), monitor.resolution_px[::-1], light_map.uniformity.shape, strict=True)
+        rows, columns = (weights_of_grid(side, n)[np.rint(at).astype(np.intp)] for at, side, n in sides)
+        weights = (rows[:, :, None] * columns[:, None]).reshape(count, -1)
         slopes = field * np.linalg.qr(weights.T)[1]  # each field is known by itself, and stars share them
         yield Effect(Input("evenness", "normal", f"fields of {name}", len(slopes), field, "relative"), even=slopes)
     yield from _of_geometry(file, figures, missing)
@@ -239,16 +236,9 @@ def _by_freedom(dof: float) -> Distribution:
     return "normal" if math.isinf(dof) else "Student t"
 
 
-def _of_fields(grid: FloatArray, size_px: tuple[int, int], figures: Figures) -> FloatArray:
-    """How far light at the stars goes with each field of a map (stars, fields)."""
-    rows, columns = (weights_of_grid(side, n) for side, n in zip(size_px[::-1], grid.shape, strict=True))
-    at = np.rint(figures.y_px).astype(np.intp), np.rint(figures.x_px).astype(np.intp)
-    return np.asarray(np.einsum("sr,sc->src", rows[at[0]], columns[at[1]]).reshape(len(at[0]), -1))
-
-
 def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
     """The effects of a geometry file: the covariance of its fit over the screen, and that of an alignment."""
-    name, count = file.config.collimator.geometry, len(figures.stars)
+    name = file.config.collimator.geometry
     error = None if name is None else load_notes(file.folder / name).error
     if error is None or (error.map_arcsec is None and error.alignment_covariance_arcsec2 is None):
         missing.append("place and attitude: [collimator] geometry names no file with its errors (hilstar calibrate geometric)")
@@ -262,9 +252,9 @@ def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
             return np.asarray(map_coordinates(values, at, order=1, mode="nearest"))
 
         known = seen(np.where(np.isnan(rows), np.nanmax(rows), rows)) / math.sqrt(2)
-        place, source = np.zeros((2, count, 2)), f"map of errors of {name}, all stars together"
-        place[0, :, 0], place[1, :, 1] = known, known
-        if error.modes_arcsec is not None:
+        if error.modes_arcsec is None:
+            place, source = np.eye(2)[:, None] * known[:, None], f"map of errors of {name}, all stars together"
+        else:
             modes = np.array(error.modes_arcsec).reshape(-1, 2, *rows.shape)
             place = np.stack([[seen(axis) for axis in mode] for mode in modes]).transpose(0, 2, 1)
             source = f"covariance of {name}"
@@ -275,8 +265,7 @@ def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
         covariance, dof = np.array(error.alignment_covariance_arcsec2), error.alignment_dof or math.inf
         size, axes = np.linalg.eigh(covariance)
         turns = (axes * np.sqrt(np.maximum(size, 0.0))).T
-        rms = math.sqrt(max(float(np.trace(covariance)) / 3, 0.0))
-        source = f"covariance of the rotation of {name}"
+        source, rms = f"covariance of the rotation of {name}", math.sqrt(max(float(size.mean()), 0.0))
         yield Effect(Input("alignment", _by_freedom(dof), source, 3, rms, "arcsec", dof), place=figures.turned(turns))
 
 
@@ -288,30 +277,29 @@ def _stated_delay(file: BenchFile, missing: list[str]) -> Iterator[Effect]:
         yield Effect(Input("delay", "normal", "[certify] panel_delay_u_ms", 1, known, "ms"), delay=np.array([known]))
 
 
-def _of_changes(file: BenchFile, figures: Figures, changes: Changes, missing: list[str]) -> Iterator[Effect]:
-    """Warm-up, and drift since the last check: each may be anywhere within the change that was seen."""
-    count, warm = len(figures.stars), changes.warm_up
+def _of_warm_up(file: BenchFile, count: int, seen: float | None, missing: list[str]) -> Iterator[Effect]:
     source, known = "white in the next ten minutes (--warm-up)", file.config.certify.warm_up_percent
-    if warm is None and known is not None:
-        warm, source = known / 100, "[certify] warm_up_percent"
-    if warm is None:
+    if seen is None and known is not None:
+        seen, source = known / 100, "[certify] warm_up_percent"
+    if seen is None:
         missing.append("warm-up: not measured (--warm-up, or first light's), and [certify] warm_up_percent is not written")
     else:
-        u = warm / math.sqrt(3)
+        u = seen / math.sqrt(3)
         yield Effect(Input("warm-up", "rectangular", source, 1, u, "relative"), even=np.full((1, count), u))
-    if changes.checked is None:
+
+
+def _of_drift(figures: Figures, checked: dict[str, float] | None, missing: list[str]) -> Iterator[Effect]:
+    """Drift since the last check: anywhere within the largest change that was seen, of each quantity by itself."""
+    if checked is None:
         missing.append("drift since the certificate: no check has been made (hilstar certify --check)")
         return
-    names = ("brightness", "shift_x", "shift_y", "rotation", "scale", "latency")
-    light, x, y, turn, scale, late = (changes.checked.get(name, 0.0) / math.sqrt(3) for name in names)
-    even, place, delay = np.zeros((len(names), count)), np.zeros((len(names), count, 2)), np.zeros(len(names))
-    even[0], delay[5] = light / 100, late
-    place[1, :, 0], place[2, :, 1] = x, y
-    place[3:4] = figures.turned(np.array([[0.0, 0.0, turn]]))
-    place[4] = scale * 1e-6 * ARCSEC_PER_RAD * figures.tangent
-    source = "largest changes over all checks of brightness, shift, rotation, scale and latency"
-    own = Input("drift", "rectangular", source, len(names), light / 100, "relative")
-    yield Effect(own, even=even, place=place, delay=delay)
+    names, count = ("brightness", "shift_x", "shift_y", "rotation", "scale", "latency"), len(figures.stars)
+    light, x, y, turn, scale, late = (checked.get(name, 0.0) / math.sqrt(3) for name in names)
+    even, place, delay = np.zeros((6, count)), np.zeros((6, count, 2)), np.zeros(6)
+    even[0], place[1, :, 0], place[2, :, 1], delay[5] = light / 100, x, y, late
+    place[3], place[4] = figures.turned(np.array([[0.0, 0.0, turn]]))[0], 1e-6 * scale * ARCSEC_PER_RAD * figures.tangent
+    source = f"largest changes over all checks: {', '.join(names)}"
+    yield Effect(Input("drift", "rectangular", source, 6, light / 100, "relative"), even=even, place=place, delay=delay)
 
 
 def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:

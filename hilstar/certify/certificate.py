@@ -13,7 +13,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.certificate import KIND, ByTrials, Certificate, CertifiedFigure, Contribution, InputRow, sha256_of_bytes
 from hilstar.bench.config import CertifySettings
 from hilstar.bench.measured_on import measured_on
-from hilstar.certify.assembly import NO_CHANGES, Assembled, Changes, assemble, read_bench
+from hilstar.certify.assembly import Assembled, assemble, read_bench
 from hilstar.certify.budget import MAX_DOF, Combined, Drawn, by_trials, first_order, why_they_differ
 from hilstar.certify.check import take_check
 from hilstar.certify.model import THIRDS, true_deviations
@@ -60,16 +60,17 @@ def certify(
     now: datetime.datetime,
     *,
     quick: bool = False,
-    changes: Changes = NO_CHANGES,
+    warm_up: float | None = None,
+    checked: dict[str, float] | None = None,
     replaces: str | None = None,
 ) -> tuple[Certificate, bytes | None]:
     """Certify a bench, by readings where there is a reader, else by its files; and the readings that checks refer to, as JSON.
 
-    Raises InputError, MachineError.
+    `warm_up` and `checked` are as in `assemble`. Raises InputError, MachineError.
     """
     read = None if reader is None else read_bench(file, reader)
     reference = None if reader is None else msgspec.json.encode(take_check(file, reader))
-    budget = assemble(file, read, changes)
+    budget = assemble(file, read, warm_up, checked)
     combined = first_order(budget.model, budget.inputs)
     drawn = by_trials(budget.model, budget.inputs, np.random.default_rng(SEED), QUICK_TRIALS if quick else MAX_TRIALS)
     truth = None

@@ -34,7 +34,7 @@ DOTS_A_TERM = 4
 MAP = (16, 9)  # fields of a usual map of light, columns and rows
 MIN_LEVELS = 4
 FAINT_SIGMAS = 5.0
-BRIGHT, FAINT = 0.05, 0.001  # relative to white: light by which a reading's relative noise is told from its floor
+BRIGHT = 0.05  # relative to white: light by which the relative noise of a reading is known; black tells its floor
 MIN_DOF = 2
 
 
@@ -86,7 +86,7 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
         design[:, -1] = hours * mean[place]
     # Light and dark share no readings, so that their scatters are two estimates, and weights take nothing from their freedom.
     lit = np.maximum(mean[place] - mean[0], 0.0)
-    bright, dark = lit > BRIGHT * lit.max(), lit < FAINT * lit.max()
+    bright, dark = lit > BRIGHT * lit.max(), place == 0
     noise, floor = 1.0, 0.0
     for _ in range(3):
         sigma = np.hypot(noise * lit, max(floor, 1e-9 * mean[-1] * noise))

@@ -93,7 +93,6 @@ def _certify(
     as_json: bool,
 ) -> None:
     from hilstar.bench.certificate import read_certificate, sha256_of_bytes
-    from hilstar.certify.assembly import Changes
     from hilstar.certify.certificate import certify as certified
     from hilstar.certify.check import largest_changes, watch
     from hilstar.certify.page import text_lines, write_certificate_page
@@ -108,8 +107,8 @@ def _certify(
         watched = watch(reader, 2**file.config.monitor.bits - 1, warm_up, output / "warm-up")
         say(watched.line)
         warmed = None if watched.law == "none" else watched.bound
-    changes = Changes(warmed, largest_changes(output))
-    found, reference = certified(file, reader, now, quick=quick, changes=changes, replaces=replaces)
+    checked = largest_changes(output)
+    found, reference = certified(file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces)
     raw = msgspec.json.format(msgspec.json.encode(found))
     digest = sha256_of_bytes(raw)
     if reference is not None:

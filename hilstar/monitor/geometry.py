@@ -63,6 +63,15 @@ class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
     alignment_covariance_arcsec2: list[list[float]] | None = None
     alignment_dof: float | None = None
 
+    def __post_init__(self) -> None:
+        rows, modes, turn = self.map_arcsec, self.modes_arcsec, self.alignment_covariance_arcsec2
+        if rows is not None and (not rows or len({len(row) for row in rows}) != 1):
+            raise ValueError("map_arcsec has rows of different lengths")
+        if modes is not None and (rows is None or {len(mode) for mode in modes} != {2 * len(rows) * len(rows[0])}):
+            raise ValueError("modes_arcsec are not x and y of each place of map_arcsec")
+        if turn is not None and [len(row) for row in turn] != [3, 3, 3]:
+            raise ValueError("alignment_covariance_arcsec2 is not 3 by 3")
+
 
 class MadeTable(msgspec.Struct, frozen=True, kw_only=True):
     """[made]: by which version, when, and of how many poses of the tracker.

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.dots import DotPlan
@@ -370,7 +371,7 @@ MODE_SHARE = 1e-6  # of the variance over the screen: less is in no interval's d
 class Uncertainty:
     """One sigma of each parameter, and of a star's place over the screen, edges included: `map_arcsec` (rows, columns).
 
-    `modes_arcsec` (modes, 2, places) times its transpose is the covariance of places along x and y, row by row of the map.
+    `modes_arcsec` (modes, 2 places) times its transpose is the covariance of places along x and y, row by row of the map.
     The map is NaN where the tracker saw no dots. From the covariance of the fit, scaled up where its residuals exceed the
     centroids' noise. Errors that no parameter can follow show in the error of held-out dots alone.
     """
@@ -407,10 +408,14 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     sigma = {name: float(step * s) for name, step, s in zip(names, steps, spread, strict=False)}
     along = (np.linspace(-0.5, size - 0.5, n) for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True))
     place_x, place_y = _slopes_of_places(problem, fit, *(part.ravel() for part in np.meshgrid(*along)))
-    arcsec = scale * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px
-    _, size_of, modes = np.linalg.svd(arcsec * (np.concatenate([place_x, place_y]) @ root).T, full_matrices=False)
-    modes = (size_of[:, None] * modes)[size_of**2 > MODE_SHARE * (size_of**2).sum()].reshape(-1, 2, len(place_x))
-    return Uncertainty(sigma, np.sqrt((modes**2).sum(axis=(0, 1))).reshape(MAP_PLACES[::-1]), modes)
+    slopes = np.stack([place_x, place_y]) @ root * (scale * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px)
+    seen = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
+    row, column = distance_transform_edt((~seen).astype(np.int64), return_distances=False, return_indices=True)
+    slopes = slopes[:, (row * seen.shape[1] + column).ravel()]  # a place that was not seen has those of its neighbour
+    variance = np.where(seen, (slopes**2).sum(axis=(0, 2)).reshape(seen.shape), np.nan)
+    _, size_of, modes = np.linalg.svd(slopes.reshape(2 * seen.size, -1).T, full_matrices=False)
+    modes = (size_of[:, None] * modes)[size_of**2 > MODE_SHARE * (size_of**2).sum()]
+    return Uncertainty(sigma, np.sqrt(variance), modes)
 
 
 def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:

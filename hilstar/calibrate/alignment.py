@@ -76,8 +76,15 @@ class Aligned:
     residual: Residual
     camera: Camera
     q_cam_to_mon: FloatArray
-    sigma_arcsec: tuple[float, float, float]
+    covariance_arcsec2: FloatArray
+    dof: int
     wild: tuple[int, ...]
+
+    @property
+    def sigma_arcsec(self) -> tuple[float, float, float]:
+        """One sigma of the rotation about x, y and z, cam axes."""
+        x, y, z = np.sqrt(np.diag(self.covariance_arcsec2)).tolist()
+        return x, y, z
 
     @property
     def rotation_arcsec(self) -> tuple[float, float, float]:
@@ -109,14 +116,15 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
             " lost stars, and rows of other times"
         )
     rate_rad_s = None if pairs.rate_rad_s is None else pairs.rate_rad_s[used]
-    x, y, z = (ARCSEC_PER_RAD * fit.sigma_rad(groups_of(pairs.commanded))).tolist()
+    covariance, dof = fit.covariance_rad2(groups_of(pairs.commanded))
     return Aligned(
         pairs=pairs,
         fit=fit,
         residual=residual_of(pairs.commanded[used], rate_rad_s, fit.residual_rad[used], fit.q),
         camera=camera,
         q_cam_to_mon=corrected(from_matrix(camera.cam_to_image), fit.q),
-        sigma_arcsec=(x, y, z),
+        covariance_arcsec2=ARCSEC_PER_RAD**2 * covariance,
+        dof=dof,
         wild=tuple(pairs.line[~used].tolist()),
     )
 
@@ -248,7 +256,13 @@ def write_alignment(path: Path, found: Aligned, file: BenchFile, identity: Monit
         lens_of=lens_of,
     )
     rms = found.residual.rms
-    error = replace(notes.error, alignment_cross_arcsec=rms.cross, alignment_roll_arcsec=rms.roll)
+    error = replace(
+        notes.error,
+        alignment_cross_arcsec=rms.cross,
+        alignment_roll_arcsec=rms.roll,
+        alignment_covariance_arcsec2=found.covariance_arcsec2.tolist(),
+        alignment_dof=float(found.dof),
+    )
     sigma = notes.sigma | dict(zip(axes, found.sigma_arcsec, strict=True))
     write_geometry(path, camera, found.q_cam_to_mon, Notes(sigma, error, made, identity or notes.identity))
 

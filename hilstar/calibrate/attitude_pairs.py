@@ -140,8 +140,8 @@ class RotationFit:
         """Which pairs (n,) are not wild."""
         return np.asarray(self.weight > 0)
 
-    def sigma_rad(self, group: IntArray) -> FloatArray:
-        """One sigma (3,) of the rotation, cam axes, if the errors within each `group` (n,) are common to it.
+    def covariance_rad2(self, group: IntArray) -> tuple[FloatArray, int]:
+        """Covariance (3, 3) of the rotation, cam axes, if errors within each `group` (n,) are common to it, and its freedom.
 
         The pairs of a single group count as independent, so that an error of that attitude itself is not included.
         """
@@ -151,7 +151,7 @@ class RotationFit:
         sums = np.stack([np.bincount(group, weighted[:, k]) for k in range(3)], axis=1)
         groups = max(len(np.unique(group[self.used])), 2)
         total = float(self.weight.sum())
-        return np.asarray(np.sqrt((sums**2).sum(axis=0) * groups / (groups - 1)) / total)
+        return np.asarray(sums.T @ sums * groups / (groups - 1) / total**2), groups - 1
 
 
 def start_of(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,5 +1,6 @@
 """Latency by a photodiode: the edges that it saw, paired with the frames of the ledger that caused them."""
 
+import math
 import re
 from array import array
 from dataclasses import asdict, dataclass
@@ -20,7 +21,7 @@ from hilstar.files import make_directory, write_whole
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.run.record.ledger_records import NO_FRAMES, FrameRecord, config_of, read_head, run_records
 from hilstar.run.sync import beat, exposures_of
-from hilstar.units import NS_PER_MS, NS_PER_S, NS_PER_US
+from hilstar.units import ERROR_OF_MEDIAN, NS_PER_MS, NS_PER_S, NS_PER_US
 
 INT64 = range(-(2**63), 2**63)
 MAX_EDGE_BYTES = 20_000_000  # a day of toggles
@@ -173,6 +174,7 @@ def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
         "fall_ms": float(np.median(fall)) if len(fall) else None,
         "swap_to_square_ms": to_square_ms,
         "panel_delay_ms": p50 - to_square_ms,
+        "panel_delay_u_ms": ERROR_OF_MEDIAN * float(ms.std()) / math.sqrt(len(ms)),
         "beat": asdict(beat(exposures_of(config))),
     }
 
@@ -193,13 +195,14 @@ def checked_delay_ms(panel_delay_ms: float) -> float:
     return round(panel_delay_ms, 3)
 
 
-def write_panel_delay(path: Path, panel_delay_ms: float) -> None:
-    """Set `[monitor] panel_delay_ms` in a bench file and leave the rest unchanged.
+def write_panel_delay(path: Path, panel_delay_ms: float, error_ms: float) -> None:
+    """Set `[monitor] panel_delay_ms` and `[certify] panel_delay_u_ms` in a bench file and leave the rest unchanged.
 
     Raises InputError where the light came before the scan-out that the file assumes, and for a file that cannot be changed.
     """
     value = checked_delay_ms(panel_delay_ms)
     text = with_key(read_text(path, "give the path of a bench file", MAX_TOML_BYTES), "monitor", "panel_delay_ms", value)
+    text = with_key(text, "certify", "panel_delay_u_ms", float(f"{error_ms:.3g}"))
     if parse_toml(path, text).get("monitor", {}).get("panel_delay_ms") != value:
         raise InputError(f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: the table is not in plain form")
     write_whole(path, text)
@@ -252,7 +255,7 @@ def latency_lines(summary: dict[str, Any]) -> list[str]:
         "jitter": f"{summary['jitter_ms']:.3f} ms (standard deviation)",
         "beat with the exposure": f"{turn['refreshes_per_exposure']:.3f} refreshes in one; {every}; {cost}",
         "of this, scan-out": f"{summary['swap_to_square_ms']:.2f} ms to the square",
-        "panel_delay_ms": f"{summary['panel_delay_ms']:.3f}",
+        "panel_delay_ms": f"{summary['panel_delay_ms']:.3f} +- {summary['panel_delay_u_ms']:.3f}",
     }
     if summary["ambiguous"]:
         figures["note"] = 'a latency longer by whole pairs of frames fits too; [monitor] photodiode = "code" tells which'

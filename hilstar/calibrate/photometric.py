@@ -351,7 +351,8 @@ def errors_of(fits: dict[str, ChannelFit]) -> ErrorsTable | None:
     error = np.hypot(levels.standard_error(fit.noise_relative), levels.standard_error(fit.noise_relative)[0])[1:]
     off = (levels.mean[1:] - levels.mean[0]) / fitted - 1
     rounded = [[float(f"{x:.6g}") for x in part] for part in (fit.light[levels.code[1:]], off, error / fitted)]
-    return ErrorsTable(light=rounded[0], off=rounded[1], relative=rounded[2], dof=float((levels.count - 1).sum()))
+    black = float(f"{levels.standard_error(fit.noise_relative)[0] / fit.white:.6g}")
+    return ErrorsTable(light=rounded[0], off=rounded[1], relative=rounded[2], black=black, dof=float((levels.count - 1).sum()))
 
 
 def fit_all(data: Measurements) -> dict[str, ChannelFit]:

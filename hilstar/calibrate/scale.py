@@ -11,7 +11,7 @@ from hilstar.bench.config import read_config
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.files import write_whole
-from hilstar.units import magnitude
+from hilstar.units import ERROR_OF_MEDIAN, MAG_PER_RELATIVE, magnitude
 
 UNSURE_MAG = 0.05  # readings that disagree by more are wrong for another reason than the scale
 
@@ -36,6 +36,12 @@ class MeasuredScale:
     def scatter_mag(self) -> float:
         """Standard deviation of the readings, magnitudes; 0 for one."""
         return float(np.std(magnitude(self.ratios), ddof=1)) if len(self.ratios) > 1 else 0.0
+
+    @property
+    def relative_error(self) -> float | None:
+        """The relative standard error of the light of white, by the readings' scatter; None for one."""
+        count = len(self.ratios)
+        return ERROR_OF_MEDIAN * self.scatter_mag / MAG_PER_RELATIVE / count**0.5 if count > 1 else None
 
 
 def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: float) -> MeasuredScale:
@@ -62,12 +68,18 @@ def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: floa
     return MeasuredScale(bench.flux_at_white_e_per_s * median, bench.flux_at_white_e_per_s, np.array(ratios))
 
 
-def with_flux_at_white(file: BenchFile, flux_at_white_e_per_s: float, output: Path) -> None:
-    """Write a copy of a bench file with the key set and comments kept. Raises InputError where that cannot be done."""
+def with_flux_at_white(file: BenchFile, found: MeasuredScale, output: Path) -> None:
+    """Write a copy of a bench file with the light of white and its standard error set, and comments kept.
+
+    Raises InputError where that cannot be done.
+    """
     if output.resolve().parent != file.path.resolve().parent:
         raise InputError(f"{output}: the bench file's paths are relative to it; write the copy beside {file.path}")
-    key = "flux_at_white_e_per_s"
+    key, flux_at_white_e_per_s = "flux_at_white_e_per_s", found.flux_at_white_e_per_s
     text = with_key(file.text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",))
+    if found.relative_error is not None:
+        text = with_key(text, "certify", "flux_at_white_relative", float(f"{found.relative_error:.3g}"))
+        text = with_key(text, "certify", "flux_at_white_dof", float(len(found.ratios) - 1))
     write_whole(output, text)
     if read_config(output).render.flux_at_white_e_per_s != flux_at_white_e_per_s:
         raise InputError(

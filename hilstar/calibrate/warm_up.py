@@ -58,6 +58,11 @@ class WarmUp:
     from_s: float = 0.0
 
     @property
+    def bound(self) -> float:
+        """The relative change in the next ten minutes that is not exceeded at 95 %; nan where no law is found."""
+        return abs(self.ahead) + float(stdtrit(self.dof, CONFIDENCE)) * self.ahead_error
+
+    @property
     def line(self) -> str:
         """The finding in a sentence."""
         limit = f"{100 * self.limit:g} %"

@@ -12,13 +12,13 @@ from scipy.ndimage import map_coordinates
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import star_flux, star_kinds, star_rates
+from hilstar.bench.build import bench_calibration, star_flux, star_kinds, star_rates
 from hilstar.bench.catalogue import sigma_instrument_mag
-from hilstar.certify.budget import Input, Model
+from hilstar.certify.budget import Distribution, Input, Model
 from hilstar.certify.estimates import LightDeviation, Surface, evenness, light_deviation, places
 from hilstar.certify.model import Deviations, Figures, reference_stars
 from hilstar.certify.readings import Reader, dot_places, geometry_of
-from hilstar.monitor.calibration import BUILT_IN, read_toml
+from hilstar.monitor.calibration import BUILT_IN, read_toml, weights_of_grid
 from hilstar.monitor.geometry import load_notes
 from hilstar.sky.facts import errors_of, motion_at
 from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
@@ -86,8 +86,13 @@ class Assembled:
     not_assessed: list[str]
 
 
-def assemble(file: BenchFile, read: Read | None, drift: tuple[float, str] | None = None) -> Assembled:
-    """The budget of a bench. `drift` is the relative change of light since the last check, and why. Raises InputError."""
+def assemble(
+    file: BenchFile, read: Read | None, warm_up: float | None = None, checked: dict[str, float] | None = None
+) -> Assembled:
+    """The budget of a bench. Raises InputError.
+
+    White was seen to change by `warm_up` in ten minutes, relative, and its checks' figures by `checked`; None: not looked at.
+    """
     figures = Figures(file, reference_stars(file))
     count, lights = len(figures.stars), len(figures.log_light)
     value = Deviations(
@@ -99,7 +104,12 @@ def assemble(file: BenchFile, read: Read | None, drift: tuple[float, str] | None
         effects = list(_of_files(file, figures, value, missing))
     else:
         value, effects = _of_readings(file, figures, read, missing)
-    effects += [*_of_settings(file, figures, drift, missing), *_of_sky(file, figures, missing)]
+    effects += [
+        *_of_settings(file, figures, missing),
+        *_of_warm_up(file, count, warm_up, missing),
+        *_of_drift(figures, checked, missing),
+        *_of_sky(file, figures, missing),
+    ]
     names = [*figures.names, *((quantity, star, unit) for quantity, unit in SKY for star in range(count))]
     quantised = np.array([star.quantised_mag for star in figures.stars])
 
@@ -125,11 +135,13 @@ KINDS = (("levels", "levels"), ("even", "even"), ("place_arcsec", "place"), ("de
 def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[str]) -> tuple[Deviations, list[Effect]]:
     light, size = read.light, file.config.monitor.resolution_px
     join = light.weights(figures.log_light)
+    dark = (join @ light.dark_factors).T
     middle = read.even.terms(np.array([size[0] // 2]) * 1.0, np.array([size[1] // 2]) * 1.0)
     even = read.even.terms(figures.x_px, figures.y_px) - middle
     place = read.place.terms(figures.x_px, figures.y_px)
     form = read.even.bowed(figures.x_px, figures.y_px) - read.even.bowed(*(np.array([side // 2]) * 1.0 for side in size))
     half = np.abs(form) / 2 / math.sqrt(3)
+    bent = light.bent(figures.log_light) / 2 / math.sqrt(6)  # the spline is the more likely of both
     late_ms = read.delays_ms
     delay = float(late_ms.mean()) if len(late_ms) > 1 else file.config.monitor.panel_delay_ms
     value = Deviations(
@@ -143,6 +155,14 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
         Effect(
             Input("response", "Student t", "patches of light", light.factors.shape[1], light.noise, "relative", light.dof),
             levels=(join @ light.factors).T,
+        ),
+        Effect(
+            Input("dark readings", "Student t", "scatter of black", len(dark), light.dark, "of white", light.dark_dof),
+            levels=dark,
+        ),
+        Effect(
+            Input("form of the response", "triangular", "a spline, or straight between codes", 1, _rms(bent), "relative"),
+            levels=bent[None],
         ),
         Effect(
             Input("evenness", "Student t", "light of dots", even.shape[1], read.even.noise, "relative", read.even.dof),
@@ -175,40 +195,78 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
 
 
 def _of_files(file: BenchFile, figures: Figures, value: Deviations, missing: list[str]) -> Iterator[Effect]:
-    """The effects of a bench's calibration files, and in `value` what they have wrong: response, full scale, lens, delay."""
-    monitor, count = file.config.monitor, len(figures.stars)
-    errors = None if monitor.calibration in BUILT_IN else read_toml(file.folder / monitor.calibration).errors
+    """The effects of a bench's calibration files and stated errors, and in `value` what the response has wrong."""
+    monitor, certify, count = file.config.monitor, file.config.certify, len(figures.stars)
+    name = monitor.calibration
+    known = None if name in BUILT_IN else read_toml(file.folder / name)
+    errors, light_map = None if known is None else known.errors, bench_calibration(file.config, file.folder)
     if errors is None:
-        missing.append(f"flux: [monitor] calibration = {monitor.calibration!r} does not say how well it is known")
+        missing.append(f"flux: [monitor] calibration = {name!r} does not say how well it is known")
     else:
         light, relative = np.log(np.array(errors.light)), np.array(errors.relative)
         join = CubicSpline(light, np.eye(len(light)), bc_type="natural")(np.clip(figures.log_light, light[0], light[-1]))
         join = join - np.eye(len(light))[-1]  # relative to white, whose light is full scale
         value.levels[0] += join @ np.array(errors.off)
-        typical, source = float(np.median(relative)), f"levels of {monitor.calibration}"
-        own = Input("response", "Student t", source, len(light), typical, "relative", errors.dof)
-        yield Effect(own, levels=(join * relative).T)
-    if (white := file.config.certify.flux_at_white_relative) is not None:
+        black = errors.black / np.array(errors.light)  # common to all levels
+        own, source = np.sqrt(np.maximum(relative**2 - black**2, 0.0)), f"levels of {name}"
         yield Effect(
-            Input("full scale", "normal", "[certify] flux_at_white_relative", 1, white, "relative"),
-            even=np.full((1, count), white),
+            Input("response", "Student t", source, len(light) + 1, float(np.median(relative)), "relative", errors.dof),
+            levels=np.concatenate([(join * own).T, (join @ black)[None]]),
         )
+    if (white := certify.flux_at_white_relative) is not None:
+        dof = certify.flux_at_white_dof or math.inf
+        source, kind = "[certify] flux_at_white_relative", _by_freedom(dof)
+        yield Effect(Input("full scale", kind, source, 1, white, "relative", dof), even=np.full((1, count), white))
     else:
         missing.append("full scale: nothing was read, and [certify] flux_at_white_relative is not written")
-    missing.append("evenness: nothing was read, and a map of light does not say how well it is known")
+    if light_map.uniformity is None or light_map.uniformity_relative is None:
+        missing.append(f"evenness: nothing was read, and {name} has no [uniformity] with its standard error")
+    else:
+        field = light_map.uniformity_relative
+        sides = zip((figures.y_px, figures.x_px), monitor.resolution_px[::-1], light_map.uniformity.shape, strict=True)
+        rows, columns = (weights_of_grid(side, n)[np.rint(at).astype(np.intp)] for at, side, n in sides)
+        weights = (rows[:, :, None] * columns[:, None]).reshape(count, -1)
+        slopes = field * np.linalg.qr(weights.T)[1]  # each field is known by itself, and stars share them
+        yield Effect(Input("evenness", "normal", f"fields of {name}", len(slopes), field, "relative"), even=slopes)
+    yield from _of_geometry(file, figures, missing)
+    yield from _stated_delay(file, missing)
+
+
+def _by_freedom(dof: float) -> Distribution:
+    return "normal" if math.isinf(dof) else "Student t"
+
+
+def _of_geometry(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
+    """The effects of a geometry file: the covariance of its fit over the screen, and that of an alignment."""
     name = file.config.collimator.geometry
     error = None if name is None else load_notes(file.folder / name).error
-    if error is None or error.map_arcsec is None:
+    if error is None or (error.map_arcsec is None and error.alignment_covariance_arcsec2 is None):
         missing.append("place and attitude: [collimator] geometry names no file with its errors (hilstar calibrate geometric)")
-    else:
+        return
+    wide, high = file.config.monitor.resolution_px
+    if error.map_arcsec is not None:
         rows = np.where(np.array(error.map_arcsec) < 0, np.nan, np.array(error.map_arcsec))
-        wide, high = monitor.resolution_px
         at = ((figures.y_px + 0.5) / high * (rows.shape[0] - 1), (figures.x_px + 0.5) / wide * (rows.shape[1] - 1))
-        known = map_coordinates(np.where(np.isnan(rows), np.nanmax(rows), rows), at, order=1, mode="nearest") / math.sqrt(2)
-        place = np.zeros((2, count, 2))
-        place[0, :, 0], place[1, :, 1] = known, known  # all stars together: the file does not say how they are correlated
-        yield Effect(Input("geometry", "normal", f"map of errors of {name}", 2, _rms(known), "arcsec"), place=place)
-    yield from _stated_delay(file, missing)
+
+        def seen(values: FloatArray) -> FloatArray:
+            return np.asarray(map_coordinates(values, at, order=1, mode="nearest"))
+
+        known = seen(np.where(np.isnan(rows), np.nanmax(rows), rows)) / math.sqrt(2)
+        if error.modes_arcsec is None:
+            place, source = np.eye(2)[:, None] * known[:, None], f"map of errors of {name}, all stars together"
+        else:
+            modes = np.array(error.modes_arcsec).reshape(-1, 2, *rows.shape)
+            place = np.stack([[seen(axis) for axis in mode] for mode in modes]).transpose(0, 2, 1)
+            source = f"covariance of {name}"
+        yield Effect(Input("geometry", "normal", source, len(place), _rms(known), "arcsec"), place=place)
+    else:
+        missing.append(f"lens: {name} has no errors of the lens, and those of its alignment alone count")
+    if error.alignment_covariance_arcsec2 is not None:
+        covariance, dof = np.array(error.alignment_covariance_arcsec2), error.alignment_dof or math.inf
+        size, axes = np.linalg.eigh(covariance)
+        turns = (axes * np.sqrt(np.maximum(size, 0.0))).T
+        source, rms = f"covariance of the rotation of {name}", math.sqrt(max(float(size.mean()), 0.0))
+        yield Effect(Input("alignment", _by_freedom(dof), source, 3, rms, "arcsec", dof), place=figures.turned(turns))
 
 
 def _stated_delay(file: BenchFile, missing: list[str]) -> Iterator[Effect]:
@@ -219,8 +277,33 @@ def _stated_delay(file: BenchFile, missing: list[str]) -> Iterator[Effect]:
         yield Effect(Input("delay", "normal", "[certify] panel_delay_u_ms", 1, known, "ms"), delay=np.array([known]))
 
 
-def _of_settings(file: BenchFile, figures: Figures, drift: tuple[float, str] | None, missing: list[str]) -> Iterator[Effect]:
-    """The instrument, temperature, drift, clock and prediction, as [certify] states them."""
+def _of_warm_up(file: BenchFile, count: int, seen: float | None, missing: list[str]) -> Iterator[Effect]:
+    source, known = "white in the next ten minutes (--warm-up)", file.config.certify.warm_up_percent
+    if seen is None and known is not None:
+        seen, source = known / 100, "[certify] warm_up_percent"
+    if seen is None:
+        missing.append("warm-up: not measured (--warm-up, or first light's), and [certify] warm_up_percent is not written")
+    else:
+        u = seen / math.sqrt(3)
+        yield Effect(Input("warm-up", "rectangular", source, 1, u, "relative"), even=np.full((1, count), u))
+
+
+def _of_drift(figures: Figures, checked: dict[str, float] | None, missing: list[str]) -> Iterator[Effect]:
+    """Drift since the last check: anywhere within the largest change that was seen, of each quantity by itself."""
+    if checked is None:
+        missing.append("drift since the certificate: no check has been made (hilstar certify --check)")
+        return
+    names, count = ("brightness", "shift_x", "shift_y", "rotation", "scale", "latency"), len(figures.stars)
+    light, x, y, turn, scale, late = (checked.get(name, 0.0) / math.sqrt(3) for name in names)
+    even, place, delay = np.zeros((6, count)), np.zeros((6, count, 2)), np.zeros(6)
+    even[0], place[1, :, 0], place[2, :, 1], delay[5] = light / 100, x, y, late
+    place[3], place[4] = figures.turned(np.array([[0.0, 0.0, turn]]))[0], 1e-6 * scale * ARCSEC_PER_RAD * figures.tangent
+    source = f"largest changes over all checks: {', '.join(names)}"
+    yield Effect(Input("drift", "rectangular", source, 6, light / 100, "relative"), even=even, place=place, delay=delay)
+
+
+def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
+    """The instrument, temperature, clock and prediction, as [certify] states them."""
     certify, stars = file.config.certify, len(figures.stars)
     one, instrument = np.ones((1, stars)), certify.instrument
     if instrument.name:
@@ -239,11 +322,6 @@ def _of_settings(file: BenchFile, figures: Figures, drift: tuple[float, str] | N
         yield Effect(Input("temperature", "rectangular", source, 3, kelvin, "K"), even=light, place=moved)
     else:
         missing.append("temperature: no range or no coefficient in [certify]")
-    if drift is not None:
-        size = abs(drift[0]) / math.sqrt(3)
-        yield Effect(Input("drift", "rectangular", drift[1], 1, size, "relative"), even=size * one)
-    else:
-        missing.append("drift since the certificate: no check has been made (hilstar certify --check)")
     if certify.rate_deg_s:
         for name, error, source in (
             ("clock", certify.clock_ms, "[certify] clock_ms"),

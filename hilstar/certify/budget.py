@@ -8,7 +8,7 @@ drawn in batches until two digits of every figure stand, or the largest number o
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -77,7 +77,6 @@ class Drawn:
     upper: FloatArray
     trials: int
     settled: bool
-    batches: list[FloatArray] = field(repr=False, default_factory=list)
 
 
 def first_order(model: Model, inputs: list[Input]) -> Combined:
@@ -116,7 +115,7 @@ def by_trials(model: Model, inputs: list[Input], rng: np.random.Generator, max_t
             tolerance = 0.5 * 10.0 ** (np.floor(np.log10(np.maximum(standard, SMALLEST))) - 1)
             settled = bool((error[1:] <= tolerance)[:, standard > SMALLEST].all())
     mean, standard, low, high = np.stack(batches).mean(axis=0)
-    return Drawn(mean, standard, low, high, len(batches) * BATCH, settled, batches)
+    return Drawn(mean, standard, low, high, len(batches) * BATCH, settled)
 
 
 def why_they_differ(combined: Combined, drawn: Drawn, inputs: list[Input], number: int) -> str:

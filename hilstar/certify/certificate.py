@@ -60,16 +60,17 @@ def certify(
     now: datetime.datetime,
     *,
     quick: bool = False,
-    drift: tuple[float, str] | None = None,
+    warm_up: float | None = None,
+    checked: dict[str, float] | None = None,
     replaces: str | None = None,
 ) -> tuple[Certificate, bytes | None]:
     """Certify a bench, by readings where there is a reader, else by its files; and the readings that checks refer to, as JSON.
 
-    Raises InputError, MachineError.
+    `warm_up` and `checked` are as in `assemble`. Raises InputError, MachineError.
     """
     read = None if reader is None else read_bench(file, reader)
     reference = None if reader is None else msgspec.json.encode(take_check(file, reader))
-    budget = assemble(file, read, drift)
+    budget = assemble(file, read, warm_up, checked)
     combined = first_order(budget.model, budget.inputs)
     drawn = by_trials(budget.model, budget.inputs, np.random.default_rng(SEED), QUICK_TRIALS if quick else MAX_TRIALS)
     truth = None

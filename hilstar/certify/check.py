@@ -21,9 +21,8 @@ from hilstar.calibrate.warm_up import WarmUp, fitted_white, judge_warm_up, watch
 from hilstar.certify.budget import COVERAGE
 from hilstar.certify.estimates import place_errors, surface
 from hilstar.certify.readings import DotReadings, Reader, VirtualReader, dot_places, geometry_of
-from hilstar.charts import BLUE, MUTED, ORANGE, chart
+from hilstar.charts import BLUE, MUTED, ORANGE, chart, write_csv
 from hilstar.errors import InputError, shortened
-from hilstar.files import write_whole
 from hilstar.reading import NOT_JSON, exists, read_bytes, read_text
 
 PATCHES, REPEATS, DOT_IMAGES = 12, 3, 4
@@ -252,11 +251,7 @@ def record(folder: Path, made: datetime.datetime, since: str, figures: list[Chec
             raise InputError(f"{path}: its columns are not {', '.join(columns)}; move it away")
     stamp = made.isoformat(timespec="milliseconds")  # two checks of one second are two
     rows += [{"made": stamp, "certificate": since, **{k: str(v) for k, v in asdict(each).items()}} for each in figures]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_whole(path, text.getvalue())
+    write_csv(path, columns, ([row[name] for name in columns] for row in rows))
     draw_checks(folder / CHART, rows)
     return rows
 
@@ -292,17 +287,18 @@ def checks_in(folder: Path) -> int:
     return read_text(path, "", MAX_BYTES).count("\n") if exists(path) else 0
 
 
-def largest_change(folder: Path) -> tuple[float, str] | None:
-    """The largest change of brightness over all checks, relative, and its source; None without checks. Raises InputError."""
+def largest_changes(folder: Path) -> dict[str, float] | None:
+    """The largest change of each quantity over all checks, in its unit; None without checks. Raises InputError."""
     path = folder / CHECKS
     if not exists(path):
         return None
-    rows = csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES)))
+    found: dict[str, float] = {}
     try:
-        found = [abs(float(row["value"])) / 100 for row in rows if row["quantity"] == "brightness"]
+        for row in csv.DictReader(io.StringIO(read_text(path, "", MAX_BYTES))):
+            found[row["quantity"]] = max(abs(float(row["value"])), found.get(row["quantity"], 0.0))
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: is no table of checks ({shortened(error)}); move it away") from error
-    return (max(found), f"largest change over {len(found)} checks, {CHECKS}") if found else None
+    return found or None
 
 
 def watch(reader: Reader, white: int, longest_min: float, path: Path) -> WarmUp:

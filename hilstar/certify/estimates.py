@@ -3,7 +3,8 @@
 All fits are linear least squares without a prior, so that their intervals hold by Student's t: a smoother curve would be
 nearer to the truth on the whole, and not hold it where its bias is larger than its scatter.
 
-    light      read / expected at each code read, above black, joined by a cubic spline in log light; a drift in time
+    light      read / expected at each code read, above black, joined by a cubic spline in log light; a drift in time.
+               Scatter relative to light and scatter in the dark are two estimates, each with its own freedom
     evenness   log(light of a dot / expected) over the screen, Chebyshev polynomials, relative to the middle
     place      direction of a dot by the tracker less that by the bench file, arcsec, Chebyshev polynomials
 
@@ -33,7 +34,7 @@ DOTS_A_TERM = 4
 MAP = (16, 9)  # fields of a usual map of light, columns and rows
 MIN_LEVELS = 4
 FAINT_SIGMAS = 5.0
-BRIGHT, FAINT = 0.05, 0.001  # relative to white: light by which a reading's relative noise is told from its floor
+BRIGHT = 0.05  # relative to white: light by which the relative noise of a reading is known; black tells its floor
 MIN_DOF = 2
 
 
@@ -41,8 +42,8 @@ MIN_DOF = 2
 class LightDeviation:
     """True over expected light at the codes read: `value` (k,) over `log_light` (k,), log of light relative to white.
 
-    `factors` (k, m) times its transpose is the covariance. It holds for the first reading's moment; `drift_per_h` is relative,
-    with its standard uncertainty, nan where no time passed. `black` is relative to white, with its standard uncertainty.
+    `factors` (k, m) times its transpose is the covariance by `noise`, which is relative to light; `dark_factors` by the scatter
+    of dark readings, `dark` relative to white. It holds for the first reading's moment.
     """
 
     log_light: FloatArray
@@ -50,15 +51,18 @@ class LightDeviation:
     factors: FloatArray
     dof: float
     noise: float
-    drift_per_h: float
-    drift_u_per_h: float
-    black: float
-    black_u: float
+    dark_factors: FloatArray
+    dark_dof: float
+    dark: float
 
     def weights(self, log_light: FloatArray) -> FloatArray:
         """What each code's value adds to the deviation at lights (n,): (n, k). Beyond the codes read it is held."""
         spline = CubicSpline(self.log_light, np.eye(len(self.log_light)), bc_type="natural")
         return np.asarray(spline(np.clip(log_light, self.log_light[0], self.log_light[-1])))
+
+    def bent(self, log_light: FloatArray) -> FloatArray:
+        """By how much the spline is above straight lines from code to code, at lights (n,)."""
+        return np.asarray(self.weights(log_light) @ self.value - np.interp(log_light, self.log_light, self.value))
 
 
 def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
@@ -80,19 +84,23 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     design[np.arange(len(read.code)), place] = 1.0
     if timed:
         design[:, -1] = hours * mean[place]
-    total, bright = np.maximum(mean[place], 1e-9 * mean[-1]), mean[place] > BRIGHT * mean[-1]
-    free = int(bright.sum()) - len(np.unique(place[bright]))
-    noise = math.sqrt(float(((read.light / total - 1)[bright] ** 2).sum()) / max(free, 1))
-    faint = mean[place] - mean[0] < FAINT * (mean[-1] - mean[0])  # black among them
-    scatter = (read.light - mean[place])[faint]
-    repeats = max(int(faint.sum()) - len(np.unique(place[faint])), 1)
-    floor = max(float((scatter**2).sum()) / repeats - float(((noise * mean[place][faint]) ** 2).mean()), 0.0)
-    sigma = np.sqrt(total**2 + floor / max(noise, 1e-12) ** 2)
-    inverse = np.linalg.pinv(design / sigma[:, None])
-    found = inverse @ (read.light / sigma)
-    noise = math.sqrt(float((((read.light - design @ found) / sigma) ** 2).sum()) / dof)
-    factors, light, size = noise * inverse, found[1 : len(codes)] - found[0], len(codes)
-    if not light[-1] > FAINT_SIGMAS * float(np.linalg.norm(factors[size - 1] - factors[0])):
+    # Light and dark share no readings, so that their scatters are two estimates, and weights take nothing from their freedom.
+    lit = np.maximum(mean[place] - mean[0], 0.0)
+    bright, dark = lit > BRIGHT * lit.max(), place == 0
+    noise, floor = 1.0, 0.0
+    for _ in range(3):
+        sigma = np.hypot(noise * lit, max(floor, 1e-9 * mean[-1] * noise))
+        inverse = np.linalg.pinv(design / sigma[:, None])
+        left = read.light - design @ (found := inverse @ (read.light / sigma))
+        own = 1 - np.einsum("ij,ji->i", design / sigma[:, None], inverse)
+        noise = math.sqrt(float(((left / np.maximum(lit, 1e-300))[bright] ** 2).sum()) / max(float(own[bright].sum()), 1e-9))
+        floor = math.sqrt(float((left[dark] ** 2).sum()) / max(float(own[dark].sum()), 1e-9))
+    if own[bright].sum() < MIN_DOF / 2 or own[dark].sum() < MIN_DOF / 2:
+        raise InputError("white and black are read too seldom to know their scatter; read both three times or more")
+    by_light, by_dark = (inverse * part / sigma for part in (noise * lit, np.full(len(lit), floor)))
+    light, size = found[1 : len(codes)] - found[0], len(codes)
+    lost = math.hypot(*(float(np.linalg.norm(each[size - 1] - each[0])) for each in (by_light, by_dark)))
+    if not light[-1] > FAINT_SIGMAS * lost:
         raise InputError("white reads no light above black; look at what the screen shows, and expose longer")
     grey, (width, height) = grey_response(file), file.config.monitor.resolution_px
     even = bench_calibration(file.config, file.folder).uniformity_map((width, height))
@@ -101,13 +109,12 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     return LightDeviation(
         log_light=np.log(grey.light[codes[1:]]),
         value=light / expected,
-        factors=(factors[1:size] - factors[0]) / expected[:, None],
-        dof=float(dof),
+        factors=(by_light[1:size] - by_light[0]) / expected[:, None],
+        dof=float(own[bright].sum()),
         noise=noise,
-        drift_per_h=float(found[size]) if timed else math.nan,
-        drift_u_per_h=float(np.linalg.norm(factors[size])) if timed else math.nan,
-        black=float(found[0] / light[-1]),
-        black_u=float(np.linalg.norm(factors[0]) / light[-1]),
+        dark_factors=(by_dark[1:size] - by_dark[0]) / expected[:, None],
+        dark_dof=float(own[dark].sum()),
+        dark=float(floor / light[-1]),
     )
 
 

@@ -151,7 +151,7 @@ class Figures:
             start += len(star.share)
         self.x_px, self.y_px = (np.array([getattr(star, name) for star in stars]) for name in ("x_px", "y_px"))
         self._direction = np.stack([star.direction for star in stars])
-        self._tangent = self._direction[:, :2] / self._direction[:, 2:]
+        self.tangent = self._direction[:, :2] / self._direction[:, 2:]
         fields = np.array([star.field for star in stars])
         self._of_field = [np.flatnonzero(fields == number) for number in range(int(fields.max()) + 1)]
         each = [("flux", "mag"), ("place_along", "arcsec"), ("place_across", "arcsec")]
@@ -159,6 +159,12 @@ class Figures:
         axes = [("attitude_x", "arcsec"), ("attitude_y", "arcsec"), ("attitude_z", "arcsec")]
         self.names += [(quantity, -1 - field, unit) for field in range(len(self._of_field)) for quantity, unit in axes]
         self.names.append(("latency", 0, "ms"))
+
+    def turned(self, turns_arcsec: FloatArray) -> FloatArray:
+        """What turns of the bench (n, 3), arcsec about cam's axes, add to the stars' places (n, stars, 2)."""
+        u, v = self.tangent.T
+        a, b, c = turns_arcsec.T[:, :, None]
+        return np.stack([b - c * v - u * (a * v - b * u), c * u - a - v * (a * v - b * u)], axis=2)
 
     def of(self, off: Deviations) -> FloatArray:
         """The figures (b, figures): flux mag (fainter is positive), places arcsec, attitudes arcsec, latency ms."""
@@ -173,7 +179,7 @@ class Figures:
     def _attitude(self, place_arcsec: FloatArray, stars: IntArray) -> FloatArray:
         """Rotation vectors (b, 3), arcsec, cam axes, from the commanded to the reported attitude."""
         seen = np.ones((len(place_arcsec), len(stars), 3))
-        seen[..., :2] = self._tangent[stars] + place_arcsec / ARCSEC_PER_RAD
+        seen[..., :2] = self.tangent[stars] + place_arcsec / ARCSEC_PER_RAD
         seen /= np.linalg.norm(seen, axis=2, keepdims=True)
         left, _, right = np.linalg.svd(np.einsum("bsi,sj->bij", seen, self._direction[stars]))
         left[..., 2] *= np.linalg.det(left @ right)[:, None]

@@ -8,7 +8,6 @@ import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -70,50 +69,6 @@ class DotReadings:
     psf_u_px: float = 0.0
 
 
-class Reader(Protocol):
-    """Where readings come from; `identity` says it in words, `truth` is a virtual bench's file."""
-
-    @property
-    def identity(self) -> str:
-        """Where readings come from, in words."""
-        ...
-
-    @property
-    def truth(self) -> BenchFile | None:
-        """The true bench, of a virtual one."""
-        ...
-
-    @property
-    def centroid_px(self) -> float:
-        """What the pattern of pixels does to a centroid, one sigma along an axis, tracker px."""
-        ...
-
-    @property
-    def monitor(self) -> MonitorIdentity | None:
-        """The monitor that is read, where the machine can tell."""
-        ...
-
-    def now_ns(self) -> int:
-        """The clock of the readings."""
-        ...
-
-    def wait(self, seconds: float) -> None:
-        """Let time pass."""
-        ...
-
-    def light(self, codes: IntArray) -> LightReadings:
-        """Read the light of codes in their order, 0 among them. Raises InputError."""
-        ...
-
-    def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
-        """Read dots whose middles are these monitor pixels, by the mean of some images. Raises InputError."""
-        ...
-
-    def delays_ms(self) -> FloatArray:
-        """Delays (n,) from a swap to the first row's light; empty without a photodiode. Raises InputError, MachineError."""
-        ...
-
-
 def geometry_of(file: BenchFile) -> BenchGeometry:
     """Monitor and tracker as a bench file has them."""
     return BenchGeometry(bench_camera(file.config, file.folder), tracker_camera(file.config.tracker, file.folder))
@@ -151,7 +106,10 @@ def delays_of(recording: DiodeRecording | None, file: BenchFile) -> FloatArray:
 
 
 class VirtualReader:
-    """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own noise. Raises InputError."""
+    """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own noise. Raises InputError.
+
+    `identity` says it in words, and `centroid_px` is what the pattern of pixels does to a centroid, one sigma along an axis.
+    """
 
     monitor: MonitorIdentity | None = None
     centroid_px = 0.0
@@ -292,6 +250,9 @@ class ImageReader:
         if not self.file.config.monitor.photodiode_px:
             return np.zeros(0)
         return delays_of(self.source.diode(self.file, WATCHED_S), self.file)
+
+
+Reader = VirtualReader | ImageReader
 
 
 def grey_response(file: BenchFile) -> Response:

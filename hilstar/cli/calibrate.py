@@ -300,12 +300,13 @@ def scale(
     if found.scatter_mag > UNSURE_MAG:
         say(f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation, and the response")
     if output is not None:
-        with_flux_at_white(file, found.flux_at_white_e_per_s, output)
+        with_flux_at_white(file, found, output)
     summary: dict[str, Any] = {
         "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
         "assumed_e_per_s": found.assumed_e_per_s,
         "readings": len(reading),
         "scatter_mag": found.scatter_mag,
+        "relative_error": found.relative_error,
         "exposure_s": exposure_s,
         "written": None if output is None else str(output),
     }
@@ -314,3 +315,6 @@ def scale(
         return
     typer.echo(f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag; under [render]:")
     typer.echo(f"flux_at_white_e_per_s = {found.flux_at_white_e_per_s!r}")
+    if found.relative_error is not None:
+        stated = f"flux_at_white_relative = {found.relative_error:.3g}\nflux_at_white_dof = {len(found.ratios) - 1}"
+        typer.echo(f"# and how well it is known, under [certify]:\n{stated}")

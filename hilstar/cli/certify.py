@@ -79,7 +79,7 @@ def certify(
         if check and reader is not None:
             _check(file, reader, output, now, warm_up, as_json)
         else:
-            _certify(file, reader, output, now, again, quick, as_json)
+            _certify(file, reader, output, now, again, quick, warm_up, as_json)
 
 
 def _certify(
@@ -89,11 +89,12 @@ def _certify(
     now: datetime.datetime,
     again: bool,
     quick: bool,
+    warm_up: float,
     as_json: bool,
 ) -> None:
     from hilstar.bench.certificate import read_certificate, sha256_of_bytes
     from hilstar.certify.certificate import certify as certified
-    from hilstar.certify.check import largest_change
+    from hilstar.certify.check import largest_changes, watch
     from hilstar.certify.page import text_lines, write_certificate_page
 
     path, replaces = output / CERTIFICATE, None
@@ -101,7 +102,13 @@ def _certify(
         if not again:
             raise InputError(f"{path}: exists; write --again to certify anew in its place, --check to check it, or another -o")
         replaces = read_certificate(path).number
-    found, reference = certified(file, reader, now, quick=quick, drift=largest_change(output), replaces=replaces)
+    warmed = None
+    if warm_up and reader is not None:
+        watched = watch(reader, 2**file.config.monitor.bits - 1, warm_up, output / "warm-up")
+        say(watched.line)
+        warmed = None if watched.law == "none" else watched.bound
+    checked = largest_changes(output)
+    found, reference = certified(file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces)
     raw = msgspec.json.format(msgspec.json.encode(found))
     digest = sha256_of_bytes(raw)
     if reference is not None:

@@ -55,4 +55,4 @@ def latency(
     else:
         typer.echo("\n".join(latency_lines(summary)))
     if write is not None:
-        write_panel_delay(write, summary["panel_delay_ms"])
+        write_panel_delay(write, summary["panel_delay_ms"], summary["panel_delay_u_ms"])

@@ -59,6 +59,7 @@ class Calibration:
     response: Response
     sha256: str
     uniformity: FloatArray | None = None
+    uniformity_relative: float | None = None  # standard error of a field
     noise: float = 0.0
     weights: Weights | None = None
     who: str = ""
@@ -141,6 +142,7 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
         response=response,
         sha256=hashlib.sha256(b"".join(read)).hexdigest(),
         uniformity=uniformity,
+        uniformity_relative=file.uniformity.relative if file.uniformity else None,
         noise=file.noise.relative if file.noise else 0.0,
         weights=shares,
         who=head.who,
@@ -195,11 +197,19 @@ def primary_responses(source: str | Path, bits: int) -> tuple[Response, ...]:
 
 
 def with_uniformity(
-    source: str | Path, bits: int, path: Path, grid: FloatArray | None, identity: MonitorIdentity | None = None, when: str = ""
+    source: str | Path,
+    bits: int,
+    path: Path,
+    grid: FloatArray | None,
+    identity: MonitorIdentity | None = None,
+    when: str = "",
+    *,
+    relative: float | None = None,
 ) -> tuple[Path, ...]:
     """Write a calibration's light with another grid of relative light (rows, columns), or with none; the files, TOML first.
 
-    `source` is a built-in name or a file, as for `load_calibration`; `when` dates a built-in's. Raises InputError.
+    `source` is a built-in name or a file, as for `load_calibration`; `when` dates a built-in's; `relative` is the standard
+    error of a field. Raises InputError.
     """
     response, weights, noise, notes, errors = f"{path.stem}.csv", None, 0.0, NotesTable(), None
     if str(source) in FORMULAS:
@@ -213,7 +223,7 @@ def with_uniformity(
         weights, noise, notes = file.weights, file.noise.relative if file.noise else 0.0, file.notes
         identity, errors = identity or file.monitor_identity, file.errors
     table = write_calibration(path, head, columns, noise, notes, weights, identity=identity, errors=errors)
-    return (path, table) if grid is None else (path, table, add_uniformity(path, grid))
+    return (path, table) if grid is None else (path, table, add_uniformity(path, grid, relative))
 
 
 def _response(
@@ -258,9 +268,10 @@ class WeightsTable(Table, frozen=True):
 
 
 class UniformityTable(Table, frozen=True):
-    """[uniformity]: where the grid of relative light is."""
+    """[uniformity]: where the grid of relative light is, and the standard error of one of its fields."""
 
     file: str
+    relative: Share | None = None
 
 
 class NoiseTable(Table, frozen=True):
@@ -270,12 +281,16 @@ class NoiseTable(Table, frozen=True):
 
 
 class ErrorsTable(Table, frozen=True):
-    """[errors]: at the levels measured, by their light relative to white: measured over fitted light less 1, and its error."""
+    """[errors]: at the levels measured, by their light relative to white: measured over fitted light less 1, and its error.
+
+    `black` is the error of code 0 over white: it is part of every level's, and all that is common to them.
+    """
 
     light: list[Annotated[float, Meta(gt=0, le=1)]]
     off: list[Annotated[float, Meta(ge=-1e6, le=1e6)]]
     relative: list[Share]
     dof: Annotated[float, Meta(gt=0, le=1e9)]
+    black: Share = 0.0
 
 
 class NotesTable(Table, frozen=True):
@@ -440,15 +455,16 @@ def write_calibration(
     return table
 
 
-def add_uniformity(path: Path, grid: FloatArray) -> Path:
+def add_uniformity(path: Path, grid: FloatArray, relative: float | None = None) -> Path:
     """Give a calibration file that has none a grid of relative light (rows, columns), rows from the top; the grid's CSV.
 
-    Raises InputError where it cannot be written.
+    `relative` is the standard error of a field. Raises InputError where it cannot be written.
     """
     table = path.with_name(f"{path.stem}-uniformity.csv")
     write_whole(table, "".join(",".join(f"{value!r}" for value in row) + "\n" for row in grid.tolist()))
     text = read_text(path, ADVICE, MAX_TOML_BYTES)
-    write_whole(path, f"{text}\n[uniformity]\nfile = {json.dumps(table.name)}\n")
+    known = "" if relative is None else f"relative = {relative:.4g}\n"
+    write_whole(path, f"{text}\n[uniformity]\nfile = {json.dumps(table.name)}\n{known}")
     return table
 
 

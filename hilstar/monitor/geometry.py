@@ -46,7 +46,8 @@ class LensTable(msgspec.Struct, frozen=True, kw_only=True):
 class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
     """[error]: of dots that were held out, and one sigma of a star's place: over the screen (-1 where unseen), rms and maximum.
 
-    An alignment adds the rms of what its rotation leaves, one axis.
+    `modes_arcsec` times its transpose is the covariance of places: a mode has x and then y of the map, row by row. An alignment
+    adds the rms of what its rotation leaves, one axis, and the covariance of the rotation about x, y and z with its freedom.
     """
 
     model: str = ""
@@ -56,8 +57,20 @@ class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
     rms_arcsec: float | None = None
     max_arcsec: float | None = None
     map_arcsec: list[list[float]] | None = None
+    modes_arcsec: list[list[float]] | None = None
     alignment_cross_arcsec: float | None = None
     alignment_roll_arcsec: float | None = None
+    alignment_covariance_arcsec2: list[list[float]] | None = None
+    alignment_dof: float | None = None
+
+    def __post_init__(self) -> None:
+        rows, modes, turn = self.map_arcsec, self.modes_arcsec, self.alignment_covariance_arcsec2
+        if rows is not None and (not rows or len({len(row) for row in rows}) != 1):
+            raise ValueError("map_arcsec has rows of different lengths")
+        if modes is not None and (rows is None or {len(mode) for mode in modes} != {2 * len(rows) * len(rows[0])}):
+            raise ValueError("modes_arcsec are not x and y of each place of map_arcsec")
+        if turn is not None and [len(row) for row in turn] != [3, 3, 3]:
+            raise ValueError("alignment_covariance_arcsec2 is not 3 by 3")
 
 
 class MadeTable(msgspec.Struct, frozen=True, kw_only=True):

@@ -122,7 +122,7 @@ def coverage(benches: int, seed: int, keys: str = "") -> dict[tuple[str, str], l
         for number in range(benches):
             paths = plant(Path(folder), drawn(rng), f"[certify]\nfields = 1\n{keys}")
             bench, truth = (read_bench_file(path) for path in paths)
-            found, _ = certify(bench, VirtualReader(bench, truth, number), NOW, quick=True)
+            found, _ = certify(bench, VirtualReader(bench, truth, 1_000_003 * seed + number), NOW, quick=True)
             for each in found.figures:
                 if each.truth is not None:
                     region = "field" if each.region.startswith("field") else each.region

@@ -91,9 +91,16 @@ class CertifySettings(Table, frozen=True):
         Relative | None,
         Meta(description="Standard uncertainty of `flux_at_white_e_per_s`, where nothing is read.", extra=NOT_KNOWN),
     ] = None
+    flux_at_white_dof: Annotated[
+        Positive | None, Meta(description="Its degrees of freedom: readings less one.", extra={"default": "unlimited"})
+    ] = None
     panel_delay_u_ms: Annotated[
         NotNegative | None,
         Meta(description="Standard uncertainty of `panel_delay_ms`, where nothing is read.", extra=NOT_KNOWN),
+    ] = None
+    warm_up_percent: Annotated[
+        NotNegative | None,
+        Meta(description="How much white may still change in the ten minutes after it counts as warm.", extra=NOT_KNOWN),
     ] = None
     temperature_k: Annotated[
         NotNegative, Meta(description="Half of the range of the bench's temperature while the certificate holds.")

@@ -331,7 +331,7 @@ def photometry(context: StepContext) -> StepOutcome:
     )
     files = [output, output.with_suffix(".csv"), measured, picture, before, *readings.images]
     if assumed.uniformity is not None:
-        files.append(add_uniformity(output, assumed.uniformity))
+        files.append(add_uniformity(output, assumed.uniformity, assumed.uniformity_relative))
     draw_calibration(measured, picture, monitor.bits)
     written = load_calibration(output, monitor.bits)
     now = written.response

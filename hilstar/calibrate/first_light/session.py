@@ -39,7 +39,7 @@ from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import clear_parts, lock_alone, write_whole
 from hilstar.run.doctor import examine
 from hilstar.run.sync import BeatSummary, beat_of
-from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
+from hilstar.units import NS_PER_S
 from hilstar.version import __version__
 
 WATCHED_S = 5.0  # about 150 edges at 60 Hz
@@ -60,7 +60,7 @@ def latency(context: StepContext) -> StepOutcome:
     picture = context.session / "latency.svg"
     draw_latency(picture, paired, found)
     delay_ms = checked_delay_ms(0.0 if -AGREE_MS < found["panel_delay_ms"] < 0 else found["panel_delay_ms"])
-    error_ms = ERROR_OF_MEDIAN * found["jitter_ms"] / math.sqrt(found["edges"])
+    error_ms = found["panel_delay_u_ms"]
     figures: dict[str, Figure] = {
         "panel_delay_ms": delay_ms,
         "error_ms": error_ms,
@@ -81,9 +81,13 @@ def latency(context: StepContext) -> StepOutcome:
         f" jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
     )
     agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
-    change = KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms)
+    before, u_ms = context.file.config.certify.panel_delay_u_ms, float(f"{error_ms:.3g}")
+    changes = (
+        KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms),
+        KeyChange(table="certify", key="panel_delay_u_ms", before=before, after=u_ms),
+    )
     number = StepNumber(delay_ms, error_ms, "ms", "from the buffer swap to the light of the first row")
-    return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else (change,), number)
+    return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else changes, number)
 
 
 MS_PER_S = 1000.0
@@ -185,6 +189,7 @@ STEPS = (
         "dots",
         "an image every ten seconds",
         needs=("focus",),
+        writes=("certify.warm_up_percent",),
     ),
     SessionStep(
         "geometry",
@@ -226,7 +231,7 @@ STEPS = (
         "an image of each",
         needs=("geometry",),
         tables=("monitor", "collimator", "tracker", "sky", "render"),
-        writes=("render.flux_at_white_e_per_s", "render.brightest_v_mag"),
+        writes=("render.flux_at_white_e_per_s", "render.brightest_v_mag", "certify.flux_at_white_relative"),
     ),
     SessionStep(
         "latency",
@@ -237,7 +242,7 @@ STEPS = (
         "its edges",
         needs=("display",),
         tables=("monitor",),
-        writes=("monitor.panel_delay_ms",),
+        writes=("monitor.panel_delay_ms", "certify.panel_delay_u_ms"),
     ),
     SessionStep(
         "verify",

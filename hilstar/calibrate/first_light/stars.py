@@ -448,9 +448,13 @@ def scale(context: StepContext) -> StepOutcome:
     verdict: Verdict = "failed" if scatter.finding else "done"
     line += f", but {scatter.finding}" if scatter.finding else ""
     key, before = "flux_at_white_e_per_s", context.file.config.render.flux_at_white_e_per_s
-    change = KeyChange(table="render", key=key, before=before, after=float(f"{found.flux_at_white_e_per_s:.6g}"))
+    relative, stated = float(f"{error_mag / MAG_PER_RELATIVE:.3g}"), context.file.config.certify.flux_at_white_relative
+    changes = (
+        KeyChange(table="render", key=key, before=before, after=float(f"{found.flux_at_white_e_per_s:.6g}")),
+        KeyChange(table="certify", key="flux_at_white_relative", before=stated, after=relative),
+    )
     agrees = abs(by_mag) < AGREE_SIGMAS * error_mag
-    return StepOutcome(verdict, line, figures, files, (picture,), () if agrees else (change,), number)
+    return StepOutcome(verdict, line, figures, files, (picture,), () if agrees else changes, number)
 
 
 def _white_e_per_s(file: BenchFile) -> float:

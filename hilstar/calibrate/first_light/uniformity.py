@@ -100,7 +100,8 @@ def uniformity(context: StepContext) -> StepOutcome:
     else:
         source, path = calibration_source(context.file), context.session / FILE
         grid, today = None if found.is_even else found.grid, datetime.datetime.now(datetime.UTC).date().isoformat()
-        files += with_uniformity(source, context.file.config.monitor.bits, path, grid, context.source.monitor, today)
+        relative, bits = float(figures["map_error_mag"]) / MAG_PER_RELATIVE, context.file.config.monitor.bits
+        files += with_uniformity(source, bits, path, grid, context.source.monitor, today, relative=relative)
         changes = context.names("monitor", "calibration", path)
         line += "; what the tracker's own lens darkens is part of it"
     noisy = found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG)
@@ -161,6 +162,10 @@ def warm_up(context: StepContext) -> StepOutcome:
         figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
         stable_s = tau_s * math.log(max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
         figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)  # of its exponential alone
+    before: float | None = context.file.config.certify.warm_up_percent
+    changes: tuple[KeyChange, ...] = ()
+    if found.is_stable and (after := float(f"{100 * found.bound:.3g}")) != before:
+        changes = (KeyChange(table="certify", key="warm_up_percent", before=before, after=after),)
     per_h = StepNumber(found.drift_percent_per_h, found.drift_error_percent_per_h, "%/h", "drift of white at the last reading")
     return StepOutcome(
         "done" if found.is_stable else "failed",
@@ -168,6 +173,7 @@ def warm_up(context: StepContext) -> StepOutcome:
         figures,
         (table, picture),
         (picture,),
+        changes,
         number=per_h if found.law != "none" else None,
     )
 

@@ -316,6 +316,7 @@ def write_calibrated(path: Path, found: Calibrated, plot: Path | None, identity:
         rms_arcsec=uncertainty.rms_arcsec,
         max_arcsec=uncertainty.max_arcsec,
         map_arcsec=[[round(float(value), 4) for value in row] for row in np.nan_to_num(uncertainty.map_arcsec, nan=-1.0)],
+        modes_arcsec=[[float(f"{value:.5g}") for value in mode] for mode in uncertainty.modes_arcsec],
     )
     sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
     when = datetime.datetime.now(datetime.UTC).date().isoformat()

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.dots import DotPlan
@@ -363,18 +364,21 @@ def best_of(found: list[Candidate]) -> Candidate:
 
 
 MAP_PLACES = (17, 11)
+MODE_SHARE = 1e-6  # of the variance over the screen: less is in no interval's digits
 
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
     """One sigma of each parameter, and of a star's place over the screen, edges included: `map_arcsec` (rows, columns).
 
+    `modes_arcsec` (modes, 2 places) times its transpose is the covariance of places along x and y, row by row of the map.
     The map is NaN where the tracker saw no dots. From the covariance of the fit, scaled up where its residuals exceed the
     centroids' noise. Errors that no parameter can follow show in the error of held-out dots alone.
     """
 
     sigma: dict[str, float]
     map_arcsec: FloatArray
+    modes_arcsec: FloatArray
 
     @property
     def rms_arcsec(self) -> float:
@@ -396,17 +400,22 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     size = fit.model.size
     field_numbers = rows.shape[1] - size
     prior = np.concatenate([np.full(size, PRIOR), np.full(field_numbers, 1 / FIELD_PRIOR_PX)])
-    covariance = np.linalg.inv(rows.T @ rows + np.diag(prior**2))
+    root = np.linalg.inv(np.linalg.qr(np.vstack([rows, np.diag(prior)]))[1])  # times its transpose: the covariance
     scale = max(1.0, MAD_TO_SIGMA * float(np.median(left)))
     steps = [STEPS[name] for name in fit.model.names] + [TRACKER_STEPS[name] for name in fit.model.tracker_names]
-    spread = scale * np.sqrt(np.diag(covariance))
+    spread = scale * np.linalg.norm(root, axis=1)
     names = (*fit.model.names, *fit.model.tracker_names)
     sigma = {name: float(step * s) for name, step, s in zip(names, steps, spread, strict=False)}
     along = (np.linspace(-0.5, size - 0.5, n) for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True))
     place_x, place_y = _slopes_of_places(problem, fit, *(part.ravel() for part in np.meshgrid(*along)))
-    variance = sum(np.einsum("ni,ij,nj->n", part, covariance, part) for part in (place_x, place_y))
-    arcsec = scale * np.sqrt(variance) * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px
-    return Uncertainty(sigma, arcsec.reshape(MAP_PLACES[::-1]))
+    slopes = np.stack([place_x, place_y]) @ root * (scale * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px)
+    seen = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
+    row, column = distance_transform_edt((~seen).astype(np.int64), return_distances=False, return_indices=True)
+    slopes = slopes[:, (row * seen.shape[1] + column).ravel()]  # a place that was not seen has those of its neighbour
+    variance = np.where(seen, (slopes**2).sum(axis=(0, 2)).reshape(seen.shape), np.nan)
+    _, size_of, modes = np.linalg.svd(slopes.reshape(2 * seen.size, -1).T, full_matrices=False)
+    modes = (size_of[:, None] * modes)[size_of**2 > MODE_SHARE * (size_of**2).sum()]
+    return Uncertainty(sigma, np.sqrt(variance), modes)
 
 
 def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:

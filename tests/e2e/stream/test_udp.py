@@ -26,7 +26,7 @@ from hilstar.run.send_log import BadCable, Faults, send, spin_samples
 from hilstar.run.sender import UdpSender
 from hilstar.run.serve import Outlet, Running
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
 from tests.support.live_runs import attitudes, serve_until
 from tests.support.senders import free_port, packet
@@ -48,7 +48,7 @@ def bench_of(folder: Path, *lines: str) -> Path:
 
 
 def sent(to: str, *options: str) -> dict:
-    result = run_hilstar("send", "--to", to, "--json", *options)
+    result = run_hilstar_here("send", "--to", to, "--json", *options)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 

@@ -239,10 +239,7 @@ class AnswerJudge:
             told |= {"rate_hz": round(1 / cycle_s, 3), "availability": round(min(len(error) / max(due, 1), 1.0), 4)}
         words = "the tracker has not answered" + (" yet" if newest is None else f" for {since_s:.1f} s")
         return TrackerFigures(
-            answers=sum(self.counts.values()),
-            refused=refused,
-            silent=words if since_s > limit_s else "",
-            **told,
+            answers=sum(self.counts.values()), refused=refused, silent=words if since_s > limit_s else "", **told
         )
 
 

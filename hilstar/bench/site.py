@@ -13,13 +13,7 @@ from hilstar.bench.config.sky import SiteSettings
 from hilstar.errors import InputError, did_you_mean
 from hilstar.reading import exists
 from hilstar.rotation import conjugate, rotate
-from hilstar.sky.air import (
-    NIGHT_SKY,
-    extinction_curve,
-    extinction_names,
-    glow_e_per_s_arcsec2,
-    standard_pressure_hpa,
-)
+from hilstar.sky.air import NIGHT_SKY, extinction_curve, extinction_names, glow_e_per_s_arcsec2, standard_pressure_hpa
 from hilstar.sky.electrons import Optics, Photometry, electron_response
 from hilstar.sky.spectrum import Curve, constant_curve, read_curve_csv
 from hilstar.units import ARCSEC_PER_RAD

@@ -32,8 +32,7 @@ def answers(
         typer.Option("--from", metavar="FILE", help="Bytes recorded from the tracker's line; by default the live link."),
     ] = None,
     explain: Annotated[
-        bool,
-        typer.Option("--explain", help="Show which bytes became which field, and each answer under every convention."),
+        bool, typer.Option("--explain", help="Show which bytes became which field, and each answer under every convention.")
     ] = False,
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,

@@ -64,10 +64,7 @@ def campaign(
     headless: Headless = False,
     windowed: running.Windowed = False,
     force: running.Force = False,
-    frames: Annotated[
-        str | None,
-        typer.Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}."),
-    ] = None,
+    frames: Annotated[str | None, typer.Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")] = None,
     console: running.Console = None,
     token: running.Token = None,
     console_name: running.ConsoleName = None,

@@ -52,8 +52,7 @@ def first_light(
         typer.Option(metavar="FILE", help="The tracker's image with the monitor switched off, for the monitor's black level."),
     ] = None,
     diode: Annotated[
-        str | None,
-        typer.Option(metavar="serial:/dev/ttyX@BAUD", help="Photodiode before the display's square, for its delay."),
+        str | None, typer.Option(metavar="serial:/dev/ttyX@BAUD", help="Photodiode before the display's square, for its delay.")
     ] = None,
     patches: Annotated[
         int | None,

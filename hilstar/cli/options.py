@@ -33,8 +33,7 @@ Explain = Annotated[
     bool, typer.Option("--explain", help="Explain on stderr what was chosen for this scene, with its error and its saving.")
 ]
 AtSeconds = Annotated[
-    float | None,
-    typer.Option("--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default."),
+    float | None, typer.Option("--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default.")
 ]
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
 ScenarioFile = Annotated[
@@ -42,8 +41,7 @@ ScenarioFile = Annotated[
 ]
 UNSAID = "What the log itself does not say"
 KernelFiles = Annotated[
-    list[Path] | None,
-    typer.Option("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.", rich_help_panel=UNSAID),
+    list[Path] | None, typer.Option("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.", rich_help_panel=UNSAID)
 ]
 TopicName = Annotated[
     str | None, typer.Option("--topic", metavar="NAME", help="The topic, where a bag has several.", rich_help_panel=UNSAID)
@@ -62,8 +60,7 @@ ReferenceName = Annotated[
     ),
 ]
 EpochUtc = Annotated[
-    str | None,
-    typer.Option("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.", rich_help_panel=UNSAID),
+    str | None, typer.Option("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.", rich_help_panel=UNSAID)
 ]
 PlaceText = Annotated[
     str | None,

@@ -19,7 +19,6 @@ REFERENCE = "docs/faults.md"
 TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
 MAX_TIME_S, MAX_LIGHT_E, MAX_PLACE_PX = 1e7, 1e12, 1e6
 MAX_TRACK_PX = 20_000  # a burst's tracks together: bounds a frame's work
-MIN_RATE_PX_S = 1e-9
 UNIT_TOLERANCE = 1e-3
 
 Seconds = Annotated[float, Meta(ge=-MAX_TIME_S, le=MAX_TIME_S)]

@@ -72,8 +72,9 @@ def shown(server: Xorg, folder: Path, name: str = "bench", *options: str) -> Ite
             process.kill()
 
 
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-@pytest.mark.parametrize("options", [(), ("--windowed",)])
+@pytest.mark.parametrize(
+    ("sign", "options"), [(signal.SIGINT, ()), (signal.SIGTERM, ("--windowed",)), (signal.SIGKILL, ("--windowed",))]
+)
 def test_nothing_blanks_during_a_run_and_all_is_as_before_after_it(server, tmp_path, sign, options):
     with shown(server, tmp_path, "bench", *options) as process:
         wait_for(lambda: awake(server) or process.poll() is not None)

@@ -1,4 +1,4 @@
-"""10 s on a 1080p window under Xvfb, 300 stars, 200 Hz of packets: every frame accounted for, and what it shows is true."""
+"""4 s on a 1080p window under Xvfb, over 200 stars, 200 Hz of packets: every frame accounted for, and what it shows is true."""
 
 from __future__ import annotations
 
@@ -24,10 +24,8 @@ from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S
 from tests.support.x11.screens import xvfb
 
-DURATION_S, REFRESH_HZ, PACKET_HZ = 10, 60, 200
+DURATION_S, REFRESH_HZ, PACKET_HZ = 4, 60, 200
 RATE_DEG_S = 0.5
-# A machine whose cores are all busy misses most frames of this size; those that it draws are right all the same.
-MIN_CHECKED = 50
 # A packet's rate is float32 of 0.0087 rad/s: 5e-10 of it, over at most 0.25 s of prediction; and the clock's own line, 5 us.
 POINTING_ARCSEC = 0.02
 ARCSEC_PER_RAD = 206_264.8
@@ -63,7 +61,7 @@ def test_every_refresh_period_is_a_frame_or_missed(run):
     frames = read_run(ledger).frames
     assert len(frames) == summary["frames"]
     assert sum(frame.missed_before for frame in frames) == frames[-1].missed <= summary["missed_frames"]
-    assert summary["stars_drawn"]["max"] > 250
+    assert summary["stars_drawn"]["max"] > 200
     assert summary["packets"]["refused"] == 0
 
 
@@ -85,7 +83,8 @@ def test_what_was_drawn_is_where_the_packets_say_the_camera_is_when_the_middle_r
     samples = read_log(ledger)
     times_ns = np.array([sample.t_ns for sample in samples])
     checked = 0
-    for frame in read_run(ledger).frames:
+    frames = read_run(ledger).frames
+    for frame in frames:
         if frame.q is None or frame.light_ns > times_ns[-1]:
             continue
         # Where the sender was held up for longer than may be predicted, the attitude is held.
@@ -94,7 +93,7 @@ def test_what_was_drawn_is_where_the_packets_say_the_camera_is_when_the_middle_r
         true = propagate(sample.q_icrs_to_cam, sample.rate_cam_rad_s, (at_ns - sample.t_ns) / 1e9)
         assert angle_between_rad(true, np.array(frame.q)) * ARCSEC_PER_RAD < POINTING_ARCSEC
         checked += 1
-    assert checked > MIN_CHECKED
+    assert checked > len(frames) / 2 > 2
 
 
 def test_the_report_says_it_on_one_page(run, tmp_path):

@@ -209,11 +209,7 @@ def _decode_body(kind: int, message: bytes) -> Event:
 
 
 def checked_sample(
-    t_ns: int,
-    q: tuple[float, ...],
-    rate: tuple[float, ...] | None,
-    sequence: int = 0,
-    discontinuity: bool = False,
+    t_ns: int, q: tuple[float, ...], rate: tuple[float, ...] | None, sequence: int = 0, discontinuity: bool = False
 ) -> AttitudeSample | Refusal:
     """A sample from raw numbers, or why they are not one: every source of attitudes passes through here."""
     if not all(map(math.isfinite, (*q, *(rate or ())))):

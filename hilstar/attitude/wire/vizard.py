@@ -36,14 +36,7 @@ from hilstar.attitude.wire.packet import (
     checked_sample,
 )
 from hilstar.attitude.wire.source import Conventions, Mounting
-from hilstar.attitude.wire.vizard_message import (
-    Components,
-    SimUpdate,
-    VizBody,
-    VizCamera,
-    WireFormatError,
-    decode_update,
-)
+from hilstar.attitude.wire.vizard_message import Components, SimUpdate, VizBody, VizCamera, WireFormatError, decode_update
 from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqReceiver
 from hilstar.attitude.wire.zmq_socket import ZmqSocket
 from hilstar.errors import InputError, printable, shortened

@@ -146,8 +146,7 @@ class AnswersSettings(Table, frozen=True):
         ),
     ] = None
     allowed_clients: Annotated[
-        str | None,
-        Meta(description="ZeroMQ: the directory with the public keys that may connect.", extra={"default": "none"}),
+        str | None, Meta(description="ZeroMQ: the directory with the public keys that may connect.", extra={"default": "none"})
     ] = None
     port: Annotated[
         str | int,

@@ -63,8 +63,7 @@ class TrackerOptics(Table, frozen=True):
         ),
     ] = GAUSSIAN
     focus_um: Annotated[
-        float,
-        Meta(ge=-1e6, le=1e6, description="Where the detector stands along the axis, as the file of `psf` counts it."),
+        float, Meta(ge=-1e6, le=1e6, description="Where the detector stands along the axis, as the file of `psf` counts it.")
     ] = 0.0
     temperature_k: Annotated[float, Meta(ge=50, le=500, description="Temperature of the lens.")] = LENS_K
     reference_temperature_k: Annotated[
@@ -358,8 +357,7 @@ class Monitor(Table, frozen=True):
         ),
     ] = None
     hold_ms: Annotated[
-        NotNegative | None,
-        Meta(description="How long a row stays lit; 0 for a panel that flashes.", extra=ONE_PERIOD),
+        NotNegative | None, Meta(description="How long a row stays lit; 0 for a panel that flashes.", extra=ONE_PERIOD)
     ] = None
     photodiode_px: Annotated[
         int, Meta(ge=0, le=1000, description="Side of a square for a photodiode in the lower left corner; 0 for none.")
@@ -394,8 +392,7 @@ class Collimator(Table, frozen=True):
 
     focal_length_mm: Annotated[Positive, Meta(description="Focal length of the collimating lens.")]
     q_cam_to_mon: Annotated[
-        Rotation,
-        Meta(description="Misalignment: the unit quaternion that turns cam components into mon components."),
+        Rotation, Meta(description="Misalignment: the unit quaternion that turns cam components into mon components.")
     ] = (1.0, 0.0, 0.0, 0.0)
     principal_point_px: Annotated[
         Point | None,
@@ -500,8 +497,7 @@ class Verify(Table, frozen=True):
     """
 
     true_calibration: Annotated[
-        str | None,
-        Meta(description="The monitor's true light: a built-in name or a calibration file.", extra=AS_ASSUMED),
+        str | None, Meta(description="The monitor's true light: a built-in name or a calibration file.", extra=AS_ASSUMED)
     ] = None
     true_flux_at_white_e_per_s: Annotated[Positive | None, Meta(description="The true full scale.", extra=AS_ASSUMED)] = None
     true_focal_length_mm: Annotated[

@@ -53,10 +53,6 @@ def _banner(records: list[StepRecord]) -> str:
     return banner_of("ok", "The bench is ready", f"All {len(records)} steps passed.")
 
 
-def _chip(record: StepRecord, text: str) -> Markup:
-    return Markup(f'<span class="chip">{escaped(text)}</span>')
-
-
 def _link(record: StepRecord) -> str:
     words = f"{record.name}: {WORDS[record.verdict]}"
     return f'<a href="#{record.name}" data-state="{STATES[record.verdict]}"><span class="chip">{escaped(words)}</span></a>'

@@ -185,8 +185,8 @@ class _Loss:
     def residuals(self, numbers: FloatArray) -> FloatArray:
         return self._off(self.geometry(numbers))
 
-    def _off(self, geometry: Geometry) -> FloatArray:
-        off = residuals_sigma(self.problem, geometry, self.data)
+    def _off(self, geometry: Geometry, directions: FloatArray | None = None) -> FloatArray:
+        off = residuals_sigma(self.problem, geometry, self.data, directions)
         return np.where(np.isfinite(off), off, FAR_SIGMA)
 
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
@@ -194,15 +194,27 @@ class _Loss:
 
         For the lens they are finite differences without the field, which hardly changes along a step; the field is linear.
         """
-        lens = numbers[: self.model.size]
-        trials = (lens + step for step in DIFFERENCE * np.eye(len(lens)))
-        bare, *varied = (geometry_of(self.model, self.problem.nominal, self.problem.q_poses, n) for n in (lens, *trials))
-        base = self._off(bare) if self.field_degree else off
-        columns = np.stack([(self._off(geometry) - base) / DIFFERENCE for geometry in varied], axis=1)
+        lens, own = numbers[: self.model.size], len(self.model.names) + len(self.model.tracker_names)
+        poses = (len(lens) - own) // 3
+        # A pose turns its own centroids alone: one trial turns all poses about one axis.
+        turns = np.hstack([np.zeros((3, own)), np.tile(np.eye(3), (1, poses))])[: 3 * poses]
+        steps = DIFFERENCE * np.vstack([np.eye(own, len(lens)), turns])
+        bare, *varied = (
+            geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens + n) for n in (0 * lens, *steps)
+        )
+        seen = self.data.seen
+        directions = directions_in_cam(bare, seen.pose, seen.x_px, seen.y_px)  # the same for all terms of the monitor's camera
+        base = self._off(bare, directions) if self.field_degree else off
+        offs = [self._off(g, directions if n < len(self.model.names) else None) for n, g in enumerate(varied)]
+        slope = np.stack([(trial - base) / DIFFERENCE for trial in offs], axis=1)
+        is_its = np.tile(seen.pose, 2)[:, None] == np.repeat(np.arange(1, poses + 1), 3)
+        columns = np.hstack([slope[:, :own], np.where(is_its, np.tile(slope[:, own:], poses), 0.0)])
         if not self.field_degree:
             return columns
-        terms = np.nan_to_num(field_terms(*_places_px(bare, self.data), bare.monitor.resolution_px, self.field_degree))
-        terms /= (self.problem.monitor_px_per_px * self.data.seen.sigma_px * self.problem.noise_px)[:, None]
+        terms = np.nan_to_num(
+            field_terms(*_places_px(bare, self.data, directions), bare.monitor.resolution_px, self.field_degree)
+        )
+        terms /= (self.problem.monitor_px_per_px * seen.sigma_px * self.problem.noise_px)[:, None]
         return np.hstack([columns, _blocks(terms)])
 
     def prior(self, count: int) -> FloatArray:
@@ -253,22 +265,30 @@ def _smallest(loss: _Loss, numbers: FloatArray) -> FloatArray:
     return numbers
 
 
-def residuals_px(problem: Problem, geometry: Geometry, data: MatchedDots) -> tuple[FloatArray, FloatArray]:
-    """Distance of each centroid from its dot along x and y (n,), on the monitor, scaled to tracker px."""
+def residuals_px(
+    problem: Problem, geometry: Geometry, data: MatchedDots, directions: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Distance of each centroid from its dot along x and y (n,), on the monitor, scaled to tracker px.
+
+    `directions` (n, 3) are the centroids' `directions_in_cam` where they are known.
+    """
     plan, scale = problem.plan, problem.monitor_px_per_px
-    x_px, y_px = _places_px(geometry, data)
+    x_px, y_px = _places_px(geometry, data, directions)
     return (x_px - plan.x_px[data.dot]) / scale, (y_px - plan.y_px[data.dot]) / scale
 
 
-def residuals_sigma(problem: Problem, geometry: Geometry, data: MatchedDots) -> FloatArray:
+def residuals_sigma(
+    problem: Problem, geometry: Geometry, data: MatchedDots, directions: FloatArray | None = None
+) -> FloatArray:
     """The residuals (2 n,), x then y, each in its own sigma."""
     sigma = data.seen.sigma_px * problem.noise_px
-    return np.concatenate([part / sigma for part in residuals_px(problem, geometry, data)])
+    return np.concatenate([part / sigma for part in residuals_px(problem, geometry, data, directions)])
 
 
-def _places_px(geometry: Geometry, data: MatchedDots) -> tuple[FloatArray, FloatArray]:
+def _places_px(geometry: Geometry, data: MatchedDots, directions: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
     """Places of the centroids (n,) on the monitor by a geometry, px."""
-    directions = directions_in_cam(geometry, data.seen.pose, data.seen.x_px, data.seen.y_px)
+    if directions is None:
+        directions = directions_in_cam(geometry, data.seen.pose, data.seen.x_px, data.seen.y_px)
     return geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
 
 

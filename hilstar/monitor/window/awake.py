@@ -16,7 +16,7 @@ import subprocess
 import sys
 from typing import Any, NamedTuple
 
-BEGINS_S, RESTORES_S = 5.0, 1.0
+MAX_WAIT_S = 5.0  # for a machine that is busy; the word comes within 20 ms on an idle one
 LOOK_S = 0.5
 DONT_PREFER_BLANKING, SCREEN_SAVER_RESET, DPMS_ON = 0, 0, 0  # X.h, dpmsconst.h
 
@@ -29,20 +29,20 @@ class Awake:
         self._process = subprocess.Popen(
             program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
         )
-        self._wait(BEGINS_S)  # GLFW sets a screen saver of its own aside, and must not be the first
+        self._wait()  # GLFW sets a screen saver of its own aside, and must not be the first
 
     def close(self) -> None:
         """Restore what was set before. Twice does nothing."""
         if self._process.stdin is None or self._process.stdin.closed:
             return
         self._process.stdin.close()
-        self._wait(RESTORES_S)
+        self._wait()
         if self._process.stdout is not None:
             self._process.stdout.close()
 
-    def _wait(self, seconds: float) -> None:
+    def _wait(self) -> None:
         """Wait for its word, or its end."""
-        if self._process.stdout is not None and select.select([self._process.stdout], [], [], seconds)[0]:
+        if self._process.stdout is not None and select.select([self._process.stdout], [], [], MAX_WAIT_S)[0]:
             os.read(self._process.stdout.fileno(), 1)
         self._process.poll()  # the one that was begun ends at once, and leaves the other behind
 

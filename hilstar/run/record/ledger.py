@@ -229,12 +229,7 @@ class Ledger(Closing):
     """Writes a run's MCAP file. Raises InputError if it cannot be created."""
 
     def __init__(
-        self,
-        path: Path,
-        bench: Bench,
-        notices: Notices | None = None,
-        overwrite: bool = False,
-        split: SplitLimits = NO_SPLIT,
+        self, path: Path, bench: Bench, notices: Notices | None = None, overwrite: bool = False, split: SplitLimits = NO_SPLIT
     ) -> None:
         self.path = self._asked = path
         self.failure: str | None = None

@@ -6,7 +6,7 @@ There is a record for each frame, each event, each second of the process, and fo
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
@@ -31,6 +31,7 @@ HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, whic
 AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # a sender's clock, or the difference to the host's
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+Record = TypeVar("Record")
 
 
 class FrameRecord(msgspec.Struct, kw_only=True):
@@ -268,16 +269,18 @@ def frame_records(path: Path) -> Iterator[FrameRecord]:
 
 def fault_records(path: Path) -> Iterator[FaultRecord]:
     """The beginnings and ends of faults in a ledger. Raises InputError for damage; says nothing of a missing end."""
-    decoder = msgspec.json.Decoder(FaultRecord)
-    for number, data in enumerate(read_messages(path, FAULT_TOPIC, tell=False), start=1):
-        yield _decoded(decoder, data, f"{path}: message {number} of {FAULT_TOPIC}")
+    return _records(path, FAULT_TOPIC, FaultRecord)
 
 
 def answer_records(path: Path) -> Iterator[AnswerRecord]:
     """The tracker's answers in a ledger, none if the run had none. Raises InputError for damage."""
-    decoder = msgspec.json.Decoder(AnswerRecord)
-    for number, data in enumerate(read_messages(path, ANSWER_TOPIC, tell=False), start=1):
-        yield _decoded(decoder, data, f"{path}: message {number} of {ANSWER_TOPIC}")
+    return _records(path, ANSWER_TOPIC, AnswerRecord)
+
+
+def _records(path: Path, topic: str, record: type[Record]) -> Iterator[Record]:
+    decoder = msgspec.json.Decoder(record)
+    for number, data in enumerate(read_messages(path, topic, tell=False), start=1):
+        yield _decoded(decoder, data, f"{path}: message {number} of {topic}")
 
 
 def _decoded(decoder: msgspec.json.Decoder[Any], data: bytes, where: str) -> Any:

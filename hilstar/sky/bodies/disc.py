@@ -55,12 +55,7 @@ RADII_KM = {
 }
 # Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see: the same source
 POLAR_RADII_KM = {"Jupiter": 66_854.0, "Saturn": 54_364.0, "Uranus": 24_973.0, "Neptune": 24_341.0}
-POLES_DEG = {
-    "Jupiter": (268.057, 64.495),
-    "Saturn": (40.589, 83.537),
-    "Uranus": (257.311, -15.175),
-    "Neptune": (299.36, 43.46),
-}
+POLES_DEG = {"Jupiter": (268.057, 64.495), "Saturn": (40.589, 83.537), "Uranus": (257.311, -15.175), "Neptune": (299.36, 43.46)}
 LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # planets: lambert
 NORTH = np.array([0.0, 0.0, 1.0])
 

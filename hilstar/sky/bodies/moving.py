@@ -154,11 +154,7 @@ class MovingSky:
         return both
 
     def seen(
-        self,
-        stars: Stars,
-        t_ns: int | None = None,
-        velocity_km_s: FloatArray | None = None,
-        place_km: FloatArray | None = None,
+        self, stars: Stars, t_ns: int | None = None, velocity_km_s: FloatArray | None = None, place_km: FloatArray | None = None
     ) -> Stars:
         """Stars made by `among` as they are seen at a moment (None: the start): bodies are moved there, in the arrays.
 

@@ -147,12 +147,7 @@ class Satellites:
     """
 
     def __init__(
-        self,
-        satellites: Sequence[Satellite],
-        brightness: Brightness,
-        v0_e_per_s: float,
-        orbit: Orbit,
-        zero_ns: int,
+        self, satellites: Sequence[Satellite], brightness: Brightness, v0_e_per_s: float, orbit: Orbit, zero_ns: int
     ) -> None:
         own = orbit.number if isinstance(orbit, TleOrbit) else None
         self._v0_e_per_s = v0_e_per_s

@@ -20,7 +20,7 @@ SOLVER = """
 import time
 from pathlib import Path
 def solve(image, tracker):
-    time.sleep(0.4 if Path(__file__).with_name("slow").exists() else 0.05)
+    time.sleep(0.4 if Path(__file__).with_name("slow").exists() else 0.0)
     if int(image.sum()) % 5 == 0:
         raise ValueError(f"not this one: {int(image.sum())}")
     return None if int(image.sum()) % 7 == 0 else [1.0, 0.0, 0.0, 0.0]

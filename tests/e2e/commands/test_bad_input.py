@@ -20,6 +20,7 @@ from hilstar.cli import app
 from hilstar.errors import HilstarError, InputError, one_line
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.commands import assert_refused, bounded_by, run_hilstar_here
+from tests.support.forks import HILSTAR, Started
 from tests.support.full_disk import WITHOUT_BYTECODE, limited_environment
 from tests.support.waiting import PATIENCE_S
 
@@ -291,12 +292,14 @@ def test_whoever_calls_from_python_gets_a_bounded_line_too():
 def test_a_full_stdout_is_one_line(words):
     Path("bench.toml").write_text(BENCH)
     Path("log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
-    with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "hilstar", *words]
-        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S, check=False)
-    assert result.returncode in {1, 2}
-    assert len(result.stderr.splitlines()) == 1, result.stderr
-    assert "stdout" in result.stderr
+    with (
+        Path("/dev/full").open("w") as full,
+        Started([*HILSTAR, *words], stdout=full, stderr=subprocess.PIPE, text=True) as process,
+    ):
+        _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode in {1, 2}
+    assert len(err.splitlines()) == 1, err
+    assert "stdout" in err
 
 
 def limited() -> None:
@@ -327,8 +330,7 @@ def test_a_full_disk_is_one_line(words):
     assert_refused(result, 2, "cannot be written")
 
 
-@pytest.mark.parametrize("module", ["study/models.py", "cli/app.py", "errors.py"])
-@pytest.mark.parametrize("kept", [200, 16])
+@pytest.mark.parametrize(("module", "kept"), [("study/models.py", 200), ("cli/app.py", 16), ("errors.py", 200)])
 def test_a_compiled_module_that_a_full_disk_cut_short_is_named(tmp_path, module, kept):
     """Marshal reads past its end: an EOFError, which click takes for Ctrl-C."""
     source = ROOT / "hilstar" / module

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def read_truth(path):
 def orion(tmp_path_factory):
     """The issue's frame of Orion: FITS, CSV and PNG."""
     folder = tmp_path_factory.mktemp("orion")
-    result = run_hilstar(
+    result = run_hilstar_here(
         "frame", ORION, "--radec", "84.057,-1.200,0", "-o", folder / "o.fits", "--truth", folder / "o.csv",
         "--codes", folder / "o.png", "--json",
     )  # fmt: skip
@@ -209,13 +210,13 @@ NUMPY_OTHER = 1e-3  # of lit pixels, whose light is within rounding of a thresho
 def test_without_opengl_numpy_draws_frame_and_simulate_as_opengl_does(small_bench_file, tmp_path, no_opengl):
     small_bench_file.write_text(SMALL_BENCH + '[render]\nquantisation = "round"\n')
     drawn = {}
-    for name, env in (("gl", None), ("numpy", no_opengl)):
+    for name, run in (("gl", run_hilstar_here), ("numpy", partial(run_hilstar, env=no_opengl))):
         folder = tmp_path / name
         folder.mkdir()
         at = (small_bench_file, "--radec", "84.057,-1.2,0", "--json", "-o", folder / "image.fits")
-        framed = run_hilstar("frame", *at, "--codes", folder / "codes.png", env=env)
+        framed = run("frame", *at, "--codes", folder / "codes.png")
         image = fits.getdata(folder / "image.fits")
-        simulated = run_hilstar("simulate", *at, "--noise", "none", "--rate", "0.1,0.2,0.3", env=env)
+        simulated = run("simulate", *at, "--noise", "none", "--rate", "0.1,0.2,0.3")
         for done in (framed, simulated):
             assert done.returncode == 0, done.stderr
             assert done.stderr.count("\n") == (name == "numpy")  # which says that it is slower, and who helps
@@ -232,8 +233,8 @@ def test_without_opengl_numpy_draws_frame_and_simulate_as_opengl_does(small_benc
 
 def test_without_opengl_verify_measures_the_same(small_bench_file, no_opengl):
     found = {}
-    for name, env in (("gl", None), ("numpy", no_opengl)):
-        done = run_hilstar("verify", small_bench_file, "--fields", "2", "--json", env=env)
+    for name, run in (("gl", run_hilstar_here), ("numpy", partial(run_hilstar, env=no_opengl))):
+        done = run("verify", small_bench_file, "--fields", "2", "--json")
         assert done.returncode == 0, done.stderr
         found[name] = json.loads(done.stdout)
     assert found["numpy"]["gl_renderer"] == "NumPy" != found["gl"]["gl_renderer"]
@@ -273,7 +274,7 @@ def test_doctor_says_what_is_there():
     checks = {check["name"]: check for check in report["checks"]}
     assert {"opengl", "zeromq", "display", "files", "catalogue", "python"} <= set(checks)
     assert "OpenGL" in checks["opengl"]["detail"]
-    plain = run_hilstar("doctor")
+    plain = run_hilstar_here("doctor")
     assert plain.returncode == 0
     assert "opengl" in plain.stdout
 
@@ -284,7 +285,7 @@ def test_replay_writes_the_frames_of_a_log(tmp_path, small_bench_file):
         q = from_radec_roll_deg(84.057 + k, -1.2, 0)
         rows.append(",".join(map(repr, [k * 0.1, *map(float, q)])))
     (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
-    result = run_hilstar(
+    result = run_hilstar_here(
         "replay", small_bench_file, tmp_path / "log.csv", "--headless", "--speed", "max", "-o", tmp_path / "out", "--json"
     )
     assert result.returncode == 0, result.stderr

@@ -19,7 +19,7 @@ from hilstar.monitor.calibration import load_calibration
 from hilstar.scene.psf import GaussianPsf, pixel_share
 from hilstar.twin.budget import budget, zero_point_mag
 from tests.support.benches import ROOT, SMALL_BENCH, bench_text
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 
 EXACT = '[render]\nquantisation = "exact"\n'
 # 1 % noise on one reading: the response of the example comes back within 1 % at nearly every code, 3 % at any.
@@ -79,7 +79,7 @@ def test_budget_writes_its_chart_and_table(tmp_path, small_bench_file):
         assert len(list(csv.DictReader(file))) == len(found["rows"])
     with Image.open(tmp_path / "out" / "budget.png") as picture:
         assert min(picture.size) > 500
-    spoken = run_hilstar("budget", small_bench_file)
+    spoken = run_hilstar_here("budget", small_bench_file)
     assert "shows nothing" in spoken.stdout
 
 
@@ -190,7 +190,7 @@ def test_a_monitor_that_is_30_percent_too_bright_is_found_by_the_tracker(tmp_pat
 
 
 def test_readings_that_disagree_are_said_to(small_bench_file):
-    result = run_hilstar("calibrate", "scale", small_bench_file, "--reading", "26311,1000", "--reading", "26727,3000")
+    result = run_hilstar_here("calibrate", "scale", small_bench_file, "--reading", "26311,1000", "--reading", "26727,3000")
     assert result.returncode == 0
     assert "disagree" in result.stderr
 
@@ -248,7 +248,7 @@ def test_the_commands_and_the_figures_of_the_calibration_page_are_true(tmp_path)
     """Its two commands as they stand, in turn; the plan is filled in as the page says."""
     page = (ROOT / "configs" / "CALIBRATION.md").read_text()
     plan, fit = (line.split("  ")[0] for line in re.findall(r"(?m)^    hilstar (.*)", page))
-    planned = run_hilstar(*plan.split(), cwd=tmp_path)
+    planned = run_hilstar_here(*plan.split(), cwd=tmp_path)
     assert planned.returncode == 0, planned.stderr
     codes, patches = re.search(r"(\d+) codes, in (\d+) patches", page).groups()
     assert planned.stdout.startswith(f"{patches} patches of {codes} codes in PLAN.csv")
@@ -258,7 +258,7 @@ def test_the_commands_and_the_figures_of_the_calibration_page_are_true(tmp_path)
         rows = list(csv.DictReader(file))
     lines = [f"{row['order']},{row['code']},w,{float(true.black + true.light[int(row['code'])])!r}" for row in rows]
     (tmp_path / "MEASURED.csv").write_text("\n".join(["order,code,channel,value", *lines]))
-    fitted = run_hilstar(*fit.split(), cwd=tmp_path)
+    fitted = run_hilstar_here(*fit.split(), cwd=tmp_path)
     assert fitted.returncode == 0, fitted.stderr
 
 

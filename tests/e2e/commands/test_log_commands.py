@@ -92,8 +92,8 @@ def test_convert_says_what_it_cannot(tmp_path, log):
 
 def test_fault_options_stand_alone_or_take_a_share(tmp_path):
     for options, said in ((["--lose", "110%"], "--lose 110%"), (["--corrupt", "60%", "--lose", "60%"], "100 %")):
-        assert_refused(run_hilstar("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", *options), 2, said)
-    result = run_hilstar(
+        assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", *options), 2, said)
+    result = run_hilstar_here(
         "send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", "--rate", "5000", "--count", "4000", "--wait", "0",
         "--json", "--reorder", "--corrupt", "--lose", "0.1",
     )  # fmt: skip

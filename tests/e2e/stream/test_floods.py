@@ -123,7 +123,7 @@ sender = zmq.Context().socket(zmq.PUB)
 sender.setsockopt(zmq.LINGER, 0)
 sender.connect("tcp://127.0.0.1:PORT")
 time.sleep(0.5)
-end = time.monotonic() + 4
+end = time.monotonic() + 2
 k = 0
 while time.monotonic() < end:
     body = packet(k, time.monotonic_ns())
@@ -135,7 +135,7 @@ while time.monotonic() < end:
     with bound(tmp_path, "--ledger", str(ledger)) as served, CoreWaits(served.process.pid) as waited:
         subprocess.run([sys.executable, "-c", flood.replace("PORT", str(served.port))], check=True, timeout=PATIENCE_S)
         summary = served.summary()
-    assert summary["link"]["flooded"] > 10_000
+    assert summary["link"]["flooded"] > 5_000
     assert 1 <= summary["events"]["flood"] <= 3
     assert 0 < summary["packets"]["received"] < MAX_BURST + MAX_PACKETS_PER_S * summary["duration_s"]
     assert summary["frames"] > 5 * (summary["missed_frames"] - missed_in(waited.s)), (summary, waited.s)

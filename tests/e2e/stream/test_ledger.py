@@ -20,7 +20,7 @@ from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.run.record.ledger_records import drawable_frames
 from hilstar.units import NS_PER_S
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.full_disk import limited_environment
 from tests.support.pages import page_of
 from tests.support.senders import await_subscriber, connected, packet, publisher, talking
@@ -118,11 +118,11 @@ def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
     ledger, _ = served(tmp_path)
     samples = read_log(ledger)
     assert len(samples) == 100
-    converted = run_hilstar("convert", ledger, tmp_path / "run.csv")
+    converted = run_hilstar_here("convert", ledger, tmp_path / "run.csv")
     assert "100 attitudes" in converted.stdout
-    replayed = run_hilstar("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json")
+    replayed = run_hilstar_here("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json")
     assert json.loads(replayed.stdout)["frames"] == len(list(drawable_frames(ledger)))
-    refused = run_hilstar("replay", tmp_path / "serve.toml", ledger, "--headless", "--step", "1")
+    refused = run_hilstar_here("replay", tmp_path / "serve.toml", ledger, "--headless", "--step", "1")
     assert_refused(refused, 2, "run.mcap", "--step")
 
 
@@ -253,7 +253,7 @@ def test_a_flood_of_wrong_packets_is_counted_and_the_ledger_stays_small(tmp_path
     assert counted + len(found["/attitude"]) == summary["packets"]["received"] > 1000
     assert summary["ledger"]["unrecorded"] == 0
     assert ledger.stat().st_size < 1_000_000
-    report = json.loads(run_hilstar("report", ledger, "-o", tmp_path / "report", "--json").stdout)
+    report = json.loads(run_hilstar_here("report", ledger, "-o", tmp_path / "report", "--json").stdout)
     assert sum(report["packets"].values()) == summary["packets"]["received"]
 
 

@@ -26,7 +26,7 @@ from hilstar.run.send_log import BadCable, Faults, send, spin_samples
 from hilstar.run.sender import SerialSender
 from hilstar.run.serve import serve
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.live_runs import attitudes, median_age_ns, serve_until
 from tests.support.senders import packet
 from tests.support.servers import interrupted, listening, summary_of, until_said
@@ -55,7 +55,7 @@ def bench_file(tmp_path, cable):
 
 
 def sent(cable, *options: str) -> dict:
-    result = run_hilstar("send", "--to", f"serial:{cable.sender}@{BAUD}", "--json", *options)
+    result = run_hilstar_here("send", "--to", f"serial:{cable.sender}@{BAUD}", "--json", *options)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 

@@ -26,11 +26,11 @@ from hilstar.run.send_log import BadCable, Faults, send, spin_samples
 from hilstar.run.sender import UdpSender
 from hilstar.run.serve import Outlet, Running
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
 from tests.support.live_runs import attitudes, serve_until
 from tests.support.senders import free_port, packet
-from tests.support.servers import Run, Served, interrupted, listening
+from tests.support.servers import Run, Served, interrupted, listening, until_said
 from tests.support.waiting import PATIENCE_S, wait_for
 
 START_DEG = (84.057, -1.2, 0.0)
@@ -48,7 +48,7 @@ def bench_of(folder: Path, *lines: str) -> Path:
 
 
 def sent(to: str, *options: str) -> dict:
-    result = run_hilstar("send", "--to", to, "--json", *options)
+    result = run_hilstar_here("send", "--to", to, "--json", *options)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 
@@ -225,17 +225,22 @@ def unread_bytes(port: int) -> int:
 
 def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     port = free_port()
-    flood = "import socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1', int(sys.argv[1])))\n"
-    flood += "end = time.time() + 1\nwhile time.time() < end: s.send(b'?' * 64)"
+    # For a second, and until stdin closes: a machine without a free core takes longer to send more than may come.
+    flood = "import select, socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1', int(sys.argv[1])))\n"
+    flood += "end = time.time() + 1\n"
+    flood += "while time.time() < end or not select.select([0], [], [], 0)[0]: [s.send(b'?' * 64) for _ in range(500)]"
     with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
-        subprocess.run([sys.executable, "-c", flood, str(port)], check=True, timeout=PATIENCE_S)
+        process.shows()
+        with subprocess.Popen([sys.executable, "-c", flood, str(port)], stdin=subprocess.PIPE) as sender:
+            until_said(process, "packets per second")
+            sender.communicate(timeout=PATIENCE_S)
         wait_for(lambda: unread_bytes(port) == 0, "the flood is read")
         assert sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "100", "--count", "20")["sent"] == 20
         process.has_accepted(20)
         summary = interrupted(process)
     assert summary["packets"]["accepted"] == 20
-    assert summary["events"]["flood"] == 1
-    assert summary["link"]["flooded"] > 1000
+    assert 1 <= summary["events"]["flood"] <= 3  # one, and more where the sender stood still for a second
+    assert summary["link"]["flooded"] > 500
     assert summary["frames"] + summary["missed_frames"] >= 60
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar_here
 from tests.support.planted_run import write_telemetry
 from tests.support.planted_tracker import Sizes, plant, scan
 
@@ -22,9 +22,9 @@ def test_a_replayed_log_and_its_trackers_answers_give_the_budget(tmp_path: Path)
     telemetry = write_telemetry(tmp_path / "telemetry.csv", planted.tau_s, planted.reported, start_s=100.0)
     bench.write_text(LIVE_BENCH)
     words = ("--headless", "--speed", "max", "--step", "0.1", "--ledger", ledger)
-    replay = run_hilstar("replay", bench, log, *words)
+    replay = run_hilstar_here("replay", bench, log, *words)
     assert replay.returncode == 0, replay.stderr
-    run = run_hilstar("assess", ledger, telemetry, "-o", tmp_path / "out", "--json", "--display-attitudes", "2")
+    run = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "out", "--json", "--display-attitudes", "2")
     assert run.returncode == 0, run.stderr
     found = json.loads(run.stdout)
     assert found["noise_arcsec"]["cross"] == pytest.approx(1.0, rel=0.1)

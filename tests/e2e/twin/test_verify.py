@@ -16,7 +16,7 @@ from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, srgb_response, table_response
 from hilstar.twin.verify.twin import Twin
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 
 BENCH = bench_text(TWIN)
 FIELDS = "6"
@@ -164,7 +164,7 @@ def test_a_missing_black_level_is_caught(tmp_path):
 def test_a_bench_that_does_not_pass_is_still_a_command_that_is_done(tmp_path):
     path = tmp_path / "bench.toml"
     path.write_text(BENCH + "[verify]\ncentroid_px = 1e-4\n")
-    result = run_hilstar("verify", path, "--fields", "1")
+    result = run_hilstar_here("verify", path, "--fields", "1")
     assert result.returncode == 0
     assert "NOT passed" in result.stdout
 

@@ -82,7 +82,7 @@ def skies(frames):
     return np.stack([tiles(linear_image(sprites, SIZE, GaussianPsf(SIGMA))) for sprites in frames])
 
 
-@pytest.mark.parametrize("name", ["srgb", "gamma2.2", "lcd-example"])
+@pytest.mark.parametrize("name", ["srgb", "lcd-example"])  # gamma 2.2: the slow star below
 def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(name):
     """Six magnitudes under white on 8 bits; `lcd-example` has a black level of a thousandth."""
     panel = Panel(load_calibration(name, 8).response, WHITE)

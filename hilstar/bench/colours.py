@@ -77,13 +77,9 @@ class Lateral:
         weight = LATERAL_WEIGHT * MEAN_WEIGHT * float(np.square(density @ nm - (density @ nm).mean()).sum()) / spread
         return cls(psf.wavelengths_nm, px, by_primary, np.zeros(px.shape[1]), weight)
 
-    def curves(self, nm: FloatArray) -> FloatArray:
-        """What moves light of wavelengths (n,), (k, n), none of it below 0: a part of all light is `lifted` off it again."""
-        return np.asarray((NodeSpline(self.nm)(nm) @ self.px).T + self.lifted[:, None])
-
     @property
     def lifted(self) -> FloatArray:
-        """By how much `curves` lie over the lens's own, px (k,)."""
+        """By how much the curves that are asked of stars lie over the lens's own, px (k,): none of them may be below 0."""
         return np.asarray(2 * np.abs(self.px).max(axis=0))  # a spline passes its nodes by less
 
 
@@ -220,7 +216,7 @@ class Colours:
 
         The colour is blue's electrons over red's, or the mean wavelength.
         """
-        found = [np.interp(_index(one), self._scale, SCALE_K) for one in (self.shown(shares), wanted)]
+        found = [np.interp(warmth(one), self._scale, SCALE_K) for one in (self.shown(shares), wanted)]
         return np.asarray(found[0] / found[1])
 
     def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
@@ -265,7 +261,7 @@ class Colours:
         return replace(sprites, primaries=light, lights=self._kept[1])
 
 
-def _index(colour: FloatArray) -> FloatArray:
+def warmth(colour: FloatArray) -> FloatArray:
     """A number that rises with temperature, of shares of channels (n, 3) or means (n, 1 or more)."""
     if colour.shape[1] != len(PRIMARIES):
         return -colour[:, 0]
@@ -312,7 +308,7 @@ def mixed_for(
     knots = np.unique(np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm]))
     lateral = Lateral.of(psf, nm, density) if isinstance(psf, GlassPsf) else None
     weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, one) for one in above)]
-    weights += [] if lateral is None else [*lateral.curves(knots)]
+    weights += [] if lateral is None else [*(NodeSpline(lateral.nm)(knots) @ lateral.px + lateral.lifted).T]
     curves = tuple(rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * one))) for one in weights)
     return Colours(matrix, places, nm, density, gram, curves, kinds, _scale(channels, False), lateral)
 
@@ -325,4 +321,4 @@ def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:
         nm, weight = integration_nodes(*curves)
         photons = blackbody_exitance_w_m2_m(nm, SCALE_K[:, None]) * nm * curves[0](nm) * curves[1](nm) * weight
         found.append(photons.sum(axis=1) if by_channel else photons @ nm / photons.sum(axis=1))
-    return np.maximum.accumulate(_index(np.stack(found, axis=1)))
+    return np.maximum.accumulate(warmth(np.stack(found, axis=1)))

@@ -21,7 +21,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.build import StarGlass, bench_channels, bench_colours, bench_optics, bench_stars, named_channels, open_bench
 from hilstar.bench.cameras import tracker_psf
-from hilstar.bench.colours import Colours
+from hilstar.bench.colours import Colours, warmth
 from hilstar.bench.config.hardware import TrackerOptics
 from hilstar.bench.frame import Bench
 from hilstar.charts import BLUE, GREEN, MUTED, ORANGE, chart, write_csv
@@ -138,16 +138,8 @@ def subtypes_by(channels: Mapping[str, Optics]) -> Callable[[FloatArray], FloatA
     seen = np.array([one.quantum_efficiency(nm) * one.transmission(nm) * nm for one in channels.values()])
     light = library.flux[order] @ seen.T
     colour = light if len(seen) > 1 else library.flux[order] @ (seen * nm).T / light
-    index = np.maximum.accumulate(redness(colour))
-    return lambda wanted: np.asarray(np.interp(redness(wanted), index, kinds[order, 0]))
-
-
-def redness(colour: FloatArray) -> FloatArray:
-    """A number that rises with a colour's red (n,)."""
-    if colour.shape[1] == 1:
-        return colour[:, 0]
-    tiny = np.finfo(np.float64).tiny
-    return np.asarray(np.log(np.maximum(colour[:, 0], tiny) / np.maximum(colour[:, -1], tiny)))
+    index = np.maximum.accumulate(-warmth(colour))
+    return lambda wanted: np.asarray(np.interp(-warmth(wanted), index, kinds[order, 0]))
 
 
 def colours_of(file: BenchFile, stars: Stars) -> Colours:

@@ -68,31 +68,19 @@ NOISE_DTYPE = np.dtype(
 Table = npt.NDArray[np.void]
 
 
-@dataclass(frozen=True, slots=True)
-class Mosaic:
-    """What pixels of red, green and blue (3,) have of a star's electrons, and of the mean pixel's background."""
-
-    star: FloatArray
-    sky: FloatArray
-
-    def pixels(self, bayer: str, height: int, width: int) -> FloatArray:
-        """Both in an image of pixels (2, height, width)."""
-        even = np.ones((height, width))
-        return np.array([in_pixels([even * one for one in each], bayer) for each in (self.star, self.sky)])
-
-    def only(self, channel: int) -> "Mosaic":
-        """The same of a star that one channel alone sees."""
-        return Mosaic(self.star * (np.arange(len(CHANNELS)) == channel), self.sky)
+def in_mosaic(mosaic: FloatArray, bayer: str, shape: tuple[int, int]) -> FloatArray:
+    """What pixels (2, h, w) have of a star and of the mean pixel's background, by those of red, green and blue (2, 3)."""
+    return np.array([in_pixels([np.full(shape, one) for one in each], bayer) for each in mosaic])
 
 
 class NoisyStar:
     """A tracker's star at a grid of places within a pixel: its shares of light, their slopes, and the detector's noise.
 
-    Of a `mosaic` within its four pixels, of light of one colour.
+    Of a `mosaic` (see `in_mosaic`) within its four pixels, of light of one colour.
     """
 
     def __init__(
-        self, psf: Psf, detector: DetectorSettings, exposure_s: float, phases: int = PHASES, mosaic: Mosaic | None = None
+        self, psf: Psf, detector: DetectorSettings, exposure_s: float, phases: int = PHASES, mosaic: FloatArray | None = None
     ) -> None:
         self.psf, self.detector, self.exposure_s, self.mosaic = psf, detector, exposure_s, mosaic
         self.side_px = max(psf.footprint_px | 1, 7)
@@ -118,7 +106,7 @@ class NoisyStar:
         if self.mosaic is None or self.detector.bayer is None:
             return np.ones((2, 1, 1, 1))
         side = self.side_px
-        whole = self.mosaic.pixels(self.detector.bayer, side + 1, side + 1)
+        whole = in_mosaic(self.mosaic, self.detector.bayer, (side + 1, side + 1))
         return np.stack([whole[:, y : y + side, x : x + side] for y in (0, 1) for x in (0, 1)], axis=1)
 
     def stamps(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
@@ -235,7 +223,7 @@ def measured_px(star: NoisyStar, star_e: float, sky_e: float, finder: CentroidSe
     )
     bayer, superpixel = star.detector.bayer, star.detector.takes_superpixels
     if star.mosaic is not None and bayer is not None:
-        seen, sky = star.mosaic.pixels(bayer, *shape)
+        seen, sky = in_mosaic(star.mosaic, bayer, shape)
         light_e, under_e = light_e * seen, sky_e * sky
     dn = device.expose(light_e + under_e, star.exposure_s, rng)
     noise = star.detector.noise(sky_e, star.exposure_s)
@@ -315,8 +303,8 @@ def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -
     if bayer is not None:
         of_star = star_flux(file.config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]
         levels = [np.mean([sky_e[part].mean() for part in of_colour(bayer, one)]) for one in CHANNELS]
-        mosaic = Mosaic(of_star / of_star.sum(), np.array(levels) / (sky_e.mean() or 1.0))
-        mosaic = mosaic if channel is None else mosaic.only(channel)
+        mosaic = np.array([of_star / of_star.sum(), np.array(levels) / (sky_e.mean() or 1.0)])
+        mosaic[0, [k for k in range(len(CHANNELS)) if channel not in (None, k)]] = 0.0
     return NoisyStar(tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s, mosaic=mosaic)
 
 
@@ -356,7 +344,7 @@ def noise_budget(
     reached = {f"{kind}_px": one for kind, one in zip(FAMILY, measured, strict=True)}
     channels = {}
     if star.mosaic is not None:
-        for number, (name, share, sky) in enumerate(zip(CHANNELS, star.mosaic.star, star.mosaic.sky, strict=True)):
+        for number, (name, share, sky) in enumerate(zip(CHANNELS, *star.mosaic, strict=True)):
             alone = noisy_star(file, sky_e, number).noise(all_e[shown], under_e[shown], finder)
             reached[f"snr_{name}"] = alone["snr"]
             channels[name] = {"star_share": float(share), "background_e_per_px": float(sky * middle_e)}

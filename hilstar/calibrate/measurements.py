@@ -185,9 +185,9 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
     code, place, count = np.unique(measured.code[chosen], return_inverse=True, return_counts=True)
     mean = np.asarray(np.bincount(place, value) / count, dtype=np.float64)
     squares = np.asarray(np.bincount(place, (value - mean[place]) ** 2), dtype=np.float64)
-    # The relative noise of the bright half, where the instrument's floor is negligible; of all levels if too few repeat.
+    # The relative noise of the bright half, where the instrument's floor is negligible; of all but black if too few repeat.
     relative = math.nan
-    for part in (mean > 0, mean > np.median(mean)):
+    for part in ((mean > 0) & (code > 0), mean > np.median(mean)):
         dof = int((count[part] - 1).sum())
         if dof >= BRIGHT_DOF:
             relative = max(math.sqrt(float((squares[part] / mean[part] ** 2).sum()) / dof), NOISE_FLOOR)

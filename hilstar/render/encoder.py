@@ -101,8 +101,8 @@ class Planes:
     @property
     def lit(self) -> Panel:
         """A grey panel whose first level takes as little light as that of any plane."""
-        first = min(self.panels, key=lambda one: float(one.response.threshold[0]))
-        return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / self.share[self.panels.index(first)])
+        first, share = min(zip(self.panels, self.share, strict=True), key=lambda one: float(one[0].response.threshold[0]))
+        return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / share)
 
     def packed(self, sprites: Sprites) -> Sprites:
         """Sprites with `dtype`; their rate is then that of the white that they need for the primary that needs most."""

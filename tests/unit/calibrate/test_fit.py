@@ -214,6 +214,18 @@ def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
     assert len(calibration.response.light) == 1786
 
 
+def test_the_scatter_of_a_black_without_light_is_no_relative_noise(tmp_path, rng):
+    """As first light reads an OLED: too few repeats of bright levels, and black is its own noise."""
+    times = {0: 5, 2: 2, 5: 2, 13: 2, 25: 2, 44: 1, 71: 1, 90: 1, 111: 1, 127: 3, 169: 1, 255: 4}
+    codes = [code for code, count in times.items() for _ in range(count)]
+    rows = [
+        (code, "w", 1e5 * (code / 255) ** 2.2 * (1 + 0.003 * rng.standard_normal()) + 0.2 * rng.standard_normal())
+        for code in codes
+    ]
+    path = write(tmp_path / "m.csv", [(code, channel, abs(value)) for code, channel, value in rows])
+    assert calibrate_photometric(path, tmp_path / "monitor.toml")["noise_relative"] < 0.1
+
+
 def test_a_drawing_says_what_it_shows(tmp_path, rng):
     path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
     finding = draw_calibration(path, tmp_path / "m.png")

@@ -308,6 +308,12 @@ class LevelTexture:
         return self._levels
 
 
+def write(buffer: moderngl.Buffer, values: npt.NDArray[Any]) -> None:
+    """Give a buffer these values and no others; it grows by doubling."""
+    buffer.orphan(2 * values.nbytes if buffer.size < values.nbytes else buffer.size)
+    buffer.write(values)
+
+
 class LookupTable:
     """Values (n,) of four bytes that a shader looks up: in a uniform block where there is room, else in a storage buffer."""
 
@@ -326,12 +332,8 @@ class LookupTable:
 
 
 def joined(tables: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], list[int]]:
-    """The tables of all planes end to end, and where each begins; several that are alike are one."""
-    begins, parts, size = [], dict[bytes, int](), 0
-    for one in tables:
-        begins.append(parts.setdefault(one.tobytes(), size))
-        size = max(size, begins[-1] + len(one))
-    return np.concatenate([one for k, one in enumerate(tables) if begins.index(begins[k]) == k]), begins
+    """The tables of all planes end to end, and where each begins."""
+    return np.concatenate(tables), [0, *np.cumsum([len(one) for one in tables])[:-1].tolist()]
 
 
 def level_steps(edges: Sequence[Float32Array]) -> tuple[npt.NDArray[Any], list[tuple[int, int, int, int]]] | None:

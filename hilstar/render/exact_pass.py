@@ -16,7 +16,7 @@ from hilstar.monitor.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left
 from hilstar.monitor.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.render.backend import Target, Turn
-from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, linear_format
+from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, linear_format, write
 from hilstar.render.star_passes import StarPasses, turns_of
 from hilstar.scene.psf import PIXEL_VARIANCE
 from hilstar.scene.sprites import Sprites
@@ -50,7 +50,7 @@ class ExactPass:
         linear: moderngl.Texture,
         levels: LevelTexture,
         shares: Shares,
-        left: "StarSums | None",
+        left: moderngl.Buffer | None,
     ) -> None:
         ctx = self._ctx = linear.ctx
         self.plane, self._makes_up, self._kept = turn
@@ -68,7 +68,7 @@ class ExactPass:
         self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
         self._memory = Memory(ctx) if quantiser.remembers else None
         self._step_e_per_s = float(light[1])
-        self._turns: moderngl.Buffer | None = None
+        self._turns = ctx.buffer(reserve=4, dynamic=True)
         self._quantiser, self._panel, self._balance = quantiser, panel, balance
         self._programs: dict[tuple[bool, bool], moderngl.ComputeShader] = {}
 
@@ -136,26 +136,22 @@ class ExactPass:
 
     def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
-        paths, star, alone = sprites.per_star > 1, sprites.star, 0
+        paths, ordered = sprites.per_star > 1, passes is not None and self._planes.apart
         program = self._program(paths, passes is not None)
-        if passes is not None and self._planes.apart and not paths:
-            count, alone = len(sprites), passes.bind_order(TURNS_BINDING)
-        else:
-            turns = stretches_of(star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
-            count, data = len(turns), turns.astype(np.int32).tobytes()
-            if self._turns is None or self._turns.size < len(data):
-                if self._turns is not None:
-                    self._turns.release()
-                self._turns = self._ctx.buffer(reserve=2 * len(data), dynamic=True)
-            self._turns.orphan()
-            self._turns.write(data)
+        count, alone = len(sprites), passes.bind_order(TURNS_BINDING) if passes is not None and ordered else 0
+        if paths or not ordered:
+            turns = stretches_of(sprites.star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
+            write(self._turns, turns.astype(np.int32))
             self._turns.bind_to_storage_buffer(TURNS_BINDING)
+            count = len(turns)
         if self._memory is not None and paths:
-            self._memory.bind(star[turns[:, 0]], turns[:, 0] != turns[:, 2])
+            self._memory.bind(sprites.star[turns[:, 0]], turns[:, 0] != turns[:, 2])
         elif self._memory is not None:
-            self._memory.bind(star, np.zeros(count, dtype=np.bool_))
+            self._memory.bind(sprites.star, np.zeros(count, dtype=np.bool_))
         elif self._together is not None:
-            self._together.bind(count * len(self._planes.panels))
+            if self._together.size < (size := count * len(self._planes.panels) * SUMS_BYTES):
+                self._together.orphan(2 * size)
+            self._together.bind_to_storage_buffer(FIRST_BINDING + 2)
         buffer.bind_to_storage_buffer(0)
         self._order.bind()
         self._light.bind()
@@ -171,19 +167,6 @@ class ExactPass:
             program["alone"] = alone
         program.run(-(-count // LOCAL_SIZE))
         self._ctx.memory_barrier()
-
-
-class StarSums:
-    """Room for what the stars of a frame leave in each plane; it lives in its renderer's context."""
-
-    def __init__(self, ctx: moderngl.Context) -> None:
-        self._buffer = ctx.buffer(reserve=SUMS_BYTES, dynamic=True)
-
-    def bind(self, count: int) -> None:
-        """Bind it for a pass, with room for `count` stars; what it has stays where there was room before."""
-        if self._buffer.size < count * SUMS_BYTES:
-            self._buffer.orphan(2 * count * SUMS_BYTES)
-        self._buffer.bind_to_storage_buffer(FIRST_BINDING + 2)
 
 
 class Memory:

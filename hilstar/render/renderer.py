@@ -33,7 +33,7 @@ from hilstar.render.encoder import (
     splat_program,
     sprites_array,
 )
-from hilstar.render.exact_pass import ExactPass, StarSums
+from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
 from hilstar.render.host_image import HostImage
 from hilstar.render.presenter import Presenter, changed_codes
@@ -125,7 +125,7 @@ class Renderer(Backend):
         self._levels = LevelTexture(self._ctx, target.resolution_px, planes)
         by_star, ctx = self._by_star, self._ctx
         if by_star is not None and by_star.takes(target.psf, ctx.version_code):
-            left = StarSums(ctx) if planes.apart and not by_star.remembers else None
+            left = ctx.buffer(reserve=4, dynamic=True) if planes.apart and not by_star.remembers else None
             chosen = partial(ExactPass, by_star, target, planes, linear=self._linear, levels=self._levels, shares=self._shares)
             self._exact_passes = [chosen(turn, left=left) for turn in target.in_turn()]
         if by_star is None or self._exact_passes:

@@ -14,7 +14,7 @@ from hilstar.monitor.footprints import PixelOrder
 from hilstar.monitor.quantise import RoundQuantiser
 from hilstar.render.backend import SpriteSides
 from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES
-from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, level_steps
+from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, level_steps, write
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
@@ -168,12 +168,7 @@ class StarPasses:
 
     def upload(self, sprites: Sprites) -> None:
         """Take the sprites that `add_light` and `encode` are about."""
-        size = sprites.data.nbytes
-        if self.sprites.size < size:
-            self.sprites.release()
-            self.sprites = self._ctx.buffer(reserve=2 * size, dynamic=True)
-        self.sprites.orphan()
-        self.sprites.write(sprites.data)
+        write(self.sprites, sprites.data)
         self._drawn = len(sprites)
         reach_per_e = self._units.reach_per_e(sprites)
         for program in self._programs:
@@ -191,9 +186,7 @@ class StarPasses:
         order = turns_of(rates, self._units.lit_e_per_s)
         last = crowded[order]
         order = np.concatenate([order[~last], order[last]]).astype(np.int32)
-        if self._order.size < order.nbytes:
-            self._order.orphan(2 * order.nbytes)
-        self._order.write(order)
+        write(self._order, order)
         self._alone = len(order) - int(np.count_nonzero(last))
         for program in self._programs:
             program["alone"], program["reach_of_alone_per_e"] = self._alone, self._units.reach_per_e(sprites, alone=True)

@@ -124,8 +124,9 @@ bool is_alone;
 float asked_of(ivec2 at, float own) {
     if (!on_image(at)) return -1.0;
 #ifdef SUMS
-    float drawn = 0.0;
-    if (!is_alone) drawn = float(sums[PLANES * (at.y * resolution_px.x + at.x) + PLANE]) * unit_e_per_s[PLANE];
+    int units = int(own / unit_e_per_s[PLANE] + 0.5);
+    if (!is_alone) units = sums[PLANES * (at.y * resolution_px.x + at.x) + PLANE];
+    float drawn = float(units) * unit_e_per_s[PLANE];
 #else
     float drawn = imageLoad(linear_e_per_s, at)[PLANE];
 #endif

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hilstar.bench.build import load
+from hilstar.monitor.quantise import Panel
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.notices import Notices
@@ -101,6 +102,20 @@ def shrunk(sigma_px) -> tuple[SpriteSide, ...]:
 def test_both_ways_choose_the_same_codes(quantisation, response, sigma_px, count, per_star, rng, monkeypatch):
     frames = [stars(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
     assert_same(*both_ways(Target(SIZE, GaussianPsf(sigma_px), response, WHITE, quantisation), frames, monkeypatch))
+
+
+@pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
+def test_so_they_do_of_three_primaries_beside_each_other(quantisation, rng, monkeypatch):
+    """Star by star those that stand alone are drawn without sums."""
+    panels = tuple(Panel(SRGB8, WHITE * share) for share in (0.3, 0.5, 0.2))
+    places_px = np.array([(-0.3, 0), (0, 0.2), (0.3, 0)])
+    target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation, primaries=panels)
+    target = replace(target, places_px=places_px, together=0.4 + 0.6 * np.eye(3))
+    frames = [stars(count, USUAL, rng) for count in (30, 300)]
+    for k, one in enumerate(frames):
+        light = one.data["electrons_per_s"][:, None] * rng.dirichlet([1, 1, 1], len(one))
+        frames[k] = replace(one, primaries=light.astype(np.float32))
+    assert_same(*both_ways(target, frames, monkeypatch))
 
 
 @pytest.mark.parametrize("quantisation", ["round", "exact"])

@@ -1,7 +1,6 @@
 """certificate.json: how sure a bench is, as `hilstar certify` states it and `serve`, `assess` and requirements read it."""
 
 import datetime
-import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -158,8 +157,3 @@ def certificate_number(file: BenchFile) -> str:
     """The number of a bench's certificate, "" without one. Raises InputError."""
     found = bench_certificate(file)
     return "" if found is None else found.number
-
-
-def sha256_of_bytes(data: bytes) -> str:
-    """A SHA-256 in hexadecimal digits."""
-    return hashlib.sha256(data).hexdigest()

@@ -138,7 +138,9 @@ def _judged(require: Require, figure: _Figure, bench_arcsec: tuple[float, float]
     own = 0.0  # what of the error the bench could have made, or hidden
     if bench_arcsec is not None and require.of_axis and maximum:
         own = bench_arcsec[1 if AXIS_INDICES[require.axis or "cross"] == [2] else 0]
-        figure = replace(figure, method=f"{figure.method}; {own:.2g} arcsec taken off for the bench")
+        share = f"{100 * min(own / figure.value, 1.0):.0f} %" if figure.value > 0 else "all"
+        told = f"{own:.2g} arcsec taken off for the bench, which could have made {share} of it"
+        figure = replace(figure, method=f"{figure.method}; {told}")
     met = figure.high <= limit - own if maximum else figure.low >= limit
     missed = figure.low > limit + own if maximum else figure.high < limit
     verdict = MET if met else NOT_MET if missed else NOT_SHOWN

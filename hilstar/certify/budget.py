@@ -22,6 +22,7 @@ STEP = 1e-3  # of a standardised variable, for slopes
 BATCH = 5000
 DIFFER = 0.05  # relative to the expanded uncertainty: both ways are shown where an end of the interval differs by more
 SMALLEST = 1e-12
+FEW_DOF, FEW_SHARE = 10.0, 0.01  # a Student's t of few degrees of freedom shows from one per cent of the variance on
 MAX_DOF = 1e6
 
 
@@ -131,6 +132,7 @@ def why_they_differ(combined: Combined, drawn: Drawn, inputs: list[Input], numbe
         return "the model is not linear over the inputs' range: its interval is not even about the value"
     if largest.distribution in ("rectangular", "triangular") and share.max() > 0.5:
         return f"the largest input ({largest.name}) is {largest.distribution}, whose tails are short"
-    if combined.dof[number] < 10:
-        return "few readings: Welch-Satterthwaite's freedom is an approximation"
+    few = [each.name for each, part in zip(inputs, share, strict=True) if each.dof < FEW_DOF and part > FEW_SHARE]
+    if few:
+        return f"few readings ({', '.join(few)}): Welch-Satterthwaite's freedom is an approximation"
     return "the model is not linear over the inputs' range"

@@ -10,7 +10,7 @@ import numpy as np
 
 import hilstar
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.certificate import KIND, ByTrials, Certificate, CertifiedFigure, Contribution, InputRow, sha256_of_bytes
+from hilstar.bench.certificate import KIND, ByTrials, Certificate, CertifiedFigure, Contribution, InputRow
 from hilstar.bench.config import CertifySettings
 from hilstar.bench.measured_on import measured_on
 from hilstar.certify.assembly import Assembled, assemble, read_bench
@@ -19,7 +19,7 @@ from hilstar.certify.check import take_check
 from hilstar.certify.model import THIRDS, true_deviations
 from hilstar.certify.readings import Reader
 from hilstar.monitor.calibration import BUILT_IN
-from hilstar.monitor.identity import MonitorIdentity
+from hilstar.monitor.identity import MonitorIdentity, sha256_of
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
 
 MAX_TRIALS, QUICK_TRIALS = 200_000, 10_000
@@ -85,7 +85,7 @@ def certify(
     settings_of = msgspec.to_builtins(config.collimator) | {"file": config.collimator.geometry}
     found = Certificate(
         kind=KIND,
-        number=f"H{made[:10].replace('-', '')}-{sha256_of_bytes(core)[:8]}",
+        number=f"H{made[:10].replace('-', '')}-{sha256_of(core)[:8]}",
         made=made,
         valid_until=(now.astimezone(datetime.UTC).date() + datetime.timedelta(days=settings.valid_days)).isoformat(),
         hilstar=hilstar.__version__,
@@ -118,7 +118,7 @@ def certify(
         figures=figures,
         not_assessed=[*budget.not_assessed, *_never_assessed(settings)],
         measurands=MEASURANDS,
-        reference_sha256=None if reference is None else sha256_of_bytes(reference),
+        reference_sha256=None if reference is None else sha256_of(reference),
         replaces=replaces,
     )
     return found, reference
@@ -201,7 +201,7 @@ def _rounded(value: float) -> float:
 
 def files_of(file: BenchFile) -> dict[str, str]:
     """The SHA-256 of a bench file and of each file that it names, by name."""
-    config, found = file.config, {file.path.name: sha256_of_bytes(file.text.encode())}
+    config, found = file.config, {file.path.name: sha256_of(file.text.encode())}
     named: list[str | float | None] = [
         config.monitor.calibration,
         config.collimator.geometry,
@@ -213,12 +213,12 @@ def files_of(file: BenchFile) -> dict[str, str]:
         if not isinstance(name, str) or name in BUILT_IN or not (file.folder / name).is_file():
             continue
         path = file.folder / name
-        found[name] = sha256_of_bytes(read_bytes(path, "", MAX_FILE_BYTES))
+        found[name] = sha256_of(read_bytes(path, "", MAX_FILE_BYTES))
         if path.suffix == ".toml":
             table = parse_toml(path, read_text(path, "", MAX_TOML_BYTES))
             for inner in (table.get("calibration", {}).get("response"), table.get("uniformity", {}).get("file")):
                 if isinstance(inner, str) and (path.parent / inner).is_file():
-                    found[str(Path(name).parent / inner)] = sha256_of_bytes(read_bytes(path.parent / inner, "", MAX_FILE_BYTES))
+                    found[str(Path(name).parent / inner)] = sha256_of(read_bytes(path.parent / inner, "", MAX_FILE_BYTES))
     return found
 
 

@@ -92,10 +92,11 @@ def _certify(
     warm_up: float,
     as_json: bool,
 ) -> None:
-    from hilstar.bench.certificate import read_certificate, sha256_of_bytes
+    from hilstar.bench.certificate import read_certificate
     from hilstar.certify.certificate import certify as certified
     from hilstar.certify.check import largest_changes, watch
     from hilstar.certify.page import text_lines, write_certificate_page
+    from hilstar.monitor.identity import sha256_of
 
     path, replaces = output / CERTIFICATE, None
     if exists(path):
@@ -110,7 +111,7 @@ def _certify(
     checked = largest_changes(output)
     found, reference = certified(file, reader, now, quick=quick, warm_up=warmed, checked=checked, replaces=replaces)
     raw = msgspec.json.format(msgspec.json.encode(found))
-    digest = sha256_of_bytes(raw)
+    digest = sha256_of(raw)
     if reference is not None:
         write_whole(output / REFERENCE, reference)
     write_whole(path, raw)

@@ -69,12 +69,7 @@ class DecomposedRun(Decomposed):
 
 
 def assess_run(
-    commanded: Commanded,
-    tau_s: FloatArray,
-    reported: FloatArray,
-    coarse: CoarseClock,
-    scale: Scale,
-    rng: np.random.Generator,
+    commanded: Commanded, tau_s: FloatArray, reported: FloatArray, coarse: CoarseClock, scale: Scale, rng: np.random.Generator
 ) -> DecomposedRun:
     """The budget of answers (n, 4) at rising times (n,), s of the tracker's clock, against the attitudes that a run commanded.
 
@@ -100,11 +95,7 @@ def assess_run(
 
 
 def assess_cases(
-    commanded: FloatArray,
-    reported: FloatArray,
-    scale: Scale,
-    rng: np.random.Generator,
-    rate_rad_s: FloatArray | None = None,
+    commanded: FloatArray, reported: FloatArray, scale: Scale, rng: np.random.Generator, rate_rad_s: FloatArray | None = None
 ) -> Decomposed:
     """The budget of cases: reported attitudes (n, 4), NaN where there is none, against the commanded ones (n, 4).
 

@@ -172,10 +172,7 @@ def fastest(benches: tuple[Bench, Bench], q: FloatArray, t_ns: int, step_ns: int
     The second bench's clock begins at `t_ns` and goes on by `step_ns` from frame to frame.
     """
     nothing, bench = benches
-    works = {
-        "nothing": lambda _: nothing.draw(q).levels,
-        "bodies": lambda k: bench.draw(q, t_ns=t_ns + k * step_ns).levels,
-    }
+    works = {"nothing": lambda _: nothing.draw(q).levels, "bodies": lambda k: bench.draw(q, t_ns=t_ns + k * step_ns).levels}
     without, shown = (Spent(*np.min(took, axis=0).tolist()) for took in in_turn(works, rounds).values())
     return without, shown
 

@@ -189,10 +189,7 @@ def draw(path: Path, left: list[OverFrames]) -> None:
                 rows = [row for row in left if (row.panel, row.method) == (name, method)]
                 frames = [row.frames for row in rows]
                 steps = f"{rows[0].steps:.{1 if rows[0].steps < 100 else 0}f}"
-                for axes, error, label in (
-                    (flux, "flux_rms_mag", f"{name}: {steps} steps"),
-                    (place, "axis_rms_px_fit", name),
-                ):
+                for axes, error, label in ((flux, "flux_rms_mag", f"{name}: {steps} steps"), (place, "axis_rms_px_fit", name)):
                     errors = np.array([getattr(row, error) for row in rows])
                     values = np.where(np.isfinite(errors), errors, np.nan)
                     axes.loglog(frames, values, style, color=colour, ms=4, label=label if method == "temporal" else "_")

@@ -15,16 +15,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.calibrate.geometric.calibration import matched
 from hilstar.calibrate.geometric.dots import DotPlan, plan_dots
-from hilstar.calibrate.geometric.fit import (
-    BROWN_CONRADY,
-    PINHOLE,
-    RADIAL,
-    Geometry,
-    Model,
-    Nominal,
-    fit,
-    held_out,
-)
+from hilstar.calibrate.geometric.fit import BROWN_CONRADY, PINHOLE, RADIAL, Geometry, Model, Nominal, fit, held_out
 from hilstar.calibrate.geometric.match import first_look
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.charts import INK, SERIES, chart, label_ends, plain_ticks, write_records

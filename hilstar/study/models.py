@@ -27,13 +27,7 @@ from hilstar.sky.electrons import (
     v_band_mean_w_m2_m,
 )
 from hilstar.sky.spectral_types import bare_and_dusty
-from hilstar.sky.spectrum import (
-    PLANCK_J_S,
-    TEMPERATURE_SCALES,
-    blackbody_exitance_w_m2_m,
-    integration_nodes,
-    torres2010_k,
-)
+from hilstar.sky.spectrum import PLANCK_J_S, TEMPERATURE_SCALES, blackbody_exitance_w_m2_m, integration_nodes, torres2010_k
 from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_by_type, held_out_errors, study_optics
 from hilstar.study.thesis import FIGURES, ChartFinding
 from hilstar.units import LIGHT_M_S, magnitude

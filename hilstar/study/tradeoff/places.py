@@ -29,17 +29,7 @@ from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites, pack_sprites
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import CELL_DEG, Stars, cell_grid, make_stars
-from hilstar.study.predictors import (
-    JITTER,
-    NEAR,
-    ORION,
-    SLEW_DEG,
-    SLEW_S,
-    AttitudeAt,
-    predictors,
-    slew_attitude,
-    slew_sample,
-)
+from hilstar.study.predictors import JITTER, NEAR, ORION, SLEW_DEG, SLEW_S, AttitudeAt, predictors, slew_attitude, slew_sample
 from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.units import NS_PER_MS, NS_PER_S
 

@@ -54,11 +54,7 @@ PANELS: dict[str, tuple[Lobes, ...]] = {
 SENSORS: dict[str, tuple[Lobes, ...]] = {
     "Bayer, infrared cut": (((600, 45, 0.75),), ((530, 45, 0.85),), ((460, 35, 0.7),)),
     "Bayer, wide dyes": (((620, 80, 0.6),), ((540, 80, 0.7),), ((460, 70, 0.6),)),
-    "Bayer, no cut": (
-        ((610, 50, 0.6), (850, 90, 0.3)),
-        ((535, 50, 0.7), (850, 80, 0.3)),
-        ((460, 40, 0.6), (850, 75, 0.3)),
-    ),
+    "Bayer, no cut": (((610, 50, 0.6), (850, 90, 0.3)), ((535, 50, 0.7), (850, 80, 0.3)), ((460, 40, 0.6), (850, 75, 0.3))),
 }
 # Mono sensors, the quantum efficiency of each: one that no light from CUT_NM on reaches is as any panel has light for it.
 CUT_NM = 700.0

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.errors import InputError
+from hilstar.optics import prescription
 from hilstar.optics.prescription import one_turn_a_break
 from hilstar.optics.psf_file import Glass, read_glass
 from hilstar.resources import resource_path
@@ -174,9 +175,11 @@ def test_breaks_keep_zemax_s_order(tmp_path):
         one_turn_a_break(text.replace("UNIT MM", "UNIT IN"))
 
 
-def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path):
+def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path, monkeypatch):
     """Chief rays, centroids and widths over field, colour and focus; counted rays, for so wide a stamp."""
     pytest.importorskip("optiland", reason="hilstar[lens] is 0.8 GB: no test environment has it")
+    monkeypatch.setattr(prescription, "POINTS", 3)
+    monkeypatch.setattr(prescription, "GEOMETRIC_RAYS", 120)
     options = ["--pitch-um", 10, "--resolution", "401,301", "--half-px", 60, "--oversampling", 2, "--focuses-um", "-40,40"]
     result = run_hilstar_here("optics", "lens", zemax(tmp_path), "-o", tmp_path / "psf.fits", *options)
     assert result.returncode == 0, result.stderr
@@ -187,7 +190,7 @@ def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path):
     start = np.concatenate([pupil, np.zeros((1, pupil.shape[1]))])
     zero = snell(start[:, :1], np.array([[0.0], [0.0], [1.0]]), 0.55)[0][:2]
     at = (np.arange(glass.basis.shape[1]) - glass.basis.shape[1] // 2) / glass.per_px
-    for point in (0, 8, 12, 24):
+    for point in (0, 4, 8):
         place_px = glass.places_px[point] - [200, 150]
         tangent = place_px * 0.01 / focal_mm
         for _ in range(20):

@@ -114,6 +114,7 @@ class Verdict:
     dim: list[str]
     dated: DatedBy | None
     fainter: "Fainter"
+    expected: "Expected" = field(repr=False)
     predicted: FloatArray = field(repr=False)
     residual: FloatArray = field(repr=False)
 
@@ -225,6 +226,7 @@ class Judge:
             dim=dim,
             dated=self._dated(number),
             fainter=self._fainter(number, expected),
+            expected=expected,
             predicted=level + light_dn,
             residual=residual,
         )

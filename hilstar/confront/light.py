@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.confront.pattern import NO_PATTERN, Pattern
 from hilstar.units import MAD_TO_SIGMA
 
 MAG = 2.5 / math.log(10)
@@ -289,11 +290,13 @@ class PixelFit:
     sigma: dict[str, float]
     points: FloatArray
     notes: tuple[str, ...] = ()
+    pattern: Pattern = NO_PATTERN
 
     def variance_dn2(self, level_dn: FloatArray) -> FloatArray:
         """Variance of a pixel at a level."""
-        light = np.maximum(level_dn - self.pedestal_dn, 0) / self.gain_e_per_dn
-        return np.asarray(light + (self.read_noise_e / self.gain_e_per_dn) ** 2 + self.step_dn**2 / 12)
+        light = np.maximum(level_dn - self.pedestal_dn, 0)
+        noise = light / self.gain_e_per_dn + (self.read_noise_e / self.gain_e_per_dn) ** 2 + self.step_dn**2 / 12
+        return np.asarray(noise + self.pattern.variance_dn2(light))
 
 
 def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> FloatArray:
@@ -331,13 +334,15 @@ class Assumed:
     gain_e_per_dn: float
 
 
-def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: Assumed) -> PixelFit:
-    """The detector by photon transfer; `pedestal` and its sigma where levels told it."""
+def fit_pixels(
+    points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: Assumed, pattern: Pattern
+) -> PixelFit:
+    """The detector by photon transfer; `pedestal` and its sigma where levels told it. A fixed pattern is no noise of light."""
     notes = []
     offset, offset_sigma = pedestal or (assumed.offset_dn, math.nan)
     if not len(points):
         notes.append("no part of the background is free of sources: the detector is the bench file's")
-        return PixelFit(assumed.gain_e_per_dn, offset, assumed.read_noise_e, step_dn, {}, points, tuple(notes))
+        return PixelFit(assumed.gain_e_per_dn, offset, assumed.read_noise_e, step_dn, {}, points, tuple(notes), pattern)
     level, variance = points.T
     if pedestal is None:
         notes.append(f"the pedestal is the bench file's, {offset:g} DN: levels of these photographs do not tell it")
@@ -348,6 +353,8 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
             offset = assumed.offset_dn
             notes.append(f"the pedestal is the bench file's, {offset:g} DN ({told})")
     low, high = np.percentile(level, [5, 95])
+    *_, column, row = pattern.rms  # of which a difference along a row, or down a column, has one
+    variance = variance - pattern.variance_dn2(np.maximum(level - offset, 0)) + (column**2 + row**2) / 2
     sigma = {"pedestal_dn": offset_sigma}
     line = _line(level - offset, variance)
     if high - offset > MIN_LEVEL_RANGE * (low - offset) and line.slope > 5 * line.slope_sigma:
@@ -355,7 +362,7 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
         read = math.sqrt(max(line.at_zero - step_dn**2 / 12, 0.0))
         sigma["gain_e_per_dn"] = gain * line.slope_sigma / line.slope
         sigma["read_noise_e"] = gain * min(line.at_zero_sigma / max(2 * read, 1e-9), math.sqrt(line.at_zero_sigma))
-        return PixelFit(gain, offset, read * gain, step_dn, sigma, points, tuple(notes))
+        return PixelFit(gain, offset, read * gain, step_dn, sigma, points, tuple(notes), pattern)
     # one level alone: shot noise of what is above the pedestal, and the bench's read noise
     signal, noise2 = float(np.median(level)) - offset, float(np.median(variance)) - step_dn**2 / 12
     gain, read_e = assumed.gain_e_per_dn, assumed.read_noise_e
@@ -365,7 +372,7 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
     else:
         notes.append("the background is at the pedestal: the gain is the bench file's")
         read_e = math.sqrt(max(noise2, 0.0)) * gain
-    return PixelFit(gain, offset, read_e, step_dn, sigma, points, tuple(notes))
+    return PixelFit(gain, offset, read_e, step_dn, sigma, points, tuple(notes), pattern)
 
 
 class _Line(NamedTuple):

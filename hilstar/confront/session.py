@@ -13,7 +13,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_optics, channel_rates, site_air
 from hilstar.bench.config.sky import SiteSettings
 from hilstar.bench.site import site_glow_e_per_s_sr
-from hilstar.confront.background import SkyLevel, Sources, find_sources, sky_level, source_mask
+from hilstar.confront.background import SkyLevel, Sources, find_sources, is_round, sky_level, source_mask
 from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera
 from hilstar.confront.images import Photograph, paged
 from hilstar.confront.light import (
@@ -32,6 +32,7 @@ from hilstar.confront.light import (
     with_extinction,
 )
 from hilstar.confront.lost_in_space import MIN_MATCHED, Field, Solved, solve_lost
+from hilstar.confront.pattern import NO_PATTERN, fixed_pattern
 from hilstar.confront.sky import DatedSky, dated_sky
 from hilstar.confront.star_psf import HALF, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
 from hilstar.errors import InputError
@@ -44,11 +45,12 @@ from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 MATCH_PX = 2.5
 BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
 PSF_STARS = 60
-TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 12.0
+TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 9.0
 BRIGHTEST = 10  # sources that tell a photograph's focus and rest
 SATURATED_SHARE = 0.97
 TONE_ROUNDS = 6
 PASSES = 2
+APART_PX = 10.0  # by which photographs' skies are moved on the detector that tell its fixed pattern
 SOURCE_PX = 4  # about a source whose pixels tell nothing of the background
 SCATTER_SNR = 10.0
 LINEAR_DONE = 0.004
@@ -131,17 +133,22 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     sky = dated_sky(file, photo.t_ns)
     points = ~sources.single & ~sources.trail
     field = _field(sources, points, photo)
+    found = _solve(field, base, sky, start) if len(field.places_px) >= MIN_MATCHED else None
+    if found is None and is_round(photo.dn):
+        raise InputError(
+            f"{photo.path}: its light fills a circle between dark corners: an all-sky lens, of which hilstar has no model; give"
+            " frames of a lens under 120 degrees, whose sky fills the image"
+        )
     if len(field.places_px) < MIN_MATCHED:
         raise InputError(
             f"{photo.path}: {len(field.places_px)} sources stand out of its noise, and an attitude takes {MIN_MATCHED}; expose"
             " longer, open the cap, or look at a sky without cloud"
         )
-    found = _solve(field, base, sky, start)
     if found is None:
         raise InputError(f"{photo.path}: {_why_not(field, base, sky, sources, points, start)}")
     kept = np.flatnonzero(points)
     matched = replace(found, source=kept[found.source])
-    wide_px = float(np.median(sources.width_px[np.sort(matched.source)[:BRIGHTEST]]))
+    wide_px = float(np.median(sources.fwhm_px[np.sort(matched.source)[:BRIGHTEST]]))
     if wide_px > WIDE_PX:
         raise InputError(f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in focus")
     return Shot(
@@ -180,8 +187,8 @@ def _why_not(field: Field, base: Camera, sky: DatedSky, sources: Sources, points
         return (
             f"its stars are trails of about {np.median(trails):.0f} px; give a frame of a camera at rest, or a shorter exposure"
         )
-    if width > WIDE_PX:
-        return f"its sources are {width:.0f} px wide; focus the lens, or give a frame in focus"
+    if (wide := np.median(sources.fwhm_px[bright])) > WIDE_PX:
+        return f"its sources are {wide:.0f} px wide; focus the lens, or give a frame in focus"
     mirrored = replace(field, places_px=field.places_px * [-1, 1])
     if _solve(mirrored, base, sky, start) is not None:
         return "is mirrored: its stars fit the sky only with left and right exchanged; flip the image"
@@ -337,17 +344,24 @@ def _masses(sky: DatedSky, pointing: Pointing) -> float | None:
 
 def _pixels(shots: Sequence[Shot], assumed: Assumed) -> PixelFit:
     """The detector by the background of all photographs."""
-    parts = []
-    for s in shots:
-        above = s.level.above(s.photo.dn)
-        parts.append(transfer_points(s.photo.dn, s.level.level, source_mask(s.sources, above, SOURCE_PX)))
-    points = np.concatenate(parts)
+    masks = [source_mask(s.sources, s.level.above(s.photo.dn), SOURCE_PX) for s in shots]
+    points = [transfer_points(s.photo.dn, s.level.level, mask) for s, mask in zip(shots, masks, strict=True)]
     height, width = shots[0].photo.dn.shape
     side = shots[0].level.block_px
     y, x = np.mgrid[side // 2 : height : side, side // 2 : width : side]
     places = np.column_stack([x.ravel() / width, y.ravel() / height]) - 0.5
     pedestal = fit_pedestal([s.level.level[y, x].ravel() for s in shots], places)
-    return fit_pixels(points, max(s.photo.step_dn for s in shots), pedestal, assumed)
+    # stars too faint to be seen are pixels' own where two photographs have one part of the sky
+    apart: list[int] = []
+    for k, shot in enumerate(shots):
+        moved = [np.linalg.norm(shot.pointing.boresight - shots[j].pointing.boresight) * shot.focal_length_px for j in apart]
+        if all(px > APART_PX for px in moved):
+            apart.append(k)
+    zero = assumed.offset_dn if pedestal is None else pedestal[0]
+    pattern = fixed_pattern(
+        (s.photo.dn - s.level.level, s.level.level - zero, ~masks[k]) for k, s in enumerate(shots) if k in apart
+    )
+    return fit_pixels(np.concatenate(points), max(s.photo.step_dn for s in shots), pedestal, assumed, pattern or NO_PATTERN)
 
 
 def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:

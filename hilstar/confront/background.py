@@ -104,7 +104,8 @@ MAX_MASK_PX = 80  # half of what is left out about a long source
 class Sources:
     """Sources (n,) of a photograph, brightest first: places, px, signal over noise, and the length and width of each, px.
 
-    Length and width are of all that stands out, `fwhm_px` is a circle's as large as what has half of the peak. `single` says that one pixel has all of the light: it is the detector's, or a cosmic ray.
+    Length and width are of all that stands out, `fwhm_px` is a circle's as large as what has half of the peak. `single` says
+    that one pixel has all of the light: it is the detector's, or a cosmic ray.
     """
 
     x_px: FloatArray

@@ -13,6 +13,7 @@ import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.confront.pattern import NO_PATTERN, Pattern
+from hilstar.confront.star_psf import MEAN_BV_MAG
 from hilstar.units import MAD_TO_SIGMA
 
 MAG = 2.5 / math.log(10)
@@ -42,7 +43,7 @@ Magnitudes = Callable[[Correction], FloatArray]
 class StarLight:
     """Stars (n,) of all photographs: which one, flux with one sigma, DN, V, B-V, the square of the radius, and whether clean.
 
-    The radius is in half diagonals from the principal point.
+    The radius is in half diagonals from the principal point. `plane` is 1, 2, 3 for red, green and blue of a mosaic, else 0.
     """
 
     image: IntArray
@@ -52,6 +53,7 @@ class StarLight:
     bv_mag: FloatArray
     radius2: FloatArray
     clean: BoolArray
+    plane: IntArray
 
     @property
     def instrument_mag(self) -> FloatArray:
@@ -77,6 +79,7 @@ class LightFit:
     about Johnson V: -2.5 log10(DN) = V + colour_term (B-V) - zero point. DN go as light to the power `linearity`. `sigma` has
     one sigma of figures by name. `mag` (n,) is what each star should have, without the photograph's offset. `masses` are each
     photograph's air masses where known, and `extinction_mag` what offsets grow by with one, beyond the site's own table.
+    `colours` (images,) are what a plane of a mosaic adds, mag a magnitude of B-V, and `colour_terms` those of planes about V.
     """
 
     offsets_mag: FloatArray
@@ -89,6 +92,8 @@ class LightFit:
     mag: FloatArray = field(default_factory=lambda: np.empty(0))
     masses: tuple[float | None, ...] = ()
     extinction_mag: float | None = None
+    colours: FloatArray = field(default_factory=lambda: np.zeros(1))
+    colour_terms: dict[str, float] = field(default_factory=dict)
 
     def illumination(self, radius2: FloatArray) -> FloatArray:
         """Light relative to the axis at squares of radii."""
@@ -117,8 +122,16 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
         held_out = _held_out(np.column_stack([ones, *columns]), off, stars.sigma_mag, use)
         if held_out < GAIN * best:
             best, chosen = held_out, name
-    found = _robust(np.column_stack([ones, *vignetting[chosen]]), off, stars.sigma_mag, use)
-    terms = (*found.values[images:].tolist(), 0.0, 0.0)[:2]
+    # a mosaic's planes have a colour each beside the one quantum efficiency
+    bv, planes = np.nan_to_num(stars.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG, np.unique(stars.plane)
+    own = [bv * (stars.plane == plane) for plane in planes if len(planes) > 1]
+    found = _robust(np.column_stack([ones, *vignetting[chosen], *own]), off, stars.sigma_mag, use)
+    terms = (*found.values[images : len(found.values) - len(own)].tolist(), 0.0, 0.0)[:2]
+    colours, colour_terms = np.zeros(images), {}
+    for k, plane in enumerate(planes if own else ()):
+        colours[np.unique(stars.image[stars.plane == plane])] = found.values[len(found.values) - len(own) + k]
+        here = use & (stars.plane == plane)
+        colour_terms[" rgb"[plane]] = float(_about_v(stars, base, here, ones[:, ones[here].any(axis=0)], ()).values[1])
     about_v = _about_v(stars, base, use, ones, vignetting[chosen])
     sigma = {name: about_v.sigma[k] for k, name in enumerate(("linearity", "colour_term"))}
     sigma |= {"zero_point_mag": float(about_v.sigma[2 : 2 + images].mean())}
@@ -131,6 +144,8 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
         linearity=float(about_v.values[0]),
         sigma=sigma,
         mag=base + found.model - ones @ found.values[:images],
+        colours=colours,
+        colour_terms=colour_terms,
     )
 
 
@@ -234,7 +249,7 @@ def _offsets_alone(stars: StarLight, images: int, base: FloatArray, held: LightF
     off = stars.instrument_mag - base - shape
     ones = np.eye(images)[stars.image]
     found = _robust(ones, off, stars.sigma_mag, _trusted(stars, ones))
-    return replace(held, offsets_mag=found.values, mag=base + shape)
+    return replace(held, offsets_mag=found.values, mag=base + shape, colours=np.zeros(images))
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,6 +58,7 @@ class Confronted:
                 "saturation_dn": session.shots[0].photo.full_dn,
                 "zero_point_mag": _number(light.zero_point_mag),
                 "colour_term": _number(light.colour_term),
+                "colour_terms": light.colour_terms,
                 "vignetting_mag": list(light.vignetting_mag),
                 "extinction_mag_per_air_mass": extinction_of(session),
                 "linearity_power": session.power * light.linearity if session.power != 1.0 else light.linearity,
@@ -169,6 +170,7 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
         found.append(f"fixed pattern: {pixels.pattern.words()}")
     if not session.fixed:
         zero = f"zero point {light.zero_point_mag:.2f} mag, colour term {light.colour_term:+.3f} (B-V)"
+        zero += "".join(f", {plane} {term:+.3f}" for plane, term in light.colour_terms.items())
         found.append(f"light: {zero}; {_tone(session)}")
     if session.fixed:
         found.append(

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_optics, channel_rates, site_air
+from hilstar.bench.build import bench_channels, bench_optics, channel_rates, site_air
 from hilstar.bench.config.sky import SiteSettings
 from hilstar.bench.site import site_glow_e_per_s_sr
 from hilstar.confront.background import SkyLevel, Sources, find_sources, is_round, sky_level, source_mask
@@ -34,7 +34,7 @@ from hilstar.confront.light import (
 from hilstar.confront.lost_in_space import MIN_MATCHED, Field, Solved, solve_lost
 from hilstar.confront.pattern import NO_PATTERN, fixed_pattern
 from hilstar.confront.sky import DatedSky, dated_sky
-from hilstar.confront.star_psf import HALF, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
+from hilstar.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
 from hilstar.errors import InputError
 from hilstar.rotation import conjugate, rotate
 from hilstar.scene.camera import Camera
@@ -117,11 +117,17 @@ class Session:
         glow = site_glow_e_per_s_sr(msgspec.structs.replace(config, site=site), folder, optics)
         return float(magnitude(np.array([glow / ARCSEC_PER_RAD**2]))[0])
 
+    def plane_mag(self, number: int, columns: FloatArray) -> FloatArray:
+        """By how much stars of V, B-V and V-I (3, n) are fainter to a plane of a mosaic than to the tracker as a whole, mag."""
+        colour = self.light.colours[number] * (np.nan_to_num(columns[1], nan=MEAN_BV_MAG) - MEAN_BV_MAG)
+        return np.asarray(colour + _channel_mag(self.file, self.shots[number].photo.plane, columns))
+
     def predicted_dn(self, number: int, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """DN of stars (n,), rows of the sky of photograph `number`, at their places on it."""
         sky, light = self.shots[number].sky, self.light
-        mag = _Magnitudes(self.file, _columns(sky, star))(NO_CORRECTION if self.fixed else light.correction)
-        mag = mag + extinct_mag(self.air, sky, star)
+        columns = sky.columns(sky.order[star])
+        mag = _Magnitudes(self.file, columns)(NO_CORRECTION if self.fixed else light.correction)
+        mag = mag + self.plane_mag(number, columns) + extinct_mag(self.air, sky, star)
         shade = light.illumination(radius2_of(self.camera.camera, x_px, y_px))
         return np.asarray(10 ** (-0.4 * (mag + light.offsets_mag[number])) * shade)
 
@@ -313,8 +319,14 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         for shot, pointing in zip(shots, camera.pointings, strict=True):
             shot.pointing = pointing
     stars = _star_light(shots, camera.camera)
-    magnitudes = _Magnitudes(start.file, np.concatenate([_columns(s.sky, s.star) for s in shots], axis=1))
-    extinct = np.concatenate([extinct_mag(start.air, shot.sky, shot.star) for shot in shots])
+    columns = [s.sky.columns(s.sky.order[s.star]) for s in shots]
+    magnitudes = _Magnitudes(start.file, np.concatenate(columns, axis=1))
+    extinct = np.concatenate(
+        [
+            extinct_mag(start.air, s.sky, s.star) + _channel_mag(start.file, s.photo.plane, own)
+            for s, own in zip(shots, columns, strict=True)
+        ]
+    )
     light = fit_light(
         stars, len(shots), lambda corrected: magnitudes(corrected) + extinct, None if fixed is None else fixed.light
     )
@@ -323,8 +335,14 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
     return Session(start.file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, start.air)
 
 
-def _columns(sky: DatedSky, star: IntArray) -> FloatArray:
-    return np.stack([sky.v_mag[star], sky.bv_mag[star], sky.vi_mag[star]])
+def _channel_mag(file: BenchFile, plane: str, columns: FloatArray) -> FloatArray:
+    """What stars have to the channel of a plane (r, g1, g2, b) more than to all, mag; 0 where the bench has one channel."""
+    channels = bench_channels(file.config.tracker, file.folder)
+    if not plane or len(channels) < 3:
+        return np.zeros(columns.shape[1])
+    both = channels["rgb".index(plane[0])], bench_optics(file.config.tracker, file.folder)
+    own, every = (magnitude(channel_rates(file.config.sky, optics)(*columns)) for optics in both)
+    return np.asarray(own - every)
 
 
 def extinct_mag(air: SiteAir | None, sky: DatedSky, star: IntArray) -> FloatArray:
@@ -456,6 +474,7 @@ def _star_light(shots: Sequence[Shot], camera: Camera) -> StarLight:
                 sky.bv_mag[shot.star],
                 radius2,
                 shot.clean,
+                np.full(len(shot.star), " rgb".index(shot.photo.plane[:1] or " ")),
             )
         )
     return StarLight(*(np.concatenate(part) for part in zip(*parts, strict=True)))

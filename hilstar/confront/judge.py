@@ -288,7 +288,10 @@ class Judge:
         for star in expected.star[expected.dn > EXPECTED_SNR * noise].tolist():
             x, y = expected.x_px[place[star]], expected.y_px[place[star]]
             inside = 2 * MATCH_PX < x < width - 1 - 2 * MATCH_PX and 2 * MATCH_PX < y < height - 1 - 2 * MATCH_PX
-            if star not in seen and inside and not near(x, y) and sources.query([x, y])[0] > 2 * MATCH_PX:
+            if star in seen or not inside or near(x, y) or sources.query([x, y])[0] <= 2 * MATCH_PX:
+                continue
+            box = np.s_[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]  # its light may be part of a larger source
+            if (shot.photo.dn[box] - shot.level.level[box]).sum() < expected.dn[place[star]] / 2:
                 rows.append(row(star, (math.nan,) * 4, ("missing",)))
         return rows
 

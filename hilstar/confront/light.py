@@ -14,6 +14,7 @@ import numpy as np
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.confront.pattern import NO_PATTERN, Pattern
 from hilstar.confront.star_psf import MEAN_BV_MAG
+from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import MAD_TO_SIGMA
 
 MAG = 2.5 / math.log(10)
@@ -340,19 +341,13 @@ def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> Float
     return np.concatenate(parts)
 
 
-@dataclass(frozen=True, slots=True)
-class Assumed:
-    """What the bench file says of the detector, taken where photographs cannot tell."""
-
-    offset_dn: float
-    read_noise_e: float
-    gain_e_per_dn: float
-
-
 def fit_pixels(
-    points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: Assumed, pattern: Pattern
+    points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: DetectorSettings, pattern: Pattern
 ) -> PixelFit:
-    """The detector by photon transfer; `pedestal` and its sigma where levels told it. A fixed pattern is no noise of light."""
+    """The detector by photon transfer, that of the bench file where photographs cannot tell it.
+
+    `pedestal` comes with its sigma where levels told it. A fixed pattern is no noise of light.
+    """
     notes = []
     offset, offset_sigma = pedestal or (assumed.offset_dn, math.nan)
     if not len(points):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -20,7 +21,6 @@ from hilstar.confront.light import (
     LINEAR_OFF,
     LINEAR_SIGMAS,
     NO_CORRECTION,
-    Assumed,
     Correction,
     LightFit,
     PixelFit,
@@ -40,6 +40,7 @@ from hilstar.rotation import conjugate, rotate
 from hilstar.scene.camera import Camera
 from hilstar.sky.air import SiteAir, air_mass
 from hilstar.sky.spectrum import Curve
+from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 MATCH_PX = 2.5
@@ -219,12 +220,11 @@ def run_session(
     Raises InputError for a photograph without an attitude.
     """
     shots = [open_shot(file, photo, base, start) for photo in photos]
-    assumed = Assumed(*(getattr(file.config.tracker.detector, name) for name in ("offset_dn", "read_noise_e", "gain_e_per_dn")))
     focal = float(np.median([shot.focal_length_px for shot in shots]))
     base = replace(base, focal_length_px=focal) if fixed is None else fixed.camera
     air = None if shots[0].sky.air is None else site_air(file.config, file.folder, shots[0].sky.catalog)
-    fit = _Fitting(file, base, assumed, fixed, air)
-    session = fit.of(shots, 1.0)
+    fit = partial(_fitted, file, base, fixed, air)
+    session = fit(shots)
     off = abs(session.light.linearity - 1)
     if (
         fixed is not None
@@ -237,10 +237,10 @@ def run_session(
     for _ in range(TONE_ROUNDS):
         power = math.exp(undone)
         linear = [_linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)]
-        trial = fit.of(linear, power, session.camera)
+        trial = fit(linear, power=power, before=session.camera)
         left = math.log(max(trial.light.linearity, 0.1))
         if abs(left) < LINEAR_DONE:
-            return fit.of(trial.shots, power)
+            return fit(trial.shots, power=power)
         slope = (left - before[1]) / (undone - before[0])
         step = -left / slope if slope < 0 else left
         before, undone = (undone, left), undone + min(max(step, -MAX_TONE_STEP), MAX_TONE_STEP)
@@ -275,23 +275,17 @@ def _level(photo: Photograph, step_dn: float) -> SkyLevel:
     return level
 
 
-@dataclass(frozen=True, slots=True)
-class _Fitting:
-    """What a fit starts from: the bench, its camera, its detector, and the camera that is held, if any."""
-
-    file: BenchFile
-    base: Camera
-    assumed: Assumed
-    fixed: FixedCamera | None
-    air: SiteAir | None
-
-    def of(self, shots: Sequence[Shot], power: float, before: CameraFit | None = None) -> Session:
-        """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
-        return _fitted(self, shots, power, before)
-
-
-def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: CameraFit | None) -> Session:
-    fixed = start.fixed
+def _fitted(
+    file: BenchFile,
+    base: Camera,
+    fixed: FixedCamera | None,
+    air: SiteAir | None,
+    shots: Sequence[Shot],
+    *,
+    power: float = 1.0,
+    before: CameraFit | None = None,
+) -> Session:
+    """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
     pointings = [shot.pointing for shot in shots] if before is None else list(before.pointings)
     first = [
         Places(
@@ -302,8 +296,8 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         )
         for s in shots
     ]
-    camera = before or fit_camera(start.base, pointings, first, fixed=fixed is not None, last=False)
-    pixels = _pixels(shots, start.assumed) if fixed is None else fixed.pixels
+    camera = before or fit_camera(base, pointings, first, fixed=fixed is not None, last=False)
+    pixels = _pixels(shots, file.config.tracker.detector) if fixed is None else fixed.pixels
     gain = pixels.gain_e_per_dn
     passes = PASSES if before is None else 1
     for number in range(passes):
@@ -315,15 +309,15 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         if before is not None:
             continue
         places = [_places(shot) for shot in shots]
-        camera = fit_camera(start.base, camera.pointings, places, fixed=fixed is not None, last=number == passes - 1)
+        camera = fit_camera(base, camera.pointings, places, fixed=fixed is not None, last=number == passes - 1)
         for shot, pointing in zip(shots, camera.pointings, strict=True):
             shot.pointing = pointing
     stars = _star_light(shots, camera.camera)
     columns = [s.sky.columns(s.sky.order[s.star]) for s in shots]
-    magnitudes = _Magnitudes(start.file, np.concatenate(columns, axis=1))
+    magnitudes = _Magnitudes(file, np.concatenate(columns, axis=1))
     extinct = np.concatenate(
         [
-            extinct_mag(start.air, s.sky, s.star) + _channel_mag(start.file, s.photo.plane, own)
+            extinct_mag(air, s.sky, s.star) + _channel_mag(file, s.photo.plane, own)
             for s, own in zip(shots, columns, strict=True)
         ]
     )
@@ -331,8 +325,8 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         stars, len(shots), lambda corrected: magnitudes(corrected) + extinct, None if fixed is None else fixed.light
     )
     masses = [_masses(shot.sky, pointing) for shot, pointing in zip(shots, camera.pointings, strict=True)]
-    light = with_extinction(light, stars, masses, known=start.air is not None)
-    return Session(start.file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, start.air)
+    light = with_extinction(light, stars, masses, known=air is not None)
+    return Session(file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, air)
 
 
 def _channel_mag(file: BenchFile, plane: str, columns: FloatArray) -> FloatArray:
@@ -360,7 +354,7 @@ def _masses(sky: DatedSky, pointing: Pointing) -> float | None:
     return None if altitude is None else float(air_mass(np.radians([altitude]))[0])
 
 
-def _pixels(shots: Sequence[Shot], assumed: Assumed) -> PixelFit:
+def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
     """The detector by the background of all photographs."""
     masks = [source_mask(s.sources, s.level.above(s.photo.dn), SOURCE_PX) for s in shots]
     points = [transfer_points(s.photo.dn, s.level.level, mask) for s, mask in zip(shots, masks, strict=True)]

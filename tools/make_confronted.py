@@ -18,14 +18,6 @@ CHARTS = {  # by the text that stands for a chart on the page
     "point spread functions": "confronted_psf.svg",
     "photon transfer": "confronted_transfer.svg",
 }
-GUESS = """[tracker]
-aperture_mm = 18.4
-focal_length_mm = 35.0
-pixel_pitch_um = 6.9
-resolution_px = [1024, 768]
-quantum_efficiency = 0.5
-exposure_s = 0.2
-"""
 SHOWN = 1  # the frame of docs/confronted_views.jpg
 CROP_PX = (330, 250, 650, 490)
 
@@ -38,8 +30,7 @@ def main() -> None:
 
     with TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "guess.toml").write_text(GUESS, encoding="utf-8")
-        words = ["confront", str(folder / "guess.toml"), *map(str, FRAMES), "-o", str(folder / "out")]
+        words = ["confront", str(FRAMES[0].parent / "guess.toml"), *map(str, FRAMES), "-o", str(folder / "out")]
         if code := run_command(words):
             sys.exit(code)
         page = (folder / "out/index.html").read_text(encoding="utf-8")

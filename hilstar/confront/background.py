@@ -61,6 +61,20 @@ def sky_level(dn: FloatArray, step: float, bad: BoolArray | None = None) -> SkyL
     return SkyLevel(_between(level, *places), np.maximum(_between(noise, *places), step / 12**0.5), side)
 
 
+def is_round(dn: FloatArray) -> bool:
+    """Whether an image is that of an all-sky lens: sky in a circle, and nothing in corners beyond it, level to its edge."""
+    height, width = dn.shape
+    y, x = np.mgrid[:height, :width]
+    radius = np.hypot(x - (width - 1) / 2, y - (height - 1) / 2) / (min(height, width) / 2)
+    rings = [dn[(radius >= low) & (radius < low + 0.1)] for low in (0.2, 0.5, 0.8, 1.15, 1.25)]
+    if min(map(len, rings)) < MIN_RING_PX:
+        return False
+    *sky, near, far = map(np.median, rings)
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(rings[-1] - far)))
+    lit, unsure = min(sky[:2]) - far, 4 * noise / len(rings[-1]) ** 0.5
+    return bool(lit > max(0.3 * noise, 10 * unsure) and abs(near - far) < 0.05 * lit + unsure)
+
+
 def _between(blocks: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
     """Values of blocks at places, cubic between their middles and straight on beyond."""
     from scipy.interpolate import make_interp_spline
@@ -78,6 +92,7 @@ def _between(blocks: FloatArray, rows: FloatArray, columns: FloatArray) -> Float
     return np.asarray(blocks)
 
 
+MIN_RING_PX = 100
 KERNEL_PX = 1.0  # sigma of the Gaussian by which sources are looked for
 THRESHOLD = 5.0
 MIN_TRAIL_PX, MIN_TRAIL_RATIO = 18.0, 5.0
@@ -89,7 +104,8 @@ MAX_MASK_PX = 80  # half of what is left out about a long source
 class Sources:
     """Sources (n,) of a photograph, brightest first: places, px, signal over noise, and the length and width of each, px.
 
-    `single` says that one pixel has all of the light: it is the detector's, or a cosmic ray.
+    Length and width are of all that stands out, `fwhm_px` is a circle's as large as what has half of the peak. `single` says
+    that one pixel has all of the light: it is the detector's, or a cosmic ray.
     """
 
     x_px: FloatArray
@@ -97,6 +113,7 @@ class Sources:
     snr: FloatArray
     length_px: FloatArray
     width_px: FloatArray
+    fwhm_px: FloatArray
     single: BoolArray
 
     def __len__(self) -> int:
@@ -128,9 +145,10 @@ def find_sources(sigmas: FloatArray, threshold: float = THRESHOLD) -> Sources:
     length, width = np.sqrt(12 * (middle + spread)), np.sqrt(12 * np.maximum(middle - spread, 1 / 12))
     peak = np.zeros(count)
     np.maximum.at(peak, blob, value)
+    fwhm = 2 * np.sqrt(np.bincount(blob, value > peak[blob] / 2, minlength=count) / np.pi)
     order = np.argsort(-peak * np.sqrt(area), kind="stable")[:MAX_SOURCES]
     single = _single(sigmas, mx[order], my[order])
-    return Sources(mx[order], my[order], peak[order], length[order], width[order], single)
+    return Sources(mx[order], my[order], peak[order], length[order], width[order], fwhm[order], single)
 
 
 def source_mask(sources: Sources, sigmas: FloatArray, grow_px: int) -> BoolArray:

@@ -372,12 +372,10 @@ def _held_out(
         out = [np.arange(len(one.x_px)) % FOLDS == fold for one in photographs]
         kept = [one.at(~mask) for one, mask in zip(photographs, out, strict=True)]
         found, turned, _ = fit_model(camera, pointings, kept, names, floor_px)
-        for one, pointing, mask in zip(photographs, turned, out, strict=True):
-            tested = one.at(mask)
-            x, y = pointing.places_px(found, tested.vectors)
-            off = np.column_stack([tested.x_px - x, tested.y_px - y])
-            sigma = np.hypot(tested.sigma_px, floor_px)[:, None]
-            squares += float((np.clip(np.nan_to_num(off / sigma, nan=1e3), -HUBER - 1, HUBER + 1) ** 2).sum())
+        tested = [one.at(mask) for one, mask in zip(photographs, out, strict=True)]
+        for one, off in zip(tested, CameraFit(found, turned, "").residuals_px(tested), strict=True):
+            sigma = np.hypot(one.sigma_px, floor_px)[:, None]
+            squares += float((np.clip(off / sigma, -HUBER - 1, HUBER + 1) ** 2).sum())
             weights += 2 * float((1 / sigma**2).sum())
     return math.sqrt(squares / max(weights, 1e-12))
 

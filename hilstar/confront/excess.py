@@ -11,11 +11,14 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.confront.judge import StarRow, Verdict
+from hilstar.confront.light import MAG
 from hilstar.confront.session import Session
-from hilstar.confront.star_psf import field_terms
+from hilstar.confront.star_psf import HALF, field_terms
 from hilstar.sky.air import scintillation as young
 
 MIN_STARS = 12
+FWHM = 2.3548
+LAW = "scintillation by law"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +67,7 @@ def split_excess(session: Session, verdicts: Sequence[Verdict]) -> Excess | None
             math.sqrt(sum(_taken(phases, off[:, k]) for k in (0, 1)) / 2),
             "what repeats with the place in the pixel: the model of the PSF, and the pixel's own response",
         ),
+        Part("pixel response", _response(session)[1], "as in the light: it moves a star's centre"),
         Part(
             "colour",
             math.sqrt(sum(_taken(columns[k], off[:, k]) for k in (0, 1)) / 2),
@@ -89,7 +93,7 @@ def _light(
     terms: FloatArray,
 ) -> tuple[Part, ...]:
     rows = [row for _, row in every]
-    noise = np.array([1.0857 * row.sigma_dn / row.dn for row in rows])
+    noise = np.array([MAG * row.sigma_dn / row.dn for row in rows])
     sigma_v = np.array([v.shot.sky.within(np.array([row.star]))[0][0] for v, row in every])
     known = np.array(["variable" in row.flags or "double" in row.flags for row in rows])
     steady = _ms(off_mag[~known]) if (~known).sum() >= MIN_STARS else _ms(off_mag)
@@ -102,30 +106,67 @@ def _light(
             f"the scatter with {int(known.sum())} known variables and doubles less that without",
         ),
         Part("colour", math.sqrt(_taken(np.column_stack([bv, bv**2]), off_mag)), "what goes with B-V: the tracker's curve"),
+        _blends(session, every),
+        Part(
+            "pixel response",
+            MAG * _response(session)[0],
+            "the pixels' response, by products of photographs of different skies, over the pixels that a star lies on",
+        ),
         Part("flat field", math.sqrt(_taken(terms, off_mag)), "what slopes over the field beyond the vignetting in the radius"),
         Part("place within the pixel", math.sqrt(_taken(phases, off_mag)), "what repeats with the place in the pixel"),
-        scintillation(session),
+        _scintillation(session, every, off_mag, noise),
     ]
     return (*parts, _rest(_ms(off_mag), parts))
 
 
-def scintillation(session: Session) -> Part:
-    """Young's law (1967, AJ 72, 747) by aperture, exposure and the air mass; at sea level without a site."""
+def _blends(session: Session, every: Sequence[tuple[Verdict, StarRow]]) -> Part:
+    """The light of other stars of the catalogue that a star's own profile takes up."""
+    sigma2 = (float(np.median(session.psf.fwhm_px(*np.array([[row.x_px, row.y_px] for _, row in every]).T))) / FWHM) ** 2
+    off = []
+    for verdict, row in every:
+        all_of = verdict.expected
+        away2 = (all_of.x_px - row.x_predicted_px) ** 2 + (all_of.y_px - row.y_predicted_px) ** 2
+        taken = all_of.dn * np.exp(-away2 / (4 * sigma2)) * (all_of.star != row.star)
+        off.append(MAG * float(taken.sum()) / row.dn_predicted)
+    spread = np.array(off) - np.mean(off)
+    return Part("catalogue: blends", math.sqrt(_ms(spread)), "light of the catalogue's other stars within a star's profile")
+
+
+def _response(session: Session) -> tuple[float, float]:
+    """What the pixels' response leaves of a bright star: a share of its light, and px an axis of its place."""
+    (x, y), reach = np.array(session.psf.size_px) / 2, np.arange(-HALF, HALF + 1.0)[None]
+    middle = np.array([x]), np.array([y]), np.array([np.nan])
+    light = session.psf.on_pixels(reach, reach, session.psf.core(*middle))[0][0]
+    response = session.pixels.pattern.rms[0]
+    return response * math.sqrt(float((light**2).sum())), response * math.sqrt(float(((light * reach) ** 2).sum()))
+
+
+def _scintillation(session: Session, every: Sequence[tuple[Verdict, StarRow]], off_mag: FloatArray, noise: FloatArray) -> Part:
+    """What changes from one photograph of a star to another beyond noise; with no star twice, Young's law."""
+    star = np.unique([row.star for _, row in every], return_inverse=True)[1]
+    seen = np.bincount(star)[star]
+    twice = seen > 1
+    free = int(twice.sum()) - len(np.unique(star[twice]))
+    if free >= MIN_STARS:
+        mean = np.bincount(star, off_mag) / np.bincount(star)
+        changed = float(((off_mag - mean[star])[twice] ** 2).sum()) / free - float((noise[twice] ** 2).mean())
+        how = f"what changes between photographs of a star beyond noise, by {free} stars seen again"
+        return Part("scintillation", math.sqrt(max(changed, 0.0)), how)
     tracker = session.file.config.tracker
     masses = [one for one in session.light.masses if one is not None]
     if not masses or tracker.exposure_s <= 0:
-        return Part("scintillation", math.nan, "not known: no air mass, as refraction was not fitted")
+        return Part(LAW, math.nan, "not known: no star is in two photographs, and no air mass, as refraction was not fitted")
     mass, site = float(np.mean(masses)), session.file.config.site
     height_m = 0.0 if site is None else site.height_m
     sigma = float(young(tracker.aperture_mm, np.array([mass]), height_m, tracker.exposure_s)[0])
     how = f"Young's law at {height_m:g} m: air mass {mass:.2f}, {tracker.aperture_mm:g} mm and {tracker.exposure_s:g} s"
-    return Part("scintillation", sigma, f"{how}; not measured")
+    return Part(LAW, MAG * sigma, f"{how}; not measured, as no star is in two photographs: it is in what is unexplained")
 
 
 def _rest(whole: float, parts: Sequence[Part]) -> Part:
-    measured = [one for one in parts if math.isfinite(one.rms) and one.name != "scintillation"]
+    measured = [one for one in parts if math.isfinite(one.rms) and one.name != LAW]
     rest = whole - math.fsum(one.rms**2 for one in measured)
-    return Part("unexplained", math.sqrt(max(rest, 0.0)), "what is left of the squares, scintillation among it")
+    return Part("unexplained", math.sqrt(max(rest, 0.0)), "what is left of the squares")
 
 
 def _ms(values: FloatArray) -> float:

@@ -16,6 +16,7 @@ from hilstar.bench.build import bench_optics
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import glass_in
 from hilstar.confront.light import NO_CORRECTION, LightFit, PixelFit
+from hilstar.confront.pattern import Pattern
 from hilstar.confront.session import FixedCamera, Session, corrected, radius2_of
 from hilstar.confront.star_psf import HALF, STAMP_PX, Stamps, StarPsf, fit_psf
 from hilstar.files import write_whole
@@ -86,13 +87,15 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     }
     if tracker.frame_hz is not None:
         table["frame_hz"] = tracker.frame_hz
-    detector = {
+    detector: dict[str, Any] = {
         "gain_e_per_dn": pixels.gain_e_per_dn,
         "full_well_e": max(full_e, 1.0),
         "bits": int(min(16, max(1, math.ceil(math.log2(session.shots[0].photo.full_dn + 1))))),
         "offset_dn": max(pixels.pedestal_dn, 0.0),
         "read_noise_e": math.hypot(pixels.read_noise_e, rounding_e),
     }
+    if pixels.pattern.rms[0]:
+        detector["prnu"] = pixels.pattern.rms[0]
     tables: dict[str, Any] = {"tracker": table | {"optics": {"psf": NAMES[3]}, "detector": detector}}
     given_tables = parse_toml(session.file.path, session.file.text)
     sky = dict(given_tables.get("sky", {}))
@@ -201,7 +204,16 @@ def fixed_camera(file: BenchFile, step_dn: float) -> FixedCamera:
     light = LightFit(np.zeros(1), vignetting, NO_CORRECTION, math.nan, math.nan, 1.0)
     detector = tracker.detector
     read_e = math.sqrt(max(detector.electronics_e**2 - (step_dn**2 - 1) / 12 * detector.gain_e_per_dn**2, 0.0))
-    pixels = PixelFit(detector.gain_e_per_dn, detector.offset_dn, read_e, step_dn, {}, np.empty((0, 2)))
+    pixels = PixelFit(
+        detector.gain_e_per_dn,
+        detector.offset_dn,
+        read_e,
+        step_dn,
+        {},
+        np.empty((0, 2)),
+        (),
+        Pattern((detector.prnu**2, 0.0, 0.0, 0.0), (0.0,) * 4),
+    )
     return FixedCamera(camera, psf, light, pixels)
 
 

@@ -23,6 +23,7 @@ FITS_MAGIC = b"SIMPLE  ="
 MAX_BYTES = 500_000_000
 BAYER = re.compile(r"^(RGGB|BGGR|GRBG|GBRG)$")
 BAYER_KEYS = ("BAYERPAT", "COLORTYP", "FILTER")
+MAP_KEYS = {"CENTAZ", "CENTEL"}  # of DASC's maps of azimuth and elevation
 DATE_KEYS = ("DATE-OBS", "DATE-BEG", "OBSDATE")
 EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE", "XPOSURE")
 EXIF_IFD, EXIF_DATE, EXIF_OFFSET, EXIF_EXPOSURE = 0x8769, 0x9003, 0x9011, 0x829A
@@ -164,6 +165,11 @@ def _fits(path: Path, data: bytes) -> tuple[npt.NDArray[Any], _Facts]:
                 if not images:
                     raise InputError(f"{path}: has no image; {ADVICE}")
                 pixels, header = np.asarray(images[0].data), images[0].header
+                if set(header) >= MAP_KEYS:
+                    raise InputError(
+                        f"{path}: has the direction of each pixel of an all-sky camera ({', '.join(sorted(MAP_KEYS))}), and"
+                        " is no photograph; leave it out"
+                    )
                 facts = _fits_facts(header)
     except InputError:
         raise

@@ -23,6 +23,7 @@ from hilstar.sky.bodies.passes import Cone
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
 from hilstar.twin.simulator import Simulator
 from hilstar.units import MAD_TO_SIGMA as MAD
+from hilstar.units import flux_ratio
 
 ALL_STARS_MAG = 25.0
 LISTED_SNR = 8.0  # from which a source that nothing explains counts
@@ -38,10 +39,10 @@ CELLS = 4
 DIM_MAG, DIM_STARS, DIM_SIGMAS = 0.25, 2, 4.0
 HOT_SIGMAS, HOT_SHARE, HOT_LIGHT = 6.0, 0.75, 0.5
 MOVED_PX = 5.0  # by which stars move between photographs that tell them from hot pixels
-# Hipparcos is complete to 7.3 + 1.1 |sin b| for late types (ESA SP-1200 vol. 1, 1.1). From V = 8 to 10 the stars of the whole
-# sky grow 2.9 times a magnitude (Allen 1973).
+# Hipparcos is complete to 7.3 + 1.1 |sin b| for late types (ESA SP-1200 vol. 1, 1.1). Over the last magnitude before it, its
+# own stars grow by 0.477, 0.458 and 0.434 dex a magnitude for |sin b| under 0.2, 0.2 to 0.5 and 0.5 to 1.
 GALACTIC_POLE = np.array([-0.867666, -0.198076, 0.455984])
-COMPLETE_V_MAG, COUNTS_SLOPE = (7.3, 1.1), 0.46
+COMPLETE_V_MAG, COUNTS_SLOPE = (7.3, 1.1), (0.484, -0.067)
 NOT_COUNTED = frozenset({"saturated", "blended", "missing", "dim region"})
 
 
@@ -114,6 +115,7 @@ class Verdict:
     dim: list[str]
     dated: DatedBy | None
     fainter: "Fainter"
+    expected: "Expected" = field(repr=False)
     predicted: FloatArray = field(repr=False)
     residual: FloatArray = field(repr=False)
 
@@ -225,6 +227,7 @@ class Judge:
             dim=dim,
             dated=self._dated(number),
             fainter=self._fainter(number, expected),
+            expected=expected,
             predicted=level + light_dn,
             residual=residual,
         )
@@ -236,6 +239,8 @@ class Judge:
         air, rate = shot.sky.air, stars.electrons_per_s
         if air is not None and session.air is not None:
             rate = rate * session.air.shares(stars.row, air.altitude_rad(stars.vectors))[0]
+        if session.light.colours.any() or shot.photo.plane:
+            rate = rate * flux_ratio(session.plane_mag(number, shot.sky.columns(stars.row)))
         columns = (pointing.seen(stars.vectors), stars.temperature_k, rate)
         by_row = [np.empty_like(column) for column in columns]
         for ordered, column in zip(by_row, columns, strict=True):
@@ -283,7 +288,10 @@ class Judge:
         for star in expected.star[expected.dn > EXPECTED_SNR * noise].tolist():
             x, y = expected.x_px[place[star]], expected.y_px[place[star]]
             inside = 2 * MATCH_PX < x < width - 1 - 2 * MATCH_PX and 2 * MATCH_PX < y < height - 1 - 2 * MATCH_PX
-            if star not in seen and inside and not near(x, y) and sources.query([x, y])[0] > 2 * MATCH_PX:
+            if star in seen or not inside or near(x, y) or sources.query([x, y])[0] <= 2 * MATCH_PX:
+                continue
+            box = np.s_[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]  # its light may be part of a larger source
+            if (shot.photo.dn[box] - shot.level.level[box]).sum() < expected.dn[place[star]] / 2:
                 rows.append(row(star, (math.nan,) * 4, ("missing",)))
         return rows
 
@@ -367,7 +375,7 @@ class Judge:
         near = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px])).query(places)[1]
         depth = shot.sky.v_mag[shot.star[shot.clean]] + 2.5 * np.log10(shot.sources.snr[near])
         reached, v_mag = float(np.median(depth)) - 2.5 * math.log10(LISTED_SNR), shot.sky.v_mag[expected.star]
-        every = float((v_mag <= complete).sum()) * 10 ** (COUNTS_SLOPE * (reached - complete))
+        every = float((v_mag <= complete).sum()) * 10 ** ((COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * sine) * (reached - complete))
         return Fainter(complete, reached, max(every - float((v_mag <= reached).sum()), 0.0) if reached > complete else 0.0)
 
     def _dated(self, number: int) -> DatedBy | None:

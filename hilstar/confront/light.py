@@ -12,6 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.confront.pattern import NO_PATTERN, Pattern
+from hilstar.confront.star_psf import MEAN_BV_MAG
+from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import MAD_TO_SIGMA
 
 MAG = 2.5 / math.log(10)
@@ -41,7 +44,7 @@ Magnitudes = Callable[[Correction], FloatArray]
 class StarLight:
     """Stars (n,) of all photographs: which one, flux with one sigma, DN, V, B-V, the square of the radius, and whether clean.
 
-    The radius is in half diagonals from the principal point.
+    The radius is in half diagonals from the principal point. `plane` is 1, 2, 3 for red, green and blue of a mosaic, else 0.
     """
 
     image: IntArray
@@ -51,6 +54,7 @@ class StarLight:
     bv_mag: FloatArray
     radius2: FloatArray
     clean: BoolArray
+    plane: IntArray
 
     @property
     def instrument_mag(self) -> FloatArray:
@@ -76,6 +80,7 @@ class LightFit:
     about Johnson V: -2.5 log10(DN) = V + colour_term (B-V) - zero point. DN go as light to the power `linearity`. `sigma` has
     one sigma of figures by name. `mag` (n,) is what each star should have, without the photograph's offset. `masses` are each
     photograph's air masses where known, and `extinction_mag` what offsets grow by with one, beyond the site's own table.
+    `colours` (images,) are what a plane of a mosaic adds, mag a magnitude of B-V, and `colour_terms` those of planes about V.
     """
 
     offsets_mag: FloatArray
@@ -88,6 +93,8 @@ class LightFit:
     mag: FloatArray = field(default_factory=lambda: np.empty(0))
     masses: tuple[float | None, ...] = ()
     extinction_mag: float | None = None
+    colours: FloatArray = field(default_factory=lambda: np.zeros(1))
+    colour_terms: dict[str, float] = field(default_factory=dict)
 
     def illumination(self, radius2: FloatArray) -> FloatArray:
         """Light relative to the axis at squares of radii."""
@@ -116,8 +123,16 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
         held_out = _held_out(np.column_stack([ones, *columns]), off, stars.sigma_mag, use)
         if held_out < GAIN * best:
             best, chosen = held_out, name
-    found = _robust(np.column_stack([ones, *vignetting[chosen]]), off, stars.sigma_mag, use)
-    terms = (*found.values[images:].tolist(), 0.0, 0.0)[:2]
+    # a mosaic's planes have a colour each beside the one quantum efficiency
+    bv, planes = np.nan_to_num(stars.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG, np.unique(stars.plane)
+    own = [bv * (stars.plane == plane) for plane in planes if len(planes) > 1]
+    found = _robust(np.column_stack([ones, *vignetting[chosen], *own]), off, stars.sigma_mag, use)
+    terms = (*found.values[images : len(found.values) - len(own)].tolist(), 0.0, 0.0)[:2]
+    colours, colour_terms = np.zeros(images), {}
+    for k, plane in enumerate(planes if own else ()):
+        colours[np.unique(stars.image[stars.plane == plane])] = found.values[len(found.values) - len(own) + k]
+        here = use & (stars.plane == plane)
+        colour_terms[" rgb"[plane]] = float(_about_v(stars, base, here, ones[:, ones[here].any(axis=0)], ()).values[1])
     about_v = _about_v(stars, base, use, ones, vignetting[chosen])
     sigma = {name: about_v.sigma[k] for k, name in enumerate(("linearity", "colour_term"))}
     sigma |= {"zero_point_mag": float(about_v.sigma[2 : 2 + images].mean())}
@@ -130,6 +145,8 @@ def fit_light(stars: StarLight, images: int, magnitudes: Magnitudes, held: Light
         linearity=float(about_v.values[0]),
         sigma=sigma,
         mag=base + found.model - ones @ found.values[:images],
+        colours=colours,
+        colour_terms=colour_terms,
     )
 
 
@@ -233,7 +250,7 @@ def _offsets_alone(stars: StarLight, images: int, base: FloatArray, held: LightF
     off = stars.instrument_mag - base - shape
     ones = np.eye(images)[stars.image]
     found = _robust(ones, off, stars.sigma_mag, _trusted(stars, ones))
-    return replace(held, offsets_mag=found.values, mag=base + shape)
+    return replace(held, offsets_mag=found.values, mag=base + shape, colours=np.zeros(images))
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,11 +306,13 @@ class PixelFit:
     sigma: dict[str, float]
     points: FloatArray
     notes: tuple[str, ...] = ()
+    pattern: Pattern = NO_PATTERN
 
     def variance_dn2(self, level_dn: FloatArray) -> FloatArray:
         """Variance of a pixel at a level."""
-        light = np.maximum(level_dn - self.pedestal_dn, 0) / self.gain_e_per_dn
-        return np.asarray(light + (self.read_noise_e / self.gain_e_per_dn) ** 2 + self.step_dn**2 / 12)
+        light = np.maximum(level_dn - self.pedestal_dn, 0)
+        noise = light / self.gain_e_per_dn + (self.read_noise_e / self.gain_e_per_dn) ** 2 + self.step_dn**2 / 12
+        return np.asarray(noise + self.pattern.variance_dn2(light))
 
 
 def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> FloatArray:
@@ -322,22 +341,18 @@ def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> Float
     return np.concatenate(parts)
 
 
-@dataclass(frozen=True, slots=True)
-class Assumed:
-    """What the bench file says of the detector, taken where photographs cannot tell."""
+def fit_pixels(
+    points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: DetectorSettings, pattern: Pattern
+) -> PixelFit:
+    """The detector by photon transfer, that of the bench file where photographs cannot tell it.
 
-    offset_dn: float
-    read_noise_e: float
-    gain_e_per_dn: float
-
-
-def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: Assumed) -> PixelFit:
-    """The detector by photon transfer; `pedestal` and its sigma where levels told it."""
+    `pedestal` comes with its sigma where levels told it. A fixed pattern is no noise of light.
+    """
     notes = []
     offset, offset_sigma = pedestal or (assumed.offset_dn, math.nan)
     if not len(points):
         notes.append("no part of the background is free of sources: the detector is the bench file's")
-        return PixelFit(assumed.gain_e_per_dn, offset, assumed.read_noise_e, step_dn, {}, points, tuple(notes))
+        return PixelFit(assumed.gain_e_per_dn, offset, assumed.read_noise_e, step_dn, {}, points, tuple(notes), pattern)
     level, variance = points.T
     if pedestal is None:
         notes.append(f"the pedestal is the bench file's, {offset:g} DN: levels of these photographs do not tell it")
@@ -348,6 +363,8 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
             offset = assumed.offset_dn
             notes.append(f"the pedestal is the bench file's, {offset:g} DN ({told})")
     low, high = np.percentile(level, [5, 95])
+    *_, column, row = pattern.rms  # of which a difference along a row, or down a column, has one
+    variance = variance - pattern.variance_dn2(np.maximum(level - offset, 0)) + (column**2 + row**2) / 2
     sigma = {"pedestal_dn": offset_sigma}
     line = _line(level - offset, variance)
     if high - offset > MIN_LEVEL_RANGE * (low - offset) and line.slope > 5 * line.slope_sigma:
@@ -355,7 +372,7 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
         read = math.sqrt(max(line.at_zero - step_dn**2 / 12, 0.0))
         sigma["gain_e_per_dn"] = gain * line.slope_sigma / line.slope
         sigma["read_noise_e"] = gain * min(line.at_zero_sigma / max(2 * read, 1e-9), math.sqrt(line.at_zero_sigma))
-        return PixelFit(gain, offset, read * gain, step_dn, sigma, points, tuple(notes))
+        return PixelFit(gain, offset, read * gain, step_dn, sigma, points, tuple(notes), pattern)
     # one level alone: shot noise of what is above the pedestal, and the bench's read noise
     signal, noise2 = float(np.median(level)) - offset, float(np.median(variance)) - step_dn**2 / 12
     gain, read_e = assumed.gain_e_per_dn, assumed.read_noise_e
@@ -365,7 +382,7 @@ def fit_pixels(points: FloatArray, step_dn: float, pedestal: tuple[float, float]
     else:
         notes.append("the background is at the pedestal: the gain is the bench file's")
         read_e = math.sqrt(max(noise2, 0.0)) * gain
-    return PixelFit(gain, offset, read_e, step_dn, sigma, points, tuple(notes))
+    return PixelFit(gain, offset, read_e, step_dn, sigma, points, tuple(notes), pattern)
 
 
 class _Line(NamedTuple):

@@ -11,6 +11,7 @@ from hilstar.arrays import FloatArray
 from hilstar.confront.excess import Excess
 from hilstar.confront.judge import Verdict
 from hilstar.confront.light import LINEAR_OFF, LINEAR_SIGMAS
+from hilstar.confront.pattern import KINDS
 from hilstar.confront.session import Session
 from hilstar.units import ARCSEC_PER_RAD
 
@@ -57,10 +58,14 @@ class Confronted:
                 "saturation_dn": session.shots[0].photo.full_dn,
                 "zero_point_mag": _number(light.zero_point_mag),
                 "colour_term": _number(light.colour_term),
+                "colour_terms": light.colour_terms,
                 "vignetting_mag": list(light.vignetting_mag),
                 "extinction_mag_per_air_mass": extinction_of(session),
                 "linearity_power": session.power * light.linearity if session.power != 1.0 else light.linearity,
                 "tone_curve": session.power != 1.0,
+                "fixed_pattern": None
+                if not math.isfinite(pixels.pattern.errors[0])
+                else dict(zip(KINDS, pixels.pattern.rms, strict=True)),
                 "hot_pixels": self.defects[0],
                 "dead_pixels": self.defects[1],
                 "sigma": {"focal_length_px": focal * sigma["log_focal"] if "log_focal" in sigma else None}
@@ -161,8 +166,11 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
         f"detector: {pixels.gain_e_per_dn:.4g} e- a DN ({pixels.gain_e_per_dn * pixels.step_dn:.3g} a step of"
         f" {pixels.step_dn:.3g} DN), read noise {pixels.read_noise_e:.2f} e-, pedestal {pixels.pedestal_dn:.0f} DN",
     ]
+    if math.isfinite(pixels.pattern.errors[0]) and not session.fixed:
+        found.append(f"fixed pattern: {pixels.pattern.words()}")
     if not session.fixed:
         zero = f"zero point {light.zero_point_mag:.2f} mag, colour term {light.colour_term:+.3f} (B-V)"
+        zero += "".join(f", {plane} {term:+.3f}" for plane, term in light.colour_terms.items())
         found.append(f"light: {zero}; {_tone(session)}")
     if session.fixed:
         found.append(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -10,17 +11,16 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_optics, channel_rates, site_air
+from hilstar.bench.build import bench_channels, bench_optics, channel_rates, site_air
 from hilstar.bench.config.sky import SiteSettings
 from hilstar.bench.site import site_glow_e_per_s_sr
-from hilstar.confront.background import SkyLevel, Sources, find_sources, sky_level, source_mask
+from hilstar.confront.background import SkyLevel, Sources, find_sources, is_round, sky_level, source_mask
 from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera
 from hilstar.confront.images import Photograph, paged
 from hilstar.confront.light import (
     LINEAR_OFF,
     LINEAR_SIGMAS,
     NO_CORRECTION,
-    Assumed,
     Correction,
     LightFit,
     PixelFit,
@@ -32,23 +32,26 @@ from hilstar.confront.light import (
     with_extinction,
 )
 from hilstar.confront.lost_in_space import MIN_MATCHED, Field, Solved, solve_lost
+from hilstar.confront.pattern import NO_PATTERN, fixed_pattern
 from hilstar.confront.sky import DatedSky, dated_sky
-from hilstar.confront.star_psf import HALF, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
+from hilstar.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
 from hilstar.errors import InputError
 from hilstar.rotation import conjugate, rotate
 from hilstar.scene.camera import Camera
 from hilstar.sky.air import SiteAir, air_mass
 from hilstar.sky.spectrum import Curve
+from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 MATCH_PX = 2.5
 BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
 PSF_STARS = 60
-TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 12.0
+TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 9.0
 BRIGHTEST = 10  # sources that tell a photograph's focus and rest
 SATURATED_SHARE = 0.97
 TONE_ROUNDS = 6
 PASSES = 2
+APART_PX = 10.0  # by which photographs' skies are moved on the detector that tell its fixed pattern
 SOURCE_PX = 4  # about a source whose pixels tell nothing of the background
 SCATTER_SNR = 10.0
 LINEAR_DONE = 0.004
@@ -115,11 +118,17 @@ class Session:
         glow = site_glow_e_per_s_sr(msgspec.structs.replace(config, site=site), folder, optics)
         return float(magnitude(np.array([glow / ARCSEC_PER_RAD**2]))[0])
 
+    def plane_mag(self, number: int, columns: FloatArray) -> FloatArray:
+        """By how much stars of V, B-V and V-I (3, n) are fainter to a plane of a mosaic than to the tracker as a whole, mag."""
+        colour = self.light.colours[number] * (np.nan_to_num(columns[1], nan=MEAN_BV_MAG) - MEAN_BV_MAG)
+        return np.asarray(colour + _channel_mag(self.file, self.shots[number].photo.plane, columns))
+
     def predicted_dn(self, number: int, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """DN of stars (n,), rows of the sky of photograph `number`, at their places on it."""
         sky, light = self.shots[number].sky, self.light
-        mag = _Magnitudes(self.file, _columns(sky, star))(NO_CORRECTION if self.fixed else light.correction)
-        mag = mag + extinct_mag(self.air, sky, star)
+        columns = sky.columns(sky.order[star])
+        mag = _Magnitudes(self.file, columns)(NO_CORRECTION if self.fixed else light.correction)
+        mag = mag + self.plane_mag(number, columns) + extinct_mag(self.air, sky, star)
         shade = light.illumination(radius2_of(self.camera.camera, x_px, y_px))
         return np.asarray(10 ** (-0.4 * (mag + light.offsets_mag[number])) * shade)
 
@@ -131,17 +140,22 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     sky = dated_sky(file, photo.t_ns)
     points = ~sources.single & ~sources.trail
     field = _field(sources, points, photo)
+    found = _solve(field, base, sky, start) if len(field.places_px) >= MIN_MATCHED else None
+    if found is None and is_round(photo.dn):
+        raise InputError(
+            f"{photo.path}: its light fills a circle between dark corners: an all-sky lens, of which hilstar has no model; give"
+            " frames of a lens under 120 degrees, whose sky fills the image"
+        )
     if len(field.places_px) < MIN_MATCHED:
         raise InputError(
             f"{photo.path}: {len(field.places_px)} sources stand out of its noise, and an attitude takes {MIN_MATCHED}; expose"
             " longer, open the cap, or look at a sky without cloud"
         )
-    found = _solve(field, base, sky, start)
     if found is None:
         raise InputError(f"{photo.path}: {_why_not(field, base, sky, sources, points, start)}")
     kept = np.flatnonzero(points)
     matched = replace(found, source=kept[found.source])
-    wide_px = float(np.median(sources.width_px[np.sort(matched.source)[:BRIGHTEST]]))
+    wide_px = float(np.median(sources.fwhm_px[np.sort(matched.source)[:BRIGHTEST]]))
     if wide_px > WIDE_PX:
         raise InputError(f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in focus")
     return Shot(
@@ -180,8 +194,8 @@ def _why_not(field: Field, base: Camera, sky: DatedSky, sources: Sources, points
         return (
             f"its stars are trails of about {np.median(trails):.0f} px; give a frame of a camera at rest, or a shorter exposure"
         )
-    if width > WIDE_PX:
-        return f"its sources are {width:.0f} px wide; focus the lens, or give a frame in focus"
+    if (wide := np.median(sources.fwhm_px[bright])) > WIDE_PX:
+        return f"its sources are {wide:.0f} px wide; focus the lens, or give a frame in focus"
     mirrored = replace(field, places_px=field.places_px * [-1, 1])
     if _solve(mirrored, base, sky, start) is not None:
         return "is mirrored: its stars fit the sky only with left and right exchanged; flip the image"
@@ -206,12 +220,11 @@ def run_session(
     Raises InputError for a photograph without an attitude.
     """
     shots = [open_shot(file, photo, base, start) for photo in photos]
-    assumed = Assumed(*(getattr(file.config.tracker.detector, name) for name in ("offset_dn", "read_noise_e", "gain_e_per_dn")))
     focal = float(np.median([shot.focal_length_px for shot in shots]))
     base = replace(base, focal_length_px=focal) if fixed is None else fixed.camera
     air = None if shots[0].sky.air is None else site_air(file.config, file.folder, shots[0].sky.catalog)
-    fit = _Fitting(file, base, assumed, fixed, air)
-    session = fit.of(shots, 1.0)
+    fit = partial(_fitted, file, base, fixed, air)
+    session = fit(shots)
     off = abs(session.light.linearity - 1)
     if (
         fixed is not None
@@ -224,10 +237,10 @@ def run_session(
     for _ in range(TONE_ROUNDS):
         power = math.exp(undone)
         linear = [_linear(shot, photo, power) for shot, photo in zip(session.shots, photos, strict=True)]
-        trial = fit.of(linear, power, session.camera)
+        trial = fit(linear, power=power, before=session.camera)
         left = math.log(max(trial.light.linearity, 0.1))
         if abs(left) < LINEAR_DONE:
-            return fit.of(trial.shots, power)
+            return fit(trial.shots, power=power)
         slope = (left - before[1]) / (undone - before[0])
         step = -left / slope if slope < 0 else left
         before, undone = (undone, left), undone + min(max(step, -MAX_TONE_STEP), MAX_TONE_STEP)
@@ -262,23 +275,17 @@ def _level(photo: Photograph, step_dn: float) -> SkyLevel:
     return level
 
 
-@dataclass(frozen=True, slots=True)
-class _Fitting:
-    """What a fit starts from: the bench, its camera, its detector, and the camera that is held, if any."""
-
-    file: BenchFile
-    base: Camera
-    assumed: Assumed
-    fixed: FixedCamera | None
-    air: SiteAir | None
-
-    def of(self, shots: Sequence[Shot], power: float, before: CameraFit | None = None) -> Session:
-        """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
-        return _fitted(self, shots, power, before)
-
-
-def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: CameraFit | None) -> Session:
-    fixed = start.fixed
+def _fitted(
+    file: BenchFile,
+    base: Camera,
+    fixed: FixedCamera | None,
+    air: SiteAir | None,
+    shots: Sequence[Shot],
+    *,
+    power: float = 1.0,
+    before: CameraFit | None = None,
+) -> Session:
+    """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
     pointings = [shot.pointing for shot in shots] if before is None else list(before.pointings)
     first = [
         Places(
@@ -289,8 +296,8 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         )
         for s in shots
     ]
-    camera = before or fit_camera(start.base, pointings, first, fixed=fixed is not None, last=False)
-    pixels = _pixels(shots, start.assumed) if fixed is None else fixed.pixels
+    camera = before or fit_camera(base, pointings, first, fixed=fixed is not None, last=False)
+    pixels = _pixels(shots, file.config.tracker.detector) if fixed is None else fixed.pixels
     gain = pixels.gain_e_per_dn
     passes = PASSES if before is None else 1
     for number in range(passes):
@@ -302,22 +309,34 @@ def _fitted(start: _Fitting, shots: Sequence[Shot], power: float, before: Camera
         if before is not None:
             continue
         places = [_places(shot) for shot in shots]
-        camera = fit_camera(start.base, camera.pointings, places, fixed=fixed is not None, last=number == passes - 1)
+        camera = fit_camera(base, camera.pointings, places, fixed=fixed is not None, last=number == passes - 1)
         for shot, pointing in zip(shots, camera.pointings, strict=True):
             shot.pointing = pointing
     stars = _star_light(shots, camera.camera)
-    magnitudes = _Magnitudes(start.file, np.concatenate([_columns(s.sky, s.star) for s in shots], axis=1))
-    extinct = np.concatenate([extinct_mag(start.air, shot.sky, shot.star) for shot in shots])
+    columns = [s.sky.columns(s.sky.order[s.star]) for s in shots]
+    magnitudes = _Magnitudes(file, np.concatenate(columns, axis=1))
+    extinct = np.concatenate(
+        [
+            extinct_mag(air, s.sky, s.star) + _channel_mag(file, s.photo.plane, own)
+            for s, own in zip(shots, columns, strict=True)
+        ]
+    )
     light = fit_light(
         stars, len(shots), lambda corrected: magnitudes(corrected) + extinct, None if fixed is None else fixed.light
     )
     masses = [_masses(shot.sky, pointing) for shot, pointing in zip(shots, camera.pointings, strict=True)]
-    light = with_extinction(light, stars, masses, known=start.air is not None)
-    return Session(start.file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, start.air)
+    light = with_extinction(light, stars, masses, known=air is not None)
+    return Session(file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, air)
 
 
-def _columns(sky: DatedSky, star: IntArray) -> FloatArray:
-    return np.stack([sky.v_mag[star], sky.bv_mag[star], sky.vi_mag[star]])
+def _channel_mag(file: BenchFile, plane: str, columns: FloatArray) -> FloatArray:
+    """What stars have to the channel of a plane (r, g1, g2, b) more than to all, mag; 0 where the bench has one channel."""
+    channels = bench_channels(file.config.tracker, file.folder)
+    if not plane or len(channels) < 3:
+        return np.zeros(columns.shape[1])
+    both = channels["rgb".index(plane[0])], bench_optics(file.config.tracker, file.folder)
+    own, every = (magnitude(channel_rates(file.config.sky, optics)(*columns)) for optics in both)
+    return np.asarray(own - every)
 
 
 def extinct_mag(air: SiteAir | None, sky: DatedSky, star: IntArray) -> FloatArray:
@@ -335,19 +354,26 @@ def _masses(sky: DatedSky, pointing: Pointing) -> float | None:
     return None if altitude is None else float(air_mass(np.radians([altitude]))[0])
 
 
-def _pixels(shots: Sequence[Shot], assumed: Assumed) -> PixelFit:
+def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
     """The detector by the background of all photographs."""
-    parts = []
-    for s in shots:
-        above = s.level.above(s.photo.dn)
-        parts.append(transfer_points(s.photo.dn, s.level.level, source_mask(s.sources, above, SOURCE_PX)))
-    points = np.concatenate(parts)
+    masks = [source_mask(s.sources, s.level.above(s.photo.dn), SOURCE_PX) for s in shots]
+    points = [transfer_points(s.photo.dn, s.level.level, mask) for s, mask in zip(shots, masks, strict=True)]
     height, width = shots[0].photo.dn.shape
     side = shots[0].level.block_px
     y, x = np.mgrid[side // 2 : height : side, side // 2 : width : side]
     places = np.column_stack([x.ravel() / width, y.ravel() / height]) - 0.5
     pedestal = fit_pedestal([s.level.level[y, x].ravel() for s in shots], places)
-    return fit_pixels(points, max(s.photo.step_dn for s in shots), pedestal, assumed)
+    # stars too faint to be seen are pixels' own where two photographs have one part of the sky
+    apart: list[int] = []
+    for k, shot in enumerate(shots):
+        moved = [np.linalg.norm(shot.pointing.boresight - shots[j].pointing.boresight) * shot.focal_length_px for j in apart]
+        if all(px > APART_PX for px in moved):
+            apart.append(k)
+    zero = assumed.offset_dn if pedestal is None else pedestal[0]
+    pattern = fixed_pattern(
+        (s.photo.dn - s.level.level, s.level.level - zero, ~masks[k]) for k, s in enumerate(shots) if k in apart
+    )
+    return fit_pixels(np.concatenate(points), max(s.photo.step_dn for s in shots), pedestal, assumed, pattern or NO_PATTERN)
 
 
 def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
@@ -442,6 +468,7 @@ def _star_light(shots: Sequence[Shot], camera: Camera) -> StarLight:
                 sky.bv_mag[shot.star],
                 radius2,
                 shot.clean,
+                np.full(len(shot.star), " rgb".index(shot.photo.plane[:1] or " ")),
             )
         )
     return StarLight(*(np.concatenate(part) for part in zip(*parts, strict=True)))

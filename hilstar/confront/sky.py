@@ -56,14 +56,13 @@ class DatedSky:
         return self.catalog.bv_mag[self.order]
 
     @property
-    def vi_mag(self) -> FloatArray:
-        """V-I."""
-        return self.catalog.vi_mag[self.order]
-
-    @property
     def hip(self) -> npt.NDArray[np.int32]:
         """HIP numbers."""
         return self.catalog.hip[self.order]
+
+    def columns(self, row: IntArray) -> FloatArray:
+        """V, B-V and V-I (3, k) of rows of the catalogue."""
+        return np.stack([self.catalog.v_mag[row], self.catalog.bv_mag[row], self.catalog.vi_mag[row]])
 
     def within(self, star: IntArray) -> tuple[FloatArray, BoolArray, BoolArray]:
         """Of some stars (k,): the error of V, mag, and whether they are known doubles or variables."""

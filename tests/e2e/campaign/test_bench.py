@@ -22,7 +22,8 @@ from hilstar.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT, bench_text
 from tests.support.campaign_tracker import FOCAL_PX, WAVE_PX, Planted, wave
 from tests.support.campaigns import plan_text, read_columns
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for
 
 pytestmark = pytest.mark.e2e
@@ -94,7 +95,7 @@ def seconds(folder: Path) -> float:
 
 
 def started(folder: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen([*HILSTAR, *COMMAND], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return Started([*HILSTAR, *COMMAND], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def reached(folder: Path, goal: int, hilstar: subprocess.Popen[str]) -> bool:

@@ -104,7 +104,8 @@ def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
 
 def test_another_plan_and_a_budget_that_is_too_small_are_refused(folder: Path) -> None:
     short = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--memory", "1MB", *OPTIONS[:2], cwd=folder)
-    assert_refused(short, 2, "--memory", "or more")
+    last = short.stderr.splitlines()[-1]  # a busy machine has told its progress before
+    assert (short.returncode, short.stdout) == (2, "") and "--memory" in last and "or more" in last, short.stderr
     before = rows_so_far(folder)
     write_campaign(folder, seed=8)
     other = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=folder)

@@ -108,8 +108,9 @@ def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():
         values = rng.normal(size=(count, 2))
         values[rng.random(count) < 0.2, 1] = np.nan
         spans = SpanTable(2, capacity=16)
-        for k, row in enumerate(values):
-            spans.add(float(k), tuple(row))
+        rows = np.column_stack([np.arange(count), values])
+        for at in range(0, count, 300):
+            spans.add(rows[at : at + 300])
         begin, length = spans.begin, spans.length
         assert len(begin) <= 16 and begin.tolist() == list(range(0, count, length))
         for column in range(2):

@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,19 +38,19 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 
 SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
 SPANS = 8192  # in which a run is drawn along its time
-BLOCK = 1024  # frames that are summed up at once
+BLOCK = 4096  # records that are added at once
 
 
 class ThinnedRows:
     """Every n-th row of a stream; n doubles as the stream grows."""
 
-    def __init__(self, columns: int, capacity: int = SAMPLES) -> None:
-        self._rows = np.zeros((capacity, columns))
+    def __init__(self, columns: int, capacity: int = SAMPLES, kind: type = float) -> None:
+        self._rows: npt.NDArray[Any] = np.zeros((capacity, columns), dtype=kind)
         self._kept = 0
         self.stride = 1
         self._seen = 0
 
-    def add(self, rows: FloatArray) -> None:
+    def add(self, rows: npt.NDArray[Any]) -> None:
         """Add rows (n, columns), or skip them."""
         while len(rows):
             first = -self._seen % self.stride
@@ -64,7 +65,7 @@ class ThinnedRows:
                 self._kept, self.stride = half, 2 * self.stride
 
     @property
-    def rows(self) -> FloatArray:
+    def rows(self) -> npt.NDArray[Any]:
         """The rows that are kept, (n, columns)."""
         return self._rows[: self._kept]
 
@@ -141,12 +142,8 @@ class TimeBins:
         self._used = 0
         self.width_ns = NS_PER_S
 
-    def add(self, at_ns: int, kind: int, number: int = 1) -> None:
-        """Count `number` arrivals at a host time; a time before the first counts in the first bin."""
-        self.add_all(np.array([at_ns]), np.array([kind]), number)
-
-    def add_all(self, at_ns: IntArray, kinds: IntArray, number: int = 1) -> None:
-        """Count `number` arrivals at each of host times (n,), of `kinds` (n,)."""
+    def add(self, at_ns: npt.NDArray[np.int64], kinds: IntArray, number: int = 1) -> None:
+        """Count `number` arrivals of `kinds` (n,) at host times (n,); a time before the first counts in the first bin."""
         if not len(at_ns):
             return
         if self._first_ns is None:
@@ -178,22 +175,13 @@ SMALL_RAD = 1e-8
 class Keyframes:
     """Frames of a run to be drawn in its report: some evenly over the run, and the first or worst of each kind."""
 
-    def __init__(self, capacity: int = KEYFRAMES) -> None:
-        self._even: list[FrameRecord] = []
-        self._capacity, self._stride, self._seen = capacity, 1, 0
+    def __init__(self) -> None:
+        self._even = ThinnedRows(1, KEYFRAMES, object)
         self._best: dict[str, tuple[int, FrameRecord]] = {}
 
     def add(self, frames: list[FrameRecord], worths: dict[str, IntArray]) -> None:
         """Look at frames (n), whose `worths` (n,) say how special each is."""
-        rest = frames
-        while rest:
-            first = -self._seen % self._stride
-            fitting = rest[first :: self._stride][: self._capacity - len(self._even)]
-            self._even += fitting
-            taken = min(len(rest), first + len(fitting) * self._stride)
-            self._seen, rest = self._seen + taken, rest[taken:]
-            if rest and len(self._even) == self._capacity:
-                self._even, self._stride = self._even[::2], 2 * self._stride
+        self._even.add(np.array([*frames, None], dtype=object)[:-1, None])
         for why, worth in worths.items():
             place = int(worth.argmax())
             if worth[place] > self._best.get(why, (0, None))[0]:
@@ -201,7 +189,7 @@ class Keyframes:
 
     def chosen(self, last: FrameRecord | None) -> list[tuple[FrameRecord, str]]:
         """The frames in order, each with what is special about it, or ""."""
-        found = {id(frame): (frame, "") for frame in self._even}
+        found = {id(frame): (frame, "") for frame in self._even.rows[:, 0]}
         for why, (_, frame) in self._best.items():
             before = found.get(id(frame), (frame, ""))[1]
             found[id(frame)] = (frame, ", ".join(part for part in (before, why) if part))
@@ -275,11 +263,27 @@ class RunFigures:
             return None
         return (self.last_process.resident_bytes - self.warm.resident_bytes) / MEGABYTE
 
-    def add(self, record: RunRecord) -> None:
-        """Add a record of the ledger."""
-        if isinstance(record, FrameRecord):
-            self.add_frames([record])
-        elif isinstance(record, ProcessRecord):
+    def add(self, *records: RunRecord) -> None:
+        """Add records of the ledger, in their order: many at once take a third of the time."""
+        frames: list[FrameRecord] = []
+        packets: list[PacketForm] = []
+        for record in records:
+            if isinstance(record, FrameRecord):
+                self.answers.frame(record)
+                frames.append(record)
+            elif isinstance(record, PacketForm):
+                self.packets.add(record)
+                if record.receive_ns is not None:
+                    packets.append(record)
+            else:
+                self._add_one(record)
+        times_ns = np.array([packet.receive_ns for packet in packets], dtype=np.int64)
+        self.packet_times.add(times_ns, np.array([ACCEPTED if packet.accepted else REFUSED for packet in packets]))
+        if frames:
+            self._add_frames(frames)
+
+    def _add_one(self, record: ProcessRecord | CountRecord | EventRecord | FaultRecord | AnswerRecord) -> None:
+        if isinstance(record, ProcessRecord):
             first = self.first_process = self.first_process or record
             if self.warm is None and (record.host_ns - first.host_ns) / NS_PER_S >= WARM_UP_S:
                 self.warm = record
@@ -297,35 +301,20 @@ class RunFigures:
             self.answers.answer(record)
             if record.verdict == "right" and record.residual_arcsec is not None:
                 self.residuals.add(np.array([(record.middle_ns / NS_PER_S, *record.residual_arcsec)]))
-        elif isinstance(record, PacketForm):
-            self.add_packets([record])
         else:
             self.packets.add(record)
-            self._add_count(record)
+            if record.kind == "pulse" and record.reason in PULSES:
+                self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
+                self.pulses[record.reason] += record.count
+            elif record.kind == "packet":
+                place = ACCEPTED if record.reason == "accepted" else REFUSED
+                self.packet_times.add(np.array([record.host_ns]), np.array([place]), record.count)
 
-    def add_packets(self, packets: list[PacketForm]) -> None:
-        """Add packets."""
-        for packet in packets:
-            self.packets.add(packet)
-        timed = [packet for packet in packets if packet.receive_ns is not None]
-        kinds = np.array([ACCEPTED if packet.accepted else REFUSED for packet in timed], dtype=np.intp)
-        self.packet_times.add_all(np.array([packet.receive_ns for packet in timed], dtype=np.int64), kinds)
-
-    def _add_count(self, record: CountRecord) -> None:
-        if record.kind == "pulse" and record.reason in PULSES:
-            self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
-            self.pulses[record.reason] += record.count
-        elif record.kind == "packet":
-            self.packet_times.add(record.host_ns, ACCEPTED if record.reason == "accepted" else REFUSED, record.count)
-
-    def add_frames(self, frames: list[FrameRecord]) -> None:
-        """Add frames that follow one another, at least one."""
+    def _add_frames(self, frames: list[FrameRecord]) -> None:
         before, self.last = self.last, frames[-1]
         if before is None:
             self.first_swap_ns = frames[0].swap_ns
         self.frames += len(frames)
-        for frame in frames:
-            self.answers.frame(frame)
         stale, blank, operator, hidden = (
             np.array(each, dtype=bool)
             for each in zip(*((f.stale, f.q is None, f.operator != "", f.hidden != "") for f in frames), strict=True)
@@ -369,16 +358,17 @@ def _times_ms(
     intervals_ns[after_missed] = np.nan
     if before is None:
         intervals_ns[0] = np.nan
-    predicted, receive, age = (
-        [np.nan if at is None else swap - at for swap, at in zip(swap_ns.tolist(), each, strict=True)]
-        for each in (
-            [frame.predicted_swap_ns for frame in frames],
-            [frame.receive_ns for frame in frames],
-            [None if frame.age_ns is None else frame.swap_ns - frame.age_ns for frame in frames],
+    rest = [
+        (
+            np.nan if f.predicted_swap_ns is None else f.swap_ns - f.predicted_swap_ns,
+            f.swap_ns - f.draw_ns,
+            np.nan if f.age_ns is None else f.age_ns,
+            f.prediction_ns,
+            np.nan if f.receive_ns is None else f.swap_ns - f.receive_ns,
         )
-    )
-    drawn, prediction = swap_ns - np.array([frame.draw_ns for frame in frames]), [frame.prediction_ns for frame in frames]
-    return np.column_stack([intervals_ns, predicted, drawn, age, prediction, receive]) / NS_PER_MS
+        for f in frames
+    ]
+    return np.column_stack([intervals_ns, np.array(rest, dtype=np.float64)]) / NS_PER_MS
 
 
 def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -398,27 +388,9 @@ def figures_of(path: Path) -> RunFigures:
     """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
     figures = RunFigures(read_head(path))
     figures.answers = AnswerTally(_begun_ns(figures.head))
-    frames: list[FrameRecord] = []
-    packets: list[PacketForm] = []
-    for record in run_records(path):
-        if isinstance(record, PacketForm):
-            packets.append(record)
-        elif isinstance(record, FrameRecord):
-            frames.append(record)
-        else:
-            if frames and isinstance(record, (FaultRecord, AnswerRecord)):  # in their order
-                figures.add_frames(frames)
-                frames = []
-            figures.add(record)
-        if len(frames) == BLOCK:
-            figures.add_frames(frames)
-            frames = []
-        if len(packets) == BLOCK:
-            figures.add_packets(packets)
-            packets = []
-    if frames:
-        figures.add_frames(frames)
-    figures.add_packets(packets)
+    records = run_records(path)
+    while block := list(islice(records, BLOCK)):
+        figures.add(*block)
     if not figures.frames:
         raise InputError(f"{path}: {NO_FRAMES}")
     return figures

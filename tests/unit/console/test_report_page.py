@@ -124,7 +124,7 @@ def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():
 def test_bins_keep_every_count_whatever_the_times():
     bins = TimeBins(1, capacity=8)
     for at_ns in (5 * 10**9, 0, 6 * 10**9, 2**62, 40 * 10**9):
-        bins.add(at_ns, 0)
+        bins.add(np.array([at_ns]), np.array([0]))
     begin_s, rates_hz = bins.rates_hz(0)
     assert begin_s[0] == 5.0 and len(begin_s) <= 8
     assert (rates_hz * bins.width_ns / 1e9).sum() == pytest.approx(5)

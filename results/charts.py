@@ -68,7 +68,7 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
     with chart(DOCS / "scale", title, 3, 2, share_x=False) as panels:
         stars, pixels, memory, workers, packets, hours = panels
         stars.plot(*points("stars", "time"), "o-", color=RED)
-        stars.axvline(250_000, color=BLUE, ls=":", label="250 000: only the brightest are drawn")
+        stars.axvline(250_000, color=BLUE, ls=":", label="only the brightest are drawn")
         stars.set(title="a frame, 1920 x 1080", xlabel="stars in view", ylabel="processor time [ms]")
         pixels.plot(*points("pixels", "time"), "o-", color=RED)
         pixels.set(title="a frame of 1000 stars, VGA to 8K", xlabel="pixels", ylabel="processor time [ms]")
@@ -85,11 +85,11 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
         at, ms = points("hours", "time")
         hours.plot(at, [value / 1e3 for value in ms], "o-", color=RED, label="processor time [s]")
         hours.plot(at, points("hours", "memory_mb")[1], "o-", color=PURPLE, label="peak of memory [MB]")
-        hours.set(title="report of a run at 60 Hz, 60 packets a second", xlabel="hours of the run", ylabel="s, or MB")
+        hours.set(title="report: 60 frames and packets a second", xlabel="hours of the run", ylabel="s, or MB")
         for axes in (stars, pixels, workers, hours):
             axes.set(xscale="log", yscale="log")
         for axes in (stars, memory, workers, hours):
-            axes.legend(fontsize="small")
+            axes.legend(fontsize="small", loc="upper left" if axes in (stars, memory) else "lower right")
         packets.set_ylim(bottom=0)
         memory.set_ylim(bottom=0)
 

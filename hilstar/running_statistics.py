@@ -5,6 +5,8 @@ import math
 import msgspec
 import numpy as np
 
+from hilstar.arrays import FloatArray
+
 MIN_SIZE, MAX_SIZE = 1e-6, 1e9
 STEP = 0.002  # the width of a bin, relative to the value: how exactly a percentile is known
 BINS = math.ceil(math.log(MAX_SIZE / MIN_SIZE) / STEP)
@@ -45,6 +47,18 @@ class RunningStatistics:
         size = abs(value)
         place = 0 if size < MIN_SIZE else min(BINS, 1 + int(math.log(size / MIN_SIZE) / STEP))
         self._counts[BINS + place if value >= 0 else BINS - place] += 1
+
+    def add_all(self, values: FloatArray) -> None:
+        """Count values (n,)."""
+        if not len(values):
+            return
+        count, step = self.count + len(values), float(values.mean()) - self._mean
+        self._squares += float(((values - values.mean()) ** 2).sum()) + step**2 * self.count * len(values) / count  # Chan 1979
+        self._mean += step * len(values) / count
+        self.count, self.max = count, max(self.max, float(values.max()))
+        place = (1 + np.log(np.maximum(np.abs(values) / MIN_SIZE, 1.0)) / STEP).astype(np.intp).clip(max=BINS)
+        place[np.abs(values) < MIN_SIZE] = 0
+        np.add.at(self._counts, BINS + np.where(values >= 0, place, -place), 1)
 
     @property
     def mean(self) -> float | None:

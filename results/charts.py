@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from hilstar.charts import read_records
+from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, TEAL, chart, read_records, value_bars
 from hilstar.study import codes, colour, stripes, timing
 from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.study.tradeoff import run as tradeoff
@@ -49,7 +49,75 @@ def colour_rows() -> list[tuple[str | float, ...]]:
         return [(*row[:3], *map(float, row[3:])) for row in list(csv.reader(file))[1:]]
 
 
+def draw_scale(rows: list[dict[str, str]]) -> None:
+    """Six panels of scale.csv: what grows with stars, pixels, workers, packets a second and hours, and where it bends."""
+
+    def points(axis: str, column: str) -> tuple[list[float], list[float]]:
+        own = [row for row in rows if row["axis"] == axis]
+        return [float(row["at"]) for row in own], [float(row[column]) for row in own]
+
+    case_s = points("workers", "time")[1][0] / 1e3
+    cores = [1.0, 2.0, 10.0, 30.0, 100.0, 300.0, 1000.0]
+    # docs/campaign.md: a task takes the scheduler 3.3 ms and the command 1.8 ms, and a row the command 60 us
+    paper: dict[str, list[float]] = {"1 s": [], "20 ms a core": []}
+    for count in cores:
+        for words, seconds in (("1 s", 1.0), ("20 ms a core", max(1.0, 0.02 * count))):
+            limits = count / case_s, seconds / case_s / 3.3e-3, 1 / (60e-6 + 1.8e-3 * case_s / seconds)
+            paper[words].append(min(limits))
+    title = "Frames grow with stars up to the cap on pixels, reports with hours; one scheduler feeds 1000 cores by longer tasks"
+    with chart(DOCS / "scale", title, 3, 2, share_x=False) as panels:
+        stars, pixels, memory, workers, packets, hours = panels
+        stars.plot(*points("stars", "time"), "o-", color=RED)
+        stars.axvline(250_000, color=BLUE, ls=":", label="only the brightest are drawn")
+        stars.set(title="a frame, 1920 x 1080", xlabel="stars in view", ylabel="processor time [ms]")
+        pixels.plot(*points("pixels", "time"), "o-", color=RED)
+        pixels.set(title="a frame of 1000 stars, VGA to 8K", xlabel="pixels", ylabel="processor time [ms]")
+        for axis, colour in (("stars", PURPLE), ("pixels", TEAL)):
+            memory.plot(*points(axis, "memory_mb"), "o-", color=colour, label=f"against {axis}")
+        memory.set(title="peak of a process's memory", xlabel="stars, or pixels", ylabel="MB", xscale="log")
+        for (words, rate), colour in zip(paper.items(), (ORANGE, GREEN), strict=True):
+            workers.plot(cores, rate, "-", color=colour, label=f"on paper, tasks of {words}")
+        at, ms = points("workers", "time")
+        workers.plot(at, [n / case * 1e3 for n, case in zip(at, ms, strict=True)], "o", color=RED, label="measured")
+        workers.set(title="a campaign's cases", xlabel="workers", ylabel="cases a second")
+        packets.plot(*points("packets", "time"), "o-", color=RED)
+        packets.set(title="serve, 640 x 480 at 60 Hz", xlabel="packets a second", ylabel="of a core [%]", xscale="log")
+        at, ms = points("hours", "time")
+        hours.plot(at, [value / 1e3 for value in ms], "o-", color=RED, label="processor time [s]")
+        hours.plot(at, points("hours", "memory_mb")[1], "o-", color=PURPLE, label="peak of memory [MB]")
+        hours.set(title="report: 60 frames and packets a second", xlabel="hours of the run", ylabel="s, or MB")
+        for axes in (stars, pixels, workers, hours):
+            axes.set(xscale="log", yscale="log")
+        for axes in (stars, memory, workers, hours):
+            axes.legend(fontsize="small", loc="upper left" if axes in (stars, memory) else "lower right")
+        packets.set_ylim(bottom=0)
+        memory.set_ylim(bottom=0)
+
+
+def draw_tracker(rows: list[dict[str, str]]) -> None:
+    """The rows of tracker.csv: each work by hilstar and beside it its peers."""
+    colours = {"hilstar": RED, "numpy": BLUE, "galsim": GREEN, "photutils": PURPLE, "sep": ORANGE}
+    names = [f"{row['kind'].replace('_', ' ')}, {row['method']}" for row in rows]
+    ms = [float(row["median_ms"]) for row in rows]
+    own = {row["kind"]: float(row["median_ms"]) for row in rows if row["method"] == "hilstar"}
+    finding = f"The virtual tracker takes {own['exposure']:.0f} ms for an exposure, {own['case']:.0f} ms for a campaign's case"
+    note = (
+        "Medians of processor time, ms, in turn, beside other work. 1024 x 1024 px of the demo's tracker, all noise; peers have"
+        " hilstar's expected image or DN. verify: one field. First frame: a process from exec to its end, 1920 x 1080."
+    )
+    with chart(DOCS / "tracker_speed", finding, note=note, height_inch=3.6) as (axes,):
+        value_bars(axes, names, ms, [colours[row["method"]] for row in rows])
+
+
+def rows_of(name: str) -> list[dict[str, str]]:
+    """The rows of a CSV file here."""
+    with (HERE / name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
 if __name__ == "__main__":
+    draw_scale(rows_of("scale.csv"))
+    draw_tracker(rows_of("tracker.csv"))
     colour.draw(DOCS / "colour.svg", colour_rows())
     timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome))
     stripes.draw(DOCS / "stripes.svg", read_records(HERE / "stripes.csv", stripes.StripePoint))

@@ -1,7 +1,7 @@
 #version 330 core
 // Light to level, in each plane: the number of thresholds at or under the pixel's light. It comes after planes.glsl.
-// With STEPS no bin of the table holds more than one threshold, so the bin's own is the only one to ask, in a block of STEPS rows
-// (levels.glsl, which then comes last). Else the bin starts the count.
+// With STEPS no bin of the table holds more than one threshold, so the bin's own is the only one to ask, in a block of STEPS rows,
+// or for 0 in a texture (levels.glsl, which then comes last). Else the bin starts the count, which takes twice as long.
 // With RISES the thresholds are the edges of another quantiser, whose shader says whether a pixel gets the next level instead.
 // With UNIFORMITY each pixel's light is first multiplied by its gain.
 // With IMAGES light is loaded from an image (OpenGL 4.2): on llvmpipe in two thirds of the time of a texture's texel.
@@ -14,8 +14,13 @@ uniform sampler2D linear_e_per_s;
 #endif
 
 #ifdef STEPS
+#if STEPS > 0
 layout(std140) uniform Steps { uvec4 steps[STEPS]; };
 #define STEP(bin) steps[(bin) >> 2][(bin) & 3]
+#else
+uniform usampler2D steps;             // in rows of TABLE_WIDTH
+#define STEP(bin) texelFetch(steps, place(bin), 0).r
+#endif
 uint level_of(float light, int k);
 #else
 uniform sampler2D threshold_e_per_s;  // in rows of TABLE_WIDTH
@@ -38,7 +43,6 @@ out uint code;
 #define CODE(k) code
 #endif
 
-#ifndef STEPS
 const int TABLE_WIDTH_BITS = 10;
 const int TABLE_WIDTH = 1 << TABLE_WIDTH_BITS;
 
@@ -46,6 +50,7 @@ ivec2 place(int index) {
     return ivec2(index & (TABLE_WIDTH - 1), index >> TABLE_WIDTH_BITS);
 }
 
+#ifndef STEPS
 float threshold(int k) {
     return texelFetch(threshold_e_per_s, place(k), 0).r;
 }

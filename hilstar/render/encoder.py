@@ -373,10 +373,10 @@ class Encoder:
         edges = [quantiser.edges_e_per_s(panel) for panel in planes.panels]
         table = None if rises else level_steps(edges)
         steps = None if table is None else table_rows(table[0], ctx)
-        defines += [] if steps is None else [f"STEPS {len(steps)}"]
+        defines += [] if table is None else [f"STEPS {0 if steps is None else len(steps)}"]
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
         defines += [f"IMAGES {linear_format(planes)}"] * (self._linear_image is not None)
-        last = ["levels.glsl"] * (steps is not None) + [rises] * bool(rises)
+        last = ["levels.glsl"] * (table is not None) + [rises] * bool(rises)
         self.sprite_program, self._whole = (
             build_program(ctx, vertex, "encode.frag", defines, ("planes.glsl",), last) for vertex in ("star.vert", "full.vert")
         )
@@ -385,7 +385,7 @@ class Encoder:
         self._sprite_vao: moderngl.VertexArray | None = None
         self._textures = {"linear_e_per_s": linear}
         self._steps = None if steps is None else ctx.buffer(steps.tobytes())
-        if table is None or steps is None:
+        if table is None:
             tables = [code_table(one) for one in edges]
             thresholds, first = joined([one.threshold for one in tables])
             codes, begins = joined([one.first_code for one in tables])
@@ -395,6 +395,7 @@ class Encoder:
             counts: list[Any] = [(begin, len(one)) for begin, one in zip(first, edges, strict=True)]
         else:
             bins, counts = table[1], []
+            self._textures |= {} if steps is not None else {"steps": self._texture(_rows(table[0]))}
         if gain is not None:
             self._textures["gain"] = self._texture(gain)
         self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}

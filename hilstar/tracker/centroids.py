@@ -179,7 +179,7 @@ def find_stars(
     under = background or estimate_background(image)
     blobs = _find_blobs(image, under.level, settings.threshold_sigma * under.noise, settings.minimum_pixels)
     x_px, y_px = _refine(image, under.level, blobs, settings)
-    stamps, _, _ = _stamps(image, under.level, x_px, y_px, settings.radius_px)
+    stamps, _, _ = squares(image, under.level, x_px, y_px, settings.radius_px)
     flux = stamps.sum(axis=(1, 2))
     height, width = image.shape
     reach = settings.radius_px
@@ -245,8 +245,8 @@ def _components(lit: IntArray, column: IntArray, shape: tuple[int, int]) -> IntA
     return np.unique(root, return_inverse=True)[1]
 
 
-def _stamps(
-    image: npt.NDArray[Any], level: float, x_px: FloatArray, y_px: FloatArray, radius_px: int
+def squares(
+    image: npt.NDArray[Any], level: float, x_px: FloatArray | IntArray, y_px: FloatArray | IntArray, radius_px: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Squares of an image around n places: values over the level (n, k, k), and the pixels' offsets dx (n, 1, k), dy (n, k, 1).
 
@@ -280,7 +280,7 @@ def _gaussian_centres(
     sigma2 = settings.window_sigma_px**2
     lost = np.zeros(place.shape[1], dtype=np.bool_)
     for _ in range(settings.iterations):
-        values, dx, dy = _stamps(image, level, place[0], place[1], settings.radius_px)
+        values, dx, dy = squares(image, level, place[0], place[1], settings.radius_px)
         weighted = values * np.exp(-0.5 * (dx**2 + dy**2) / sigma2)
         total = weighted.sum(axis=(1, 2))
         lost |= total <= 0
@@ -309,7 +309,7 @@ def _plain_centres(
     start = np.stack([blobs.x_px, blobs.y_px])
     place, middle = start, np.rint(start)
     for _ in range(settings.iterations):
-        values, dx, dy = _stamps(image, level, middle[0], middle[1], settings.radius_px)
+        values, dx, dy = squares(image, level, middle[0], middle[1], settings.radius_px)
         total = values.sum(axis=(1, 2))
         sums = np.stack([(values * dx).sum(axis=(1, 2)), (values * dy).sum(axis=(1, 2))])
         step = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)

@@ -22,7 +22,7 @@ def in_pixels(images: Iterable[npt.NDArray[Any]], bayer: str | None) -> FloatArr
     """
     if bayer is None:
         (image,) = images
-        return np.asarray(image, dtype=np.float64)
+        return image
     found = np.empty(0)
     for channel, image in zip(CHANNELS, images, strict=True):
         if not found.size:

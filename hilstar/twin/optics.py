@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.bench.build import bench_primaries, named_channels
 from hilstar.bench.frame import Bench
 from hilstar.monitor.primaries import channel_matrix
@@ -144,10 +144,12 @@ class TwinOptics(Closing):
         """Electrons per second of each tracker pixel by each primary's light (H, W): (primaries, h, w), float64."""
         return np.array([self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)])
 
-    def image_e_per_s(self, light_e_per_s: FloatArray, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
+    def image_e_per_s(self, light_e_per_s: FloatArray | Float32Array, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of each monitor pixel (H, W), float64."""
-        rows, columns = np.nonzero(light_e_per_s)
-        return self.lit_image_e_per_s(rows, columns, light_e_per_s[rows, columns], primary)
+        rows, columns = np.divmod(
+            np.flatnonzero(light_e_per_s != 0), light_e_per_s.shape[1]
+        )  # `np.nonzero` takes six times as long
+        return self.lit_image_e_per_s(rows, columns, light_e_per_s[rows, columns].astype(np.float64), primary)
 
     def lit_image_e_per_s(
         self, rows: IntArray, columns: IntArray, light_e_per_s: FloatArray, primary: Primary = ALL_ALIKE[0]

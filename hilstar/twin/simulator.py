@@ -219,7 +219,7 @@ class Simulator(Closing):
         """Electrons of each pixel (h, w) by sprites of `stars` in some time."""
         channels = [sprites] if self._bayer is None else by_channel(sprites, stars)
         images = (self._image(light, stars, glass) for light, glass in zip(channels, self._glasses, strict=True))
-        return np.multiply(in_pixels(images, self._bayer), seconds)
+        return np.multiply(in_pixels(images, self._bayer), seconds, dtype=np.float64)
 
     def _image(self, sprites: Sprites, stars: Stars, glass: StarGlass | None) -> Float32Array:
         """Electrons per second of each pixel (h, w) of one colour, in memory that the next image takes."""

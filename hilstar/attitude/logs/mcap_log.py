@@ -187,7 +187,7 @@ def records_of(path: Path) -> Iterator[McapRecord]:
             raise InputError(f"{path}: is no MCAP file; {ADVICE}")
         file.seek(0)
         capped = _Capped(file, size)
-        reader = StreamReader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
+        reader = _Reader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
         records = reader.records
         room = FREE_BYTES + MAX_INFLATION * size
         while True:
@@ -209,6 +209,13 @@ def records_of(path: Path) -> Iterator[McapRecord]:
                 yield from _inside(data)
             except Exception as error:
                 raise _refused(path, file, error) from error
+
+
+class _Reader(StreamReader):
+    """Skips the indexes of messages, which nothing here uses and the library takes apart entry by entry."""
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
 
 
 class _Capped:

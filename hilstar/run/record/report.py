@@ -1,16 +1,17 @@
-"""The figures of a run's report, from its ledger: added record by record, in memory that does not grow with the run."""
+"""The figures of a run's report, from its ledger: added in blocks, in memory that does not grow with the run."""
 
-import math
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.notices import MAX_DETAIL_CHARACTERS
 from hilstar.run.record.answer_figures import AnswerReport, AnswerTally, answer_rows
@@ -37,32 +38,34 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 
 SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
 SPANS = 8192  # in which a run is drawn along its time
-BLOCK = 1024  # frames that are summed up at once
+BLOCK = 4096  # records that are added at once
 
 
 class ThinnedRows:
     """Every n-th row of a stream; n doubles as the stream grows."""
 
-    def __init__(self, columns: int, capacity: int = SAMPLES) -> None:
-        self._rows = np.zeros((capacity, columns))
+    def __init__(self, columns: int, capacity: int = SAMPLES, kind: type = float) -> None:
+        self._rows: npt.NDArray[Any] = np.zeros((capacity, columns), dtype=kind)
         self._kept = 0
         self.stride = 1
         self._seen = 0
 
-    def add(self, row: tuple[float, ...]) -> None:
-        """Add a row, or skip it."""
-        if self._seen % self.stride == 0:
-            if self._kept == len(self._rows):
+    def add(self, rows: npt.NDArray[Any]) -> None:
+        """Add rows (n, columns), or skip them."""
+        while len(rows):
+            first = -self._seen % self.stride
+            fitting = rows[first :: self.stride][: len(self._rows) - self._kept]
+            self._rows[self._kept : self._kept + len(fitting)] = fitting
+            self._kept += len(fitting)
+            taken = min(len(rows), first + len(fitting) * self.stride)
+            self._seen, rows = self._seen + taken, rows[taken:]
+            if len(rows) and self._kept == len(self._rows):
                 half = len(self._rows) // 2
                 self._rows[:half] = self._rows[::2]
                 self._kept, self.stride = half, 2 * self.stride
-            if self._seen % self.stride == 0:
-                self._rows[self._kept] = row
-                self._kept += 1
-        self._seen += 1
 
     @property
-    def rows(self) -> FloatArray:
+    def rows(self) -> npt.NDArray[Any]:
         """The rows that are kept, (n, columns)."""
         return self._rows[: self._kept]
 
@@ -82,19 +85,11 @@ class SpanTable:
         shape = (capacity, columns)
         self._low, self._high, self._sum = np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros(shape)
         self._begin = np.zeros(capacity)
-        self._waiting: list[tuple[float, ...]] = []
         self._used = self._in_last = 0
         self.length = 1
 
-    def add(self, at: float, row: tuple[float, ...]) -> None:
-        """Add a frame; NaN is no value."""
-        self._waiting.append((at, *row))
-        if len(self._waiting) == BLOCK:
-            self._take()
-
-    def _take(self) -> None:
-        """Sum up the frames that wait."""
-        rows, self._waiting = np.array(self._waiting).reshape(-1, 1 + self._low.shape[1]), []
+    def add(self, rows: FloatArray) -> None:
+        """Add frames (n, 1 + columns): when each was, and its values; NaN is no value."""
         while len(rows):
             if self._used == 0 or self._in_last == self.length:
                 if self._used == len(self._begin):
@@ -129,12 +124,10 @@ class SpanTable:
     @property
     def begin(self) -> FloatArray:
         """When each span begins, (n,)."""
-        self._take()
         return self._begin[: self._used]
 
     def column(self, number: int) -> SpanColumn:
         """One column over all spans."""
-        self._take()
         low, high, total = (table[: self._used, number] for table in (self._low, self._high, self._sum))
         some = np.isfinite(low)
         return SpanColumn(np.where(some, low, np.nan), np.where(some, high, np.nan), total)
@@ -149,17 +142,20 @@ class TimeBins:
         self._used = 0
         self.width_ns = NS_PER_S
 
-    def add(self, at_ns: int, kind: int, number: int = 1) -> None:
-        """Count `number` arrivals at a host time; a time before the first counts in the first bin."""
+    def add(self, at_ns: npt.NDArray[np.int64], kinds: IntArray, number: int = 1) -> None:
+        """Count `number` arrivals of `kinds` (n,) at host times (n,); a time before the first counts in the first bin."""
+        if not len(at_ns):
+            return
         if self._first_ns is None:
-            self._first_ns = at_ns
-        while (place := max(at_ns - self._first_ns, 0) // self.width_ns) >= len(self._counts):
+            self._first_ns = int(at_ns[0])
+        since_ns = np.maximum(at_ns - self._first_ns, 0)
+        while (last := int(since_ns.max()) // self.width_ns) >= len(self._counts):
             half = len(self._counts) // 2
             self._counts[:half] = self._counts[::2] + self._counts[1::2]
             self._counts[half:] = 0
             self._used, self.width_ns = (self._used + 1) // 2, 2 * self.width_ns
-        self._counts[place, kind] += number
-        self._used = max(self._used, place + 1)
+        np.add.at(self._counts, (since_ns // self.width_ns, kinds), number)
+        self._used = max(self._used, last + 1)
 
     def rates_hz(self, zero_ns: int) -> tuple[FloatArray, FloatArray]:
         """The start of each bin, s after a host time, (n,), and the rate of each kind in it, 1/s, (n, kinds)."""
@@ -179,30 +175,21 @@ SMALL_RAD = 1e-8
 class Keyframes:
     """Frames of a run to be drawn in its report: some evenly over the run, and the first or worst of each kind."""
 
-    def __init__(self, capacity: int = KEYFRAMES) -> None:
-        self._even: list[FrameRecord] = []
-        self._capacity, self._stride, self._seen = capacity, 1, 0
-        self._best: dict[str, tuple[float, FrameRecord]] = {}
+    def __init__(self) -> None:
+        self._even = ThinnedRows(1, KEYFRAMES, object)
+        self._best: dict[str, tuple[int, FrameRecord]] = {}
 
-    def add(self, frame: FrameRecord) -> None:
-        """Look at a frame."""
-        if self._seen % self._stride == 0:
-            if len(self._even) == self._capacity:
-                self._even, self._stride = self._even[::2], 2 * self._stride
-            if self._seen % self._stride == 0:
-                self._even.append(frame)
-        self._seen += 1
-        self._keep("first stale", frame, float(frame.stale and frame.q is not None))
-        self._keep("most clipped stars", frame, float(frame.clipped))
-        self._keep("most stars", frame, float(frame.stars_drawn))
-
-    def _keep(self, why: str, frame: FrameRecord, worth: float) -> None:
-        if worth > self._best.get(why, (0.0,))[0]:
-            self._best[why] = (worth, frame)
+    def add(self, frames: list[FrameRecord], worths: dict[str, IntArray]) -> None:
+        """Look at frames (n), whose `worths` (n,) say how special each is."""
+        self._even.add(np.array([*frames, None], dtype=object)[:-1, None])
+        for why, worth in worths.items():
+            place = int(worth.argmax())
+            if worth[place] > self._best.get(why, (0, None))[0]:
+                self._best[why] = int(worth[place]), frames[place]
 
     def chosen(self, last: FrameRecord | None) -> list[tuple[FrameRecord, str]]:
         """The frames in order, each with what is special about it, or ""."""
-        found = {id(frame): (frame, "") for frame in self._even}
+        found = {id(frame): (frame, "") for frame in self._even.rows[:, 0]}
         for why, (_, frame) in self._best.items():
             before = found.get(id(frame), (frame, ""))[1]
             found[id(frame)] = (frame, ", ".join(part for part in (before, why) if part))
@@ -260,8 +247,8 @@ class RunFigures:
     first_process: ProcessRecord | None = None
     warm: ProcessRecord | None = None
     last_process: ProcessRecord | None = None
-    _turned: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    _q: tuple[float, float, float, float] | None = None
+    _turned: FloatArray = field(default_factory=lambda: np.zeros(3))
+    _q: FloatArray | None = None
     _first_t_ns: int | None = None
 
     @property
@@ -276,16 +263,32 @@ class RunFigures:
             return None
         return (self.last_process.resident_bytes - self.warm.resident_bytes) / MEGABYTE
 
-    def add(self, record: RunRecord) -> None:
-        """Add a record of the ledger."""
-        if isinstance(record, FrameRecord):
-            self._add_frame(record)
-        elif isinstance(record, ProcessRecord):
+    def add(self, *records: RunRecord) -> None:
+        """Add records of the ledger, in their order: many at once take a third of the time."""
+        frames: list[FrameRecord] = []
+        packets: list[PacketForm] = []
+        for record in records:
+            if isinstance(record, FrameRecord):
+                self.answers.frame(record)
+                frames.append(record)
+            elif isinstance(record, PacketForm):
+                self.packets.add(record)
+                if record.receive_ns is not None:
+                    packets.append(record)
+            else:
+                self._add_one(record)
+        times_ns = np.array([packet.receive_ns for packet in packets], dtype=np.int64)
+        self.packet_times.add(times_ns, np.array([ACCEPTED if packet.accepted else REFUSED for packet in packets]))
+        if frames:
+            self._add_frames(frames)
+
+    def _add_one(self, record: ProcessRecord | CountRecord | EventRecord | FaultRecord | AnswerRecord) -> None:
+        if isinstance(record, ProcessRecord):
             first = self.first_process = self.first_process or record
             if self.warm is None and (record.host_ns - first.host_ns) / NS_PER_S >= WARM_UP_S:
                 self.warm = record
             self.last_process = record
-            self.process.add((record.host_ns / NS_PER_S, record.resident_bytes / MEGABYTE, record.cpu_s))
+            self.process.add(np.array([(record.host_ns / NS_PER_S, record.resident_bytes / MEGABYTE, record.cpu_s)]))
         elif isinstance(record, EventRecord):
             kind = record.kind[:MAX_REASON_CHARACTERS]
             if kind in self.events or len(self.events) < MAX_REASONS:
@@ -297,87 +300,97 @@ class RunFigures:
         elif isinstance(record, AnswerRecord):
             self.answers.answer(record)
             if record.verdict == "right" and record.residual_arcsec is not None:
-                self.residuals.add((record.middle_ns / NS_PER_S, *record.residual_arcsec))
+                self.residuals.add(np.array([(record.middle_ns / NS_PER_S, *record.residual_arcsec)]))
         else:
             self.packets.add(record)
-            self._add_packets(record)
+            if record.kind == "pulse" and record.reason in PULSES:
+                self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
+                self.pulses[record.reason] += record.count
+            elif record.kind == "packet":
+                place = ACCEPTED if record.reason == "accepted" else REFUSED
+                self.packet_times.add(np.array([record.host_ns]), np.array([place]), record.count)
 
-    def _add_packets(self, record: PacketForm | CountRecord) -> None:
-        if isinstance(record, PacketForm):
-            if record.receive_ns is not None:
-                self.packet_times.add(record.receive_ns, ACCEPTED if record.accepted else REFUSED)
-        elif record.kind == "pulse" and record.reason in PULSES:
-            self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
-            self.pulses[record.reason] += record.count
-        elif record.kind == "packet":
-            self.packet_times.add(record.host_ns, ACCEPTED if record.reason == "accepted" else REFUSED, record.count)
-
-    def _add_frame(self, frame: FrameRecord) -> None:
-        before = self.last
+    def _add_frames(self, frames: list[FrameRecord]) -> None:
+        before, self.last = self.last, frames[-1]
         if before is None:
-            self.first_swap_ns = frame.swap_ns
-        self.last = frame
-        self.frames += 1
-        self.answers.frame(frame)
-        self.stale_frames += frame.stale
-        self.blank_frames += frame.q is None
-        self.late += frame.stale and frame.q is not None
-        self.capped_frames += frame.capped > 0
-        self.operator_frames += bool(frame.operator)
-        self.hidden_frames += bool(frame.hidden)
-        self.right_frames += not (frame.stale or frame.q is None or frame.operator or frame.hidden)
-        for name in self.most:
-            self.most[name] = max(self.most[name], getattr(frame, name))
-        values = _times_ms(frame, before)
-        for name, value in zip(METRICS, values, strict=True):
-            if not math.isnan(value):
-                self.spreads[name].add(value)
-        self.samples.add(values)
-        run_s = (frame.swap_ns - self.first_swap_ns) / NS_PER_S
-        counts = (frame.missed_before, frame.stars_drawn, frame.clipped, frame.below_step, frame.stale, frame.q is None)
-        self.spans.add(run_s, (*values, *map(float, counts)))
-        self.keyframes.add(frame)
-        if frame.q is not None:
-            if self._q is not None:
-                self._turned = [a + b for a, b in zip(self._turned, _turn_rad(self._q, frame.q), strict=True)]
-            self._q = frame.q
-            self._first_t_ns = frame.t_ns if self._first_t_ns is None else self._first_t_ns
-            self.path.add((run_s, (frame.t_ns - self._first_t_ns) / NS_PER_S, *frame.q, *self._turned))
+            self.first_swap_ns = frames[0].swap_ns
+        self.frames += len(frames)
+        stale, blank, operator, hidden = (
+            np.array(each, dtype=bool)
+            for each in zip(*((f.stale, f.q is None, f.operator != "", f.hidden != "") for f in frames), strict=True)
+        )
+        self.stale_frames += int(stale.sum())
+        self.blank_frames += int(blank.sum())
+        self.late += int((stale & ~blank).sum())
+        self.operator_frames += int(operator.sum())
+        self.hidden_frames += int(hidden.sum())
+        self.right_frames += int((~(stale | blank | operator | hidden)).sum())
+        self.capped_frames += sum(frame.capped > 0 for frame in frames)
+        missed, stars, clipped, below = counts = np.array(
+            [(f.missed_before, f.stars_drawn, f.clipped, f.below_step) for f in frames], dtype=np.int64
+        ).T
+        for name, number in (("clipped", clipped), ("below_step", below), ("stars_drawn", stars)):
+            self.most[name] = max(self.most[name], int(number.max()))
+        swap_ns = np.array([frame.swap_ns for frame in frames], dtype=np.int64)
+        times = _times_ms(frames, swap_ns, before, missed > 0)
+        for name, values in zip(METRICS, times.T, strict=True):
+            self.spreads[name].add_all(values[~np.isnan(values)])
+        self.samples.add(times)
+        run_s = (swap_ns - self.first_swap_ns) / NS_PER_S
+        self.spans.add(np.column_stack([run_s, times, counts.T, stale, blank]))
+        self.keyframes.add(frames, {"first stale": stale & ~blank, "most clipped stars": clipped, "most stars": stars})
+        seen = np.flatnonzero(~blank)
+        if not len(seen):
+            return
+        q, t_ns = np.array([frames[k].q for k in seen]), np.array([frames[k].t_ns for k in seen], dtype=np.int64)
+        self._first_t_ns = int(t_ns[0]) if self._first_t_ns is None else self._first_t_ns
+        last_q = q[0] if self._q is None else self._q
+        turned = np.cumsum(np.vstack([self._turned, _turns_rad(np.vstack([last_q, q[:-1]]), q)]), axis=0)
+        self._q, self._turned = q[-1], turned[-1]
+        self.path.add(np.column_stack([run_s[seen], (t_ns - self._first_t_ns) / NS_PER_S, q, turned[1:]]))
 
 
-def _times_ms(frame: FrameRecord, before: FrameRecord | None) -> tuple[float, ...]:
-    """The METRICS of a frame; NaN where there is none. An interval across missed frames does not count."""
+def _times_ms(
+    frames: list[FrameRecord], swap_ns: npt.NDArray[np.int64], before: FrameRecord | None, after_missed: BoolArray
+) -> FloatArray:
+    """The METRICS of frames (n, 6); NaN where there is none. An interval across missed frames does not count."""
+    intervals_ns = np.diff(swap_ns, prepend=swap_ns[0] if before is None else before.swap_ns).astype(np.float64)
+    intervals_ns[after_missed] = np.nan
+    if before is None:
+        intervals_ns[0] = np.nan
+    rest = [
+        (
+            np.nan if f.predicted_swap_ns is None else f.swap_ns - f.predicted_swap_ns,
+            f.swap_ns - f.draw_ns,
+            np.nan if f.age_ns is None else f.age_ns,
+            f.prediction_ns,
+            np.nan if f.receive_ns is None else f.swap_ns - f.receive_ns,
+        )
+        for f in frames
+    ]
+    return np.column_stack([intervals_ns, np.array(rest, dtype=np.float64)]) / NS_PER_MS
 
-    def ms(value: int | None) -> float:
-        return math.nan if value is None else value / NS_PER_MS
 
-    return (
-        ms(None if before is None or frame.missed_before else frame.swap_ns - before.swap_ns),
-        ms(None if frame.predicted_swap_ns is None else frame.swap_ns - frame.predicted_swap_ns),
-        ms(frame.swap_ns - frame.draw_ns),
-        ms(frame.age_ns),
-        ms(frame.prediction_ns),
-        ms(None if frame.receive_ns is None else frame.swap_ns - frame.receive_ns),
-    )
-
-
-def _turn_rad(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
-    """The turn from one attitude to the next about the camera's axes, as `rotation.rate_between_rad_s` but faster for one."""
-    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-    x = -b[0] * a[1] + b[1] * a[0] - b[2] * a[3] + b[3] * a[2]
-    y = -b[0] * a[2] + b[1] * a[3] + b[2] * a[0] - b[3] * a[1]
-    z = -b[0] * a[3] - b[1] * a[2] + b[2] * a[1] + b[3] * a[0]
-    sine = math.sqrt(x * x + y * y + z * z)
-    scale = -2.0 * math.copysign(1.0, w) * (math.atan2(sine, abs(w)) / sine if sine > SMALL_RAD else 1.0)
-    return scale * x, scale * y, scale * z
+def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The turns (n, 3) from attitudes (n, 4) to others about the camera's axes."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
+    w = aw * bw + ax * bx + ay * by + az * bz
+    x = -bw * ax + bx * aw - by * az + bz * ay
+    y = -bw * ay + bx * az + by * aw - bz * ax
+    z = -bw * az - bx * ay + by * ax + bz * aw
+    sine = np.sqrt(x * x + y * y + z * z)
+    small = sine <= SMALL_RAD
+    scale = -2.0 * np.copysign(1.0, w) * np.where(small, 1.0, np.arctan2(sine, np.abs(w)) / np.where(small, 1.0, sine))
+    return np.asarray(scale[:, None] * np.stack([x, y, z], axis=1))
 
 
 def figures_of(path: Path) -> RunFigures:
     """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
     figures = RunFigures(read_head(path))
     figures.answers = AnswerTally(_begun_ns(figures.head))
-    for record in run_records(path):
-        figures.add(record)
+    records = run_records(path)
+    while block := list(islice(records, BLOCK)):
+        figures.add(*block)
     if not figures.frames:
         raise InputError(f"{path}: {NO_FRAMES}")
     return figures

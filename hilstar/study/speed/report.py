@@ -171,7 +171,7 @@ def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
     """The virtual tracker's works, by whom, their medians, and each peer's ratio to hilstar."""
     own = {row.kind: row.ms.median for row in rows if row.method == "hilstar"}
     if rows:
-        yield f"the virtual tracker, {_words(rows[0].size)}, {rows[0].stars} stars, ms (median)"
+        yield f"the virtual tracker, {_words(rows[0].size)}, {rows[0].stars} stars, ms of the processor (median)"
     for row in rows:
         beside = "" if row.method == "hilstar" else f"   {row.ms.median / own[row.kind]:.2f} of hilstar's"
         yield f"  {row.kind.replace('_', ' '):12}{row.method:11}{row.ms.median:8.1f}{beside}"

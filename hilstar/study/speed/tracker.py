@@ -1,4 +1,4 @@
-"""The virtual tracker's times: an exposure, its stars found, a campaign's case, a field of `verify`; other programs in turn.
+"""The virtual tracker's processor times: an exposure, its stars found, a case, a field of `verify`; other programs in turn.
 
 Each exposure has 1024 x 1024 pixels and all noise. Peers are given hilstar's expected image, so their times have no sky and no
 drawing: NumPy's and GalSim's noise beside the whole exposure, and the finders of photutils and sep on hilstar's own DN.
@@ -98,7 +98,7 @@ class Exposing:
 
 
 def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list[Skipped]]:
-    """Times of each work in turn, and the peers that are not installed. Raises InputError, MachineError."""
+    """Processor times of each work in turn, and the peers that are not installed. Raises InputError, MachineError."""
     threads = os.environ.get("LP_NUM_THREADS")
     file = read_bench_file(resource_path("configs", "demo.toml"))
     skipped: list[Skipped] = []
@@ -139,7 +139,7 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
         os.environ.pop("LP_NUM_THREADS", None)
     rows = []
     for name, kind in sorted(works, key=lambda each: (KINDS.index(each[1]), each[0] != "hilstar", each[0])):
-        ms = [one.wall_ms for one in times[f"{name} {kind}"]]
+        ms = [one.cpu_ms for one in times[f"{name} {kind}"]]
         spread = Spread(float(np.median(ms)), min(ms), max(ms))
         rows.append(MethodTiming(cell.width, cell.height, cell.stars, name, kind, spread))
     return rows, skipped

@@ -115,7 +115,7 @@ class FaultyFields:
         twin, exposure_s = self._twin, self._twin.config.tracker.exposure_s
         frame = twin.bench.frame(q, first_frame, faults=effects)
         lights = exposure_lights(twin.bench, frame, first_frame, [twin.true_panel], effects)
-        asked = twin.sky_optics.image_e_per_s(frame.linear.astype(np.float64)) * exposure_s
+        asked = twin.sky_optics.image_e_per_s(frame.linear) * exposure_s
         shown = twin.true_optics.images_e_per_s(lights[0], twin.primaries).sum(axis=0) * exposure_s
         return _Shot(asked, shown, frame)
 

@@ -399,7 +399,7 @@ class Comparison:
         sigma_x, sigma_y = self.finder.psf.width_px
         disc_px = 4 * math.pi * sigma_x * sigma_y
         return GlowFit(
-            assumed_e_per_s_px=on_screen_median(self.twin.sky_optics.glow_e_per_s(self.twin.bench.panel)),
+            assumed_e_per_s_px=on_screen_median(self.twin.assumed_glow_e_per_s),
             seen_e_per_s_px=on_screen_median(self.twin.glow_e_per_s),
             limit_e_per_s_px=BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px if given is None else given,
         )

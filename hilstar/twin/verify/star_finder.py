@@ -11,7 +11,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.frame import Bench
 from hilstar.scene.psf import GaussianPsf, Psf
 from hilstar.tracker.centroiders import Centroider, psf_places, star_places
-from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground, find_stars
+from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground, find_stars, squares
 from hilstar.tracker.mosaic import software_psf_px
 from hilstar.twin.glass import told_psf
 from hilstar.units import magnitude
@@ -85,15 +85,11 @@ class StarFinder:
         index, reach = matched.index[stars], self.settings.radius_px
         aside = (np.rint(seen[index] - true[stars]) for seen, true in zip((found.x_px, found.y_px), true_px, strict=True))
         column, row = (np.rint(true[stars] + by).astype(np.intp) for true, by in zip(true_px, aside, strict=True))
-        near = np.arange(2 * reach + 1)
-        # A star's true place may lie up to the largest distance of a match off the image.
-        far = reach + math.ceil(MATCH_PX) + 1
-        padded = np.pad(image_e, far)
-        stamps = padded[(row[:, None] + near + far - reach)[:, :, None], (column[:, None] + near + far - reach)[:, None, :]]
+        stamps = squares(image_e, 0.0, column, row, reach)[0]
         middle = np.full(len(stars), reach)
         dx_px, dy_px = star_places(stamps, kind, self.psf.width_px, (middle, middle))
         if kind == "psf" and self.told is not None:
-            dx_px, dy_px = psf_places(stamps, told_psf(self.told, (row, column), len(near)), (dx_px, dy_px))
+            dx_px, dy_px = psf_places(stamps, told_psf(self.told, (row, column), 2 * reach + 1), (dx_px, dy_px))
         x_px, y_px = found.x_px.copy(), found.y_px.copy()
         x_px[index], y_px[index] = column + dx_px, row + dy_px
         return Matched(replace(found, x_px=x_px, y_px=y_px), matched.index)

@@ -151,8 +151,11 @@ class Twin(Closing):
         self.true_camera = true.monitor
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.true_optics = TwinOptics(true, self.bench.tracker_psf)
-        self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
-        self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
+        self.glow_e_per_s = self.assumed_glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
+        self.sky_optics = self.true_optics
+        if self.differs:
+            self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
+            self.assumed_glow_e_per_s = self.sky_optics.glow_e_per_s(self.bench.panel)
         self.primaries, self._mosaic = seen_primaries(self.bench), DisplayColours.of(self.bench)
         self._background = TrackerBackground(self.config, file.folder, self.camera, refuse=False, moving=self.bench.moving)
 
@@ -160,7 +163,7 @@ class Twin(Closing):
         """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""
         frame = self.bench.frame(q_icrs_to_cam, first_frame)
         exposure_s = self.config.tracker.exposure_s
-        skies = [self.sky_optics.image_e_per_s(light.astype(np.float64)) * exposure_s for light in frame.light]
+        skies = [self.sky_optics.image_e_per_s(light) * exposure_s for light in frame.light]
         panels = [self.true_panel, self.bench.panel] if self.differs else [self.true_panel]
         view = rolled(self._exposure_at(frame), self.config.tracker)
         glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s
@@ -222,8 +225,9 @@ class Twin(Closing):
 
     def close(self) -> None:
         """Free the GL contexts."""
-        for part in (self.bench, self.true_optics, self.sky_optics):
-            part.close()
+        self.bench.close()
+        for optics in {self.true_optics, self.sky_optics}:
+            optics.close()
 
 
 def changed_keys(verify: Verify) -> list[str]:

@@ -108,8 +108,9 @@ def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():
         values = rng.normal(size=(count, 2))
         values[rng.random(count) < 0.2, 1] = np.nan
         spans = SpanTable(2, capacity=16)
-        for k, row in enumerate(values):
-            spans.add(float(k), tuple(row))
+        rows = np.column_stack([np.arange(count), values])
+        for at in range(0, count, 300):
+            spans.add(rows[at : at + 300])
         begin, length = spans.begin, spans.length
         assert len(begin) <= 16 and begin.tolist() == list(range(0, count, length))
         for column in range(2):
@@ -123,7 +124,7 @@ def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():
 def test_bins_keep_every_count_whatever_the_times():
     bins = TimeBins(1, capacity=8)
     for at_ns in (5 * 10**9, 0, 6 * 10**9, 2**62, 40 * 10**9):
-        bins.add(at_ns, 0)
+        bins.add(np.array([at_ns]), np.array([0]))
     begin_s, rates_hz = bins.rates_hz(0)
     assert begin_s[0] == 5.0 and len(begin_s) <= 8
     assert (rates_hz * bins.width_ns / 1e9).sum() == pytest.approx(5)

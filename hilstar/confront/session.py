@@ -500,6 +500,7 @@ def corrected(curve: Curve, correction: Correction) -> Curve:
         return curve
     ends = curve.wavelength_nm[[0, -1]]
     nm = np.union1d(curve.wavelength_nm, np.linspace(ends[0], ends[-1], max(2, round(float(np.ptp(ends)) / KNOT_NM))))
+    nm = np.unique(np.round(nm, 2))  # as it is written
     x = np.log(nm / PIVOT_NM)
     value = curve(nm) * np.exp(correction[0] * x + correction[1] * x * x)
     return Curve(nm, value / max(1.0, float(value.max())))

@@ -2,7 +2,7 @@
 
 bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv, timing.csv and those of colour by
 `hilstar study NAME -o`, quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on
-which machine; bench_h100.csv on an NVIDIA H100.
+which machine; bench_h100.csv on an NVIDIA H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine changes it.
 """
 
@@ -57,6 +57,21 @@ def bench_table(name: str = "bench.csv", counts: tuple[int, ...] = COUNTS, other
 def card_table() -> str:
     """The same on a graphics card."""
     return bench_table("bench_h100.csv", COUNTS[1:], OTHERS[:2])
+
+
+def kinds_table() -> str:
+    """Grey stars, three primaries and a glass on a graphics card, by image size."""
+    rows = rows_of("kinds_h200.csv")
+    sizes = list(dict.fromkeys((r["width"], r["height"]) for r in rows))
+    at = {(r["width"], r["quantisation"], r["kind"], i // 8 % 2): r for i, r in enumerate(rows)}
+    body = []
+    for width, height in sizes:
+        for few in (0, 1):
+            for quantisation in ("round", "exact"):
+                found = [at[width, quantisation, kind, few] for kind in dict.fromkeys(r["kind"] for r in rows)]
+                head = [f"{width} x {height}", found[0]["stars"], f"`{quantisation}`"]
+                body.append(head + [figure(float(one["median_ms"])) for one in found])
+    return table(["ms, median", "stars", "codes", *dict.fromkeys(r["kind"] for r in rows)], body)
 
 
 def tradeoff_table() -> str:
@@ -268,6 +283,7 @@ TABLES = {
     "centroiders": centroider_table,
     "bench": bench_table,
     "card": card_table,
+    "kinds": kinds_table,
     "tradeoff": tradeoff_table,
     "economy": economy_table,
     "timing": timing_table,

@@ -4,6 +4,7 @@ Robust least squares of places. A larger lens, and refraction, are taken where s
 them.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,6 +33,7 @@ STEPS = {"log_focal": 1e-3, "centre_x": 10.0, "centre_y": 10.0, "k1": 0.1, "k2":
 PRIOR = {"log_focal": 1e3, "centre_x": 10.0, "centre_y": 10.0, "k1": 10.0, "k2": 10.0, "p1": 10.0, "p2": 10.0}
 LENS_NAMES = ("k1", "k2", "p1", "p2")
 ZENITH_PRIOR = 1.5  # sigma of the tangent of a zenith distance
+FOLDED = 0.3  # error of a place by a lens that folds, of that by the largest that does not: such a lens is what is there
 MODELS: dict[str, tuple[str, ...]] = {
     "pinhole": ("log_focal",),
     "k1": ("log_focal", "k1"),
@@ -308,15 +310,10 @@ def fit_camera(
     models: dict[str, tuple[str, ...]] = {"fixed": ()} if fixed else enough
     if not models:
         models = {"pinhole": MODELS["pinhole"]}
-    # the error of a place by the largest model, so that all are weighed alike
-    for largest in reversed(list(models)):
-        camera, start, floor = _settled(base, bare, photographs, models[largest])
-        if (within := _bounded(camera)) is not None:
-            break
-        del models[largest]  # too many terms for so few stars: it folds
-    bare = start
+    largest, camera, bare, floor = _largest(base, bare, photographs, models)
     if not last:
-        return CameraFit(within or camera, bare, largest, floor_px=floor)
+        return CameraFit(_bounded(camera) or camera, bare, largest, floor_px=floor)
+    models = dict(itertools.takewhile(lambda one: one[0] != largest, models.items())) | {largest: models[largest]}
     chosen, best, held = largest, math.inf, {}
     for name, names in models.items():
         held[name] = _held_out(base, bare, photographs, names, floor)
@@ -338,6 +335,33 @@ def fit_camera(
     camera, bare, covariance = fit_model(camera, bare, photographs, names, floor)
     sigma = {name: STEPS[name] * math.sqrt(covariance[k, k]) for k, name in enumerate(names)}
     return CameraFit(_bounded(camera) or camera, bare, chosen, sigma, held, floor)
+
+
+def _largest(
+    base: Camera, pointings: tuple[Pointing, ...], photographs: Sequence[Places], models: dict[str, tuple[str, ...]]
+) -> tuple[str, Camera, tuple[Pointing, ...], float]:
+    """The largest model that does not fold within the image, its fit, and the error of a place by it, so that all weigh alike.
+
+    Raises InputError where the smallest fits far worse than those that fold.
+    """
+    folding_px = math.inf
+    for name in reversed(models):
+        camera, turned, floor = _settled(base, pointings, photographs, models[name])
+        if _bounded(camera) is not None:
+            break
+        folding_px = min(folding_px, floor)  # too many terms for so few stars, or a lens of another kind
+    if folding_px < FOLDED * floor:
+        raise InputError(
+            "the stars ask for a distortion that folds within the image: two directions share a pixel near its corners; give"
+            " frames that are cut to the middle ([tracker] resolution_px with them), or of a longer focal length"
+        )
+    return name, camera, turned, floor
+
+
+def k1_camera(base: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places]) -> tuple[Camera, list[Pointing]]:
+    """The camera of least terms that has a distortion, and the pointings."""
+    camera, found, _ = _settled(base, tuple(pointings), photographs, MODELS["k1"])
+    return _bounded(camera) or camera, list(found)
 
 
 def _bounded(camera: Camera) -> Camera | None:

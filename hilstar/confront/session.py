@@ -15,7 +15,7 @@ from hilstar.bench.build import bench_channels, bench_optics, channel_rates, sit
 from hilstar.bench.config.sky import SiteSettings
 from hilstar.bench.site import site_glow_e_per_s_sr
 from hilstar.confront.background import SkyLevel, Sources, find_sources, is_round, sky_level, source_mask
-from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera
+from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera, k1_camera
 from hilstar.confront.images import Photograph, paged
 from hilstar.confront.light import (
     LINEAR_OFF,
@@ -31,7 +31,7 @@ from hilstar.confront.light import (
     transfer_points,
     with_extinction,
 )
-from hilstar.confront.lost_in_space import MIN_MATCHED, Field, Solved, solve_lost
+from hilstar.confront.lost_in_space import MAX_SOURCES, MIN_MATCHED, NEAR, Field, Solved, solve_lost
 from hilstar.confront.pattern import NO_PATTERN, fixed_pattern
 from hilstar.confront.sky import DatedSky, dated_sky
 from hilstar.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
@@ -44,6 +44,8 @@ from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 MATCH_PX = 2.5
+FIRST_PX = 0.15  # error of a source's place before it is measured
+BEYOND, FURTHER, MAX_ROUNDS = 1.25, 1.05, 12  # of the radius of a match, where it is continued, and while it grows so
 BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
 PSF_STARS = 60
 TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 9.0
@@ -287,15 +289,9 @@ def _fitted(
 ) -> Session:
     """The session of shots whose levels were made linear by a power; with the camera `before`, of their light alone."""
     pointings = [shot.pointing for shot in shots] if before is None else list(before.pointings)
-    first = [
-        Places(
-            s.sources.x_px[s.matched.source],
-            s.sources.y_px[s.matched.source],
-            np.full(len(s.matched.star), 0.15),
-            s.sky.vectors[s.matched.star],
-        )
-        for s in shots
-    ]
+    first = [_seen_at(s, s.matched.star, s.matched.source) for s in shots]
+    if before is None and fixed is None:
+        first, pointings = _outward(base, pointings, shots, first)
     camera = before or fit_camera(base, pointings, first, fixed=fixed is not None, last=False)
     pixels = _pixels(shots, file.config.tracker.detector) if fixed is None else fixed.pixels
     gain = pixels.gain_e_per_dn
@@ -327,6 +323,53 @@ def _fitted(
     masses = [_masses(shot.sky, pointing) for shot, pointing in zip(shots, camera.pointings, strict=True)]
     light = with_extinction(light, stars, masses, known=air is not None)
     return Session(file, tuple(shots), camera, psf, light, stars, pixels, power, fixed is not None, air)
+
+
+def _seen_at(shot: Shot, star: IntArray, source: IntArray) -> Places:
+    """Stars (n,) at their sources, before those are measured."""
+    x_px, y_px = shot.sources.x_px[source], shot.sources.y_px[source]
+    return Places(x_px, y_px, np.full(len(star), FIRST_PX), shot.sky.vectors[star])
+
+
+def _outward(
+    base: Camera, pointings: list[Pointing], shots: Sequence[Shot], first: list[Places]
+) -> tuple[list[Places], list[Pointing]]:
+    """First places and pointings, further from the middle than a pinhole's first match where the lens has a strong distortion.
+
+    Stars are matched a little further out by the k1 of those matched before, until no more are found.
+    """
+    places, now = first, list(pointings)
+    for _ in range(MAX_ROUNDS):
+        camera, turned = k1_camera(base, now, places)
+        found = [_beyond(shot, camera, *one) for shot, one in zip(shots, zip(turned, places, strict=True), strict=True)]
+        if max(_reach_px(camera, one) for one in found) < FURTHER * max(_reach_px(camera, one) for one in places):
+            break
+        places, now = found, turned
+    return (first, list(pointings)) if places is first else (places, turned)
+
+
+def _reach_px(camera: Camera, places: Places) -> float:
+    """The radius about the principal point that holds 95 % of places."""
+    cx, cy = camera.principal_point_px
+    return float(np.quantile(np.hypot(places.x_px - cx, places.y_px - cy), 0.95)) if len(places.x_px) else 0.0
+
+
+def _beyond(shot: Shot, camera: Camera, pointing: Pointing, matched: Places) -> Places:
+    """The bright stars at sources up to BEYOND times the radius of those that are `matched`."""
+    (cx, cy), (width, height), sources = camera.principal_point_px, shot.photo.size_px, shot.sources
+    reach_px = BEYOND * _reach_px(camera, matched)
+    points = np.flatnonzero(~sources.single & ~sources.trail)[:MAX_SOURCES]
+    points = points[np.hypot(sources.x_px[points] - cx, sources.y_px[points] - cy) < reach_px]
+    x, y = pointing.places_px(camera, shot.sky.vectors)
+    with np.errstate(invalid="ignore"):
+        inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1) & (np.hypot(x - cx, y - cy) < reach_px)
+    star = np.flatnonzero(inside)[: len(points)]
+    tree = cKDTree(np.column_stack([sources.x_px[points], sources.y_px[points]]))
+    near_px = NEAR * math.hypot(width, height)
+    off, source = map(np.asarray, tree.query(np.column_stack([x[star], y[star]]), distance_upper_bound=near_px))
+    here = np.flatnonzero(np.isfinite(off))
+    here = here[np.unique(source[here], return_index=True)[1]]
+    return _seen_at(shot, star[here], points[source[here]])
 
 
 def _channel_mag(file: BenchFile, plane: str, columns: FloatArray) -> FloatArray:

@@ -14,12 +14,11 @@ from tests.support.servers import Served
 from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.screen
-ROUND = '\n[render]\nquantisation = "round"\n'
 
 
 def test_the_page_s_picture_is_what_the_display_shows_under_every_aid(screen, tmp_path):
     bench = tmp_path / "bench.toml"
-    bench.write_text(SCREEN_BENCH + ROUND)
+    bench.write_text(SCREEN_BENCH.replace('"exact"', '"round"'))
     command = [*HILSTAR, "replay", str(bench), str(still_log(tmp_path / "still.csv")), "--console", "127.0.0.1:0", "--control"]
     with Started(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=screen.env) as process:
         served = Served(process, 0)

@@ -29,9 +29,7 @@ def test_doctor_names_the_gpu_of_a_window_and_the_headless_one(screen):
 
 
 def test_the_summary_and_the_ledger_have_the_gpu_that_drew_the_window(softpipe_screen, bench_file: Path, tmp_path: Path):
-    bench_file.write_text(
-        SCREEN_BENCH.replace("[640, 480]", "[160, 120]") + '[render]\ngpu = "llvmpipe"\nquantisation = "round"\n'
-    )
+    bench_file.write_text(SCREEN_BENCH.replace("[640, 480]", "[160, 120]").replace('"exact"', '"round"\ngpu = "llvmpipe"'))
     ledger = tmp_path / "run.mcap"
     log = still_log(tmp_path / "second.csv", seconds=1)
     environment = softpipe_screen.env | {"GALLIUM_DRIVER": "softpipe"}

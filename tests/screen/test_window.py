@@ -56,7 +56,7 @@ def test_a_portrait_bench_is_turned_onto_a_landscape_screen(screen, bench_file):
 
 
 def test_bit_stealing_reaches_the_screen(screen, bench_file):
-    bench_file.write_text(SCREEN_BENCH + "[render]\nbit_stealing = true\n")
+    bench_file.write_text(SCREEN_BENCH.replace('quantisation = "exact"', "bit_stealing = true"))
     codes = codes_of(bench_file)
     assert (codes[..., 0] != codes[..., 2]).any()
     with Shown(screen, bench_file) as shown:

@@ -239,7 +239,7 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
     rows += [planted(time_ms=time_ms * k, error_arcsec=error, chosen=name) for name, k in (("default", 1), ("auto", 1.01))]
     kept = []
     monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
-    run.draw(tmp_path / "c", rows, "A finding", "a machine")
+    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
     (figure,) = kept
     assert_legible(figure)
     names = [text.get_text() for text in figure.axes[0].texts]

@@ -109,7 +109,7 @@ class Planes:
         if not self.apart or sprites.primaries is None:
             return sprites
         data = np.empty(len(sprites), dtype=APART_DTYPE)
-        words = data.view(np.int32).reshape(len(sprites), -1)
+        words = data.view(np.int32).reshape(len(sprites), APART_DTYPE.itemsize // 4)
         words[:, :5] = sprites.data.view(np.int32).reshape(-1, 5)
         data["primaries_e_per_s"] = sprites.primaries
         data["electrons_per_s"] = (sprites.primaries / np.array(self.share, dtype=np.float32)).max(axis=1)

@@ -107,6 +107,14 @@ def test_each_quantisation_works_by_primary(tmp_path, quantisation):
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
+def test_a_field_without_a_star_is_dark(tmp_path, quantisation):
+    with load(bench_path(tmp_path, {"render": {"quantisation": quantisation}, "sky": {"faintest_v_mag": 2.0}})) as bench:
+        for q, lit in ((np.array(ORION_Q), True), (from_radec_roll_deg(10.0, -30.0, 0.0), False)):
+            assert bench.draw(q).levels.any() == lit
+
+
+@pytest.mark.gpu
 def test_the_twin_sees_the_stars_electrons_at_their_places(tmp_path):
     change = {"monitor.primaries": {"layout": "rgb-stripe"}, "tracker": {"transmission": 1.0}, "render": {"colour": None}}
     mosaic = {"tracker.detector": {"bayer": "rggb"}}  # whose default is "star"

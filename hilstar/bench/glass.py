@@ -9,6 +9,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import GAUSSIAN, Tracker
+from hilstar.errors import InputError
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline, glass_psf, regridded
 from hilstar.optics.psf_file import Glass, read_glass
 from hilstar.scene.camera import Camera
@@ -76,9 +77,13 @@ def _glass_psf(
         basis, per_px = regridded(glass.basis.astype(np.float64), glass.per_px, onto.matrix)
         weights = glass.weights / (glass.weights @ basis.sum(axis=(1, 2)))[..., None]
         places_px, lateral_px = np.round(onto.places_px(glass.places_px), 6), glass.lateral_px @ onto.matrix.T
-        fine = basis.astype(np.float32)
-        glass = replace(glass, places_px=places_px, basis=fine, weights=weights, lateral_px=lateral_px, per_px=per_px)
-        return glass_psf(glass, focus_um, np.array(shares))
+        each = {"places_px": places_px, "weights": weights, "lateral_px": lateral_px}
+        each |= {"illumination": glass.illumination, "outside": glass.outside}
+        known = np.isfinite(places_px).all(axis=1)  # points far beyond the detector may lie beyond either lens
+        if not known.any():
+            raise InputError("none of its points lies before the display's lens")
+        fine = {name: values[known] for name, values in each.items()}
+        return glass_psf(replace(glass, basis=basis.astype(np.float32), per_px=per_px, **fine), focus_um, np.array(shares))
     found = glass_psf(glass, focus_um, np.array(shares))
     width, height = resolution_px
     corners = np.array([(x, y) for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])

@@ -85,6 +85,14 @@ def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(bench):
     assert len(zones) == 9
 
 
+def test_points_beyond_a_lens_are_left_out(bench, tmp_path):
+    (tmp_path / "flight.toml").write_text("k1 = -0.1\n")
+    glass = glass_of(stack(**SMALL))
+    far = replace(glass, places_px=glass.places_px * [30.0, 1.0])
+    with open_bench(bench({"tracker": {"distortion": "flight.toml"}}, glass=far)) as shown:
+        assert 0 < len(shown.psf.field.places_px) < len(glass.places_px)
+
+
 def test_both_backends_show_the_same_levels_by_place(bench):
     for quantisation in ("round", "exact"):
         with open_bench(bench(scale=1.0, quantisation=quantisation)) as shown:

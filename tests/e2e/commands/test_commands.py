@@ -353,7 +353,12 @@ def test_a_command_that_is_killed_leaves_no_process_of_the_tests_behind(tmp_path
     orphan_command = [sys.executable, "-c", "import time; time.sleep(60)", f"-m hilstar {tmp_path}"]
     middle = f"import subprocess; subprocess.Popen({orphan_command!r})"
     subprocess.run([sys.executable, "-c", middle], check=True)
-    orphan = [number for number, command in leftovers.living_children().items() if str(tmp_path) in command]
+
+    def orphans() -> list[int]:
+        return [number for number, command in leftovers.living_children().items() if str(tmp_path) in command]
+
+    wait_for(orphans)  # /proc may still have another name or parent for it
+    orphan = orphans()
     assert len(orphan) == 1
     assert any(str(tmp_path) in command for command in leftovers.end_hilstar_leftovers())
     os.waitpid(orphan[0], 0)

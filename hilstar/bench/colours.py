@@ -182,12 +182,17 @@ class Colours:
 
     def on(self, stars: Stars) -> Stars:
         """The stars with the light of each primary."""
-        if stars.primaries is not None:
-            return stars
+        primaries, by_bv = self._shares_of_all(stars)
+        return replace(stars, primaries=primaries, primaries_by_bv=by_bv)
+
+    def _shares_of_all(self, stars: Stars) -> tuple[FloatArray, FloatArray]:
+        """The light of each primary of every star, and of light of the colours BV_MAG."""
+        if stars.primaries is not None and stars.primaries_by_bv is not None:
+            return stars.primaries, stars.primaries_by_bv
         by_bv, unknown = stars.colours_by_bv, np.full_like(BV_MAG, np.nan)
         if by_bv is None:
             by_bv = self._means(BV_MAG, unknown, None if self._kinds is None else np.full((len(BV_MAG), 2), np.nan))
-        return replace(stars, primaries=self.shares(self.wanted(stars)), primaries_by_bv=self.shares(by_bv))
+        return self.shares(self.wanted(stars)), self.shares(by_bv)
 
     def drive(self, shares: FloatArray) -> FloatArray:
         """How much of white stars of so much light of each primary (n, 3) ask for, relative to a white star, (n,)."""
@@ -221,10 +226,7 @@ class Colours:
 
     def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
         """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where light is none's, their mean."""
-        return shares_at(self._all(stars), stars, star)
-
-    def _all(self, stars: Stars) -> FloatArray:
-        return self.shares(self.wanted(stars)) if stars.primaries is None else stars.primaries
+        return shares_at(self._shares_of_all(stars)[0], stars, star)
 
     def on_truth(self, truth: npt.NDArray[np.void], stars: Stars, star: IntArray) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE with what is shown of stars at places (n,): temperature, electrons by channel, and how far off.
@@ -247,15 +249,13 @@ class Colours:
 
     def driven(self, sprites: Sprites, stars: Stars) -> Sprites:
         """Sprites with the light of each primary; `sprites.star` has places among `stars`."""
-        stars = self.on(stars)
-        if stars.primaries is None:
-            raise AssertionError("stars that the bench's colours are on have their shares")
-        shares = shares_of_sprites(sprites, stars, stars.primaries, stars.primaries_by_bv)
+        primaries, by_bv = self._shares_of_all(stars)
+        shares = shares_of_sprites(sprites, stars, primaries, by_bv)
         light = np.maximum(sprites.data["electrons_per_s"][:, None] * shares, TINY).astype(np.float32)
         if not sprites.extended:
             return replace(sprites, primaries=light)
         if not self._kept or self._kept[0] != sprites.extended:  # the same objects are the same light: it is moved once
-            each = extended_by_share(sprites, stars, stars.primaries, stars.primaries_by_bv)
+            each = extended_by_share(sprites, stars, primaries, by_bv)
             moved = zip(each, self.places_px.tolist(), strict=True)
             self._kept[:] = [sprites.extended, tuple(tuple(shifted(one, -x, -y) for one in part) for part, (x, y) in moved)]
         return replace(sprites, primaries=light, lights=self._kept[1])

@@ -4,7 +4,6 @@ Robust least squares of places. A larger lens, and refraction, are taken where s
 them.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -313,7 +312,7 @@ def fit_camera(
     largest, camera, bare, floor = _largest(base, bare, photographs, models)
     if not last:
         return CameraFit(_bounded(camera) or camera, bare, largest, floor_px=floor)
-    models = dict(itertools.takewhile(lambda one: one[0] != largest, models.items())) | {largest: models[largest]}
+    models = {name: models[name] for name in [*models][: [*models].index(largest) + 1]}
     chosen, best, held = largest, math.inf, {}
     for name, names in models.items():
         held[name] = _held_out(base, bare, photographs, names, floor)

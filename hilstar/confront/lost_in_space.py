@@ -226,10 +226,16 @@ class _Proof:
     def _pairs(self, seen: IntArray, matrix: FloatArray, focal_px: float) -> tuple[IntArray, IntArray]:
         """Stars and the sources on which they lie, each once."""
         places = self._places(self.vectors[seen], matrix, focal_px)
-        off, source = map(np.asarray, self.tree.query(places, distance_upper_bound=self.radius_px))
-        here = np.flatnonzero(np.isfinite(off))
-        _, first = np.unique(source[here], return_index=True)
-        return seen[here[first]], source[here[first]]
+        one, source = nearest_once(self.tree, places, self.radius_px)
+        return seen[one], source
+
+
+def nearest_once(tree: cKDTree, places_px: FloatArray, radius_px: float) -> tuple[IntArray, IntArray]:
+    """Which places (n, 2), brightest first, have a source of a tree within a radius, each source once, and that source."""
+    off, source = map(np.asarray, tree.query(places_px, distance_upper_bound=radius_px))
+    here = np.flatnonzero(np.isfinite(off))
+    here = here[np.sort(np.unique(source[here], return_index=True)[1])]
+    return here, source[here]
 
 
 def turned(cam: FloatArray, icrs: FloatArray) -> FloatArray:

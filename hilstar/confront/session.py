@@ -31,7 +31,7 @@ from hilstar.confront.light import (
     transfer_points,
     with_extinction,
 )
-from hilstar.confront.lost_in_space import MAX_SOURCES, MIN_MATCHED, NEAR, Field, Solved, solve_lost
+from hilstar.confront.lost_in_space import MAX_SOURCES, MIN_MATCHED, NEAR, Field, Solved, nearest_once, solve_lost
 from hilstar.confront.pattern import NO_PATTERN, fixed_pattern
 from hilstar.confront.sky import DatedSky, dated_sky
 from hilstar.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
@@ -365,11 +365,8 @@ def _beyond(shot: Shot, camera: Camera, pointing: Pointing, matched: Places) -> 
         inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1) & (np.hypot(x - cx, y - cy) < reach_px)
     star = np.flatnonzero(inside)[: len(points)]
     tree = cKDTree(np.column_stack([sources.x_px[points], sources.y_px[points]]))
-    near_px = NEAR * math.hypot(width, height)
-    off, source = map(np.asarray, tree.query(np.column_stack([x[star], y[star]]), distance_upper_bound=near_px))
-    here = np.flatnonzero(np.isfinite(off))
-    here = here[np.unique(source[here], return_index=True)[1]]
-    return _seen_at(shot, star[here], points[source[here]])
+    one, source = nearest_once(tree, np.column_stack([x[star], y[star]]), NEAR * math.hypot(width, height))
+    return _seen_at(shot, star[one], points[source])
 
 
 def _channel_mag(file: BenchFile, plane: str, columns: FloatArray) -> FloatArray:
@@ -426,11 +423,8 @@ def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:
     with np.errstate(invalid="ignore"):
         inside = np.flatnonzero((x > HALF) & (x < width - 1 - HALF) & (y > HALF) & (y < height - 1 - HALF))
     tree = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px]))
-    off, source = map(np.asarray, tree.query(np.column_stack([x[inside], y[inside]]), distance_upper_bound=MATCH_PX))
-    near = np.isfinite(off)
-    star, source = inside[near], source[near]
-    first = np.unique(source, return_index=True)[1]  # stars are in order of light: the brightest has a source
-    star, source = star[np.sort(first)], source[np.sort(first)]
+    one, source = nearest_once(tree, np.column_stack([x[inside], y[inside]]), MATCH_PX)
+    star = inside[one]
     every = cKDTree(np.column_stack([x[inside], y[inside]]))
     v = shot.sky.v_mag
     blended = np.zeros(len(star), dtype=bool)

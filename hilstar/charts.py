@@ -173,7 +173,7 @@ def finish(figure: "Figure") -> None:
         log_ticks(axis, box.width / 45 if axis.axis_name == "x" else box.height / 25)
     if engine is not None:
         engine.execute(figure)
-    figure.set_layout_engine("none")  # each file that is written would repeat it
+    figure.set_layout_engine(None)  # each file that is written would repeat it, and draw twice
 
 
 def capital(text: str) -> str:

@@ -43,7 +43,7 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
     codes = np.arange(2**bits, dtype=np.uint16)
     triples = np.concatenate([np.outer(codes, primaries).astype(np.uint16) for primaries in PRIMARIES.values()])
     width, height = screen_px
-    wrong: list[str] = []
+    wrong, first = 0, ""
     for part in np.array_split(triples, -(-len(triples) // min(MAX_LEVELS, width * height))):
         levels = (np.arange(width * height, dtype=np.uint32) % len(part)).astype(np.uint16).reshape(height, width)
         with context:
@@ -53,10 +53,12 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             texture.release()
         drawn = np.rint(np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1])
         differ = (drawn != part[levels]).any(axis=-1)
-        for level in np.unique(levels[differ]):
-            became = drawn[(levels == level) & differ][0].astype(int)
-            wrong.append(f"{tuple(map(int, part[level]))} as {tuple(map(int, became))}")
-    return f"{len(wrong)} of {len(triples)} codes are not drawn as they are, {wrong[0]}" if wrong else ""
+        changed = np.unique(levels[differ])
+        if len(changed) and not wrong:
+            became = drawn[(levels == changed[0]) & differ][0].astype(int)
+            first = f"{tuple(map(int, part[changed[0]]))} as {tuple(map(int, became))}"
+        wrong += len(changed)
+    return f"{wrong} of {len(triples)} codes are not drawn as they are, {first}" if wrong else ""
 
 
 class Presenter:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.scene.camera import Camera
+from hilstar.scene.camera import Camera, Lens
 
 MAX_NODES = 64  # on one path: leggauss is an eigenvalue problem, 1 ms for 64 nodes and minutes for 10 000
 # A place may be off by the larger of these: px, and of the path's length within the turn. Either changes a pixel of a star of
@@ -210,7 +210,8 @@ class ShortPaths:
 
 def points_within(camera: Camera, half_turn_rad: float) -> int | None:
     """How many points keep paths within LIMIT_PX or LIMIT_SHARE, for a turn of twice that angle; None where no few do."""
-    for points, longest_rad in zip(POINTS, _longest_half_turns_rad(camera), strict=True):
+    mapping = camera.resolution_px, camera.focal_length_px, camera.principal_point_px, camera.lens
+    for points, longest_rad in zip(POINTS, _longest_half_turns_rad(*mapping), strict=True):
         if 0 < half_turn_rad <= longest_rad:
             return points
     return None
@@ -227,8 +228,11 @@ def bend_px(camera: Camera) -> float:
 
 
 @lru_cache(maxsize=16)
-def _longest_half_turns_rad(camera: Camera) -> tuple[float, ...]:
-    """The longest half turn that each of POINTS can draw, tried on this camera: 0 where even a short one is off."""
+def _longest_half_turns_rad(
+    resolution_px: tuple[int, int], focal_length_px: float, principal_point_px: tuple[float, float], lens: Lens | None
+) -> tuple[float, ...]:
+    """The longest half turn that each of POINTS can draw, tried on such a camera: 0 where even a short one is off."""
+    camera = Camera(resolution_px, focal_length_px, principal_point_px, np.eye(3), lens)
     turns = [MAX_HALF_TURN_RAD * NARROWER**k for k in range(TRIES)]
     firsts = [bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0) for points in POINTS]
     return tuple([*turns, 0.0][first] for first in firsts)

@@ -1,9 +1,12 @@
 """The reference of the bench file, docs/bench-file.md: `python -m hilstar.bench.config.reference` prints it.
 
-All of it comes from the classes of the tables: keys, types, units, limits, defaults and meanings.
+All of it comes from the classes of the tables: keys, types, units, limits and defaults, and their meanings from the comments
+`#:` above or beside each key, which may end in a default in words (`Default: the middle of the screen`).
 """
 
+import ast
 import inspect
+import textwrap
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -12,7 +15,9 @@ from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
 from hilstar.bench.config.bench_config import TYPE_WORDS, BenchConfig
+from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
+from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.toml_tables import plain
 
 # The unit that the end of a key's name says, the longest end first.
@@ -40,6 +45,11 @@ UNITS = {
     "_e": "e-",
     "_k": "K",
     "_s": "s",
+}
+FILLED_IN = {
+    "QUANTISERS": "".join(f'`"{name}"`: {quantiser.words} ' for name, quantiser in QUANTISERS.items()),
+    "MAX_JUDGED_FRAMES": f"{MAX_JUDGED_FRAMES}",
+    "DEFAULT_BRIGHTEST_V_MAG": f"{DEFAULT_BRIGHTEST_V_MAG}",
 }
 
 HEAD = """\
@@ -98,26 +108,42 @@ def table_in(hint: Any) -> type[msgspec.Struct] | None:
 def section(name: str, table: Any) -> str:
     """A table of the file: what it is for, its keys, and what else there is to know."""
     summary, _, notes = (inspect.getdoc(table) or "").partition("\n\n")
-    hints = get_type_hints(table, include_extras=True)
-    rows = [row(field, hints[field.name]) for field in msgspec.structs.fields(table) if table_in(field.type) is None]
+    hints, meanings = get_type_hints(table, include_extras=True), meanings_of(table)
+    keys = [field for field in msgspec.structs.fields(table) if table_in(field.type) is None]
+    rows = [row(field, hints[field.name], meanings[field.name]) for field in keys]
     lines = [f"## `[{name}]`", "", summary, "", "| key | value | default | meaning |", "|---|---|---|---|", *rows, ""]
     return "\n".join([*lines, notes, ""] if notes else lines)
 
 
-def row(field: FieldInfo, hint: Any) -> str:
-    """A key: its name, what it may hold, what it holds otherwise, and what it means."""
-    notes = notes_of(hint)
-    meaning = next(note.description for note in reversed(notes) if note.description)
-    return f"| `{field.name}` | {value_text(field.name, hint)} | {default_text(field, notes)} | {meaning} |"
+def meanings_of(table: type) -> dict[str, str]:
+    """The meaning of each key of a table: the comments `#:` above it and beside it."""
+    source = textwrap.dedent(inspect.getsource(table))
+    lines, meanings, (definition,) = source.splitlines(), {}, ast.parse(source).body
+    for key in definition.body if isinstance(definition, ast.ClassDef) else []:
+        if isinstance(key, ast.AnnAssign) and isinstance(key.target, ast.Name):
+            first = key.lineno - 1
+            while lines[first - 1].lstrip().startswith("#:"):
+                first -= 1
+            told = " ".join(line.partition("#:")[2].strip() for line in lines[first : key.end_lineno] if "#:" in line)
+            for name, words in FILLED_IN.items():
+                told = told.replace(f"{{{name}}}", words)
+            meanings[key.target.id] = told
+    return meanings
+
+
+def row(field: FieldInfo, hint: Any, told: str) -> str:
+    """A key: its name, what it may hold, what it holds otherwise, and what it means by its comment (see `meanings_of`)."""
+    meaning, _, default = told.partition(" Default: ")
+    if field.default is NODEFAULT:
+        default = "**required**"
+    return f"| `{field.name}` | {value_text(field.name, hint)} | {default or f'`{toml(field.default)}`'} | {meaning} |"
 
 
 def notes_of(hint: Any) -> list[Meta]:
     """The notes in the annotations of a type, inner ones first; those of `X | None` are X's too."""
-    if get_origin(hint) is not Annotated:
-        return []
-    inner, *notes = get_args(hint)
-    optional = [choice for choice in get_args(inner) if get_origin(choice) is Annotated] if is_optional(inner) else []
-    return [note for choice in optional for note in notes_of(choice)] + [note for note in notes if isinstance(note, Meta)]
+    kind, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    inner = [note for choice in get_args(kind) if get_origin(choice) is Annotated for note in notes_of(choice)]
+    return (inner if is_optional(kind) else []) + [note for note in notes if isinstance(note, Meta)]
 
 
 def is_optional(kind: Any) -> bool:
@@ -147,14 +173,6 @@ def limits_text(notes: list[Meta]) -> str:
         return ""
     above = "above 0" if low == MIN_POSITIVE else f"{low:g} or more"
     return above if high is None or high >= MAX_NUMBER else f"{low:g} to {high:.12g}"
-
-
-def default_text(field: FieldInfo, notes: list[Meta]) -> str:
-    """The value where the file has no such key."""
-    told = next((note.extra["default"] for note in notes if note.extra and "default" in note.extra), None)
-    if field.default is NODEFAULT:
-        return "**required**"
-    return str(told) if told is not None else f"`{toml(field.default)}`"
 
 
 def toml(value: Any) -> str:

@@ -25,24 +25,7 @@ JPEG_QUALITY = 82
 MAX_ROWS = 40
 GRID, TILE_PER_PX, TILE_HALF_PX = 5, 8, 3
 VIEWS = ("image", "prediction", "residual")
-STYLE = """<style>
-.views { position: relative; background: #000 } .views img { width: 100%; display: none; image-rendering: pixelated }
-.views img.on { display: block } .views.all img { display: inline-block; width: 33.33% }
-.views.all svg { display: none } .views svg { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none }
-button { font: inherit; padding: .15em .8em } button.on { font-weight: 700 } .bad { color: #c0182b }
-@media print { .views img { display: block; width: 33%; float: left } button { display: none } }
-</style>"""
-SCRIPT = """<script>
-for (const box of document.querySelectorAll(".frame")) {
-  const images = box.querySelectorAll("img"), buttons = box.querySelectorAll("button"); let timer = 0;
-  const show = k => { images.forEach((one, i) => one.classList.toggle("on", i === k));
-    buttons.forEach((one, i) => one.classList.toggle("on", i === k)); };
-  const all = on => box.querySelector(".views").classList.toggle("all", on);
-  buttons.forEach((one, k) => one.addEventListener("click", () => { clearInterval(timer); timer = 0; all(k === 4);
-    if (k !== 3) { show(k); return; } let at = 0; show(0); timer = setInterval(() => show(at = 1 - at), 600); }));
-  all(true); show(4);
-}
-</script>"""
+STYLE, SCRIPT = (Path(__file__).with_suffix(ending) for ending in (".css", ".js"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +68,7 @@ def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> N
         "beyond the limits: " + "; ".join(found.failures) if found.failures else "the simulator explains these photographs"
     )
     body = [
-        STYLE,
+        f"<style>{STYLE.read_text()}</style>",
         f'<p class="note"><b>{"Fixed" if found.session.fixed else "Fitted"} camera:</b> {escaped(verdict)}.</p>',
         *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
         "<h2>Verdicts</h2><ul>" + "".join(f"<li>{escaped(line)}</li>" for line in found.lines) + "</ul>",
@@ -104,7 +87,7 @@ def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> N
             rows += [(one.name, None if math.isnan(one.rms) else one.rms, one.how) for one in parts]
             body.append(table_of(rows, ("part", f"rms, {unit}", "how it is told apart"), 3))
     body.append(_lists(found.verdicts))
-    write_whole(path, page_of("Photographs against the simulator", [*body, SCRIPT]))
+    write_whole(path, page_of("Photographs against the simulator", [*body, f"<script>{SCRIPT.read_text()}</script>"]))
 
 
 def _summary(verdicts: Sequence[Verdict]) -> str:

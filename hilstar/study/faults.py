@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.bench.fault_schedule import FaultSchedule
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
-from hilstar.bench.scenario import Scenario
+from hilstar.bench.scenario import FaultSchedule, Scenario
 from hilstar.charts import BLUE, GREEN, INK, MUTED, chart, label_ends, write_records
 from hilstar.frame.fault_kinds import Freeze, Now, fault_of
 from hilstar.frame.faults import FaultLayer

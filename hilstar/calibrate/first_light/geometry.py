@@ -12,9 +12,16 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.calibrate.effective_psf import dots_of_image, draw_effective, fit_effective
-from hilstar.calibrate.first_light.context import DarkSubtracted, StepContext
+from hilstar.calibrate.first_light.context import (
+    DarkSubtracted,
+    Figure,
+    KeyChange,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    with_changes,
+)
 from hilstar.calibrate.first_light.image_sources import Pattern, black
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, with_changes
 from hilstar.calibrate.geometric.calibration import calibrate_files, notes_for_a_person, parameters_of, write_calibrated
 from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, dot_image, plan_dots, write_plan
 from hilstar.charts import DARK, ORANGE, TEXT_PT, chart

@@ -14,9 +14,8 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_primaries, named_channels
 from hilstar.bench.config.bench_config import drives_apart
-from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
+from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, Figure, StepContext, StepNumber, StepOutcome
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
-from hilstar.calibrate.first_light.records import Figure, StepNumber, StepOutcome
 from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
 from hilstar.calibrate.plan import Patch, PlanSettings, in_channel, plan_patches

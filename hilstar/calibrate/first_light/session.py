@@ -15,15 +15,12 @@ from typing import Any
 import msgspec
 
 from hilstar.bench.bench_file import BenchFile
-from hilstar.calibrate.first_light.context import StepContext
-from hilstar.calibrate.first_light.geometry import focus, geometry, orientation
-from hilstar.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
-from hilstar.calibrate.first_light.photometry import photometry
-from hilstar.calibrate.first_light.records import (
+from hilstar.calibrate.first_light.context import (
     KIND,
     Figure,
     KeyChange,
     SessionFile,
+    StepContext,
     StepNumber,
     StepOutcome,
     StepRecord,
@@ -32,6 +29,9 @@ from hilstar.calibrate.first_light.records import (
     sha256_of,
     write_session,
 )
+from hilstar.calibrate.first_light.geometry import focus, geometry, orientation
+from hilstar.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
+from hilstar.calibrate.first_light.photometry import photometry
 from hilstar.calibrate.first_light.stars import scale, verify
 from hilstar.calibrate.first_light.uniformity import uniformity, warm_up
 from hilstar.calibrate.latency import checked_delay_ms, draw_latency, pair, summarise

@@ -16,9 +16,17 @@ from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import bench_camera, display_psf, tracker_camera
 from hilstar.bench.config import Verify
 from hilstar.bench.frame import Bench, Frame
-from hilstar.calibrate.first_light.context import MAX_FILL, DarkSubtracted, StepContext
+from hilstar.calibrate.first_light.context import (
+    MAX_FILL,
+    DarkSubtracted,
+    Figure,
+    KeyChange,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    Verdict,
+)
 from hilstar.calibrate.first_light.image_sources import Pattern
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, Verdict
 from hilstar.calibrate.scale import UNSURE_MAG, MeasuredScale
 from hilstar.charts import BLUE, INK, MUTED, SMALL_PT, chart
 from hilstar.errors import InputError

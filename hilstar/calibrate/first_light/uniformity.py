@@ -10,11 +10,19 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.calibrate.first_light.context import HOT_FILL, DarkSubtracted, StepContext
+from hilstar.calibrate.first_light.context import (
+    HOT_FILL,
+    DarkSubtracted,
+    Figure,
+    KeyChange,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    Verdict,
+)
 from hilstar.calibrate.first_light.geometry import sharp_dots
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.calibrate.first_light.photometry import calibration_of, calibration_source
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, Verdict
 from hilstar.calibrate.geometric.dots import DOT_PX
 from hilstar.calibrate.warm_up import AHEAD_S, S_PER_H, fitted_white, judge_warm_up, watch_white
 from hilstar.charts import BLUE, MUTED, chart, label_ends, write_csv

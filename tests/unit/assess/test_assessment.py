@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from hilstar import charts
 from hilstar.arrays import FloatArray
 from hilstar.assess import report
+from hilstar.assess.assessment import lock_of
 from hilstar.assess.bench_effects import display_cost, slices_of, turn_between
-from hilstar.assess.lock import lock_of
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.bench.build import bench_stars
 from hilstar.bench.cameras import tracker_camera

@@ -35,18 +35,8 @@ from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
+from hilstar.study import settings
 from hilstar.study.predictors import Movement, attitude_at
-from hilstar.study.settings import (
-    FULL_HD,
-    GLASS,
-    Isolation,
-    Table,
-    bench_text,
-    centroid_px,
-    lone_windows,
-    star_error,
-    study_bench,
-)
 from hilstar.study.sweep import medians_ms
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.shutter import S_PER_US
@@ -89,18 +79,18 @@ class StripePoint:
 def stripe_points(case: StripeCase) -> list[StripePoint]:
     """The rows of one case, every so many."""
     exposure_s = case.refreshes / REFRESH_HZ
-    tables: dict[str, Table] = {
-        "tracker": {"resolution_px": STRIPE_SIZE_PX, "exposure_s": exposure_s, "transmission": GLASS},
+    tables: dict[str, settings.Table] = {
+        "tracker": {"resolution_px": STRIPE_SIZE_PX, "exposure_s": exposure_s, "transmission": settings.GLASS},
         "sky": {"faintest_v_mag": 3.0},
-        "monitor": {**FULL_HD, "hold_ms": case.lit_ms, "calibration": "lcd-example"},
+        "monitor": {**settings.FULL_HD, "hold_ms": case.lit_ms, "calibration": "lcd-example"},
         "collimator": {"focal_length_mm": 350},
     }
-    rolling: Table = {"shutter": "rolling", "row_time_us": ROW_TIME_US}
+    rolling: settings.Table = {"shutter": "rolling", "row_time_us": ROW_TIME_US}
     view, light = View.exposure(from_radec_roll_deg(*STRIPES_RADEC_ROLL_DEG), STILL, exposure_s), []
     for extra in ({"tracker.detector": rolling}, {}):
         with TemporaryDirectory() as folder:
             path = Path(folder) / "bench.toml"
-            path.write_text(bench_text({**tables, **extra}), encoding="utf-8")
+            path.write_text(settings.bench_text({**tables, **extra}), encoding="utf-8")
             file = read_bench_file(path)
             tracker = DisplayTracker(file)
             light.append(
@@ -155,7 +145,7 @@ RATE_DEG_S = 1.0
 PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
 STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
 STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
-ISOLATION = Isolation(margin_px=8.0, max_share=1e-3)
+ISOLATION = settings.Isolation(margin_px=8.0, max_share=1e-3)
 RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
 QUICK_RATES_DEG_S = (2.0,)
 # A window reaches the largest error here and the PSF beyond a star's path.
@@ -170,7 +160,7 @@ def slew(rate_deg_s: float) -> Movement:
 class Compensation:
     """A bench's compensation: further keys of [monitor], and `motion` of [render]."""
 
-    monitor_keys: Table
+    monitor_keys: settings.Table
     motion: str
 
 
@@ -206,17 +196,17 @@ class ScanningPanel(Closing):
     """
 
     def __init__(self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0) -> None:
-        held: Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
-        tables: dict[str, Table] = {
-            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": GLASS},
+        held: settings.Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
+        tables: dict[str, settings.Table] = {
+            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": settings.GLASS},
             "sky": {"faintest_v_mag": 6.0},
-            "monitor": {**FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
+            "monitor": {**settings.FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
             "collimator": {"focal_length_mm": 350},
             "render": {"quantisation": "exact", "motion": WAYS[way].motion, "brightest_v_mag": 1.5},
         }
         self.way = way
         self.start_s = START_S
-        self.bench = study_bench(path, tables)
+        self.bench = settings.study_bench(path, tables)
         config = self.bench.config
         self.period_s = 1 / config.monitor.refresh_hz
         self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s)
@@ -346,7 +336,7 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
 def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, movement: Movement) -> Iterator[BeatPoint]:
     shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
     paths, to_tracker, camera = sky.paths(movement), panel.optics.geometry.to_tracker, panel.bench.camera
-    windows = list(lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
+    windows = list(settings.lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
     # Where each star is on the monitor in the middle of the exposure, and just before and after: its row, and its speed.
     middle_ns = round((panel.start_s + panel.exposure_s / 2) * NS_PER_S)
     middle = Motion(movement.at(middle_ns), movement.turn_rad_s, panel.exposure_s)
@@ -357,7 +347,7 @@ def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, mov
     phase = (panel.start_s / panel.period_s - (now[1] + 0.5) / camera.resolution_px[1]) % 1.0
     foretold = seen_at(Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s), phase)
     for index, (_, window) in enumerate(windows):
-        off_px = np.subtract(centroid_px(shown, window), centroid_px(true, window))
+        off_px = np.subtract(settings.centroid_px(shown, window), settings.centroid_px(true, window))
         speed = speed_px_s[:, index]
         yield BeatPoint(
             case.refreshes,
@@ -434,8 +424,8 @@ def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingO
     shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
     paths = sky.paths(movement)
     places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
-    windows = lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
-    errors = [star_error(shown, true, window) for _, window in windows]
+    windows = settings.lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
+    errors = [settings.star_error(shown, true, window) for _, window in windows]
     flux_mag = np.array([error.flux_mag for error in errors])
     off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / panel.camera.focal_length_px
     rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))

@@ -56,11 +56,7 @@ class PixelNoise:
 
 
 class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The virtual tracker's sensor.
-
-    Physical order: light, PRNU, shot noise, dark current, full well, read noise, ADC. Rates are per pixel, those of dark
-    current at `dark_reference_temperature_k`.
-    """
+    """The virtual tracker's sensor."""
 
     gain_e_per_dn: Charge = 24.0  #: Electrons per DN. The ADC rounds and clips.
     full_well_e: Charge = 70_000.0  #: Charge above this is lost, or spills with `blooming`.

@@ -24,10 +24,7 @@ Byte = Annotated[int, Meta(ge=-MAX_FRAME_BYTES, le=MAX_FRAME_BYTES)]
 
 
 class Convention(Table, frozen=True):
-    """What the tracker's quaternion turns into what.
-
-    Compositions are Hamilton's. `hilstar answers --explain` shows an answer under every convention beside what is shown.
-    """
+    """What the tracker's quaternion turns into what."""
 
     #: Where the scalar of `q` stands, `"first"` or `"last"`, in JSON and in what a Python function gives.
     scalar: Literal["first", "last"] = "first"
@@ -64,17 +61,7 @@ class FrameMatch(Table, frozen=True):
 
 
 class AnswersSettings(Table, frozen=True):
-    """Where the answers of the star tracker come from, and what their bytes mean (see [answers](answers.md)).
-
-    Without this table nobody listens. A process of its own reads, decodes and stamps. At most 500 kB and 200 answers a second
-    are taken; what is beyond, and what is no answer, is counted by reason.
-
-    A field of `fields` is `{ name = "qw", at = 6, type = "i32be", scale = 4.656612873077393e-10 }`: `name` is one of qw, qx,
-    qy, qz, t_s (s), t_sub (s, added to t_s), t_ns, valid (not 0), mode, stars, wx, wy, wz (rad/s). `at` counts bytes from the
-    frame's first, which is that of the sync bytes, or of what SLIP or COBS hold. `type` is u8, i8, u16 to u64, i16 to i64, u24,
-    i24, f32 or f64, with `le` (the default) or `be` at its end. The value is raw x `scale` (1) + `add` (0); `mask` takes some
-    bits of a whole number, as a number of their own.
-    """
+    """Where the answers of the star tracker come from, and what their bytes mean (see [answers](answers.md))."""
 
     #: The road: a `"serial"` line, `"udp"`, `"tcp"`, `"zmq"`, or a `"file"` to which something appends: what is appended after
     #: the start counts.

@@ -21,14 +21,7 @@ ENDPOINTS = {
 
 
 class AttitudeSettings(Table, frozen=True):
-    """Where the attitude comes from, and what is shown without one.
-
-    The packets, and what each side may expect of the other, are in [firmware_protocol](../firmware_protocol/README.md).
-
-    CURVE keys come from `hilstar keys`. An endpoint that is not loopback is refused without them: the side that binds needs
-    its own secret key and a directory with the public keys of its clients (read again when it changes), the side that
-    connects needs its own secret key and the public key of the side that binds.
-    """
+    """Where the attitude comes from, and what is shown without one."""
 
     #: `"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet or JSON in each
     #: datagram. `"vizard"`: Basilisk's Vizard stream, and `"42"`: the text stream of NASA's 42; their attitude is the body's
@@ -156,10 +149,7 @@ def nasa42_road(settings: AttitudeSettings) -> tuple[int, AllowedSenders]:
 
 
 class FaultSettings(Table, frozen=True):
-    """Where faults come from beside a scenario file: a second ZeroMQ stream, of JSON (see [faults](faults.md)).
-
-    As with the attitude, an endpoint that is not loopback is refused without CURVE keys (`hilstar keys`).
-    """
+    """Where faults come from beside a scenario file: a second ZeroMQ stream, of JSON (see [faults](faults.md))."""
 
     #: The address to which hilstar's SUB socket connects, as in `[attitude]`: `tcp://HOST:PORT` or `ipc:///WHOLE/PATH`. Without
     #: it there is no stream of faults. Default: none

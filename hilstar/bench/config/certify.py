@@ -11,10 +11,7 @@ Relative = Annotated[float, Meta(ge=0, le=1)]
 
 
 class InstrumentSettings(Table, frozen=True):
-    """The photometer by which full scale was measured, from its own certificate.
-
-    Without a name there is none: light is then certified in the tracker's own electrons, and its scale is not assessed.
-    """
+    """The photometer by which full scale was measured, from its own certificate."""
 
     name: str = ""  #: Maker, model and serial number; empty for none.
     relative_expanded: Relative = 0.0  #: Expanded uncertainty of its scale, relative: 0.01 for one per cent.

@@ -42,13 +42,7 @@ Offset = tuple[Annotated[float, Meta(ge=-1, le=1)], Annotated[float, Meta(ge=-1,
 
 
 class TrackerOptics(Table, frozen=True):
-    """How the tracker's lens spreads a star over the detector.
-
-    The file's first image has odd sides, x right and y down, its first row on top, and the chief ray in its middle, where it
-    stays: with coma a star's centroid lies beside its place. hilstar integrates the pixel. Give at least 1.2 samples a sigma,
-    and all of the light: a star's pixels sum to its rate, whatever lies outside ([errors](where-it-fails.md#the-light)). Large
-    discs are spread by the Gaussian nearest to it.
-    """
+    """How the tracker's lens spreads a star over the detector."""
 
     #: `"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file. That of [`hilstar optics`](optics.md) has point
     #: spread functions over field, wavelength and focus. Or it has one image of the point spread function, the same all over
@@ -75,20 +69,7 @@ class TrackerOptics(Table, frozen=True):
 
 
 class Tracker(Table, frozen=True):
-    """The star tracker under test.
-
-    Its aperture, quantum efficiency and transmission turn a star's light into electrons. Focal length, pixels, exposure,
-    point spread function and detector describe the *virtual* tracker of `simulate` and `verify`; the display adds nothing of
-    them, because the real tracker brings its own.
-
-    A curve (`quantum_efficiency`, `transmission`) is interpolated linearly between its points and is zero outside them. Where
-    both curves are plain numbers, light from 300 to 1100 nm counts.
-
-    A tracker that tells colours apart has `quantum_efficiency_r`, `_g` and `_b` in place of `quantum_efficiency`. Then
-    `hilstar frame -o` writes the linear image as a cube of three channels, and a bench's full scale and magnitudes are those of
-    all channels together. Each pixel of the virtual tracker has its own colour, by `[tracker.detector] bayer`; without that,
-    it adds up its channels, and says so.
-    """
+    """The star tracker under test."""
 
     aperture_mm: Positive  #: Diameter of the entrance pupil.
     focal_length_mm: Positive  #: Focal length of the tracker's lens.
@@ -154,15 +135,7 @@ def check_channels(tracker: Tracker) -> None:
 
 
 class PrimariesSettings(Table, frozen=True):
-    """The light of the monitor's red, green and blue, and where it lies within a pixel.
-
-    With it `hilstar budget` says how many electrons per second each channel of the tracker has of each primary at full light:
-    all of them together are full scale. The condition number says how much larger an error of the primaries' mixture can be
-    than that of the channels' light. `[render] colour = "star"` mixes each star's light of them ([colour](colour.md)).
-
-    A primary's response is that of its column in the calibration file, or the grey one. Light that one primary's drive adds
-    to another's is part of its spectrum, as measured at full drive.
-    """
+    """The light of the monitor's red, green and blue, and where it lies within a pixel."""
 
     #: The path of a CSV file with the header `wavelength_nm,r,g,b`: the relative spectral power per nm of each primary at full
     #: drive, all in one unit. Or that of an ArgyllCMS `.ccss` with the display's own samples: its primaries are those three of
@@ -214,28 +187,7 @@ def check_primaries(primaries: PrimariesSettings) -> None:
 
 
 class Monitor(Table, frozen=True):
-    """The screen behind the collimator.
-
-    The window opens for `serve` and `replay` unless `--headless` is given; `--windowed` keeps it on the desktop. At the start
-    120 frames are measured. A display is refused (exit code 3), unless `--force` is given, when its size or refresh rate
-    differs from the bench file, when it has fewer bits, when it is scaled, composited or mirrored by another display, when it
-    drops frames, or when it does not wait for its refresh. So is a monitor that is not the one, or not as it was, when the
-    files of `calibration` and `[collimator] geometry` were measured ([which monitor](first-day.md#which-monitor-this-is)). A
-    display that is unplugged is filled again when it returns.
-
-    Keys in the window: q quit, b blank, space pause, c crosshair, g grid, t next test pattern, h help. Frames whose sky was
-    changed with these keys are counted as `operator`; frames while the window was minimised, covered, moved off its display,
-    or on a display that slept are counted as `hidden`. The status, the ledger's frames and events, and `--json` have both
-    counts, in frames and in seconds.
-
-    A frame is drawn for the moment at which the middle row lights: the buffer swap plus `panel_delay_ms` plus half of
-    `scanout_ms`. A star on another row is drawn where it is when that row lights, and along its path for `hold_ms`.
-
-    To measure `panel_delay_ms`, put a photodiode in front of the square that `photodiode_px` draws, run
-    `serve --ledger RUN.mcap`, and meanwhile `hilstar latency RUN.mcap --diode serial:/dev/ttyACM0@115200 --write BENCH.toml`.
-    The photodiode's device sends a line `1` at each edge from dark to light and `0` at each edge back, or `1,MICROSECONDS`
-    by its own clock. `--edges FILE.csv` takes recorded edges instead (`host_ns,level`, on the host's monotonic clock).
-    """
+    """The screen behind the collimator."""
 
     resolution_px: Size  #: Size of the screen.
     pixel_pitch_um: Positive  #: Distance between the centres of adjacent pixels.
@@ -294,19 +246,7 @@ class Collimator(Table, frozen=True):
 
 
 class SyncSettings(Table, frozen=True):
-    """The tracker's exposures and the monitor's refresh: how they beat, and a pulse for a tracker that takes a trigger.
-
-    An exposure of whole refreshes sees whole frames; of one that is not, the parts at both ends are counted where their frames'
-    middles are, and a star of a turning camera is off by an amount that depends on the phase between the two. A panel that
-    flashes (`[monitor] hold_ms`) is seen at its flashes alone, and whole refreshes cure its light, not its places.
-    `serve`, when it starts, and `first-light` say how much that is where it is over `[render] tolerance_px` or `tolerance_mag`,
-    and the nearest refresh rate and exposure without it.
-
-    With `port`, `serve` and `replay` raise the line RTS of a serial port at each frame: on a screen after its swap, headless at
-    the frame's moment. The host's scheduling and a USB adapter's own time are in the pulse's delay; `--json` has its mean and
-    standard deviation against the frames' time stamps as far as this machine sees them. A line that is lost is tried again and
-    never stops the display. Write `[tracker] trigger = "external"` for a tracker that exposes by it.
-    """
+    """The tracker's exposures and the monitor's refresh: how they beat, and a pulse for a tracker that takes a trigger."""
 
     #: The serial port whose RTS is pulsed, such as `"/dev/ttyUSB0"`, or `"rfc2217://HOST:PORT"`. Not the attitude's. Default:
     #: none
@@ -343,25 +283,7 @@ def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude:
 
 class Verify(Table, frozen=True):
     """The digital twin: what `hilstar verify` takes as true where the bench assumes otherwise, and the limits within which
-    the bench passes.
-
-    The bench draws random attitudes as it believes itself to be; the monitor as it truly is turns the codes into light, and
-    the tracker measures each star without noise. `flux_error_mag` and `centroid_error_px` compare that with the same
-    measurement of the tracker's image of the linear image, so that the errors of the estimator itself (`estimator_floor`,
-    against the catalogue) are not charged to the display.
-
-    A star is **lost** when nothing is found within 3 px of its true place. Counted, but not part of the errors: `blended`
-    (others put more than 2 % of its light into its window), `clipped`, `not_shown` (too faint for the monitor), `at_edge` (of
-    the detector or the monitor). Stars that the tracker cannot part, within 1.5 sigmas of what it sees of a star, are measured
-    as one of the sum at the centre of their light; `summed` counts those added to a brighter one. `codes_alone` is what the
-    codes would cost were everything else as assumed; `noisy` is the same with all of `[tracker.detector]`. `scale_error`,
-    `rotation_arcsec`, `offset_px`, `tilt_deg`, `k1` and `distortion_px` (by the lens, the largest in the field) are those of
-    the smallest model that explains the centroids, true minus assumed; what it does not need is 0. `reasons` names what failed
-    and its likely cause.
-
-    `-o DIR` writes `errors.png`, `field.png` and `stars.csv` (a row per star, with `nan` for the errors of a lost one). The
-    exit code is 0 whatever the verdict; with `--strict` it is 1 when the bench does not pass.
-    """
+    the bench passes."""
 
     #: The monitor's true light: a built-in name or a calibration file. Default: as the bench assumes
     true_calibration: str | None = None

@@ -1,13 +1,16 @@
 """The reference of the bench file, docs/bench-file.md: `python -m hilstar.bench.config.reference` prints it.
 
 All of it comes from the classes of the tables: keys, types, units, limits and defaults, and their meanings from the comments
-`#:` above or beside each key, which may end in a default in words (`Default: the middle of the screen`).
+`#:` above or beside each key, which may end in a default in words (`Default: the middle of the screen`). What is to be said
+of a whole table stands in bench-file.md beside this file.
 """
 
 import ast
 import inspect
+import re
 import textwrap
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -51,41 +54,16 @@ FILLED_IN = {
     "MAX_JUDGED_FRAMES": f"{MAX_JUDGED_FRAMES}",
     "DEFAULT_BRIGHTEST_V_MAG": f"{DEFAULT_BRIGHTEST_V_MAG}",
 }
-
-HEAD = """\
-# Bench file
-
-A bench file is TOML: it describes the star tracker, the monitor and the lens between them, and how hilstar draws. This page
-is generated from the definitions that hilstar reads the file with (`python tools/make_pages.py`).
-
-The shortest file that works:
-
-```toml
-[tracker]
-aperture_mm = 30
-focal_length_mm = 70
-pixel_pitch_um = 13
-resolution_px = [1024, 1024]
-quantum_efficiency = "ccd47-20"
-[monitor]
-resolution_px = [1920, 1080]
-pixel_pitch_um = 57.65
-[collimator]
-focal_length_mm = 350
-```
-
-Every other key has the default shown below. Unknown keys are refused. Paths are relative to the bench file.
-
-**Frames.** `icrs` is the sky. `cam` has +z along the boresight, +x right and +y down in the image. `mon`, the monitor, has the
-same axes. Quaternions are unit, Hamilton, scalar first: `[w, x, y, z]`. Pixel (0, 0) is the centre of the top-left pixel.
-
-**Units** are in the names of the keys.
-"""
+WORDS = Path(__file__).with_name("bench-file.md")  # what the page says beside the tables of keys
 
 
 def page() -> str:
     """The whole page."""
-    return "\n".join([HEAD, *(section(name, table) for name, table in tables_of(BenchConfig, ""))])
+    head, *sections = re.split(r"^## `\[(.*)\]`$", WORDS.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    notes = dict(zip(sections[::2], sections[1::2], strict=True))
+    return "\n".join(
+        [f"{head.rstrip()}\n", *(section(name, table, notes.get(name, "")) for name, table in tables_of(BenchConfig, ""))]
+    )
 
 
 def tables_of(table: Any, prefix: str) -> Iterator[tuple[str, Any]]:
@@ -105,14 +83,13 @@ def table_in(hint: Any) -> type[msgspec.Struct] | None:
     return only if isinstance(only, type) and issubclass(only, msgspec.Struct) else None
 
 
-def section(name: str, table: Any) -> str:
+def section(name: str, table: Any, notes: str) -> str:
     """A table of the file: what it is for, its keys, and what else there is to know."""
-    summary, _, notes = (inspect.getdoc(table) or "").partition("\n\n")
     hints, meanings = get_type_hints(table, include_extras=True), meanings_of(table)
     keys = [field for field in msgspec.structs.fields(table) if table_in(field.type) is None]
     rows = [row(field, hints[field.name], meanings[field.name]) for field in keys]
-    lines = [f"## `[{name}]`", "", summary, "", "| key | value | default | meaning |", "|---|---|---|---|", *rows, ""]
-    return "\n".join([*lines, notes, ""] if notes else lines)
+    lines = [f"## `[{name}]`", "", inspect.getdoc(table) or "", "", "| key | value | default | meaning |", "|---|---|---|---|"]
+    return "\n".join([*lines, *rows, "", *([notes.strip(), ""] if notes else [])])
 
 
 def meanings_of(table: type) -> dict[str, str]:

@@ -15,22 +15,7 @@ MAX_JUDGED_FRAMES = 16  # without `cycle_frames`; errors of longer exposures are
 
 
 class RenderSettings(Table, frozen=True):
-    """From electrons to code values.
-
-    Full scale (white) is fixed when the bench is loaded, and no frame changes it. It trades bright stars for faint ones. On
-    8 bits and a field of 18 by 10 degrees (`demo.toml` with `round`), over 200 random fields:
-
-    | `brightest_v_mag` | stars that clip | fields with one | median brightest code | flux error, 95 % | centroid error, 95 % |
-    |---|---|---|---|---|---|
-    | `-2` (full scale is Sirius) | none | none | 38 | 0.41 mag | 0.29 px |
-    | `1.5` | 13 of 25 688 | 8 % | 100 | 0.064 mag | 0.063 px |
-    | `2.5` | 50 | 15 % | 167 | 0.025 mag | 0.022 px |
-
-    A clipped star keeps its place and loses the flux that `hilstar frame` reports; `serve` and `replay` name the stars of the
-    whole sky that clip when they start, and `budget` lists all of them. Where none may clip, write `brightest_v_mag = -2`.
-    Stars too faint to light a pixel are not drawn; `hilstar frame` says how many, and their share of the light.
-    `hilstar study quantisation` shows what each method costs and achieves.
-    """
+    """From electrons to code values."""
 
     # results/tradeoff.csv, quantisation: `exact` is 9 times as right as `round`, which does where a panel has levels enough.
     #: How light becomes codes. {QUANTISERS}`"auto"`: `round` where that stays within the tolerance, else `exact`, unless an

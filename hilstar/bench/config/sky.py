@@ -14,12 +14,7 @@ PressureHpa = Annotated[float, Meta(ge=0, le=1100)]
 
 
 class Bodies(Table, frozen=True):
-    """Bodies of the Solar System: places by JPL's DE421, magnitudes by phase, sunlight times their albedo.
-
-    They need `[sky] epoch_utc` and `pip install 'hilstar[bodies]'`. A body wider than 0.2 px of the screen, above all the Moon
-    and the Sun, is drawn as a disc with its phase, which hides what is behind it; `hilstar frame --explain` and `hilstar
-    verify` say which.
-    """
+    """Bodies of the Solar System: places by JPL's DE421, magnitudes by phase, sunlight times their albedo."""
 
     planets: bool = False  #: Mercury, Venus, Mars, Jupiter, Saturn (with its rings' light), Uranus, Neptune.
     moon: bool = False  #: The Moon.
@@ -37,10 +32,7 @@ class Bodies(Table, frozen=True):
 
 
 class Diffuse(Table, frozen=True):
-    """Light that stands on the sky: galaxies, nebulae, unresolved stars. The virtual tracker always has it.
-
-    The monitor draws it where it passes the first step of light; `hilstar frame --explain` says where none does.
-    """
+    """Light that stands on the sky: galaxies, nebulae, unresolved stars. The virtual tracker always has it."""
 
     #: The path of a FITS image with a WCS, or of a HEALPix map of the whole sky (`pip install 'hilstar[healpix]'`). `BUNIT`, of
     #: HEALPix `TUNIT1`, is any surface brightness that Astropy knows, at V: such as `mag/arcsec2`, `MJy/sr` or `W/(m2 um sr)`.
@@ -94,11 +86,7 @@ class SkySettings(Table, frozen=True):
 
 
 class SpacecraftSettings(Table, frozen=True):
-    """From where the sky is seen. With this table, or bodies, places are apparent: parallax, light bending and aberration.
-
-    `[sky] observer_velocity_km_s` is then left out: the velocity is that of the Earth about the barycentre, and the satellite's
-    about the Earth.
-    """
+    """From where the sky is seen. With this table, or bodies, places are apparent: parallax, light bending and aberration."""
 
     #: `"geocentre"`, or the path of a file: one two-line element set (TLE), propagated by SGP4, or a CCSDS OEM (KVN; ICRF, GCRF
     #: or EME2000 about the Earth); `"source"`: where the messages of `[attitude] source = "vizard"` (Basilisk) have the
@@ -107,12 +95,7 @@ class SpacecraftSettings(Table, frozen=True):
 
 
 class SiteSettings(Table, frozen=True):
-    """A place on the Earth from which the sky is seen, through its air. It needs `[sky] epoch_utc` and `hilstar[bodies]`.
-
-    Stars and bodies are bent towards the zenith and dimmed by their own spectra, and none below the horizon is shown. In
-    `simulate` the sky glows, and stars twinkle by Young's law (1967) with `--noise full`. Zodiacal light and a diffuse map stay
-    as they are outside the air. The Earth's turn is UT1 by Astropy's table.
-    """
+    """A place on the Earth from which the sky is seen, through its air. It needs `[sky] epoch_utc` and `hilstar[bodies]`."""
 
     latitude_deg: Annotated[float, Meta(ge=-90, le=90)]  #: Geodetic latitude, north positive (WGS84).
     longitude_deg: Annotated[float, Meta(ge=-180, le=360)]  #: Longitude, east positive.
@@ -132,10 +115,7 @@ class SiteSettings(Table, frozen=True):
 
 
 class Background(Table, frozen=True):
-    """Light between the stars. Only the virtual tracker sees it; the monitor shows none.
-
-    Give at most one of the first three keys.
-    """
+    """Light between the stars. Only the virtual tracker sees it; the monitor shows none."""
 
     #: Electrons that the background makes in each tracker pixel per exposure. Default: `0`
     electrons_per_px: NotNegative | None = None

@@ -6,6 +6,9 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
+
+from hilstar.charts import svg
 
 DIGITS = 4
 COLOURS = Path(__file__).resolve().parent / "console" / "page" / "page.css"  # their one place
@@ -75,3 +78,8 @@ def _cell(value: object, digits: int) -> str:
 def picture_of(data: bytes, kind: str, alt: str) -> str:
     """A picture of a media type (image/KIND) within the page."""
     return f'<figure><img alt="{escaped(alt)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}"></figure>'
+
+
+def drawing_of(figure: Any, alt: str) -> str:
+    """A figure of matplotlib's within the page."""
+    return picture_of(svg(figure).encode(), "svg+xml", alt)

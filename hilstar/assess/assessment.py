@@ -3,7 +3,7 @@
 Lock is availability, acquisition and loss: which of the answers that were due came.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -269,9 +269,7 @@ def _rising(t_ns: IntArray) -> BoolArray:
     return np.append(True, t_ns[1:] > np.maximum.accumulate(t_ns)[:-1])
 
 
-def assess_files(
-    ledger: Path, telemetry: Path | None, settings: AssessSettings, say: Callable[[str], None] = lambda _: None
-) -> Assessment:
+def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings) -> Assessment:
     """Assess telemetry, or the ledger's own answers, against a ledger. Raises InputError for a fault of either."""
     run = read_ledger(ledger)
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
@@ -289,7 +287,6 @@ def assess_files(
     valid = np.flatnonzero(answers.valid)
     if len(valid) < MIN_ROWS:
         raise InputError(f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer telemetry")
-    say("clock and parts of the error")
     coarse = matched(run, answers, tau_s[valid], answers.q[valid])
     try:
         found = assess_run(run.commanded, tau_s[valid], answers.q[valid], coarse, run.scale, np.random.default_rng(SEED))
@@ -310,13 +307,11 @@ def assess_files(
     try:
         file = run.bench_file()
         certificate = bench_certificate(file)
-        say("the field's stars")
         by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
         limit = noise_limit(file, found.commanded_q)
         glass, told_by = _glass_of(file, found, [centroids[row] for row in valid[found.row]] if any(centroids) else ())
         notes += told_by
         if settings.display_attitudes:
-            say("the display's own error")
             some = np.unique(np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int))
             display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
             if display is None:

@@ -182,7 +182,6 @@ def sigma_instrument_mag(stars: Catalog, facts: dict[str, Any], rates: StarRates
 
 
 def _distances(stars: Catalog, facts: dict[str, Any], light: dict[str, Column]) -> dict[str, Column]:
-    """Absolute magnitudes (eq. 2.5) where the parallax is MIN_PARALLAX_SIGMAS times its error, without extinction."""
     parallax, sigma = stars.parallax_mas, facts["sigma_parallax_mas"]
     sure = (parallax > 0) & ~(parallax < MIN_PARALLAX_SIGMAS * sigma)
     modulus = 10 - 5 * np.log10(np.where(sure, parallax, np.nan))

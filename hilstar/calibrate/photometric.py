@@ -115,7 +115,6 @@ class _Solution:
 
     @property
     def parameters(self) -> float:
-        """The effective number of parameters, given the penalty."""
         return float(np.einsum("ij,jk,ik->", self.design, self.covariance, self.design))
 
 
@@ -356,7 +355,6 @@ def fit_all(data: measurements.Measurements) -> dict[str, ChannelFit]:
 
 
 def _decades(fit: ChannelFit) -> dict[int, int]:
-    """The codes whose light is nearest to so many decades below white."""
     log_light = np.log(np.maximum(fit.light, 1e-12))
     return {decade: int(np.argmin(np.abs(log_light + decade * math.log(10)))) for decade in DECADES}
 

@@ -100,18 +100,15 @@ class _Pairs:
         self._sum = self._squares = self._count = np.zeros(1)
 
     def add(self, values: FloatArray, use: BoolArray) -> None:
-        """One array more; values that do not count are as none."""
         self.photographs += 1
         values = np.where(use, values, 0.0)
         self._sum, self._squares, self._count = self._sum + values, self._squares + values**2, self._count + use
 
     @property
     def pairs(self) -> float:
-        """How many products there are."""
         return float((self._count * (self._count - 1) / 2).sum())
 
     def mean(self) -> tuple[float, float]:
-        """The mean product, and one sigma of it by the values' own variance."""
         product = float((self._sum**2 - self._squares).sum()) / 2 / max(self.pairs, 1.0)
         variance = float(self._squares.sum()) / max(float(self._count.sum()), 1.0)
         return product, variance / math.sqrt(max(self.pairs, 1.0))
@@ -140,23 +137,17 @@ class SkyLevel:
         return np.asarray((dn - self.level) / self.noise)
 
 
-def sky_level(dn: FloatArray, step: float, bad: BoolArray | None = None) -> SkyLevel:
-    """The background of an image (height, width) in whole steps of `step`: means of blocks without their stars, smooth between.
-
-    Pixels that are `bad` do not count.
-    """
+def sky_level(dn: FloatArray, step: float) -> SkyLevel:
+    """The background of an image (height, width) in steps of `step`: means of blocks without their stars, smooth between."""
     height, width = dn.shape
     side = int(np.clip(min(height, width) // MIN_BLOCKS, MIN_BLOCK_PX, BLOCK_PX))
     rows, columns = max(height // side, 1), max(width // side, 1)
     high, wide = height // rows, width // columns
     blocks = dn[: rows * high, : columns * wide].reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows, columns, -1)
-    use = np.ones(blocks.shape, dtype=bool)
-    if bad is not None:
-        use = ~bad[: rows * high, : columns * wide].reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows, columns, -1)
     middle = np.median(blocks, axis=2, keepdims=True)
     sigma = MAD_TO_SIGMA * np.median(np.abs(blocks - middle), axis=2, keepdims=True) + step / 2
     for _ in range(ROUNDS):
-        kept = use & (np.abs(blocks - middle) <= CLIP * sigma)
+        kept = np.abs(blocks - middle) <= CLIP * sigma
         count = np.maximum(kept.sum(axis=2, keepdims=True), 1)
         middle = (blocks * kept).sum(axis=2, keepdims=True) / count
         sigma = np.sqrt(((blocks - middle) ** 2 * kept).sum(axis=2, keepdims=True) / count) / CLIPPED
@@ -234,11 +225,11 @@ class Sources:
         return (self.length_px > MIN_TRAIL_PX) & (self.length_px > MIN_TRAIL_RATIO * self.width_px)
 
 
-def find_sources(sigmas: FloatArray, threshold: float = THRESHOLD) -> Sources:
-    """Sources of an image in sigmas: connected pixels of it, smoothed, above a threshold."""
+def find_sources(sigmas: FloatArray) -> Sources:
+    """Sources of an image in sigmas: connected pixels of it, smoothed, above THRESHOLD."""
     norm = float(np.sqrt((_kernel(sigmas.shape) ** 2).sum()))
     smooth = ndimage.gaussian_filter(sigmas, KERNEL_PX, mode="nearest", truncate=4.0) / norm
-    above = smooth > threshold
+    above = smooth > THRESHOLD
     labels, count = ndimage.label(above, structure=EIGHT_NEIGHBOURS)
     y, x = np.nonzero(above)
     blob, value = labels[y, x] - 1, smooth[y, x]

@@ -137,7 +137,6 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
 
 
 def _absolute(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Tables whose paths are those of files in `folder`."""
     found: dict[str, Any] = {}
     for key, value in tables.items():
         if isinstance(value, dict):

@@ -66,11 +66,6 @@ class StarLight:
         """One sigma of it by noise."""
         return np.asarray(MAG * self.sigma_dn / np.maximum(self.dn, 1e-9))
 
-    @property
-    def bright(self) -> BoolArray:
-        """Clean stars to V = 6.5."""
-        return self.clean & (self.v_mag <= BRIGHT_V_MAG)
-
 
 @dataclass(frozen=True, slots=True)
 class LightFit:

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import BLUE, INK, MUTED, ORANGE, panels_of, svg
+from hilstar.charts import BLUE, INK, MUTED, ORANGE, panels_of
 from hilstar.confront.judge import LISTED_SNR, NOT_COUNTED, Verdict
 from hilstar.confront.report import Confronted
 from hilstar.confront.session import Session
 from hilstar.files import write_whole
-from hilstar.html_pages import escaped, page_of, picture_of, table_of
+from hilstar.html_pages import drawing_of, escaped, page_of, table_of
 
 MAX_SIDE_PX = 960
 BLACK, WHITE = -2.0, 60.0  # sigmas of the background, between which a picture's greys lie
@@ -122,10 +122,6 @@ def _frame(verdict: Verdict, pictures: Pictures) -> str:
     )
 
 
-def _image(figure: Any, alt: str) -> str:
-    return picture_of(svg(figure).encode(), "svg+xml", alt)
-
-
 def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, str]]:
     rows = [row for verdict in found.verdicts for row in verdict.stars if row.dn > 0 and row.dn_predicted > 0]
     good = [row for row in rows if not NOT_COUNTED & set(row.flags)]
@@ -163,7 +159,7 @@ def _flux(found: Confronted, rows: Sequence[Any]) -> str:
             panels[0].plot(
                 line, line - light.zero_point_mag + light.colour_term * float(np.nanmedian(bv)), color=ORANGE, lw=1.2
             )
-    return _image(panels[0].figure, "flux against V, and what is left of it against V and colour")
+    return drawing_of(panels[0].figure, "flux against V, and what is left of it against V and colour")
 
 
 def _places(rows: Sequence[Any]) -> str:
@@ -178,7 +174,7 @@ def _places(rows: Sequence[Any]) -> str:
         axes.quiverkey(arrows, 0.86, 0.04, 0.1, "0.1 px", labelpos="E")
         axes.set(xlabel="x [px]", ylabel="y [px]", aspect="equal")
         axes.invert_yaxis()
-    return _image(panels[0].figure, "places seen less predicted over the field")
+    return drawing_of(panels[0].figure, "places seen less predicted over the field")
 
 
 def _psf_grid(session: Session) -> str:
@@ -199,7 +195,7 @@ def _psf_grid(session: Session) -> str:
             axes.text(number % GRID + 0.03, number // GRID + 0.97, f"{x:.0f}, {y:.0f}: {wide:.2f}", fontsize=7, color=MUTED)
         axes.set_xticks(range(GRID + 1), [""] * (GRID + 1))
         axes.set_yticks(range(GRID + 1), [""] * (GRID + 1))
-    return _image(panels[0].figure, "point spread functions over the field")
+    return drawing_of(panels[0].figure, "point spread functions over the field")
 
 
 def _transfer(session: Session) -> str:
@@ -213,7 +209,7 @@ def _transfer(session: Session) -> str:
         axes.plot(line, pixels.variance_dn2(line), color=ORANGE)
         axes.set(xlabel="background level [DN]", ylabel="variance between neighbours [DN²]")
         axes.set_ylim(0, 2 * float(np.median(variance)))
-    return _image(panels[0].figure, "photon transfer")
+    return drawing_of(panels[0].figure, "photon transfer")
 
 
 def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str:
@@ -232,7 +228,7 @@ def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str
         for axes in panels[len(verdicts) :]:
             axes.set_axis_off()
         panels[0].figure.colorbar(drawn, ax=panels, label="chi²", shrink=0.7)
-    return _image(panels[0].figure, "squared residuals over the field")
+    return drawing_of(panels[0].figure, "squared residuals over the field")
 
 
 def _lists(verdicts: Sequence[Verdict]) -> str:

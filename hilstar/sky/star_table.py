@@ -139,7 +139,6 @@ class _Columns:
         return values if factor == 1.0 else values * factor
 
     def role(self, role: str, blank: float) -> FloatArray:
-        """The figures of a role, `blank` where the table has none."""
         if role not in self.layout.role:
             return np.full(self.table.row_count, blank)
         values = self._in_unit(role, self.layout.role[role])
@@ -202,7 +201,6 @@ class _Columns:
         return f"{self.path.stem[:MAX_STEM]} row", np.arange(1, self.table.row_count + 1, dtype=np.int64)
 
     def hip(self) -> npt.NDArray[np.int64]:
-        """HIP numbers, 0 where the table has none."""
         if "hip" not in self.layout.role:
             return np.zeros(self.table.row_count, dtype=np.int64)
         return np.asarray(self.table.columns[self.layout.role["hip"]], dtype=np.int64)

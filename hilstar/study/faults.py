@@ -101,7 +101,6 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
         return bench.draw(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)).levels
 
     def faulty(k: int) -> object:
-        """A frame of such faults, as the frame loop draws it."""
         t_ns = round(k / REFRESH_HZ * NS_PER_S)
         schedule.at(t_ns)
         effects = FaultLayer(view, tuple(Now(n, fault, t_ns) for n, fault in enumerate(ready, start=1)))

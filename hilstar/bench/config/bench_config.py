@@ -215,7 +215,6 @@ def _check_finite(value: Any, where: str = "") -> None:
 
 
 def _check_meaning(config: BenchConfig) -> None:
-    """Refuse (InputError) values that contradict each other."""
     for where, q in (
         ("[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon),
         ("[tracker] q_body_to_cam", config.tracker.q_body_to_cam),
@@ -272,7 +271,6 @@ def _check_answers(config: BenchConfig) -> None:
 
 
 def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
-    """Refuse (InputError) a sky that lacks a date, a place or a velocity, or has two of them."""
     sky, background, attitude = config.sky, config.background, config.attitude
     room_km_s = MAX_SPEED_KM_S if attitude.source == "vizard" else 0.0
     if math.hypot(*sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
@@ -303,7 +301,6 @@ def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
 
 
 def _check_site(config: BenchConfig) -> None:
-    """Refuse (InputError) a place on the ground that is to be in orbit too."""
     if config.site is None:
         return
     if config.spacecraft.orbit is not None or config.sky.bodies.earth:
@@ -317,7 +314,6 @@ def _check_site(config: BenchConfig) -> None:
 
 
 def _check_orbit(config: BenchConfig) -> None:
-    """Refuse (InputError) a place that nobody gives, two velocities, and the Earth from its own centre."""
     attitude, orbit = config.attitude, config.spacecraft.orbit
     if config.sky.bodies.earth and orbit in {None, GEOCENTRE}:
         raise InputError(

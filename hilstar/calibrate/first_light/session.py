@@ -312,7 +312,6 @@ class FirstLightSession:
         return all(_is_file(path) and sha256_of(path) == digest for path, digest in paths)
 
     def _unmet(self, step: SessionStep) -> str | None:
-        """The first missing step that this one needs."""
         for name in step.needs:
             record = self.records.get(name)
             if record is None or record.verdict == "failed" or (record.verdict == "skipped" and name != "display"):
@@ -349,7 +348,6 @@ class FirstLightSession:
         )
 
     def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
-        """Run a step and write its keys into the bench file; a refusal makes it a failed step."""
         try:
             outcome = step.run(context)
             self.file = rewrite(self.file, outcome.changes)

@@ -226,8 +226,12 @@ class StepContext:
 
     def names(self, table: str, key: str, path: Path) -> tuple[KeyChange, ...]:
         """The change of a key of the bench file that names a file of the session; none where it does already."""
-        name, before = os.path.relpath(path, self.file.folder), getattr(getattr(self.file.config, table), key)
-        return () if before == name else (KeyChange(table=table, key=key, before=before, after=name),)
+        return self.change(table, key, os.path.relpath(path, self.file.folder))
+
+    def change(self, table: str, key: str, after: TomlValue) -> tuple[KeyChange, ...]:
+        """The change of a key of the bench file; none where it is so already."""
+        before = getattr(getattr(self.file.config, table), key)
+        return () if before == after else (KeyChange(table=table, key=key, before=before, after=after),)
 
     @property
     def exposure_s(self) -> float:

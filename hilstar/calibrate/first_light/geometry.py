@@ -266,8 +266,8 @@ def orientation(context: StepContext) -> StepOutcome:
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
     first, measured = _way(context, "figure_000")
     after = corrected(before, first)
-    pairs = [(key, getattr(before, key), getattr(after, key)) for key in ("flip_x", "flip_y", "rotate_deg")]
-    changes = tuple(KeyChange(table="monitor", key=key, before=old, after=new) for key, old, new in pairs if old != new)
+    keys = ("flip_x", "flip_y", "rotate_deg")
+    changes = tuple(change for key in keys for change in context.change("monitor", key, getattr(after, key)))
     if (before.rotate_deg - after.rotate_deg) % 180:
         width, height = monitor.resolution_px
         changes += (KeyChange(table="monitor", key="resolution_px", before=[width, height], after=[height, width]),)

@@ -21,14 +21,14 @@ from msgspec.structs import replace
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import open_bench, orientation_of
+from hilstar.bench.build import calibration_source, open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.bench.measured_on import check_monitor
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.files import written
-from hilstar.monitor.calibration import BUILT_IN, primary_lights
+from hilstar.monitor.calibration import primary_lights
 from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.window.this_monitor import identity_here
 from hilstar.process.closing import Closing
@@ -582,8 +582,7 @@ class VirtualBench(ImageSource):
             white = self._panel.flux_at_white_e_per_s
             return np.array([one.response.light * (one.flux_at_white_e_per_s / white) for one in self._panel.primaries])
         monitor = self.truth.config.monitor
-        source = monitor.calibration if monitor.calibration in BUILT_IN else self.truth.folder / monitor.calibration
-        return primary_lights(source, monitor.bits)
+        return primary_lights(calibration_source(monitor, self.truth.folder), monitor.bits)
 
     def close(self) -> None:
         """Free the GL context."""

@@ -18,7 +18,6 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.first_light.context import (
     KIND,
     Figure,
-    KeyChange,
     SessionFile,
     StepContext,
     StepNumber,
@@ -81,10 +80,9 @@ def latency(context: StepContext) -> StepOutcome:
         f" jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
     )
     agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
-    before, u_ms = context.file.config.certify.panel_delay_u_ms, float(f"{error_ms:.3g}")
     changes = (
-        KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms),
-        KeyChange(table="certify", key="panel_delay_u_ms", before=before, after=u_ms),
+        *context.change("monitor", "panel_delay_ms", delay_ms),
+        *context.change("certify", "panel_delay_u_ms", float(f"{error_ms:.3g}")),
     )
     number = StepNumber(delay_ms, error_ms, "ms", "from the buffer swap to the light of the first row")
     return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else changes, number)

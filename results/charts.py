@@ -9,7 +9,7 @@ import csv
 from pathlib import Path
 
 from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, TEAL, chart, read_records, value_bars
-from hilstar.study import codes, colour, stripes, timing
+from hilstar.study import codes, colour, timing
 from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import ROUNDING_MAG
@@ -120,6 +120,6 @@ if __name__ == "__main__":
     draw_tracker(rows_of("tracker.csv"))
     colour.draw(DOCS / "colour.svg", colour_rows())
     timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome))
-    stripes.draw(DOCS / "stripes.svg", read_records(HERE / "stripes.csv", stripes.StripePoint))
+    timing.draw_stripes(DOCS / "stripes.svg", read_records(HERE / "stripes.csv", timing.StripePoint))
     codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.OverFrames))
     tradeoff.draw(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)

@@ -1,7 +1,11 @@
-"""A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and the bench's own errors."""
+"""A tracker's telemetry against the ledger of the run that it saw: matching, budget, lock, and the bench's own errors.
 
-from collections.abc import Callable, Sequence
+Lock is availability, acquisition and loss: which of the answers that were due came.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +30,6 @@ from hilstar.assess.bench_effects import (
 from hilstar.assess.budget import Axes, Decomposed, DecomposedRun, assess_run, axes_of_variance
 from hilstar.assess.clock import CoarseClock, coarse_offset, speed_offsets
 from hilstar.assess.components import MIN_ROWS
-from hilstar.assess.lock import Lock, lock_of
 from hilstar.assess.places import Scale
 from hilstar.attitude.logs.telemetry import Telemetry, read_telemetry
 from hilstar.bench.bench_file import BenchFile, bench_file_of
@@ -38,6 +41,96 @@ from hilstar.rotation import from_rotation_vector, multiply, to_matrix, to_rotat
 from hilstar.run.record.commanded import NOT_SHOWN, Commanded, CommandedRun, read_commanded
 from hilstar.run.record.ledger_records import answer_records, config_of, read_head
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+
+MISSED_CYCLES = 1.5  # a longer time between right answers is an outage
+LOST_CYCLES = 3.0  # in a longer outage the lock is lost
+MAX_CYCLES = 20_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Outage:
+    """A time without right answers: its start in run time and its length, s; `lost` if longer than LOST_CYCLES."""
+
+    start_s: float
+    length_s: float
+    lost: bool
+    rows: int
+    wrong: int
+
+
+@dataclass(frozen=True, slots=True)
+class Acquisition:
+    """The run time, s, at which a sky appeared, and the wait for the first right answer; None if none came before it went."""
+
+    start_s: float
+    wait_s: float | None
+
+
+@dataclass(frozen=True)
+class Lock:
+    """The answers that were due and the right ones among them; `availability` is right over due."""
+
+    cycle_s: float
+    due: int
+    right: int
+    availability: float
+    outages: tuple[Outage, ...]
+    acquisitions: tuple[Acquisition, ...]
+
+    @property
+    def lost(self) -> tuple[Outage, ...]:
+        """The outages in which the lock was lost."""
+        return tuple(each for each in self.outages if each.lost)
+
+    @property
+    def acquisition_probability(self) -> float | None:
+        """The share of appearances of a sky and losses of lock after which a right answer came."""
+        if not self.acquisitions:
+            return None
+        return sum(each.wait_s is not None for each in self.acquisitions) / len(self.acquisitions)
+
+    @property
+    def acquisition_s(self) -> float | None:
+        """The median time until the first right answer."""
+        waits = [each.wait_s for each in self.acquisitions if each.wait_s is not None]
+        return float(np.median(waits)) if waits else None
+
+
+def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: BoolArray) -> Lock:
+    """The lock over rows at rising run times (n,): right answers, wrong ones, and rows without an answer."""
+    cycle_s = max(float(np.median(np.diff(t_s))), 1e-6)
+    cycle_s = max(cycle_s, float(t_s[-1] - t_s[0]) / MAX_CYCLES)
+    due = commanded.at(np.arange(t_s[0], t_s[-1] + cycle_s / 2, cycle_s)).known
+    outages = []
+    for before, after in pairwise(np.flatnonzero(right).tolist()):
+        gap_s = float(t_s[after] - t_s[before])
+        if gap_s <= MISSED_CYCLES * cycle_s:
+            continue
+        inner = np.arange(t_s[before] + cycle_s, t_s[after] - cycle_s / 2, cycle_s)
+        if len(inner) and commanded.at(inner).known.mean() > 0.5:
+            length_s, rows = gap_s - cycle_s, after - before - 1
+            lost = length_s > LOST_CYCLES * cycle_s
+            outages.append(Outage(float(inner[0]), length_s, lost, rows, int(wrong[before + 1 : after].sum())))
+    # After each appearance of the sky during the telemetry, and after each loss of the lock.
+    acquisitions = []
+    shown = np.flatnonzero(np.diff(np.r_[False, commanded.joined].astype(int)) == 1)
+    ends = np.flatnonzero(np.diff(np.r_[commanded.joined, False].astype(int)) == -1) + 1
+    answers = t_s[right]
+    for first, last in zip(commanded.t_s[shown], commanded.t_s[ends], strict=True):
+        if last > t_s[0] and first < t_s[-1]:
+            first = max(first, t_s[0])  # what the tracker did before its first row is unknown
+            inside = answers[(answers >= first) & (answers <= last)]
+            acquisitions.append(Acquisition(float(first), float(inside[0] - first) if len(inside) else None))
+    acquisitions += [Acquisition(each.start_s, each.length_s) for each in outages if each.lost]
+    return Lock(
+        cycle_s=cycle_s,
+        due=int(due.sum()),
+        right=int(right.sum()),
+        availability=min(int(right.sum()) / max(int(due.sum()), 1), 1.0),
+        outages=tuple(outages),
+        acquisitions=tuple(sorted(acquisitions, key=lambda each: each.start_s)),
+    )
+
 
 AGREE_RAD = np.radians(1.0)  # half of the answers of one sky lie this near to one rotation
 MAX_TURN_RAD = np.radians(5.0)  # from commanded to reported; a larger rotation is another frame
@@ -176,9 +269,7 @@ def _rising(t_ns: IntArray) -> BoolArray:
     return np.append(True, t_ns[1:] > np.maximum.accumulate(t_ns)[:-1])
 
 
-def assess_files(
-    ledger: Path, telemetry: Path | None, settings: AssessSettings, say: Callable[[str], None] = lambda _: None
-) -> Assessment:
+def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings) -> Assessment:
     """Assess telemetry, or the ledger's own answers, against a ledger. Raises InputError for a fault of either."""
     run = read_ledger(ledger)
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
@@ -196,7 +287,6 @@ def assess_files(
     valid = np.flatnonzero(answers.valid)
     if len(valid) < MIN_ROWS:
         raise InputError(f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer telemetry")
-    say("clock and parts of the error")
     coarse = matched(run, answers, tau_s[valid], answers.q[valid])
     try:
         found = assess_run(run.commanded, tau_s[valid], answers.q[valid], coarse, run.scale, np.random.default_rng(SEED))
@@ -217,13 +307,11 @@ def assess_files(
     try:
         file = run.bench_file()
         certificate = bench_certificate(file)
-        say("the field's stars")
         by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
         limit = noise_limit(file, found.commanded_q)
         glass, told_by = _glass_of(file, found, [centroids[row] for row in valid[found.row]] if any(centroids) else ())
         notes += told_by
         if settings.display_attitudes:
-            say("the display's own error")
             some = np.unique(np.linspace(0, len(found.row) - 1, settings.display_attitudes).astype(int))
             display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
             if display is None:

@@ -12,9 +12,9 @@ from hilstar.assess.assessment import Assessment
 from hilstar.assess.bench_effects import Slice
 from hilstar.assess.budget import Axes, Decomposed, DecomposedRun
 from hilstar.bench.certificate import Certificate, off_by
-from hilstar.charts import BLUE, INK, MUTED, label_ends, panels_of, svg, write_csv
+from hilstar.charts import BLUE, INK, MUTED, label_ends, panels_of, write_csv
 from hilstar.files import write_whole
-from hilstar.html_pages import escaped, page_of, picture_of, table_of
+from hilstar.html_pages import drawing_of, escaped, page_of, table_of
 from hilstar.rotation import to_matrix
 
 COUNT = "1"  # the unit of counts and shares in the tables
@@ -226,10 +226,6 @@ def write_page(path: Path, found: Assessment) -> None:
     write_whole(path, page_of(title, body))
 
 
-def _image(figure: Any, alt: str) -> str:
-    return picture_of(svg(figure).encode(), "svg+xml", alt)
-
-
 def _over_time(found: Assessment) -> str:
     parts = found.found.components
     valid = np.flatnonzero(found.telemetry.valid)
@@ -252,7 +248,7 @@ def _over_time(found: Assessment) -> str:
             axes.set_ylabel(f"{name} [arcsec]")
             label_ends(axes)
         panels[-1].set_xlabel("run time [s]")
-    return _image(panels[0].figure, "errors over the run")
+    return drawing_of(panels[0].figure, "errors over the run")
 
 
 def _field_map(found: Assessment) -> str:
@@ -278,7 +274,7 @@ def _field_map(found: Assessment) -> str:
             panel.set_xlabel("star field x [px]")
             panel.invert_yaxis()
         panels[0].set_ylabel("star field y [px]")
-    return _image(panels[0].figure, "field-of-view error over the field")
+    return drawing_of(panels[0].figure, "field-of-view error over the field")
 
 
 def _histogram(found: Assessment) -> str:
@@ -296,4 +292,4 @@ def _histogram(found: Assessment) -> str:
             axes.set_ylim(1e-6 / sigma, 1 / sigma)
             axes.set_xlabel(f"{name} [arcsec]")
         panels[0].set_ylabel("share [1/arcsec]")
-    return _image(panels[0].figure, "noise, and the normal distribution")
+    return drawing_of(panels[0].figure, "noise, and the normal distribution")

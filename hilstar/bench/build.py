@@ -270,12 +270,18 @@ def moved(stars: Stars, moving: MovingSky | None) -> Stars:
     return stars if moving is None else moving.among(stars)
 
 
+def catalogue_choice(config: BenchConfig, folder: Path) -> TableChoice:
+    """What `[sky] catalogue` names, and how it is read."""
+    sky = config.sky
+    source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
+    return TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear)
+
+
 def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = None) -> Stars:
     """The stars of a bench with their electron rates, which are computed only here, as `moving`'s observer sees them."""
     sky = config.sky
     epoch_utc_ns(config)  # which refuses one that a source was to give
-    source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
-    chosen = choose_catalog(TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
+    chosen = choose_catalog(catalogue_choice(config, folder))
     if sky.variables == "phase":
         chosen = chosen.at_phase(sky_jd(config, None))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
@@ -378,9 +384,13 @@ def channel_rates(sky: SkySettings, optics: Optics) -> StarRates:
 
 def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:
     """The light of the bench file's monitor. Raises InputError."""
-    name = config.monitor.calibration
-    source = name if name in BUILT_IN else folder / name
+    source = calibration_source(config.monitor, folder)
     return load_calibration(source, config.monitor.bits, bit_stealing=config.render.bit_stealing)
+
+
+def calibration_source(monitor: Monitor, folder: Path) -> str | Path:
+    """What `[monitor] calibration` names: a built-in curve, or the path of a file."""
+    return monitor.calibration if monitor.calibration in BUILT_IN else folder / monitor.calibration
 
 
 def bench_primaries(monitor: Monitor, folder: Path) -> tuple[Curve, ...] | None:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import StarRates, bench_optics, star_kinds, star_rates
+from hilstar.bench.build import StarRates, bench_optics, catalogue_choice, star_kinds, star_rates
 from hilstar.charts import write_csv
 from hilstar.errors import InputError, MachineError
 from hilstar.files import whole_file
@@ -17,7 +17,7 @@ from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Photometry, star_temperatures_k
 from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag
 from hilstar.sky.spectral_types import luminosity_class
-from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
+from hilstar.sky.star_table import choose_catalog, table_facts
 from hilstar.sky.stars import unit_vectors_icrs
 from hilstar.sky.synthetic import BANDS, VEGA_V_MAG, ab_electrons_per_s, colours, vega_electrons_per_s
 from hilstar.units import ARCSEC_PER_RAD, magnitude
@@ -57,8 +57,7 @@ def bench_catalogue(file: BenchFile, faintest_v_mag: float | None, epoch_jyear: 
     Places are barycentric ICRS, without aberration or parallax. Raises InputError.
     """
     sky = file.config.sky
-    source = sky.catalogue if sky.catalogue == "hipparcos" else file.folder / sky.catalogue
-    choice = TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear)
+    choice = catalogue_choice(file.config, file.folder)
     every = choose_catalog(choice)
     limit = sky.faintest_v_mag if faintest_v_mag is None else faintest_v_mag
     rows = np.flatnonzero(every.v_mag <= limit)
@@ -182,7 +181,6 @@ def sigma_instrument_mag(stars: Catalog, facts: dict[str, Any], rates: StarRates
 
 
 def _distances(stars: Catalog, facts: dict[str, Any], light: dict[str, Column]) -> dict[str, Column]:
-    """Absolute magnitudes (eq. 2.5) where the parallax is MIN_PARALLAX_SIGMAS times its error, without extinction."""
     parallax, sigma = stars.parallax_mas, facts["sigma_parallax_mas"]
     sure = (parallax > 0) & ~(parallax < MIN_PARALLAX_SIGMAS * sigma)
     modulus = 10 - 5 * np.log10(np.where(sure, parallax, np.nan))

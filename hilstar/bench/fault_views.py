@@ -9,9 +9,8 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import star_rates
 from hilstar.bench.cameras import bench_camera, tracker_camera
-from hilstar.bench.fault_schedule import FaultSchedule
 from hilstar.bench.frame import Bench
-from hilstar.bench.scenario import NO_SCENARIO, Scenario
+from hilstar.bench.scenario import NO_SCENARIO, FaultSchedule, Scenario
 from hilstar.frame.fault_light import FaultCamera, FaultView
 from hilstar.frame.faults import FaultLayer
 from hilstar.frame.layers import StarLayer

@@ -113,7 +113,6 @@ def _measured(one: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
 
 
 def _spectra(psf: GlassPsf) -> FloatArray:
-    """The shares (spectra, L) that a glass's wavelengths have of a cool and a hot star's photons."""
     nm = psf.wavelengths_nm
     if len(nm) == 1:
         return np.ones((len(SPECTRA_K), 1))

@@ -207,7 +207,6 @@ def _causes(
 
 
 def _means(values: FloatArray, group: IntArray) -> FloatArray:
-    """The means (g, k) of each group's rows of (n, k)."""
     return np.stack([np.bincount(group, column) for column in values.T], axis=1) / np.bincount(group)[:, None]
 
 

@@ -195,7 +195,6 @@ def _moved(q: FloatArray, step_rad: FloatArray) -> FloatArray:
 
 
 def _weights(residual: FloatArray, near: npt.NDArray[np.bool_], cut: float) -> FloatArray:
-    """Tukey's weights (n,); 0 for what is not near."""
     off = np.abs(residual[near])
     cross = max(MAD_TO_SIGMA * float(np.median(off[:, :2])), FLOOR_RAD)
     roll = max(MAD_TO_SIGMA * float(np.median(off[:, 2])), FLOOR_RAD)
@@ -271,6 +270,5 @@ def _spread(commanded: FloatArray, reported: FloatArray) -> tuple[FloatArray, fl
 
 
 def _boresight_rad(rotation: FloatArray) -> float:
-    """The angle by which a rotation moves the boresight, rad."""
     turned = to_matrix(rotation)[:, 2]
     return float(np.arctan2(np.hypot(turned[0], turned[1]), turned[2]))

@@ -23,17 +23,7 @@ from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
 
 from hilstar.arrays import FloatArray
-from hilstar.calibrate.measurements import (
-    CHANNELS,
-    NOISE_FLOOR,
-    PRIMARIES,
-    MeasuredLevels,
-    Measurements,
-    check_drift,
-    check_levels,
-    group_levels,
-    read_measurements,
-)
+from hilstar.calibrate import measurements
 from hilstar.charts import BLUE, GREEN, INK, MUTED, RED, chart, label_ends
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import CalibrationHead, ErrorsTable, NotesTable, load_calibration, write_calibration
@@ -88,7 +78,7 @@ class ChannelFit:
     white: float
     black: float
     error: FloatArray
-    levels: MeasuredLevels
+    levels: measurements.MeasuredLevels
     residual: FloatArray
     noise_relative: float
     shape: str
@@ -125,27 +115,26 @@ class _Solution:
 
     @property
     def parameters(self) -> float:
-        """The effective number of parameters, given the penalty."""
         return float(np.einsum("ij,jk,ik->", self.design, self.covariance, self.design))
 
 
-def fit_channel(measured: Measurements, channel: str) -> ChannelFit:
+def fit_channel(measured: measurements.Measurements, channel: str) -> ChannelFit:
     """The response of one channel. Raises InputError for data that no response can be fitted to (`check_levels`)."""
-    levels = group_levels(measured, channel)
-    check_levels(measured, channel, levels)
+    levels = measurements.group_levels(measured, channel)
+    measurements.check_levels(measured, channel, levels)
     try:
         return fit_levels(levels, measured.white)
     except np.linalg.LinAlgError as error:
         raise InputError(f"{measured.source}: channel {channel}: no smooth response fits these values; check them") from error
 
 
-def fit_levels(levels: MeasuredLevels, white: int) -> ChannelFit:
+def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
     """The response to levels that have passed `check_levels`, for codes 0 to `white`."""
     noise = levels.relative_noise
     if math.isnan(noise):
         first = _best_solution(levels, white, ASSUMED_NOISE)
         left = max(len(first.misfit) - first.parameters, 1.0)
-        noise = max(ASSUMED_NOISE * math.sqrt(float(first.misfit @ first.misfit) / left), NOISE_FLOOR)
+        noise = max(ASSUMED_NOISE * math.sqrt(float(first.misfit @ first.misfit) / left), measurements.NOISE_FLOOR)
     best = _best_solution(levels, white, noise)
     problem, scale = best.problem, float(levels.mean[-1] - levels.mean[0])
     above = np.exp(problem.log_base_codes + problem.at_codes @ best.theta)
@@ -177,11 +166,11 @@ def strictly_rising(light: FloatArray) -> FloatArray:
     return np.asarray(rising / rising[-1])
 
 
-def _best_solution(levels: MeasuredLevels, white: int, noise: float) -> _Solution:
+def _best_solution(levels: measurements.MeasuredLevels, white: int, noise: float) -> _Solution:
     return min((_solve(shape, _problem(shape, levels, white, noise)) for shape in SHAPES), key=lambda s: s.minus_log_evidence)
 
 
-def _problem(shape: Shape, levels: MeasuredLevels, white: int, noise: float) -> _Problem:
+def _problem(shape: Shape, levels: measurements.MeasuredLevels, white: int, noise: float) -> _Problem:
     codes = np.arange(1, white + 1) / white
     at = levels.code[1:] / white
     low, high = shape.coordinate(codes[[0, -1]])
@@ -294,11 +283,11 @@ def calibrate_photometric(
     `channels` has each channel's; those of the first one in the calibration file stand at the top level, too.
     Raises InputError for files that cannot be read or written, and for data that are too few, saturated, falling or drifting.
     """
-    data = read_measurements(measured, bits)
+    data = measurements.read_measurements(measured, bits)
     fits = fit_all(data)
-    drift = check_drift(data)
+    drift = measurements.check_drift(data)
     # For the calibration file: r, g and b where known, else w, all with the mean black.
-    names = PRIMARIES if "r" in fits else ("w",)
+    names = measurements.PRIMARIES if "r" in fits else ("w",)
     black = float(np.mean([fits[name].black for name in names]))
     columns = {name: black + fits[name].white * fits[name].light for name in names}
     noise = max(fits[name].noise_relative for name in columns)
@@ -315,8 +304,8 @@ def calibrate_photometric(
     )
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
     additivity, crosstalk, unsure = None, None, None  # r + g + b against w, above black: at white and codes decades below it
-    if len(fits) == len(CHANNELS):
-        together = np.sum([fits[name].white * fits[name].light for name in PRIMARIES], axis=0)
+    if len(fits) == len(measurements.CHANNELS):
+        together = np.sum([fits[name].white * fits[name].light for name in measurements.PRIMARIES], axis=0)
         more = 100 * (together / np.maximum(fits["w"].white * fits["w"].light, 1e-300) - 1)
         additivity = float(more[-1])
         decades = {f"1e-{decade}": place for decade, place in _decades(fits["w"]).items()}
@@ -326,7 +315,7 @@ def calibrate_photometric(
         off = {
             name: np.hypot(one.error[at], one.noise_relative / math.sqrt(one.levels.count[-1])) for name, one in fits.items()
         }
-        errors = [fits[name].white * fits[name].light[at] / together[at] * off[name] for name in PRIMARIES]
+        errors = [fits[name].white * fits[name].light[at] / together[at] * off[name] for name in measurements.PRIMARIES]
         error = np.sqrt(np.square([*errors, off["w"]]).sum(axis=0))
         unsure = dict(zip(decades, (100 * error).tolist(), strict=True))
     return channels[next(iter(columns))] | {
@@ -355,10 +344,10 @@ def errors_of(fits: dict[str, ChannelFit]) -> ErrorsTable | None:
     return ErrorsTable(light=rounded[0], off=rounded[1], relative=rounded[2], black=black, dof=float((levels.count - 1).sum()))
 
 
-def fit_all(data: Measurements) -> dict[str, ChannelFit]:
+def fit_all(data: measurements.Measurements) -> dict[str, ChannelFit]:
     """The response of each channel that was measured. Raises InputError where it is neither w nor all of r, g and b."""
     channels = data.channels
-    if "w" not in channels and channels != PRIMARIES:
+    if "w" not in channels and channels != measurements.PRIMARIES:
         raise InputError(f"{data.source}: only channel {', '.join(channels)}; measure w, or all of r, g and b")
     if len(channels) not in {1, 3, 4}:
         raise InputError(f"{data.source}: channels {', '.join(channels)}; measure w alone, or all of r, g and b")
@@ -366,7 +355,6 @@ def fit_all(data: Measurements) -> dict[str, ChannelFit]:
 
 
 def _decades(fit: ChannelFit) -> dict[int, int]:
-    """The codes whose light is nearest to so many decades below white."""
     log_light = np.log(np.maximum(fit.light, 1e-12))
     return {decade: int(np.argmin(np.abs(log_light + decade * math.log(10)))) for decade in DECADES}
 
@@ -405,7 +393,7 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
 
     Raises InputError for the same data as the fit does, and where the PNG cannot be written.
     """
-    fits = fit_all(read_measurements(measured, bits))
+    fits = fit_all(measurements.read_measurements(measured, bits))
     worst = max(fits.values(), key=lambda fit: held_out(fit)["rms_percent"])
     left = held_out(worst)
     finding = (

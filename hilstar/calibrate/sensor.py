@@ -117,7 +117,6 @@ def import_emva(path: Path) -> SensorFile:
 
 
 def _checked(path: Path, sensor: SensorFile) -> SensorFile:
-    """Refuse (InputError) what no sensor has."""
     if len({nm for nm, _ in sensor.efficiency}) < len(sensor.efficiency):
         raise InputError(f"{path}: eta has a wavelength twice; write each once")
     for nm, share in sensor.efficiency:

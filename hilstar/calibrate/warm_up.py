@@ -96,12 +96,10 @@ class _Law:
 
     @property
     def criterion(self) -> float:
-        """Akaike's criterion."""
         return len(self.residual) * math.log(float(np.mean(self.residual**2)) + FLOOR**2) + 2 * len(self.parameters)
 
     @property
     def is_refused(self) -> bool:
-        """Whether the residuals are no noise."""
         steps, n = np.diff(self.residual), len(self.residual)
         scatter = MAD_TO_SIGMA * float(np.median(np.abs(steps)))
         ratio = (float(np.mean(steps**2)) / 2 + FLOOR**2) / (float(self.residual @ self.residual) / self.dof + FLOOR**2)
@@ -109,7 +107,6 @@ class _Law:
 
     @property
     def noise(self) -> float:
-        """The reading noise, relative."""
         return math.sqrt(float(self.residual @ self.residual) / self.dof)
 
     def died_away(self, at_s: float) -> bool:
@@ -136,13 +133,9 @@ class _Law:
 
 
 def watch_white(
-    read: Callable[[], float],
-    clock_ns: Callable[[], int],
-    wait: Callable[[float], object],
-    longest_s: float = LONGEST_S,
-    every_s: float = EVERY_S,
+    read: Callable[[], float], clock_ns: Callable[[], int], wait: Callable[[float], object], longest_s: float = LONGEST_S
 ) -> tuple[FloatArray, FloatArray]:
-    """Times (n,), s from the first, and readings (n,) of white, every `every_s` until it is stable or `longest_s` are over.
+    """Times (n,), s from the first, and readings (n,) of white, every EVERY_S until it is stable or `longest_s` are over.
 
     `wait` lets seconds pass. At least 12 readings are taken. Raises InputError for a reading without light.
     """
@@ -157,10 +150,10 @@ def watch_white(
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"white reads {value:g} after {t_s[-1]:.0f} s; look at what the instrument sees")
         light.append(value)
-        over = (ended_ns - first_ns) / NS_PER_S + every_s > longest_s
+        over = (ended_ns - first_ns) / NS_PER_S + EVERY_S > longest_s
         if len(light) >= MIN_READINGS and (over or judge_warm_up(np.array(t_s), np.array(light)).is_stable):
             return np.array(t_s), np.array(light)
-        wait(max(every_s - (ended_ns - begun_ns) / NS_PER_S, 1e-3))
+        wait(max(EVERY_S - (ended_ns - begun_ns) / NS_PER_S, 1e-3))
 
 
 def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> WarmUp:
@@ -228,7 +221,6 @@ def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
 
 
 def _line(t_s: FloatArray, light: FloatArray) -> _Law:
-    """The line that fits readings (n,) best."""
     return _law(t_s - t_s[0], light / np.median(light))
 
 

@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_calibration, star_flux, star_kinds, star_rates
+from hilstar.bench.build import bench_calibration, catalogue_choice, star_flux, star_kinds, star_rates
 from hilstar.bench.catalogue import sigma_instrument_mag
 from hilstar.certify.budget import Distribution, Input, Model
 from hilstar.certify.estimates import LightDeviation, Surface, evenness, light_deviation, places
@@ -21,7 +21,7 @@ from hilstar.certify.readings import Reader, dot_places, geometry_of
 from hilstar.monitor.calibration import BUILT_IN, read_toml, weights_of_grid
 from hilstar.monitor.geometry import load_notes
 from hilstar.sky.facts import errors_of, motion_at
-from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
+from hilstar.sky.star_table import choose_catalog, table_facts
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 
 SEED = 5  # of the order of readings
@@ -363,8 +363,7 @@ def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[E
 def catalogue_errors(file: BenchFile, row: IntArray) -> tuple[FloatArray, FloatArray]:
     """The catalogue's errors of stars (n,) by their rows: of light in the tracker, mag, and of place along an axis, arcsec."""
     sky = file.config.sky
-    source = sky.catalogue if sky.catalogue == "hipparcos" else file.folder / sky.catalogue
-    choice = TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear)
+    choice = catalogue_choice(file.config, file.folder)
     stars = choose_catalog(choice).taken(row)
     facts = table_facts(choice, stars, errors_of(stars))
     covariance = motion_at(stars, facts, sky.epoch_jyear).covariance

@@ -8,9 +8,9 @@ import numpy as np
 
 from hilstar.bench.certificate import Certificate, CertifiedFigure
 from hilstar.certify.model import THIRDS
-from hilstar.charts import BLUE, TEAL, panels_of, svg, value_bars
+from hilstar.charts import BLUE, TEAL, panels_of, value_bars
 from hilstar.files import write_whole
-from hilstar.html_pages import Markup, escaped, page_of, picture_of, table_of
+from hilstar.html_pages import Markup, drawing_of, escaped, page_of, table_of
 
 PRINTED = """<style>@page { size: A4; margin: 16mm } @media print { body { margin: 0; max-width: none; font-size: 11px }
 details { display: block } details > * { display: block } h2 { break-after: avoid } tr, img, p { break-inside: avoid } }
@@ -120,7 +120,7 @@ def _bars(found: Certificate, quantity: str) -> str:
     with panels_of(finding, height_inch=1.1 + 0.3 * len(ranked)) as (axes,):
         colours = [BLUE if k == 0 else TEAL for k in range(len(ranked))]
         value_bars(axes, [f"{name} [{unit}]" for name, _ in ranked], [float(np.sqrt(value)) for _, value in ranked], colours)
-    return picture_of(svg(axes.figure).encode(), "svg+xml", f"budget of {quantity}")  # type: ignore[arg-type]
+    return drawing_of(axes.figure, f"budget of {quantity}")
 
 
 def _both_ways(found: Certificate) -> Iterator[str]:

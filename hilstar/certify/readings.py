@@ -13,7 +13,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_calibration, open_bench, orientation_of
+from hilstar.bench.build import bench_calibration, calibration_source, open_bench, orientation_of
 from hilstar.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.geometry import sharpness
@@ -30,7 +30,7 @@ from hilstar.calibrate.geometric.dots import DOT_PX
 from hilstar.calibrate.latency import pair, swap_to_square_ms
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import BUILT_IN, load_calibration
+from hilstar.monitor.calibration import load_calibration
 from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.response import Response
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
@@ -257,8 +257,8 @@ Reader = VirtualReader | ImageReader
 
 def grey_response(file: BenchFile) -> Response:
     """The response of greys, code by code, whatever the bench's quantisation."""
-    name, monitor = file.config.monitor.calibration, file.config.monitor
-    return load_calibration(name if name in BUILT_IN else file.folder / name, monitor.bits).response
+    monitor = file.config.monitor
+    return load_calibration(calibration_source(monitor, file.folder), monitor.bits).response
 
 
 def code_of_light(file: BenchFile, share: float) -> int:

@@ -1,5 +1,11 @@
-"""The background of a photograph, smooth over the field, and the noise about it; sources above both."""
+"""The background of a photograph, smooth over the field, and the noise about it; sources above both.
 
+With several photographs also the detector's fixed pattern: what pixels, columns and rows have in common in different parts of
+the sky.
+"""
+
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +13,106 @@ from scipy import ndimage
 
 from hilstar.arrays import BoolArray, FloatArray
 from hilstar.units import MAD_TO_SIGMA
+
+PATTERN_CLIP = 4.0  # sigmas beyond which a pixel of one photograph does not count
+FOUND_SIGMAS = 4.0
+
+
+KINDS = ("response", "offsets_dn", "columns_dn", "rows_dn")
+NAMES = ("response of pixels", "offsets of pixels", "of columns", "of rows")
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """One sigma of the pixels' response, as a share of the light, and of offsets of pixels, of columns and of rows, DN.
+
+    `squares` has the square of each, without what noise adds, and `errors` one sigma of these.
+    """
+
+    squares: tuple[float, ...] = (0.0,) * 4
+    errors: tuple[float, ...] = (math.inf,) * 4
+
+    @property
+    def rms(self) -> tuple[float, ...]:
+        """Response, pixels, columns, rows; 0 where it is within FOUND_SIGMAS of its error."""
+        return tuple(math.sqrt(s) if s > FOUND_SIGMAS * e else 0.0 for s, e in zip(self.squares, self.errors, strict=True))
+
+    def variance_dn2(self, light_dn: FloatArray) -> FloatArray:
+        """Variance of a pixel about its neighbours at a level of light."""
+        response, *offsets = self.rms
+        return np.asarray((response * light_dn) ** 2 + math.fsum(one**2 for one in offsets))
+
+    def words(self) -> str:
+        """What was found, or under what it is (two sigmas)."""
+        said = []
+        for name, square, error, rms in zip(NAMES, self.squares, self.errors, self.rms, strict=True):
+            times, unit = (100, "%") if name == NAMES[0] else (1, "DN")
+            found = f"{times * rms:.3g} +- {times * error / (2 * rms):.2g}" if rms else ""
+            said.append(f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'} {unit}")
+        return ", ".join(said)
+
+
+NO_PATTERN = Pattern()
+
+
+def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]]) -> Pattern | None:
+    """The pattern by products of each two of several photographs, whose noise has mean 0; None with fewer than two.
+
+    Each gives its pixels less their smooth level, that level above the pedestal, DN, and which pixels count (height, width).
+    Response and offsets are told apart by levels that differ; all is response where they do not.
+    """
+    pixels, shares, columns, rows, light, inverse = (_Pairs() for _ in range(6))
+    for off, level, use in photographs:
+        use = use & (np.abs(off) < PATTERN_CLIP * math.sqrt(float((off[use] ** 2).mean()))) & (level > 0)
+        off, level = np.where(use, off - off[use].mean(), 0.0), np.where(use, level, 1.0)
+        for axis, sums in ((0, columns), (1, rows)):
+            count = use.sum(axis=axis)
+            sums.add(off.sum(axis=axis) / np.maximum(count, 1), count > use.shape[axis] / 4)
+        # neighbours' differences: what is smooth is the sky's or the lens's
+        off, use = (off[:, 1:] - off[:, :-1]) / math.sqrt(2), use[:, 1:] & use[:, :-1]
+        level = (level[:, 1:] + level[:, :-1]) / 2
+        for sums, values in ((pixels, off), (shares, off / level), (light, level), (inverse, 1 / level)):
+            sums.add(values, use)
+    if pixels.photographs < 2 or not pixels.pairs:
+        return None
+    (column, column_error), (row, row_error), (both, both_error), (share, share_error) = (
+        one.mean() for one in (columns, rows, pixels, shares)
+    )
+    lit, dim = light.mean()[0], inverse.mean()[0]
+    both, share = both - max(column, 0.0), share - max(column, 0.0) * dim
+    # both = response^2 lit + offsets^2, share = response^2 + offsets^2 dim
+    apart = lit * dim - 1
+    response, offset = (both * dim - share) / apart, (share * lit - both) / apart
+    response_error, offset_error = (
+        math.hypot(both_error * dim, share_error) / apart,
+        math.hypot(share_error * lit, both_error) / apart,
+    )
+    if offset < FOUND_SIGMAS * offset_error:
+        response, response_error = both / lit, both_error / lit
+    return Pattern((response, offset, column, row), (response_error, offset_error, column_error, row_error))
+
+
+class _Pairs:
+    """The mean product of each two of several arrays, by their sums."""
+
+    def __init__(self) -> None:
+        self.photographs = 0
+        self._sum = self._squares = self._count = np.zeros(1)
+
+    def add(self, values: FloatArray, use: BoolArray) -> None:
+        self.photographs += 1
+        values = np.where(use, values, 0.0)
+        self._sum, self._squares, self._count = self._sum + values, self._squares + values**2, self._count + use
+
+    @property
+    def pairs(self) -> float:
+        return float((self._count * (self._count - 1) / 2).sum())
+
+    def mean(self) -> tuple[float, float]:
+        product = float((self._sum**2 - self._squares).sum()) / 2 / max(self.pairs, 1.0)
+        variance = float(self._squares.sum()) / max(float(self._count.sum()), 1.0)
+        return product, variance / math.sqrt(max(self.pairs, 1.0))
+
 
 EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 MIN_BLOCKS = 12  # along the shorter side; a block is 64 px or less
@@ -31,23 +137,17 @@ class SkyLevel:
         return np.asarray((dn - self.level) / self.noise)
 
 
-def sky_level(dn: FloatArray, step: float, bad: BoolArray | None = None) -> SkyLevel:
-    """The background of an image (height, width) in whole steps of `step`: means of blocks without their stars, smooth between.
-
-    Pixels that are `bad` do not count.
-    """
+def sky_level(dn: FloatArray, step: float) -> SkyLevel:
+    """The background of an image (height, width) in steps of `step`: means of blocks without their stars, smooth between."""
     height, width = dn.shape
     side = int(np.clip(min(height, width) // MIN_BLOCKS, MIN_BLOCK_PX, BLOCK_PX))
     rows, columns = max(height // side, 1), max(width // side, 1)
     high, wide = height // rows, width // columns
     blocks = dn[: rows * high, : columns * wide].reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows, columns, -1)
-    use = np.ones(blocks.shape, dtype=bool)
-    if bad is not None:
-        use = ~bad[: rows * high, : columns * wide].reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows, columns, -1)
     middle = np.median(blocks, axis=2, keepdims=True)
     sigma = MAD_TO_SIGMA * np.median(np.abs(blocks - middle), axis=2, keepdims=True) + step / 2
     for _ in range(ROUNDS):
-        kept = use & (np.abs(blocks - middle) <= CLIP * sigma)
+        kept = np.abs(blocks - middle) <= CLIP * sigma
         count = np.maximum(kept.sum(axis=2, keepdims=True), 1)
         middle = (blocks * kept).sum(axis=2, keepdims=True) / count
         sigma = np.sqrt(((blocks - middle) ** 2 * kept).sum(axis=2, keepdims=True) / count) / CLIPPED
@@ -125,11 +225,11 @@ class Sources:
         return (self.length_px > MIN_TRAIL_PX) & (self.length_px > MIN_TRAIL_RATIO * self.width_px)
 
 
-def find_sources(sigmas: FloatArray, threshold: float = THRESHOLD) -> Sources:
-    """Sources of an image in sigmas: connected pixels of it, smoothed, above a threshold."""
+def find_sources(sigmas: FloatArray) -> Sources:
+    """Sources of an image in sigmas: connected pixels of it, smoothed, above THRESHOLD."""
     norm = float(np.sqrt((_kernel(sigmas.shape) ** 2).sum()))
     smooth = ndimage.gaussian_filter(sigmas, KERNEL_PX, mode="nearest", truncate=4.0) / norm
-    above = smooth > threshold
+    above = smooth > THRESHOLD
     labels, count = ndimage.label(above, structure=EIGHT_NEIGHBOURS)
     y, x = np.nonzero(above)
     blob, value = labels[y, x] - 1, smooth[y, x]

@@ -188,7 +188,6 @@ class _Loss:
         return camera, turns, numbers[last:].reshape(-1, 2)
 
     def unpacked(self, numbers: FloatArray) -> tuple[Camera, tuple[Pointing, ...]]:
-        """The camera and the pointings of numbers."""
         camera, turns, zeniths = self.parts(numbers)
         found = [replace(p, q_icrs_to_cam=multiply(q, p.q_icrs_to_cam)) for p, q in zip(self.pointings, turns, strict=True)]
         for i in np.flatnonzero(self.bent):
@@ -404,8 +403,6 @@ def _held_out(
 
 
 def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: float) -> Pointing:
-    """The pointing with the zenith that fits best, the camera as it is."""
-
     def off(trial: Pointing) -> FloatArray:
         return CameraFit(camera, (trial,), "").residuals_px([places])[0] / np.hypot(places.sigma_px, floor_px)[:, None]
 

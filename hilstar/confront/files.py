@@ -15,8 +15,8 @@ from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.build import bench_optics
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import glass_in
+from hilstar.confront.background import Pattern
 from hilstar.confront.light import NO_CORRECTION, LightFit, PixelFit
-from hilstar.confront.pattern import Pattern
 from hilstar.confront.session import FixedCamera, Session, corrected, radius2_of
 from hilstar.confront.star_psf import HALF, STAMP_PX, Stamps, StarPsf, fit_psf
 from hilstar.files import write_whole
@@ -137,7 +137,6 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
 
 
 def _absolute(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Tables whose paths are those of files in `folder`."""
     found: dict[str, Any] = {}
     for key, value in tables.items():
         if isinstance(value, dict):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.confront.pattern import NO_PATTERN, Pattern
+from hilstar.confront.background import NO_PATTERN, Pattern
 from hilstar.confront.star_psf import MEAN_BV_MAG
 from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import MAD_TO_SIGMA
@@ -27,7 +27,7 @@ NO_CORRECTION = (0.0, 0.0)
 FOLDS, GAIN = 5, 0.985
 BRIGHT_V_MAG = 6.5  # to which rms errors are stated
 TRUSTED_SNR = 20.0
-CLIP, ROUNDS = 3.5, 8
+PATTERN_CLIP, ROUNDS = 3.5, 8
 MIN_STARS = 8
 MIN_MASSES, CLOUD_MAG = 0.3, 0.01  # air masses that tell extinction, and by how much skies differ beside it
 BLOCK_PX = 32
@@ -65,11 +65,6 @@ class StarLight:
     def sigma_mag(self) -> FloatArray:
         """One sigma of it by noise."""
         return np.asarray(MAG * self.sigma_dn / np.maximum(self.dn, 1e-9))
-
-    @property
-    def bright(self) -> BoolArray:
-        """Clean stars to V = 6.5."""
-        return self.clean & (self.v_mag <= BRIGHT_V_MAG)
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +271,7 @@ def _robust(design: FloatArray, target: FloatArray, sigma: FloatArray, use: Bool
         spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept]))) * math.sqrt(kept.sum() / (kept.sum() - design.shape[1]))
         floor = math.sqrt(max(spread**2 - float(np.median(sigma[kept])) ** 2, 1e-6))
         covariance = np.linalg.pinv(rows.T @ rows)
-        kept = use & (np.abs(off) < CLIP * np.hypot(sigma, max(spread, 0.01)))
+        kept = use & (np.abs(off) < PATTERN_CLIP * np.hypot(sigma, max(spread, 0.01)))
     model = design @ values
     return _Robust(values, np.sqrt(np.maximum(np.diag(covariance), 0)), model, target - model)
 
@@ -407,7 +402,7 @@ def _line(x: FloatArray, y: FloatArray) -> _Line:
         off = y - slope * x - at_zero
         spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept] * weight)))
         sigma = spread * np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
-        kept = np.abs(off) < CLIP * spread * scale
+        kept = np.abs(off) < PATTERN_CLIP * spread * scale
     return _Line(float(slope), float(at_zero), float(sigma[0]), float(sigma[1]))
 
 

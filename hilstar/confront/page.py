@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import BLUE, INK, MUTED, ORANGE, panels_of, svg
+from hilstar.charts import BLUE, INK, MUTED, ORANGE, panels_of
 from hilstar.confront.judge import LISTED_SNR, NOT_COUNTED, Verdict
 from hilstar.confront.report import Confronted
 from hilstar.confront.session import Session
 from hilstar.files import write_whole
-from hilstar.html_pages import escaped, page_of, picture_of, table_of
+from hilstar.html_pages import drawing_of, escaped, page_of, table_of
 
 MAX_SIDE_PX = 960
 BLACK, WHITE = -2.0, 60.0  # sigmas of the background, between which a picture's greys lie
@@ -25,24 +25,7 @@ JPEG_QUALITY = 82
 MAX_ROWS = 40
 GRID, TILE_PER_PX, TILE_HALF_PX = 5, 8, 3
 VIEWS = ("image", "prediction", "residual")
-STYLE = """<style>
-.views { position: relative; background: #000 } .views img { width: 100%; display: none; image-rendering: pixelated }
-.views img.on { display: block } .views.all img { display: inline-block; width: 33.33% }
-.views.all svg { display: none } .views svg { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none }
-button { font: inherit; padding: .15em .8em } button.on { font-weight: 700 } .bad { color: #c0182b }
-@media print { .views img { display: block; width: 33%; float: left } button { display: none } }
-</style>"""
-SCRIPT = """<script>
-for (const box of document.querySelectorAll(".frame")) {
-  const images = box.querySelectorAll("img"), buttons = box.querySelectorAll("button"); let timer = 0;
-  const show = k => { images.forEach((one, i) => one.classList.toggle("on", i === k));
-    buttons.forEach((one, i) => one.classList.toggle("on", i === k)); };
-  const all = on => box.querySelector(".views").classList.toggle("all", on);
-  buttons.forEach((one, k) => one.addEventListener("click", () => { clearInterval(timer); timer = 0; all(k === 4);
-    if (k !== 3) { show(k); return; } let at = 0; show(0); timer = setInterval(() => show(at = 1 - at), 600); }));
-  all(true); show(4);
-}
-</script>"""
+STYLE, SCRIPT = (Path(__file__).with_suffix(ending) for ending in (".css", ".js"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +68,7 @@ def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> N
         "beyond the limits: " + "; ".join(found.failures) if found.failures else "the simulator explains these photographs"
     )
     body = [
-        STYLE,
+        f"<style>{STYLE.read_text()}</style>",
         f'<p class="note"><b>{"Fixed" if found.session.fixed else "Fitted"} camera:</b> {escaped(verdict)}.</p>',
         *(f'<p class="note">{escaped(note)}</p>' for note in found.notes),
         "<h2>Verdicts</h2><ul>" + "".join(f"<li>{escaped(line)}</li>" for line in found.lines) + "</ul>",
@@ -104,7 +87,7 @@ def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> N
             rows += [(one.name, None if math.isnan(one.rms) else one.rms, one.how) for one in parts]
             body.append(table_of(rows, ("part", f"rms, {unit}", "how it is told apart"), 3))
     body.append(_lists(found.verdicts))
-    write_whole(path, page_of("Photographs against the simulator", [*body, SCRIPT]))
+    write_whole(path, page_of("Photographs against the simulator", [*body, f"<script>{SCRIPT.read_text()}</script>"]))
 
 
 def _summary(verdicts: Sequence[Verdict]) -> str:
@@ -137,10 +120,6 @@ def _frame(verdict: Verdict, pictures: Pictures) -> str:
         f'<p class="small">Squares: sources over {LISTED_SNR:g} sigmas that nothing explains. Circles: stars that are missing.'
         f" Residual: black is -{RESIDUAL:g}, white +{RESIDUAL:g} sigmas.</p>"
     )
-
-
-def _image(figure: Any, alt: str) -> str:
-    return picture_of(svg(figure).encode(), "svg+xml", alt)
 
 
 def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, str]]:
@@ -180,7 +159,7 @@ def _flux(found: Confronted, rows: Sequence[Any]) -> str:
             panels[0].plot(
                 line, line - light.zero_point_mag + light.colour_term * float(np.nanmedian(bv)), color=ORANGE, lw=1.2
             )
-    return _image(panels[0].figure, "flux against V, and what is left of it against V and colour")
+    return drawing_of(panels[0].figure, "flux against V, and what is left of it against V and colour")
 
 
 def _places(rows: Sequence[Any]) -> str:
@@ -195,7 +174,7 @@ def _places(rows: Sequence[Any]) -> str:
         axes.quiverkey(arrows, 0.86, 0.04, 0.1, "0.1 px", labelpos="E")
         axes.set(xlabel="x [px]", ylabel="y [px]", aspect="equal")
         axes.invert_yaxis()
-    return _image(panels[0].figure, "places seen less predicted over the field")
+    return drawing_of(panels[0].figure, "places seen less predicted over the field")
 
 
 def _psf_grid(session: Session) -> str:
@@ -216,7 +195,7 @@ def _psf_grid(session: Session) -> str:
             axes.text(number % GRID + 0.03, number // GRID + 0.97, f"{x:.0f}, {y:.0f}: {wide:.2f}", fontsize=7, color=MUTED)
         axes.set_xticks(range(GRID + 1), [""] * (GRID + 1))
         axes.set_yticks(range(GRID + 1), [""] * (GRID + 1))
-    return _image(panels[0].figure, "point spread functions over the field")
+    return drawing_of(panels[0].figure, "point spread functions over the field")
 
 
 def _transfer(session: Session) -> str:
@@ -230,7 +209,7 @@ def _transfer(session: Session) -> str:
         axes.plot(line, pixels.variance_dn2(line), color=ORANGE)
         axes.set(xlabel="background level [DN]", ylabel="variance between neighbours [DN²]")
         axes.set_ylim(0, 2 * float(np.median(variance)))
-    return _image(panels[0].figure, "photon transfer")
+    return drawing_of(panels[0].figure, "photon transfer")
 
 
 def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str:
@@ -249,7 +228,7 @@ def _chi2_maps(verdicts: Sequence[Verdict], pictures: Sequence[Pictures]) -> str
         for axes in panels[len(verdicts) :]:
             axes.set_axis_off()
         panels[0].figure.colorbar(drawn, ax=panels, label="chi²", shrink=0.7)
-    return _image(panels[0].figure, "squared residuals over the field")
+    return drawing_of(panels[0].figure, "squared residuals over the field")
 
 
 def _lists(verdicts: Sequence[Verdict]) -> str:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.confront.background import KINDS
 from hilstar.confront.excess import Excess
 from hilstar.confront.judge import Verdict
 from hilstar.confront.light import LINEAR_OFF, LINEAR_SIGMAS
-from hilstar.confront.pattern import KINDS
 from hilstar.confront.session import Session
 from hilstar.units import ARCSEC_PER_RAD
 

@@ -14,7 +14,16 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_channels, bench_optics, channel_rates, site_air
 from hilstar.bench.config.sky import SiteSettings
 from hilstar.bench.site import site_glow_e_per_s_sr
-from hilstar.confront.background import SkyLevel, Sources, find_sources, is_round, sky_level, source_mask
+from hilstar.confront.background import (
+    NO_PATTERN,
+    SkyLevel,
+    Sources,
+    find_sources,
+    fixed_pattern,
+    is_round,
+    sky_level,
+    source_mask,
+)
 from hilstar.confront.camera_fit import CameraFit, Places, Pointing, fit_camera, k1_camera
 from hilstar.confront.images import Photograph, paged
 from hilstar.confront.light import (
@@ -32,7 +41,6 @@ from hilstar.confront.light import (
     with_extinction,
 )
 from hilstar.confront.lost_in_space import MAX_SOURCES, MIN_MATCHED, NEAR, Field, Solved, nearest_once, solve_lost
-from hilstar.confront.pattern import NO_PATTERN, fixed_pattern
 from hilstar.confront.sky import DatedSky, dated_sky
 from hilstar.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
 from hilstar.errors import InputError

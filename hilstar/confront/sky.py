@@ -10,13 +10,13 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_optics
+from hilstar.bench.build import bench_optics, catalogue_choice
 from hilstar.bench.config.bench_config import UNIX_JD, jyear
 from hilstar.bench.site import Ground, site_refraction
 from hilstar.sky.air import air_mass
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.facts import errors_of, sigma_v_mag
-from hilstar.sky.star_table import TableChoice, choose_catalog
+from hilstar.sky.star_table import choose_catalog
 from hilstar.sky.stars import AirAbove, aberrate, unit_vectors_icrs
 from hilstar.units import NS_PER_S
 
@@ -79,8 +79,7 @@ class DatedSky:
 def dated_sky(file: BenchFile, t_ns: int | None) -> DatedSky:
     """The sky of a UTC, of a bench's catalogue. Raises InputError for a catalogue that cannot be read."""
     sky = file.config.sky
-    source = sky.catalogue if sky.catalogue == "hipparcos" else file.folder / sky.catalogue
-    catalog = choose_catalog(TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
+    catalog = choose_catalog(catalogue_choice(file.config, file.folder))
     epoch = sky.epoch_jyear if t_ns is None else jyear(t_ns)
     velocity = None if t_ns is None else earth_velocity_km_s(t_ns)
     air = None

@@ -156,12 +156,11 @@ def join(parts: Sequence[Stamps]) -> Stamps:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Stars by the PSF: place, px, flux and local background, DN, with one sigma of place and flux, and reduced chi^2, (n,)."""
+    """Stars by the PSF: place, px, and flux, DN, with one sigma of place and flux, and reduced chi^2, (n,)."""
 
     x_px: FloatArray
     y_px: FloatArray
     dn: FloatArray
-    level_dn: FloatArray
     sigma_px: FloatArray
     sigma_dn: FloatArray
     chi2: FloatArray
@@ -207,7 +206,7 @@ def measure(stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, ga
     counted = np.isfinite(stamps.variance).sum(axis=(1, 2))
     chi2 = (off**2 * w).sum(axis=1) / np.maximum(counted - 4, 1)
     place = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
-    return Measured(x, y, flux, level, place, np.sqrt(covariance[:, 2, 2]), chi2)
+    return Measured(x, y, flux, place, np.sqrt(covariance[:, 2, 2]), chi2)
 
 
 def _linear(shape: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -60,7 +60,7 @@ from hilstar.version import __version__
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile
-    from hilstar.bench.fault_schedule import FaultSchedule
+    from hilstar.bench.scenario import FaultSchedule
     from hilstar.calibrate.first_light.image_sources import Pattern
     from hilstar.notices import Notices
     from hilstar.run.live_answers import LiveAnswers

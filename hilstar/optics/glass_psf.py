@@ -456,7 +456,6 @@ def regridded(images: FloatArray, per_px: int, matrix: FloatArray) -> tuple[Floa
 
 
 def _middle(optics: Focused, field: Field, shares: FloatArray) -> FloatArray:
-    """The PSF (height, width) in the middle of the field."""
     middle = field(*field.places_px.mean(axis=0)[:, None])[0]
     return np.asarray(np.tensordot(np.einsum("f,l,flk->k", middle, shares, optics.weights), optics.basis, axes=1))
 

@@ -52,12 +52,11 @@ class Plate:
 
 @dataclass(frozen=True, slots=True)
 class Traced:
-    """The glass of a prescription, its focal length and F-number, and where its image surface's axis meets the detector."""
+    """The glass of a prescription, its focal length and F-number."""
 
     glass: Glass
     focal_length_mm: float
     f_number: float
-    axis_px: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +218,6 @@ class _LensRays:
         return np.asarray(fields)
 
     def bundle(self, field: FloatArray, um: float, rays: int) -> _Bundle:
-        """The rays of a pupil's grid at a field."""
         at = (np.arange(rays) + 0.5) / rays * 2 - 1
         across, down = np.meshgrid(at, at)
         filled = _filled(rays)
@@ -284,8 +282,7 @@ def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, 
                 facts.append((min(light, 2.0) if light > MIN_LIT else 0.0, outside, *moved))
     stack = Stack(np.array(images), np.array(at), np.array(facts), samples)
     history = (made_by, f"focal length {camera.focal_length_mm:.6g} mm, F-number {lens.f_number:.4g}")
-    x_px, y_px = (-lens.centre_mm / pitch_mm).tolist()
-    return Traced(glass_of(stack, tolerance, camera.lens, history=history), camera.focal_length_mm, lens.f_number, (x_px, y_px))
+    return Traced(glass_of(stack, tolerance, camera.lens, history=history), camera.focal_length_mm, lens.f_number)
 
 
 def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
@@ -351,7 +348,6 @@ def _waves(
 
 
 def _fastest(rays: _Bundle) -> float:
-    """The F-number of a bundle along its wider direction."""
     lit = rays.light > 0
     return 1 / max(1e-6, float(max(np.ptp(cosine[lit]) for cosine in rays.cosines[:2])))
 
@@ -387,7 +383,6 @@ class _Chiefs:
 
     @classmethod
     def of(cls, lens: _LensRays) -> "_Chiefs":
-        """Least squares over the field."""
         if lens.max_field == 0:
             return cls(lens.focal_length_mm, None)
         turn = np.linspace(0, 2 * np.pi, DISTORTION_SPOKES, endpoint=False)

@@ -18,10 +18,9 @@ import msgspec
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.bench.config.attitude import FaultSettings
-from hilstar.bench.fault_schedule import FILE, FaultChange, FaultSchedule, share_on
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
-from hilstar.bench.scenario import Scenario
+from hilstar.bench.scenario import FILE, FaultChange, FaultSchedule, Scenario, share_on
 from hilstar.errors import InputError, printable, shortened
 from hilstar.frame.fault_kinds import Fault, Freeze, MeasuredMap, Now, fault_of, table_of
 from hilstar.frame.stray_light import map_sha256

@@ -12,17 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.sky import electrons
 from hilstar.sky.catalog import Catalog
-from hilstar.sky.electrons import (
-    Library,
-    Optics,
-    Photometry,
-    PicklesTable,
-    band_mean,
-    fit_table,
-    library_electrons_per_s,
-    load_library,
-)
 from hilstar.sky.facts import facts_of
 from hilstar.sky.spectrum import DATA_DIR, read_curve_csv
 from hilstar.units import flux_ratio, magnitude
@@ -100,18 +91,20 @@ def star_types(catalog: Catalog) -> FloatArray:
 
 
 @cache
-def bare_and_dusty() -> Library:
+def bare_and_dusty() -> electrons.Library:
     """The library (m stars), and after it the same stars behind dust of DUST_EBV_MAG, whose B-V is still that without dust."""
     from scipy.interpolate import CubicSpline  # which a bench without types need not load
 
-    bare = load_library()
+    bare = electrons.load_library()
     wavelength_nm, curve = bare.wavelength_nm, CubicSpline(DUST_PER_UM, DUST_MAG, bc_type="natural")
     flux = bare.flux * flux_ratio(DUST_EBV_MAG * curve(1000.0 / wavelength_nm))
     behind = replace(bare, flux=flux)
     v, i = (read_curve_csv(DATA_DIR / f"{name}.csv") for name in ("johnson-v", "bessell-i"))
-    light = band_mean(behind, v)
-    redder = magnitude(light / band_mean(behind, i)) - magnitude(band_mean(bare, v) / band_mean(bare, i))
-    return Library(
+    light = electrons.band_mean(behind, v)
+    redder = magnitude(light / electrons.band_mean(behind, i)) - magnitude(
+        electrons.band_mean(bare, v) / electrons.band_mean(bare, i)
+    )
+    return electrons.Library(
         wavelength_nm,
         np.concatenate([bare.flux, flux / light[:, None]]),
         bare.spectral_type * 2,
@@ -128,7 +121,7 @@ class TypeTable:
     and V-I (universal kriging). Without type or V-I it is that of `by_colour`.
     """
 
-    by_colour: PicklesTable
+    by_colour: electrons.PicklesTable
     trend: FloatArray
     spectra: FloatArray
     weight: FloatArray
@@ -176,7 +169,7 @@ def fit_types(rate: FloatArray) -> TypeTable:
     return fit_spectra(read_types(np.array(library.spectral_type, dtype=np.bytes_)), library, rate)
 
 
-def fit_spectra(kind: FloatArray, library: Library, rate: FloatArray) -> TypeTable:
+def fit_spectra(kind: FloatArray, library: electrons.Library, rate: FloatArray) -> TypeTable:
     """Fit the table to the rates (m,) of a library's spectra, the first half bare, of `kind` (m, 2)."""
     bare = slice(len(rate) // 2)
     covariance = _alike_types(kind, kind) * _alike_colours(library.vi_mag, library.vi_mag)
@@ -186,21 +179,21 @@ def fit_spectra(kind: FloatArray, library: Library, rate: FloatArray) -> TypeTab
     system = np.block([[covariance, trend], [trend.T, np.zeros((TREND_DEGREE + 1, TREND_DEGREE + 1))]])
     found = np.linalg.solve(system, np.concatenate([np.log(rate), np.zeros(TREND_DEGREE + 1)]))
     weight, coefficients = found[: len(rate)], found[len(rate) :]
-    by_colour = fit_table(library.bv_mag[bare], library.vi_mag[bare], rate[bare])
+    by_colour = electrons.fit_table(library.bv_mag[bare], library.vi_mag[bare], rate[bare])
     return TypeTable(by_colour, coefficients, np.column_stack([kind, library.vi_mag]), weight)
 
 
-def tabulate_types(optics: Optics, photometry: Photometry) -> TypeTable:
+def tabulate_types(optics: electrons.Optics, photometry: electrons.Photometry) -> TypeTable:
     """The rate table of a bench. Raises InputError as `tabulate_pickles` does."""
-    return fit_types(library_electrons_per_s(bare_and_dusty(), optics, photometry))
+    return fit_types(electrons.library_electrons_per_s(bare_and_dusty(), optics, photometry))
 
 
-def class_shares(optics: Optics, from_nm: float) -> dict[str, float]:
+def class_shares(optics: electrons.Optics, from_nm: float) -> dict[str, float]:
     """The share of a star's electrons that is light from a wavelength on, by spectral class: the mean of the library's stars.
 
     Light beyond the library's 250 to 1600 nm counts for nothing.
     """
-    library = load_library()
+    library = electrons.load_library()
     nm = library.wavelength_nm
     detected = library.flux * nm * optics.quantum_efficiency(nm) * optics.transmission(nm)
     shares = detected[:, nm >= from_nm].sum(axis=1) / np.maximum(detected.sum(axis=1), np.finfo(np.float64).tiny)

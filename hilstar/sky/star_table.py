@@ -29,20 +29,9 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import HilstarError, InputError
 from hilstar.files import make_directory, whole_file
 from hilstar.reading import open_regular
+from hilstar.sky import table_reader
 from hilstar.sky.catalog import PACKAGED_CATALOG, RANGES, TYC_REGION, TYCHO, Catalog, column_names, load_catalog, plain_catalog
 from hilstar.sky.stars import cell_grid, unit_vectors_icrs
-from hilstar.sky.table_reader import (
-    COLUMNS_WANTED,
-    ERROR_NAMES,
-    FILE_WANTED,
-    MAX_TABLE_BYTES,
-    NAMES,
-    ROUTES,
-    SPECTRAL_TYPE,
-    RawTable,
-    factor_to,
-    read_table,
-)
 
 # Epochs of the places, Julian years, where a table has its catalogue's own names and no epoch.
 EPOCH_OF_PLACES = {"ramdeg": 2000.0, "raicrs": 1991.25, "raj2000": 2000.0, "_raj2000": 2000.0}
@@ -87,7 +76,7 @@ class Assembled:
     dropped: int
 
 
-def assemble(path: Path, table: RawTable, stated_epoch_jyear: float | None, compared: bool = False) -> Assembled:
+def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float | None, compared: bool = False) -> Assembled:
     """The stars of a table, whose epoch matters where they move or are to be `compared` with stars that do.
 
     Raises InputError where no row is a star, and where a unit or the epoch has to be stated.
@@ -113,7 +102,9 @@ def assemble(path: Path, table: RawTable, stated_epoch_jyear: float | None, comp
     reason = _dropped(figures)
     kept = reason == 0
     if not kept.any():
-        raise InputError(f"{path}: none of its {len(reason)} rows is a star ({_reasons(reason)}); {COLUMNS_WANTED}")
+        raise InputError(
+            f"{path}: none of its {len(reason)} rows is a star ({_reasons(reason)}); {table_reader.COLUMNS_WANTED}"
+        )
     dated = compared or any((motion[kept] != 0).any() for motion in pm.values())
     epoch, epoch_words = columns.epoch(stated_epoch_jyear, dated, designation)
     figures |= {"epoch_jyear": epoch, "identifier": identifier, "hip": _once(columns.hip(), kept, v_mag)}
@@ -135,7 +126,7 @@ class TableMagnitudes(NamedTuple):
 class _Columns:
     """A table's columns by role, in the units of a catalogue."""
 
-    def __init__(self, path: Path, table: RawTable) -> None:
+    def __init__(self, path: Path, table: table_reader.RawTable) -> None:
         self.path, self.table, self.layout = path, table, table.layout
         self.pair = self.layout.places[0]
 
@@ -143,12 +134,11 @@ class _Columns:
         return bool((self.table.unit.get(column) or "").strip())
 
     def _in_unit(self, role: str, column: str) -> FloatArray:
-        factor = factor_to(role, column, self.table.unit.get(column), self.path)
+        factor = table_reader.factor_to(role, column, self.table.unit.get(column), self.path)
         values = np.asarray(self.table.columns[column], dtype=np.float64)
         return values if factor == 1.0 else values * factor
 
     def role(self, role: str, blank: float) -> FloatArray:
-        """The figures of a role, `blank` where the table has none."""
         if role not in self.layout.role:
             return np.full(self.table.row_count, blank)
         values = self._in_unit(role, self.layout.role[role])
@@ -170,7 +160,7 @@ class _Columns:
         """The magnitudes of each row by the first conversion that its columns allow."""
         v, bv, vi = (np.full(self.table.row_count, np.nan) for _ in range(3))
         words: list[str] = []
-        for route in (route for route in ROUTES if route.roles in self.layout.magnitudes):
+        for route in (route for route in table_reader.ROUTES if route.roles in self.layout.magnitudes):
             blank = ~(np.isfinite(v) & np.isfinite(bv))
             if not blank.any():
                 break
@@ -211,7 +201,6 @@ class _Columns:
         return f"{self.path.stem[:MAX_STEM]} row", np.arange(1, self.table.row_count + 1, dtype=np.int64)
 
     def hip(self) -> npt.NDArray[np.int64]:
-        """HIP numbers, 0 where the table has none."""
         if "hip" not in self.layout.role:
             return np.zeros(self.table.row_count, dtype=np.int64)
         return np.asarray(self.table.columns[self.layout.role["hip"]], dtype=np.int64)
@@ -390,7 +379,7 @@ class Kept:
 
 def file_sha256(path: Path, advice: str) -> str:
     """The SHA-256 of a file of at most MAX_TABLE_BYTES, computed once for each state of it. Raises InputError."""
-    with open_regular(path, advice, MAX_TABLE_BYTES) as file:
+    with open_regular(path, advice, table_reader.MAX_TABLE_BYTES) as file:
         status = os.fstat(file.fileno())
     return _sha256(path, (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns), advice)
 
@@ -490,7 +479,7 @@ def choose_catalog(choice: TableChoice) -> Catalog:
     path = Path(choice.source)
     made_of = (
         path.name,
-        file_sha256(path, FILE_WANTED),
+        file_sha256(path, table_reader.FILE_WANTED),
         repr(choice.epoch_jyear),
         hashlib.sha256(PACKAGED_CATALOG.read_bytes()).hexdigest() if choice.with_hipparcos else "",
     )
@@ -506,7 +495,7 @@ def choose_catalog(choice: TableChoice) -> Catalog:
 
 
 def _made(path: Path, choice: TableChoice) -> Kept:
-    found = assemble(path, read_table(path), choice.epoch_jyear, choice.with_hipparcos)
+    found = assemble(path, table_reader.read_table(path), choice.epoch_jyear, choice.with_hipparcos)
     doubts = [found.line] if found.dropped else []
     if not choice.with_hipparcos:
         return Kept(_by_cell(found.catalog, found.line), tuple(doubts))
@@ -528,17 +517,19 @@ def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArra
     """
     if str(choice.source) == "hipparcos" or _is_hip_main(Path(choice.source)):
         return facts
-    columns = _Columns(Path(choice.source), read_table(Path(choice.source), NAMES | ERROR_NAMES))
-    if not any(role in columns.layout.role for role in ERROR_NAMES):
+    columns = _Columns(
+        Path(choice.source), table_reader.read_table(Path(choice.source), table_reader.NAMES | table_reader.ERROR_NAMES)
+    )
+    if not any(role in columns.layout.role for role in table_reader.ERROR_NAMES):
         return facts
     identifier = columns.identifiers()[1]
     order = np.argsort(identifier, kind="stable")
     row = order[np.minimum(np.searchsorted(identifier, stars.identifier, sorter=order), len(order) - 1)]
     own = (identifier[row] == stars.identifier) & ~(choice.with_hipparcos & (stars.hip == stars.identifier))
     found = dict(facts)
-    for role in ERROR_NAMES:
+    for role in table_reader.ERROR_NAMES:
         name = columns.layout.role.get(role)
-        if name is not None and role == SPECTRAL_TYPE:
+        if name is not None and role == table_reader.SPECTRAL_TYPE:
             found[role] = np.where(own, columns.table.columns[name][row], facts[role])
             found["spectral_type_source"] = np.where(own, b"U", facts["spectral_type_source"])
         elif name is not None:
@@ -549,5 +540,5 @@ def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArra
 
 
 def _is_hip_main(path: Path) -> bool:
-    with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
+    with open_regular(path, table_reader.FILE_WANTED, table_reader.MAX_TABLE_BYTES) as file:
         return file.read(2) == b"H|"

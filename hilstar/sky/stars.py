@@ -92,6 +92,8 @@ def tell(told: set[str], key: str, text: str, *values: object) -> None:
 
 
 BV_MAG = np.linspace(-0.4, 2.4, 57)  # for light that is no star's
+# Of each star, beside its vector.
+COLUMNS = ("hip", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row", "colours", "primaries")
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,21 +188,9 @@ def split_by_rate(stars: Stars, faintest_e_per_s: float, drive: FloatArray | flo
 def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
     grid = cell_grid(stars.vectors[kept])
     order = np.flatnonzero(kept)[grid.order]
-    return Stars(
-        hip=stars.hip[order],
-        vectors=np.asfortranarray(stars.vectors[order]),
-        v_mag=stars.v_mag[order],
-        bv_mag=stars.bv_mag[order],
-        temperature_k=stars.temperature_k[order],
-        electrons_per_s=stars.electrons_per_s[order],
-        grid=grid,
-        catalog=stars.catalog,
-        row=stars.row[order],
-        colours=None if stars.colours is None else stars.colours[order],
-        primaries=None if stars.primaries is None else stars.primaries[order],
-        colours_by_bv=stars.colours_by_bv,
-        primaries_by_bv=stars.primaries_by_bv,
-    )
+    columns = {name: values[order] for name in COLUMNS if (values := getattr(stars, name)) is not None}
+    vectors = np.asfortranarray(stars.vectors[order])
+    return replace(stars, **columns, vectors=vectors, grid=grid, velocity_km_s=None, bodies=(), air=None)
 
 
 def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray, electrons_per_s: FloatArray) -> Stars:

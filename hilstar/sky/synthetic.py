@@ -7,21 +7,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev
 
 from hilstar.arrays import FloatArray
-from hilstar.sky.electrons import (
-    BOLOMETRIC_0_W_M2,
-    TABLE_DEGREE,
-    TABLE_RANGE_K,
-    VEGA_V0_W_M2_M,
-    Library,
-    Optics,
-    Photometry,
-    band_mean,
-    fit_table,
-    load_library,
-    reference_mean_w_m2_m,
-    star_temperatures_k,
-    v_band_mean_w_m2_m,
-)
+from hilstar.sky import electrons
 from hilstar.sky.spectral_types import bare_and_dusty, fit_types
 from hilstar.sky.spectrum import (
     DATA_DIR,
@@ -36,7 +22,7 @@ from hilstar.sky.spectrum import (
 from hilstar.units import LIGHT_M_S, flux_ratio, magnitude
 
 # F_lambda of magnitude 0, W/m2/m: Bessell, Castelli and Plez 1998, A&A 333, 231, table A2 (thesis table 2.5).
-ZERO_W_M2_M = {"u": 4.175e-2, "b": 6.32e-2, "v": VEGA_V0_W_M2_M, "r": 2.177e-2, "i": 1.126e-2}
+ZERO_W_M2_M = {"u": 4.175e-2, "b": 6.32e-2, "v": electrons.VEGA_V0_W_M2_M, "r": 2.177e-2, "i": 1.126e-2}
 BANDS = ("u", "b", "r", "i", "g")
 VEGA_V_MAG = 0.03  # the V and the instrument magnitude of Vega (thesis 2.4.3)
 AB_0_W_M2_HZ = 3.631e-23  # Oke and Gunn 1983: 3631 Jy
@@ -60,7 +46,7 @@ def curve_mean(spectrum: Curve, passband: Curve, weighting: str = "energy") -> f
     return float(spectrum(nodes_nm) @ response / response.sum())
 
 
-def colours(spectrum: Spectrum, temperature: str, photometry: Photometry) -> dict[str, Colour]:
+def colours(spectrum: Spectrum, temperature: str, photometry: electrons.Photometry) -> dict[str, Colour]:
     """The colours of BANDS and of "bolometric" (eq. 2.6, 2.7) against V, of the spectra that a bench gives its stars."""
     johnson_v, light = read_curve_csv(DATA_DIR / "johnson-v.csv"), vega()
     found: dict[str, Colour] = {}
@@ -69,7 +55,7 @@ def colours(spectrum: Spectrum, temperature: str, photometry: Photometry) -> dic
         # Gaia's G counts photons, and Vega scaled to V = 0 has G = 0.
         weighting = "photon" if band == "g" else "energy"
         zero = curve_mean(light, passband, weighting) / curve_mean(light, johnson_v)
-        zero = zero if band == "g" else ZERO_W_M2_M[band] / VEGA_V0_W_M2_M
+        zero = zero if band == "g" else ZERO_W_M2_M[band] / electrons.VEGA_V0_W_M2_M
         found[band] = _band(spectrum, temperature, passband, weighting, zero)
     found["bolometric"] = _bolometric(spectrum, temperature, photometry)
     return found
@@ -77,47 +63,47 @@ def colours(spectrum: Spectrum, temperature: str, photometry: Photometry) -> dic
 
 def _band(spectrum: Spectrum, temperature: str, passband: Curve, weighting: str, zero: float) -> Colour:
     if spectrum != "blackbody":
-        means = band_mean(_spectra(spectrum), passband, "photon" if weighting == "photon" else "energy")
+        means = electrons.band_mean(_spectra(spectrum), passband, "photon" if weighting == "photon" else "energy")
         return _by_library(spectrum, means / zero)
     nodes_nm, weight_m = integration_nodes(passband)
     response = passband(nodes_nm) * weight_m * (nodes_nm if weighting == "photon" else 1.0)
 
     def log_mean(inverse_k: FloatArray) -> FloatArray:
         mean = blackbody_exitance_w_m2_m(nodes_nm, 1.0 / inverse_k[..., None]) @ response / response.sum()
-        return np.asarray(np.log(mean / v_band_mean_w_m2_m(1.0 / inverse_k, "energy") / zero), dtype=np.float64)
+        return np.asarray(np.log(mean / electrons.v_band_mean_w_m2_m(1.0 / inverse_k, "energy") / zero), dtype=np.float64)
 
-    low_k, high_k = TABLE_RANGE_K
-    table = Chebyshev.interpolate(log_mean, TABLE_DEGREE, domain=[1.0 / high_k, 1.0 / low_k])
-    return lambda bv, _vi, _kind: magnitude(np.exp(table(1.0 / star_temperatures_k(bv, temperature))))
+    low_k, high_k = electrons.TABLE_RANGE_K
+    table = Chebyshev.interpolate(log_mean, electrons.TABLE_DEGREE, domain=[1.0 / high_k, 1.0 / low_k])
+    return lambda bv, _vi, _kind: magnitude(np.exp(table(1.0 / electrons.star_temperatures_k(bv, temperature))))
 
 
-def _spectra(spectrum: Spectrum) -> Library:
-    return bare_and_dusty() if spectrum == "mk" else load_library()
+def _spectra(spectrum: Spectrum) -> electrons.Library:
+    return bare_and_dusty() if spectrum == "mk" else electrons.load_library()
 
 
 def _by_library(spectrum: Spectrum, relative: FloatArray) -> Colour:
     if spectrum == "mk":
         by_type = fit_types(relative)
         return lambda bv, vi, kind: magnitude(by_type.electrons_per_s(np.zeros(len(bv)), bv, vi, kind))
-    library = load_library()
-    table = fit_table(library.bv_mag, library.vi_mag, relative)
+    library = electrons.load_library()
+    table = electrons.fit_table(library.bv_mag, library.vi_mag, relative)
     return lambda bv, vi, _: magnitude(table.electrons_per_s(np.zeros(len(bv)), bv, vi))
 
 
-def _bolometric(spectrum: Spectrum, temperature: str, photometry: Photometry) -> Colour:
-    v0 = reference_mean_w_m2_m(photometry)
+def _bolometric(spectrum: Spectrum, temperature: str, photometry: electrons.Photometry) -> Colour:
+    v0 = electrons.reference_mean_w_m2_m(photometry)
     if spectrum != "blackbody":
-        return _by_library(spectrum, v0 * library_exitance_m(_spectra(spectrum)) / BOLOMETRIC_0_W_M2)
+        return _by_library(spectrum, v0 * library_exitance_m(_spectra(spectrum)) / electrons.BOLOMETRIC_0_W_M2)
 
     def colour(bv_mag: FloatArray, _vi: FloatArray, _kind: FloatArray | None) -> FloatArray:
-        kelvin = star_temperatures_k(bv_mag, temperature)
-        whole = STEFAN_BOLTZMANN_W_M2_K4 * kelvin**4 / v_band_mean_w_m2_m(kelvin, photometry.weighting)
-        return magnitude(v0 * whole / BOLOMETRIC_0_W_M2)
+        kelvin = electrons.star_temperatures_k(bv_mag, temperature)
+        whole = STEFAN_BOLTZMANN_W_M2_K4 * kelvin**4 / electrons.v_band_mean_w_m2_m(kelvin, photometry.weighting)
+        return magnitude(v0 * whole / electrons.BOLOMETRIC_0_W_M2)
 
     return colour
 
 
-def library_exitance_m(library: Library) -> FloatArray:
+def library_exitance_m(library: electrons.Library) -> FloatArray:
     """A library's spectra over all wavelengths, in their mean through V times m (n,).
 
     Beyond a spectrum's ends stands a black body of its B-V (Torres 2010), fitted to its last END_NM.
@@ -133,22 +119,24 @@ def library_exitance_m(library: Library) -> FloatArray:
     return np.asarray(total)
 
 
-def vega_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
+def vega_electrons_per_s(optics: electrons.Optics, photometry: electrons.Photometry) -> float:
     """Electron rate of Vega's own spectrum scaled to V = 0.03, by the bench's zero point."""
     light = vega()
     passband = read_curve_csv(DATA_DIR / "johnson-v.csv")
-    scale = flux_ratio(VEGA_V_MAG) * reference_mean_w_m2_m(photometry) / curve_mean(light, passband, photometry.weighting)
+    scale = (
+        flux_ratio(VEGA_V_MAG) * electrons.reference_mean_w_m2_m(photometry) / curve_mean(light, passband, photometry.weighting)
+    )
     return scale * _through(optics, light)
 
 
-def ab_electrons_per_s(optics: Optics) -> float:
+def ab_electrons_per_s(optics: electrons.Optics) -> float:
     """Electron rate of AB magnitude 0: 3631 Jy at every wavelength."""
     nodes_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
     response = optics.quantum_efficiency(nodes_nm) * optics.transmission(nodes_nm) * weight_m
     return float(optics.area_m2 * AB_0_W_M2_HZ / PLANCK_J_S * (response / (nodes_nm * 1e-9)).sum())
 
 
-def _through(optics: Optics, light: Curve) -> float:
+def _through(optics: electrons.Optics, light: Curve) -> float:
     nodes_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission, light)
     electrons_per_j = nodes_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
     response = optics.quantum_efficiency(nodes_nm) * optics.transmission(nodes_nm) * electrons_per_j * weight_m

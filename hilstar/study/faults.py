@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.bench.fault_schedule import FaultSchedule
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
-from hilstar.bench.scenario import Scenario
+from hilstar.bench.scenario import FaultSchedule, Scenario
 from hilstar.charts import BLUE, GREEN, INK, MUTED, chart, label_ends, write_records
 from hilstar.frame.fault_kinds import Freeze, Now, fault_of
 from hilstar.frame.faults import FaultLayer
@@ -102,7 +101,6 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
         return bench.draw(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)).levels
 
     def faulty(k: int) -> object:
-        """A frame of such faults, as the frame loop draws it."""
         t_ns = round(k / REFRESH_HZ * NS_PER_S)
         schedule.at(t_ns)
         effects = FaultLayer(view, tuple(Now(n, fault, t_ns) for n, fault in enumerate(ready, start=1)))

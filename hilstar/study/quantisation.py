@@ -136,7 +136,6 @@ def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
 
 
 def _draw_each(path: Path, faintest: dict[tuple[int, str], StarErrors]) -> None:
-    """Each centroider's error with `round` and with `exact`, at the faint end of each panel's aim."""
     left = {
         (bits, kind): faintest[bits, "exact"].axis_rms_px(kind) / faintest[bits, "round"].axis_rms_px(kind)
         for bits in BITS

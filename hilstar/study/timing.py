@@ -3,6 +3,9 @@
 The virtual tracker integrates over several frames of a simulated panel, which lights row by row and holds each row until it is
 written again. Its image is compared with that of the sky in the same exposure, star by star. Each row is at its own phase, so
 the stars of one exposure see the whole beat. The beat is compared with the prediction of `run.sync`.
+
+Before a tracker with a rolling shutter such a display shows stripes: the tracker is at rest and without noise, the glow of the
+black level shows each row's light, and lines are `run.sync`'s at each row's own phase.
 """
 
 import math
@@ -16,8 +19,12 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
-from hilstar.bench.cameras import tracker_camera
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.bench.build import scan_of
+from hilstar.bench.cameras import bench_camera, tracker_camera
+from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
+from hilstar.frame.view import STILL, View
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import Levels
 from hilstar.process.closing import Closing
@@ -28,12 +35,109 @@ from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
-from hilstar.study import stripes
+from hilstar.study import settings
 from hilstar.study.predictors import Movement, attitude_at
-from hilstar.study.settings import FULL_HD, GLASS, Isolation, Table, centroid_px, lone_windows, star_error, study_bench
 from hilstar.study.sweep import medians_ms
 from hilstar.twin.optics import BenchGeometry, TwinOptics
+from hilstar.twin.shutter import S_PER_US
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
+
+STRIPES_RADEC_ROLL_DEG = (84.0, 0.0, 0.0)
+STRIPE_ROWS, ROW_TIME_US, REFRESH_HZ = 1024, 60.0, 60.0
+STRIPE_SIZE_PX = (128, STRIPE_ROWS)
+EVERY_ROWS = 16  # between dots
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class StripeCase:
+    """Refreshes in an exposure, and how long the display's rows stay lit, ms."""
+
+    refreshes: float
+    lit_ms: float
+
+    @property
+    def words(self) -> str:
+        """For a legend."""
+        return f"{self.refreshes:g} refreshes, rows lit {self.lit_ms:.3g} ms"
+
+
+STRIPE_CASES = (StripeCase(0.6, 4.0), StripeCase(2.4, 4.0), StripeCase(2.0, 4.0), StripeCase(2.4, 1e3 / REFRESH_HZ))
+
+
+@dataclass(frozen=True, slots=True)
+class StripePoint:
+    """A row of one case: its light relative to the mean, seen and foretold."""
+
+    refreshes: float
+    lit_ms: float
+    row: int
+    light: float
+    foretold: float
+
+
+def stripe_points(case: StripeCase) -> list[StripePoint]:
+    """The rows of one case, every so many."""
+    exposure_s = case.refreshes / REFRESH_HZ
+    tables: dict[str, settings.Table] = {
+        "tracker": {"resolution_px": STRIPE_SIZE_PX, "exposure_s": exposure_s, "transmission": settings.GLASS},
+        "sky": {"faintest_v_mag": 3.0},
+        "monitor": {**settings.FULL_HD, "hold_ms": case.lit_ms, "calibration": "lcd-example"},
+        "collimator": {"focal_length_mm": 350},
+    }
+    rolling: settings.Table = {"shutter": "rolling", "row_time_us": ROW_TIME_US}
+    view, light = View.exposure(from_radec_roll_deg(*STRIPES_RADEC_ROLL_DEG), STILL, exposure_s), []
+    for extra in ({"tracker.detector": rolling}, {}):
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "bench.toml"
+            path.write_text(settings.bench_text({**tables, **extra}), encoding="utf-8")
+            file = read_bench_file(path)
+            tracker = DisplayTracker(file)
+            light.append(
+                tracker.expose(view, None).mean_e[::EVERY_ROWS, 0]
+            )  # the left edge: the boresight's stars are elsewhere
+            tracker.close()
+    config, x, y = file.config, np.zeros(STRIPE_ROWS)[::EVERY_ROWS], np.arange(float(STRIPE_ROWS))[::EVERY_ROWS]
+    geometry = BenchGeometry(bench_camera(config, path.parent), tracker_camera(config.tracker, path.parent))
+    screen_late_s = scan_of(config.monitor).late_s(*geometry.to_monitor(x, y), config.monitor.resolution_px)
+    late = REFRESH_HZ * ((y - (STRIPE_ROWS - 1) / 2) * ROW_TIME_US * S_PER_US - screen_late_s)  # middle rows begin together
+    foretold = seen_at(Exposures(REFRESH_HZ, exposure_s, lit_s=case.lit_ms * 1e-3), late).light
+    return [
+        StripePoint(case.refreshes, case.lit_ms, int(y[row]), float(light[0][row] / light[1][row]), float(foretold[row]))
+        for row in np.flatnonzero(light[1])  # the first and last see past the screen
+    ]
+
+
+def stripe_findings(directory: Path) -> list[str]:
+    """Write `stripes.csv` and its chart; its finding. Raises InputError."""
+    points = [point for case in STRIPE_CASES for point in stripe_points(case)]
+    write_records(directory / "stripes.csv", points)
+    return [draw_stripes(directory / "stripes", points)]
+
+
+def draw_stripes(path: Path, points: list[StripePoint]) -> str:
+    """The chart of the cases; its finding."""
+    off = max(abs(point.light - point.foretold) for point in points)
+    finding = (
+        "A display that flashes shows as stripes behind a rolling shutter, unless exposures are whole refreshes:"
+        f" as foretold within {max(off, ROUNDING):.0e} of the light"
+    )
+    note = (
+        f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us each, the top row first."
+        " Dots: glow on the virtual tracker's rows. Lines: foretold."
+    )
+    with chart(path, finding, note=note) as (axes,):
+        for case, colour in zip(STRIPE_CASES, SERIES, strict=False):
+            mine = [point for point in points if (point.refreshes, point.lit_ms) == (case.refreshes, case.lit_ms)]
+            rows = [point.row for point in mine]
+            axes.plot(rows, [point.foretold for point in mine], color=colour, label=case.words)
+            axes.plot(rows, [point.light for point in mine], "o", ms=3, color=colour, label="_seen")
+        axes.set_ylabel("light / mean light")
+        axes.set_xlabel("row of the tracker")
+        axes.set_ylim(bottom=0)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False)
+    return finding
+
 
 RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
 PACKET_HZ = 200
@@ -41,7 +145,7 @@ RATE_DEG_S = 1.0
 PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
 STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
 STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
-ISOLATION = Isolation(margin_px=8.0, max_share=1e-3)
+ISOLATION = settings.Isolation(margin_px=8.0, max_share=1e-3)
 RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
 QUICK_RATES_DEG_S = (2.0,)
 # A window reaches the largest error here and the PSF beyond a star's path.
@@ -56,7 +160,7 @@ def slew(rate_deg_s: float) -> Movement:
 class Compensation:
     """A bench's compensation: further keys of [monitor], and `motion` of [render]."""
 
-    monitor_keys: Table
+    monitor_keys: settings.Table
     motion: str
 
 
@@ -92,17 +196,17 @@ class ScanningPanel(Closing):
     """
 
     def __init__(self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0) -> None:
-        held: Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
-        tables: dict[str, Table] = {
-            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": GLASS},
+        held: settings.Table = {"hold_ms": lit * REFRESH_MS} if lit < 1 else {}
+        tables: dict[str, settings.Table] = {
+            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": settings.GLASS},
             "sky": {"faintest_v_mag": 6.0},
-            "monitor": {**FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
+            "monitor": {**settings.FULL_HD, "bits": 10, **WAYS[way].monitor_keys, **held},
             "collimator": {"focal_length_mm": 350},
             "render": {"quantisation": "exact", "motion": WAYS[way].motion, "brightest_v_mag": 1.5},
         }
         self.way = way
         self.start_s = START_S
-        self.bench = study_bench(path, tables)
+        self.bench = settings.study_bench(path, tables)
         config = self.bench.config
         self.period_s = 1 / config.monitor.refresh_hz
         self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s)
@@ -232,7 +336,7 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
 def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, movement: Movement) -> Iterator[BeatPoint]:
     shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
     paths, to_tracker, camera = sky.paths(movement), panel.optics.geometry.to_tracker, panel.bench.camera
-    windows = list(lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
+    windows = list(settings.lone_windows(paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION))
     # Where each star is on the monitor in the middle of the exposure, and just before and after: its row, and its speed.
     middle_ns = round((panel.start_s + panel.exposure_s / 2) * NS_PER_S)
     middle = Motion(movement.at(middle_ns), movement.turn_rad_s, panel.exposure_s)
@@ -243,7 +347,7 @@ def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, mov
     phase = (panel.start_s / panel.period_s - (now[1] + 0.5) / camera.resolution_px[1]) % 1.0
     foretold = seen_at(Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s), phase)
     for index, (_, window) in enumerate(windows):
-        off_px = np.subtract(centroid_px(shown, window), centroid_px(true, window))
+        off_px = np.subtract(settings.centroid_px(shown, window), settings.centroid_px(true, window))
         speed = speed_px_s[:, index]
         yield BeatPoint(
             case.refreshes,
@@ -320,8 +424,8 @@ def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingO
     shown, true = panel.exposed_e_per_s(movement), sky.exposed_e_per_s(movement)
     paths = sky.paths(movement)
     places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
-    windows = lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
-    errors = [star_error(shown, true, window) for _, window in windows]
+    windows = settings.lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
+    errors = [settings.star_error(shown, true, window) for _, window in windows]
     flux_mag = np.array([error.flux_mag for error in errors])
     off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / panel.camera.focal_length_px
     rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
@@ -349,7 +453,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         for o in outcomes
         if o.rate_deg_s == QUICK_RATES_DEG_S[0]
     ]
-    return [finding, *lines, *beat_findings(measure_beat(quick), directory), *stripes.findings(directory)]
+    return [finding, *lines, *beat_findings(measure_beat(quick), directory), *stripe_findings(directory)]
 
 
 def draw(path: Path, outcomes: list[TimingOutcome]) -> str:

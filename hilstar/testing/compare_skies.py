@@ -20,22 +20,8 @@ from hilstar.errors import InputError, cannot_read
 from hilstar.frame.truth import TRUTH_DTYPE
 from hilstar.reading import read_bytes, read_text, size_text
 from hilstar.scene.psf import Psf
+from hilstar.testing import star_fit
 from hilstar.testing.sky_comparison import Limits, SkyComparison, StarDifference, common_change
-from hilstar.testing.star_fit import (
-    RIPPLE_SHARE,
-    Seeds,
-    StarTemplates,
-    Truth,
-    around,
-    blend_distance_px,
-    bright_pixels,
-    find_seeds,
-    nameless_seeds,
-    names_at,
-    refined,
-    shifts_px,
-    star_psf,
-)
 from hilstar.units import MAG_PER_RELATIVE, magnitude
 
 # Error of float32 in any pixel that a star reaches, relative to its flux. Measured 7e-8 on llvmpipe against float64.
@@ -56,8 +42,8 @@ def compare_skies(
     frame: FloatArray,
     golden: FloatArray,
     limits: Limits,
-    truth: Truth | None = None,
-    frame_truth: Truth | None = None,
+    truth: star_fit.Truth | None = None,
+    frame_truth: star_fit.Truth | None = None,
 ) -> SkyComparison:
     """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE), `truth` the golden one's.
 
@@ -70,8 +56,8 @@ def compare_skies(
         pairs = zip(CHANNELS, frame, golden, strict=True)
         each = {name: compare_skies(one, other, limits, *tables) for name, one, other in pairs}
         return replace(compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables), channels=each)
-    psf = star_psf(golden)
-    seeds, unmeasured = _measurable(golden, find_seeds(golden, truth, psf), psf)
+    psf = star_fit.star_psf(golden)
+    seeds, unmeasured = _measurable(golden, star_fit.find_seeds(golden, truth, psf), psf)
     if not seeds.hip:
         raise InputError("compare: no star of the golden image has enough light in view; give one that has")
     fit = _SkyFit(golden, seeds.places_px, psf)
@@ -82,7 +68,9 @@ def compare_skies(
         places, flux = _unexplained(light, fit, moved)
         stars += [
             StarDifference(hip, float(x), float(y), float(f), error, 0.0, 0.0, limits)
-            for hip, (x, y), f in zip(names_at(places, table, blend_distance_px(psf)), places, flux, strict=True)
+            for hip, (x, y), f in zip(
+                star_fit.names_at(places, table, star_fit.blend_distance_px(psf)), places, flux, strict=True
+            )
         ]
     return SkyComparison(stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0])))
 
@@ -103,13 +91,13 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
         raise InputError("compare: the golden image has no star; give one that has")
 
 
-def _measurable(golden: FloatArray, seeds: Seeds, psf: Psf) -> tuple[Seeds, int]:
+def _measurable(golden: FloatArray, seeds: star_fit.Seeds, psf: Psf) -> tuple[star_fit.Seeds, int]:
     """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many stars do not."""
     count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
-    seeds = seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
-    seeds = Seeds(refined(golden, seeds.places_px, psf), seeds.hip)
-    seeds = seeds.only(StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
-    templates = StarTemplates(seeds.places_px, psf, shape)
+    seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
+    seeds = star_fit.Seeds(star_fit.refined(golden, seeds.places_px, psf), seeds.hip)
+    seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
+    templates = star_fit.StarTemplates(seeds.places_px, psf, shape)
     flux = templates.fit(golden)[:, 0]
     seeds = seeds.only(flux > templates.errors(flux, PIXEL_ERROR)[0] / MAX_ERROR)
     return seeds, count - seeds.stars
@@ -121,10 +109,10 @@ class _SkyFit:
     def __init__(self, image: FloatArray, places_px: FloatArray, psf: Psf) -> None:
         self.light = image
         self.psf = psf
-        self.templates = StarTemplates(places_px, psf, (image.shape[0], image.shape[1]))
+        self.templates = star_fit.StarTemplates(places_px, psf, (image.shape[0], image.shape[1]))
         fitted = self.templates.fit(image)
         self.flux = fitted[:, 0]
-        self.places_px = places_px + shifts_px(fitted)
+        self.places_px = places_px + star_fit.shifts_px(fitted)
         self.model = self.templates.image(fitted)
         self.residual = image - self.model
 
@@ -143,7 +131,7 @@ class _SkyFit:
         return fit
 
 
-def _differences(seeds: Seeds, fit: _SkyFit, moved: _SkyFit, limits: Limits) -> list[StarDifference]:
+def _differences(seeds: star_fit.Seeds, fit: _SkyFit, moved: _SkyFit, limits: Limits) -> list[StarDifference]:
     flux_error, place_error_px = fit.templates.errors(fit.flux, PIXEL_ERROR)
     limit_mag = np.maximum(MAG_PER_RELATIVE * flux_error / fit.flux, limits.flux_mag)
     limit_px = np.maximum(place_error_px, limits.centroid_px)
@@ -166,11 +154,13 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
     any on it, and its wing wrong by that star's rounding.
     """
     change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))
-    floor = RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
+    floor = star_fit.RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
     rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
-    seeds = nameless_seeds(bright_pixels(light, around(floor, fit.psf) + rounding), fit.psf).places_px
-    places = refined(light, seeds, fit.psf)
-    flux = StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[:, 0]
+    seeds = star_fit.nameless_seeds(
+        star_fit.bright_pixels(light, star_fit.around(floor, fit.psf) + rounding), fit.psf
+    ).places_px
+    places = star_fit.refined(light, seeds, fit.psf)
+    flux = star_fit.StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[:, 0]
     column, row = seeds.astype(np.intp).T
     # Two stars at one place: the fit may give one too much and the other less than 0.
     return places, np.maximum(flux, light[row, column])
@@ -213,7 +203,7 @@ def _inflated(path: Path, raw: bytes, wanted: str) -> bytes:
     return plain
 
 
-def read_truth_csv(path: Path) -> Truth:
+def read_truth_csv(path: Path) -> star_fit.Truth:
     """The stars of a CSV of `hilstar frame --truth`, TRUTH_DTYPE, only `name` and the columns of TRUTH_COLUMNS filled."""
     wanted = "give the CSV that `hilstar frame --truth OUT.csv` writes"
     try:

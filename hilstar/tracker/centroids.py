@@ -196,7 +196,6 @@ def find_stars(
 
 
 def _check(image: npt.NDArray[Any]) -> None:
-    """Refuse (InputError) what is no image of finite numbers."""
     if image.ndim != 2 or 0 in image.shape or image.dtype.kind not in "fiu":
         raise InputError(f"centroids: an image of type {image.dtype}, shape {image.shape}; give numbers (height, width)")
     if image.dtype.kind == "f" and not np.isfinite(image).all():

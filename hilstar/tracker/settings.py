@@ -56,155 +56,77 @@ class PixelNoise:
 
 
 class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The virtual tracker's sensor.
+    """The virtual tracker's sensor."""
 
-    Physical order: light, PRNU, shot noise, dark current, full well, read noise, ADC. Rates are per pixel, those of dark
-    current at `dark_reference_temperature_k`.
-    """
-
-    gain_e_per_dn: Annotated[Charge, Meta(description="Electrons per DN. The ADC rounds and clips.")] = 24.0
-    full_well_e: Annotated[Charge, Meta(description="Charge above this is lost, or spills with `blooming`.")] = 70_000.0
-    bits: Annotated[int, Meta(ge=1, le=16, description="Bits of a DN.")] = 12
-    offset_dn: Annotated[Amount, Meta(description="Added by the ADC.")] = 0.0
-    bayer: Annotated[
-        Literal["rggb", "bggr", "grbg", "gbrg"] | None,
-        Meta(
-            description='Colours of the pixels, each row of two from the top left: `"rggb"` has red in pixel (0, 0). It needs '
-            "`[tracker] quantum_efficiency_r`, `_g` and `_b`, each that of the pixels of its colour ([colour](colour.md)).",
-            extra={"default": "no mosaic: mono"},
-        ),
-    ] = None
-    solver_image: Annotated[
-        Literal["superpixel", "mosaic"],
-        Meta(
-            description='With `bayer`, where `hilstar tracker` and the solvers of `campaign` find stars. `"superpixel"`: the '
-            'mean of the four squares of 2 x 2 that a pixel belongs to. `"mosaic"`: the raw pixels. Places are those of the '
-            "whole mosaic either way."
-        ),
-    ] = "superpixel"
-    fill_factor: Annotated[
-        float,
-        Meta(ge=1e-3, le=1, description="Share of a pixel that takes light: `quantum_efficiency` is that of its open part."),
-    ] = 1.0
-    read_noise_e: Annotated[Amount, Meta(description="Sigma of the read noise, at `read_noise_reference_hz`.")] = 0.0
-    readout_hz: Annotated[
-        Amount, Meta(description="Pixels that an output reads in a second; 0: `read_noise_e` holds as it is.")
-    ] = 0.0
-    read_noise_reference_hz: Annotated[Charge, Meta(description="Readout frequency of `read_noise_e`.")] = 1e6
-    read_noise_corner_hz: Annotated[
-        Amount,
-        Meta(description="Where 1/f noise equals white noise: read noise goes as the root of readout frequency plus this."),
-    ] = 0.0
-    read_noise_table: Annotated[
-        tuple[tuple[Charge, Amount], ...],
-        Meta(
-            description="Read noise by readout frequency, instead: points `[hz, e-]`, between which its logarithm is straight.",
-            extra={"form": "[[hz, e], ...]", "default": "none"},
-        ),
-    ] = ()
-    shutter: Annotated[
-        Literal["global", "rolling", "frame-transfer"],
-        Meta(
-            description='`"global"`: all pixels at once. `"rolling"`: each row begins `row_time_us` after the one before. '
-            '`"frame-transfer"`: no shutter while rows are shifted under the mask, so light smears along the columns '
-            "([real glass](optics.md#the-shutter))."
-        ),
-    ] = "global"
-    row_time_us: Annotated[
-        Amount, Meta(description="Of `rolling`: from the beginning of a row's exposure to the next row's.")
-    ] = 0.0
-    row_direction: Annotated[
-        Literal["down", "up"], Meta(description='Of `rolling`: `"down"`, the top row first, or `"up"`, the bottom row first.')
-    ] = "down"
-    row_shift_us: Annotated[
-        Amount, Meta(description="Of `frame-transfer`: the time in which charge is shifted by one row.")
-    ] = 0.0
-    sense_capacitance_ff: Annotated[
-        Amount,
-        Meta(description="Capacitance whose reset adds kTC noise; 0: none, as with correlated double sampling."),
-    ] = 0.0
-    dark_e_per_s: Annotated[Amount, Meta(description="Dark current of a pixel at the reference temperature.")] = 0.0
-    dsnu_e_per_s: Annotated[Amount, Meta(description="Sigma of the dark current over the device (DSNU).")] = 0.0
-    dsnu_e: Annotated[
-        Amount, Meta(description="Sigma of a fixed offset of each pixel, whatever the exposure (EMVA 1288's DSNU).")
-    ] = 0.0
-    dark_distribution: Annotated[
-        Literal["normal", "gamma", "log-normal"],
-        Meta(description='Law of pixels\' dark currents about their mean: `"normal"`, cut at 0, `"gamma"`, `"log-normal"`.'),
-    ] = "normal"
-    dark_quantiles: Annotated[
-        tuple[tuple[Share, Amount], ...],
-        Meta(
-            description="Measured quantiles of the pixels' dark currents, points `[share, e-/s]`. `dark_distribution` is fitted"
-            " to them, and gives `dark_e_per_s` and `dsnu_e_per_s`.",
-            extra={"form": "[[share, e/s], ...]", "default": "none"},
-        ),
-    ] = ()
-    prnu: Annotated[Share, Meta(description="Relative sigma of the gain map (PRNU), which is fixed for a device.")] = 0.0
-    device_seed: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=2**63 - 1,
-            description="Seed of all that is fixed in a device: PRNU, DSNU, hot and dead pixels, columns. `--seed` is the "
-            "frame's.",
-        ),
-    ] = 0
-    fixed_pattern: Annotated[
-        Literal["ccd", "cmos"], Meta(description='`"cmos"` allows `column_noise_e`; a `"ccd"` has one amplifier.')
-    ] = "ccd"
-    temperature_k: Annotated[Temperature, Meta(description="Temperature of the sensor.")] = TABLE_4_2_TEMPERATURE_K
-    dark_reference_temperature_k: Annotated[
-        Temperature, Meta(description="Temperature at which the dark currents above hold.")
-    ] = TABLE_4_2_TEMPERATURE_K
-    dark_law: Annotated[
-        Literal["arrhenius", "diffusion-depletion", "ccd47-20", "e2v-nimo"],
-        Meta(
-            description='Dark current against temperature. `"arrhenius"`: with `dark_activation_ev`. `"diffusion-depletion"`: '
-            "T^3 exp(-E/kT) and T^1.5 exp(-E/2kT). "
-            '`"ccd47-20"` (AIMO) and `"e2v-nimo"`: e2v\'s laws, 230 to 300 K.'
-        ),
-    ] = "arrhenius"
-    dark_depletion_share: Annotated[
-        Share, Meta(description="Share of depletion in the dark current at the reference temperature; the rest is diffusion.")
-    ] = 1.0
-    dark_gap_ev: Annotated[
-        float,
-        Meta(ge=0, le=2, description="E of `diffusion-depletion`; 0 is silicon's gap, 1.125 eV at 300 K, wider if colder."),
-    ] = 0.0
+    gain_e_per_dn: Charge = 24.0  #: Electrons per DN. The ADC rounds and clips.
+    full_well_e: Charge = 70_000.0  #: Charge above this is lost, or spills with `blooming`.
+    bits: Annotated[int, Meta(ge=1, le=16)] = 12  #: Bits of a DN.
+    offset_dn: Amount = 0.0  #: Added by the ADC.
+    #: Colours of the pixels, each row of two from the top left: `"rggb"` has red in pixel (0, 0). It needs `[tracker]
+    #: quantum_efficiency_r`, `_g` and `_b`, each that of the pixels of its colour ([colour](colour.md)). Default: no mosaic:
+    #: mono
+    bayer: Literal["rggb", "bggr", "grbg", "gbrg"] | None = None
+    #: With `bayer`, where `hilstar tracker` and the solvers of `campaign` find stars. `"superpixel"`: the mean of the four
+    #: squares of 2 x 2 that a pixel belongs to. `"mosaic"`: the raw pixels. Places are those of the whole mosaic either way.
+    solver_image: Literal["superpixel", "mosaic"] = "superpixel"
+    #: Share of a pixel that takes light: `quantum_efficiency` is that of its open part.
+    fill_factor: Annotated[float, Meta(ge=1e-3, le=1)] = 1.0
+    read_noise_e: Amount = 0.0  #: Sigma of the read noise, at `read_noise_reference_hz`.
+    readout_hz: Amount = 0.0  #: Pixels that an output reads in a second; 0: `read_noise_e` holds as it is.
+    read_noise_reference_hz: Charge = 1e6  #: Readout frequency of `read_noise_e`.
+    #: Where 1/f noise equals white noise: read noise goes as the root of readout frequency plus this.
+    read_noise_corner_hz: Amount = 0.0
+    #: Read noise by readout frequency, instead: points `[hz, e-]`, between which its logarithm is straight. Default: none
+    read_noise_table: Annotated[tuple[tuple[Charge, Amount], ...], Meta(extra={"form": "[[hz, e], ...]"})] = ()
+    #: `"global"`: all pixels at once. `"rolling"`: each row begins `row_time_us` after the one before. `"frame-transfer"`: no
+    #: shutter while rows are shifted under the mask, so light smears along the columns ([real glass](optics.md#the-shutter)).
+    shutter: Literal["global", "rolling", "frame-transfer"] = "global"
+    row_time_us: Amount = 0.0  #: Of `rolling`: from the beginning of a row's exposure to the next row's.
+    #: Of `rolling`: `"down"`, the top row first, or `"up"`, the bottom row first.
+    row_direction: Literal["down", "up"] = "down"
+    row_shift_us: Amount = 0.0  #: Of `frame-transfer`: the time in which charge is shifted by one row.
+    sense_capacitance_ff: Amount = 0.0  #: Capacitance whose reset adds kTC noise; 0: none, as with correlated double sampling.
+    dark_e_per_s: Amount = 0.0  #: Dark current of a pixel at the reference temperature.
+    dsnu_e_per_s: Amount = 0.0  #: Sigma of the dark current over the device (DSNU).
+    dsnu_e: Amount = 0.0  #: Sigma of a fixed offset of each pixel, whatever the exposure (EMVA 1288's DSNU).
+    #: Law of pixels' dark currents about their mean: `"normal"`, cut at 0, `"gamma"`, `"log-normal"`.
+    dark_distribution: Literal["normal", "gamma", "log-normal"] = "normal"
+    #: Measured quantiles of the pixels' dark currents, points `[share, e-/s]`. `dark_distribution` is fitted to them, and gives
+    #: `dark_e_per_s` and `dsnu_e_per_s`. Default: none
+    dark_quantiles: Annotated[tuple[tuple[Share, Amount], ...], Meta(extra={"form": "[[share, e/s], ...]"})] = ()
+    prnu: Share = 0.0  #: Relative sigma of the gain map (PRNU), which is fixed for a device.
+    #: Seed of all that is fixed in a device: PRNU, DSNU, hot and dead pixels, columns. `--seed` is the frame's.
+    device_seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    fixed_pattern: Literal["ccd", "cmos"] = "ccd"  #: `"cmos"` allows `column_noise_e`; a `"ccd"` has one amplifier.
+    temperature_k: Temperature = TABLE_4_2_TEMPERATURE_K  #: Temperature of the sensor.
+    dark_reference_temperature_k: Temperature = TABLE_4_2_TEMPERATURE_K  #: Temperature at which the dark currents above hold.
+    #: Dark current against temperature. `"arrhenius"`: with `dark_activation_ev`. `"diffusion-depletion"`: T^3 exp(-E/kT) and
+    #: T^1.5 exp(-E/2kT). `"ccd47-20"` (AIMO) and `"e2v-nimo"`: e2v's laws, 230 to 300 K.
+    dark_law: Literal["arrhenius", "diffusion-depletion", "ccd47-20", "e2v-nimo"] = "arrhenius"
+    #: Share of depletion in the dark current at the reference temperature; the rest is diffusion.
+    dark_depletion_share: Share = 1.0
+    #: E of `diffusion-depletion`; 0 is silicon's gap, 1.125 eV at 300 K, wider if colder.
+    dark_gap_ev: Annotated[float, Meta(ge=0, le=2)] = 0.0
     # Half of silicon's band gap: the depletion term of eq. 4.12.
-    dark_activation_ev: Annotated[
-        float, Meta(ge=0, le=1.2, description="Activation energy of `arrhenius`; the default is half of silicon's band gap.")
-    ] = 0.56
-    hot_pixel_fraction: Annotated[Share, Meta(description="Share of the pixels that are hot.")] = 0.0
-    hot_pixel_e_per_s: Annotated[
-        Amount, Meta(description="Mean of the exponential law from which the extra dark current of a hot pixel is drawn.")
-    ] = 10_000.0
-    hot_pixel_activation_ev: Annotated[
-        float, Meta(ge=0, le=2, description="Activation energy of that extra current; 0: it goes as the dark current does.")
-    ] = 0.0
-    dead_pixel_fraction: Annotated[Share, Meta(description="Share of the pixels that give no electrons.")] = 0.0
-    column_noise_e: Annotated[Amount, Meta(description="Sigma of a fixed offset of each column, for `cmos`.")] = 0.0
-    column_dark_e_per_s: Annotated[
-        Amount, Meta(description="Sigma of a dark current that a column's pixels share, for `cmos`.")
-    ] = 0.0
-    cosmic_rays_per_cm2_s: Annotated[
-        Amount, Meta(description="Hits by isotropic minimum-ionising particles; each leaves a straight track.")
-    ] = 0.0
-    false_stars: Annotated[int, Meta(ge=0, le=100_000, description="False stars, at new places in every frame.")] = 0
-    false_star_e_per_s: Annotated[Amount, Meta(description="Rate of a false star.")] = 10_000.0
-    false_star_sigma_px: Annotated[float, Meta(ge=0.05, le=20, description="Gaussian sigma of a false star.")] = 0.55
-    blooming: Annotated[bool, Meta(description="Charge above the full well spills along the column.")] = False
-    noise_version: Annotated[
-        Literal[1, 2],
-        Meta(
-            description="How a frame's noise is drawn from its seed. `2`: in blocks, on every core, the same on any number "
-            "of them; `1`: as up to version 0.2, slower."
-        ),
-    ] = 2
-    quantisation_noise: Annotated[
-        bool, Meta(description="Adds the Gaussian quantisation noise of the thesis to what rounding does.")
-    ] = False
+    #: Activation energy of `arrhenius`; the default is half of silicon's band gap.
+    dark_activation_ev: Annotated[float, Meta(ge=0, le=1.2)] = 0.56
+    hot_pixel_fraction: Share = 0.0  #: Share of the pixels that are hot.
+    #: Mean of the exponential law from which the extra dark current of a hot pixel is drawn.
+    hot_pixel_e_per_s: Amount = 10_000.0
+    #: Activation energy of that extra current; 0: it goes as the dark current does.
+    hot_pixel_activation_ev: Annotated[float, Meta(ge=0, le=2)] = 0.0
+    dead_pixel_fraction: Share = 0.0  #: Share of the pixels that give no electrons.
+    column_noise_e: Amount = 0.0  #: Sigma of a fixed offset of each column, for `cmos`.
+    column_dark_e_per_s: Amount = 0.0  #: Sigma of a dark current that a column's pixels share, for `cmos`.
+    cosmic_rays_per_cm2_s: Amount = 0.0  #: Hits by isotropic minimum-ionising particles; each leaves a straight track.
+    false_stars: Annotated[int, Meta(ge=0, le=100_000)] = 0  #: False stars, at new places in every frame.
+    false_star_e_per_s: Amount = 10_000.0  #: Rate of a false star.
+    false_star_sigma_px: Annotated[float, Meta(ge=0.05, le=20)] = 0.55  #: Gaussian sigma of a false star.
+    blooming: bool = False  #: Charge above the full well spills along the column.
+    #: How a frame's noise is drawn from its seed. `2`: in blocks, on every core, the same on any number of them; `1`: as up to
+    #: version 0.2, slower.
+    noise_version: Literal[1, 2] = 2
+    quantisation_noise: bool = False  #: Adds the Gaussian quantisation noise of the thesis to what rounding does.
 
     def __post_init__(self) -> None:
         """Refuse (InputError) a value that no sensor has."""

@@ -24,25 +24,14 @@ Byte = Annotated[int, Meta(ge=-MAX_FRAME_BYTES, le=MAX_FRAME_BYTES)]
 
 
 class Convention(Table, frozen=True):
-    """What the tracker's quaternion turns into what.
+    """What the tracker's quaternion turns into what."""
 
-    Compositions are Hamilton's. `hilstar answers --explain` shows an answer under every convention beside what is shown.
-    """
-
-    scalar: Annotated[
-        Literal["first", "last"],
-        Meta(description='Where the scalar of `q` stands, `"first"` or `"last"`, in JSON and in what a Python function gives.'),
-    ] = "first"
-    direction: Annotated[
-        Literal["icrs_to_cam", "cam_to_icrs"],
-        Meta(
-            description='`"icrs_to_cam"`: it turns ICRS components into the tracker\'s. `"cam_to_icrs"`: the other way round.'
-        ),
-    ] = "icrs_to_cam"
-    frame: Annotated[
-        Literal["cam", "body"],
-        Meta(description='`"cam"`: the camera\'s axes. `"body"`: the spacecraft\'s, which `[tracker] q_body_to_cam` relates.'),
-    ] = "cam"
+    #: Where the scalar of `q` stands, `"first"` or `"last"`, in JSON and in what a Python function gives.
+    scalar: Literal["first", "last"] = "first"
+    #: `"icrs_to_cam"`: it turns ICRS components into the tracker's. `"cam_to_icrs"`: the other way round.
+    direction: Literal["icrs_to_cam", "cam_to_icrs"] = "icrs_to_cam"
+    #: `"cam"`: the camera's axes. `"body"`: the spacecraft's, which `[tracker] q_body_to_cam` relates.
+    frame: Literal["cam", "body"] = "cam"
 
 
 class FrameField(Table, frozen=True):
@@ -72,172 +61,68 @@ class FrameMatch(Table, frozen=True):
 
 
 class AnswersSettings(Table, frozen=True):
-    """Where the answers of the star tracker come from, and what their bytes mean (see [answers](answers.md)).
+    """Where the answers of the star tracker come from, and what their bytes mean (see [answers](answers.md))."""
 
-    Without this table nobody listens. A process of its own reads, decodes and stamps. At most 500 kB and 200 answers a second
-    are taken; what is beyond, and what is no answer, is counted by reason.
-
-    A field of `fields` is `{ name = "qw", at = 6, type = "i32be", scale = 4.656612873077393e-10 }`: `name` is one of qw, qx,
-    qy, qz, t_s (s), t_sub (s, added to t_s), t_ns, valid (not 0), mode, stars, wx, wy, wz (rad/s). `at` counts bytes from the
-    frame's first, which is that of the sync bytes, or of what SLIP or COBS hold. `type` is u8, i8, u16 to u64, i16 to i64, u24,
-    i24, f32 or f64, with `le` (the default) or `be` at its end. The value is raw x `scale` (1) + `add` (0); `mask` takes some
-    bits of a whole number, as a number of their own.
-    """
-
-    source: Annotated[
-        Literal["serial", "udp", "tcp", "zmq", "file"],
-        Meta(
-            description='The road: a `"serial"` line, `"udp"`, `"tcp"`, `"zmq"`, or a `"file"` to which something appends: '
-            "what is appended after the start counts."
-        ),
-    ]
-    format: Annotated[
-        str,
-        Meta(
-            description='`"packet"`: hilstar\'s own (kind 5), as COBS frames over serial lines, TCP and files. `"json"`: an '
-            'object a line or a message. `"frame"`: the tracker\'s own telemetry, declared by the keys below. '
-            '`"python:MODULE:FUNCTION"`: bytes in, answers out.',
-            extra={"form": '"packet", "json", "frame" or "python:MODULE:FUNCTION"'},
-        ),
-    ] = "packet"
-    endpoint: Annotated[
-        str | None,
-        Meta(
-            description="ZeroMQ: the address to which hilstar's SUB socket connects. UDP: `udp://ADDRESS:PORT`, another way to "
-            "write `bind`.",
-            extra={"default": "`tcp://127.0.0.1:5562` for ZeroMQ"},
-        ),
-    ] = None
-    bind: Annotated[
-        bool | str | None,
-        Meta(
-            description="ZeroMQ: `true` when hilstar binds. UDP: the address and port listened on.",
-            extra={"default": '`false`; `"127.0.0.1:5562"` over UDP'},
-        ),
-    ] = None
-    connect: Annotated[
-        str | None,
-        Meta(
-            description='TCP: the tracker\'s `"HOST:PORT"`. UDP: the same, where the tracker has to be asked (`poll_hex`).',
-            extra={"default": "none"},
-        ),
-    ] = None
-    listen: Annotated[
-        str | None, Meta(description='TCP: where hilstar listens, `"ADDRESS:PORT"`.', extra={"default": "none"})
-    ] = None
-    path: Annotated[
-        str | None,
-        Meta(description="File: its path, relative to the bench file.", extra={"default": "none; required for file"}),
-    ] = None
-    allow: Annotated[
-        tuple[str, ...],
-        Meta(
-            description="UDP, and TCP with `listen`: who may send: addresses and networks.",
-            extra={"default": "this machine; required where the address is not loopback", "form": '["ADDRESS", ...]'},
-        ),
-    ] = ()
-    curve_secret_key: Annotated[
-        str | None, Meta(description="ZeroMQ: the file of hilstar's own secret key.", extra={"default": "none"})
-    ] = None
-    curve_server_key: Annotated[
-        str | None,
-        Meta(
-            description="ZeroMQ: the file of the binding side's public key, when hilstar connects.", extra={"default": "none"}
-        ),
-    ] = None
-    allowed_clients: Annotated[
-        str | None, Meta(description="ZeroMQ: the directory with the public keys that may connect.", extra={"default": "none"})
-    ] = None
-    port: Annotated[
-        str | int,
-        Meta(
-            description='Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none.',
-            extra={"default": "none; required for serial"},
-        ),
-    ] = ""
-    baud: Annotated[int, Meta(ge=1, le=12_000_000, description="Serial: the speed, 8N1.")] = 115_200
-    poll_hex: Annotated[
-        HexBytes | None,
-        Meta(
-            description="What is sent to a tracker that answers only when it is asked, in hexadecimal.",
-            extra={"default": "none", "form": '"55 AA 01 ..."'},
-        ),
-    ] = None
-    poll_hz: Annotated[Annotated[float, Meta(ge=0.01, le=1000)], Meta(description="How often that is sent.")] = 10.0
-    convention: Annotated[Convention, Meta(description="What the quaternion turns into what.")] = Convention()
-    stamp: Annotated[
-        Literal["middle", "start", "end", "arrival"],
-        Meta(
-            description='Where in the exposure the tracker\'s stamp stands: in its `"middle"`, at its `"start"` or `"end"`. '
-            '`"arrival"`: it is not used, or there is none.'
-        ),
-    ] = "middle"
-    clock: Annotated[
-        Literal["own", "unix", "host"],
-        Meta(
-            description='The stamps\' clock. `"own"`: the tracker\'s, fitted from the answers. `"unix"`: UTC since 1970, of a '
-            'tracker that PTP or NTP disciplines. `"host"`: this machine\'s monotonic clock.'
-        ),
-    ] = "own"
-    latency_ms: Annotated[
-        NotNegative | None,
-        Meta(
-            description="How much later than the middle of its exposure an answer comes, where it is known.",
-            extra={"default": "fitted"},
-        ),
-    ] = None
-    wrong_arcsec: Annotated[Positive, Meta(description="An answer further than this from what was lit is a wrong one.")] = (
-        3600.0
-    )
-    framing: Annotated[
-        Literal["sync", "slip", "cobs", "fixed", "ccsds"] | None,
-        Meta(
-            description='How frames are told apart. `"sync"`: by `sync_hex`. `"slip"` (RFC 1055), `"cobs"`. `"fixed"`: each as '
-            'long as `length`. `"ccsds"`: Space Packets (133.0-B), by the length in their header.',
-            extra={"default": "none; required for frame"},
-        ),
-    ] = None
-    sync_hex: Annotated[
-        HexBytes | None, Meta(description="The bytes with which a frame begins.", extra={"default": "none", "form": '"1A CF"'})
-    ] = None
+    #: The road: a `"serial"` line, `"udp"`, `"tcp"`, `"zmq"`, or a `"file"` to which something appends: what is appended after
+    #: the start counts.
+    source: Literal["serial", "udp", "tcp", "zmq", "file"]
+    #: `"packet"`: hilstar's own (kind 5), as COBS frames over serial lines, TCP and files. `"json"`: an object a line or a
+    #: message. `"frame"`: the tracker's own telemetry, declared by the keys below. `"python:MODULE:FUNCTION"`: bytes in,
+    #: answers out.
+    format: Annotated[str, Meta(extra={"form": '"packet", "json", "frame" or "python:MODULE:FUNCTION"'})] = "packet"
+    #: ZeroMQ: the address to which hilstar's SUB socket connects. UDP: `udp://ADDRESS:PORT`, another way to write `bind`.
+    #: Default: `tcp://127.0.0.1:5562` for ZeroMQ
+    endpoint: str | None = None
+    #: ZeroMQ: `true` when hilstar binds. UDP: the address and port listened on. Default: `false`; `"127.0.0.1:5562"` over UDP
+    bind: bool | str | None = None
+    #: TCP: the tracker's `"HOST:PORT"`. UDP: the same, where the tracker has to be asked (`poll_hex`). Default: none
+    connect: str | None = None
+    listen: str | None = None  #: TCP: where hilstar listens, `"ADDRESS:PORT"`. Default: none
+    path: str | None = None  #: File: its path, relative to the bench file. Default: none; required for file
+    #: UDP, and TCP with `listen`: who may send: addresses and networks. Default: this machine; required where the address is
+    #: not loopback
+    allow: Annotated[tuple[str, ...], Meta(extra={"form": '["ADDRESS", ...]'})] = ()
+    curve_secret_key: str | None = None  #: ZeroMQ: the file of hilstar's own secret key. Default: none
+    #: ZeroMQ: the file of the binding side's public key, when hilstar connects. Default: none
+    curve_server_key: str | None = None
+    allowed_clients: str | None = None  #: ZeroMQ: the directory with the public keys that may connect. Default: none
+    #: Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none. Default: none; required for serial
+    port: str | int = ""
+    baud: Annotated[int, Meta(ge=1, le=12_000_000)] = 115_200  #: Serial: the speed, 8N1.
+    #: What is sent to a tracker that answers only when it is asked, in hexadecimal. Default: none
+    poll_hex: Annotated[HexBytes | None, Meta(extra={"form": '"55 AA 01 ..."'})] = None
+    poll_hz: Annotated[float, Meta(ge=0.01, le=1000)] = 10.0  #: How often that is sent.
+    convention: Convention = Convention()  #: What the quaternion turns into what.
+    #: Where in the exposure the tracker's stamp stands: in its `"middle"`, at its `"start"` or `"end"`. `"arrival"`: it is not
+    #: used, or there is none.
+    stamp: Literal["middle", "start", "end", "arrival"] = "middle"
+    #: The stamps' clock. `"own"`: the tracker's, fitted from the answers. `"unix"`: UTC since 1970, of a tracker that PTP or
+    #: NTP disciplines. `"host"`: this machine's monotonic clock.
+    clock: Literal["own", "unix", "host"] = "own"
+    #: How much later than the middle of its exposure an answer comes, where it is known. Default: fitted
+    latency_ms: NotNegative | None = None
+    wrong_arcsec: Positive = 3600.0  #: An answer further than this from what was lit is a wrong one.
+    #: How frames are told apart. `"sync"`: by `sync_hex`. `"slip"` (RFC 1055), `"cobs"`. `"fixed"`: each as long as `length`.
+    #: `"ccsds"`: Space Packets (133.0-B), by the length in their header. Default: none; required for frame
+    framing: Literal["sync", "slip", "cobs", "fixed", "ccsds"] | None = None
+    #: The bytes with which a frame begins. Default: none
+    sync_hex: Annotated[HexBytes | None, Meta(extra={"form": '"1A CF"'})] = None
+    #: Bytes of a frame, sync and checksum among them; or the field that says it, `{ at = 2, type = "u8", add = 5 }`: raw + add.
+    #: Default: none; required for sync and fixed
     length: Annotated[
         Annotated[int, Meta(ge=1, le=MAX_FRAME_BYTES)] | FrameLength | None,
-        Meta(
-            description="Bytes of a frame, sync and checksum among them; or the field that says it, "
-            '`{ at = 2, type = "u8", add = 5 }`: raw + add.',
-            extra={"default": "none; required for sync and fixed", "form": 'N or { at = N, type = "u8", add = N }'},
-        ),
+        Meta(extra={"form": 'N or { at = N, type = "u8", add = N }'}),
     ] = None
-    checksum: Annotated[
-        Literal["none", "crc16-ccitt-false", "crc16-xmodem", "crc32", "sum8", "xor8"],
-        Meta(
-            description='A frame\'s checksum: `"crc16-ccitt-false"`, `"crc16-xmodem"`, `"crc32"`, `"sum8"`, `"xor8"`. '
-            'With `"none"` a damaged frame may be taken for an answer.'
-        ),
-    ] = "none"
-    checksum_at: Annotated[
-        Byte | None, Meta(description="Its first byte; below 0 from the end.", extra={"default": "the end of the frame"})
-    ] = None
-    checksum_from: Annotated[
-        Annotated[int, Meta(ge=0, lt=MAX_FRAME_BYTES)], Meta(description="The first byte that it covers.")
-    ] = 0
-    checksum_order: Annotated[
-        Literal["big", "little"], Meta(description='The order of its bytes, `"big"` or `"little"` end first.')
-    ] = "big"
-    match: Annotated[
-        tuple[FrameMatch, ...],
-        Meta(
-            description="Bytes that frames with an attitude have; others are counted (`other`) and not decoded.",
-            extra={"default": "all frames", "form": '[{ at = N, hex = "21" }, ...]'},
-        ),
-    ] = ()
-    fields: Annotated[
-        tuple[FrameField, ...],
-        Meta(
-            description="The numbers in a frame.",
-            extra={"default": "none; required for frame", "form": '[{ name = "qw", at = N, type = "f32be" }, ...]'},
-        ),
-    ] = ()
+    #: A frame's checksum: `"crc16-ccitt-false"`, `"crc16-xmodem"`, `"crc32"`, `"sum8"`, `"xor8"`. With `"none"` a damaged frame
+    #: may be taken for an answer.
+    checksum: Literal["none", "crc16-ccitt-false", "crc16-xmodem", "crc32", "sum8", "xor8"] = "none"
+    checksum_at: Byte | None = None  #: Its first byte; below 0 from the end. Default: the end of the frame
+    checksum_from: Annotated[int, Meta(ge=0, lt=MAX_FRAME_BYTES)] = 0  #: The first byte that it covers.
+    checksum_order: Literal["big", "little"] = "big"  #: The order of its bytes, `"big"` or `"little"` end first.
+    #: Bytes that frames with an attitude have; others are counted (`other`) and not decoded. Default: all frames
+    match: Annotated[tuple[FrameMatch, ...], Meta(extra={"form": '[{ at = N, hex = "21" }, ...]'})] = ()
+    #: The numbers in a frame. Default: none; required for frame
+    fields: Annotated[tuple[FrameField, ...], Meta(extra={"form": '[{ name = "qw", at = N, type = "f32be" }, ...]'})] = ()
 
 
 def field_format(type_name: str) -> tuple[str, int, bool] | None:

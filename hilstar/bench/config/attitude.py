@@ -21,160 +21,71 @@ ENDPOINTS = {
 
 
 class AttitudeSettings(Table, frozen=True):
-    """Where the attitude comes from, and what is shown without one.
+    """Where the attitude comes from, and what is shown without one."""
 
-    The packets, and what each side may expect of the other, are in [firmware_protocol](../firmware_protocol/README.md).
-
-    CURVE keys come from `hilstar keys`. An endpoint that is not loopback is refused without them: the side that binds needs
-    its own secret key and a directory with the public keys of its clients (read again when it changes), the side that
-    connects needs its own secret key and the public key of the side that binds.
-    """
-
-    source: Annotated[
-        Literal["zmq", "serial", "udp", "vizard", "42", "scpi"],
-        Meta(
-            description='`"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet '
-            'or JSON in each datagram. `"vizard"`: Basilisk\'s Vizard stream, and `"42"`: the text '
-            "stream of NASA's 42; their attitude is the body's (`[tracker] q_body_to_cam`). "
-            '`"scpi"`: `SKY:ATT` and `SKY:RATE` of a test stand (`hilstar serve --scpi`), with no other key of a source.'
-        ),
-    ] = "zmq"
-    endpoint: Annotated[
-        str | None,
-        Meta(
-            description="ZeroMQ and Vizard: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`, where HOST "
-            "is an IPv4 address, an IPv6 address in brackets, or a name (when hilstar binds also `*`, and PORT may be `*` for "
-            "a free one, which is then reported), or `ipc:///WHOLE/PATH`. Basilisk has no keys: its endpoint is on this "
-            "machine. UDP: `udp://ADDRESS:PORT`, another way to write `bind`. 42: where its socket is, when it is the server.",
-            extra={
-                "default": "`tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`; of "
-                "42 `tcp://127.0.0.1:10001`"
-            },
-        ),
-    ] = None
-    bind: Annotated[
-        bool | str | None,
-        Meta(
-            description="ZeroMQ, Vizard and 42: `true` when hilstar binds and the sender connects. UDP: the address and port "
-            'listened on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported).',
-            extra={"default": '`false`; `true` in lockstep; `"127.0.0.1:5560"` over UDP'},
-        ),
-    ] = None
-    allow: Annotated[
-        tuple[str, ...],
-        Meta(
-            description='UDP, and 42 where hilstar binds: who may send: addresses and networks, such as `["192.168.1.20", '
-            '"fd00::/64"]`. What others send is counted, and never answered.',
-            extra={"default": "this machine; required where `bind` is not loopback", "form": '["ADDRESS", ...]'},
-        ),
-    ] = ()
-    lockstep: Annotated[
-        bool,
-        Meta(
-            description="ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one reply, at "
-            "whatever speed the sender has. Vizard: `true` for Basilisk's live stream instead of its broadcast; hilstar "
-            "stands in Vizard's place, and Basilisk's cameras get pictures of the virtual tracker. 42: `true` to acknowledge "
-            "each message once its frame is out, so that 42 may run as fast as it can."
-        ),
-    ] = False
-    spacecraft: Annotated[
-        str | int | None,
-        Meta(
-            description='Vizard: the name of the spacecraft that carries the tracker. 42: its number, such as `"SC[0]"`.',
-            extra={"default": 'the only one that is there; `"SC[0]"`'},
-        ),
-    ] = None
-    use_velocity: Annotated[
-        bool,
-        Meta(
-            description="Vizard: `true` when the spacecraft's velocity aberrates the stars: 5 arcsec in low orbit. It adds to "
-            "`[sky] observer_velocity_km_s`, which is then that of the origin of Basilisk's frame."
-        ),
-    ] = True
-    curve_secret_key: Annotated[
-        str | None, Meta(description="ZeroMQ: the file of hilstar's own secret key.", extra={"default": "none"})
-    ] = None
-    curve_server_key: Annotated[
-        str | None,
-        Meta(
-            description="ZeroMQ: the file of the binding side's public key, when hilstar connects.", extra={"default": "none"}
-        ),
-    ] = None
-    allowed_clients: Annotated[
-        str | None,
-        Meta(
-            description="ZeroMQ: the directory with the public keys that may connect, when hilstar binds.",
-            extra={"default": "none"},
-        ),
-    ] = None
-    port: Annotated[
-        str | int,
-        Meta(
-            description='Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none.',
-            extra={"default": "none; required for serial"},
-        ),
-    ] = ""
-    baud: Annotated[int, Meta(ge=1, le=12_000_000, description="Serial: the speed, 8N1.")] = 115_200
-    status_hz: Annotated[
-        float, Meta(ge=0, le=1000, description="Serial and UDP: status packets sent back to the sender per second; 0 for none.")
-    ] = 10.0
-    time_requests: Annotated[
-        bool,
-        Meta(
-            description="Serial and UDP: ask the sender for its time. A sender that does not answer is followed by its packets "
-            "alone."
-        ),
-    ] = True
-    clock: Annotated[
-        Literal["estimated", "shared", "unix"],
-        Meta(
-            description='`"estimated"`: the offset of the sender\'s clock is estimated. `"shared"`: the sender runs on this '
-            "machine and `t_ns` is its CLOCK_MONOTONIC; nothing is estimated, and latency is absolute. "
-            '`"unix"`: `t_ns` is Unix time of a machine that PTP or NTP disciplines, as this one; the offset is that of this '
-            "machine's own clock, with the error that its kernel states."
-        ),
-    ] = "estimated"
-    stale_after_ms: Annotated[
-        NotNegative,
-        Meta(description="The age at which an attitude counts as stale; below half of that it counts as fresh again."),
-    ] = 250.0
-    max_extrapolation_ms: Annotated[
-        NotNegative,
-        Meta(
-            description="How long the rate of the newest sample carries the attitude on; after that the attitude stands still."
-        ),
-    ] = 250.0
-    on_stale: Annotated[
-        Literal["hold", "blank"],
-        Meta(description='What is shown while the attitude is stale. `"hold"`: the last attitude. `"blank"`: no stars.'),
-    ] = "hold"
-    max_rate_deg_s: Annotated[
-        float,
-        Meta(
-            ge=1e-3,
-            le=1e9,
-            description="A packet or a log entry with a faster rate is refused (reason `rate`; rates in packets are rad/s), "
-            "and two samples that would need a faster turn between them are a jump, never a turn.",
-        ),
-    ] = 60.0
-    prediction: Annotated[
-        Literal["rate", "auto"],
-        Meta(
-            description='How the newest attitude is carried on to the moment of light. `"rate"`: by its rate, which is exact '
-            'for a steady turn and amplifies jitter from about 0.3 / age on (15 Hz at 20 ms). `"auto"`: a steady turn as '
-            "before, and of the jitter as much as the last second's samples show to go on "
-            "([On time](on-time.md#prediction-and-jitter))."
-        ),
-    ] = "rate"
-    check_rates: Annotated[
-        Literal["use-quaternions", "warn", "off"],
-        Meta(
-            description="Rates that are not those of the packets' own quaternions (in deg/s, of the wrong sign, axes or frame, "
-            'or zero) are reported (`rates-wrong`). `"use-quaternions"`: and the sky is drawn by the quaternions\' own turn '
-            'until the rates are right. `"warn"`: they are used all the same. `"off"`: nothing is compared. At rest nothing '
-            "can be told. A log's rates are used only where they fit its attitudes."
-        ),
-    ] = "use-quaternions"
+    #: `"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet or JSON in each
+    #: datagram. `"vizard"`: Basilisk's Vizard stream, and `"42"`: the text stream of NASA's 42; their attitude is the body's
+    #: (`[tracker] q_body_to_cam`). `"scpi"`: `SKY:ATT` and `SKY:RATE` of a test stand (`hilstar serve --scpi`), with no other
+    #: key of a source.
+    source: Literal["zmq", "serial", "udp", "vizard", "42", "scpi"] = "zmq"
+    #: ZeroMQ and Vizard: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`, where HOST is an IPv4 address,
+    #: an IPv6 address in brackets, or a name (when hilstar binds also `*`, and PORT may be `*` for a free one, which is then
+    #: reported), or `ipc:///WHOLE/PATH`. Basilisk has no keys: its endpoint is on this machine. UDP: `udp://ADDRESS:PORT`,
+    #: another way to write `bind`. 42: where its socket is, when it is the server. Default: `tcp://127.0.0.1:5560`; of Vizard
+    #: `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`; of 42 `tcp://127.0.0.1:10001`
+    endpoint: str | None = None
+    #: ZeroMQ, Vizard and 42: `true` when hilstar binds and the sender connects. UDP: the address and port listened on,
+    #: `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported). Default: `false`; `true` in
+    #: lockstep; `"127.0.0.1:5560"` over UDP
+    bind: bool | str | None = None
+    #: UDP, and 42 where hilstar binds: who may send: addresses and networks, such as `["192.168.1.20", "fd00::/64"]`. What
+    #: others send is counted, and never answered. Default: this machine; required where `bind` is not loopback
+    allow: Annotated[tuple[str, ...], Meta(extra={"form": '["ADDRESS", ...]'})] = ()
+    #: ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one reply, at whatever speed the
+    #: sender has. Vizard: `true` for Basilisk's live stream instead of its broadcast; hilstar stands in Vizard's place, and
+    #: Basilisk's cameras get pictures of the virtual tracker. 42: `true` to acknowledge each message once its frame is out, so
+    #: that 42 may run as fast as it can.
+    lockstep: bool = False
+    #: Vizard: the name of the spacecraft that carries the tracker. 42: its number, such as `"SC[0]"`. Default: the only one
+    #: that is there; `"SC[0]"`
+    spacecraft: str | int | None = None
+    #: Vizard: `true` when the spacecraft's velocity aberrates the stars: 5 arcsec in low orbit. It adds to `[sky]
+    #: observer_velocity_km_s`, which is then that of the origin of Basilisk's frame.
+    use_velocity: bool = True
+    curve_secret_key: str | None = None  #: ZeroMQ: the file of hilstar's own secret key. Default: none
+    #: ZeroMQ: the file of the binding side's public key, when hilstar connects. Default: none
+    curve_server_key: str | None = None
+    #: ZeroMQ: the directory with the public keys that may connect, when hilstar binds. Default: none
+    allowed_clients: str | None = None
+    #: Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none. Default: none; required for serial
+    port: str | int = ""
+    baud: Annotated[int, Meta(ge=1, le=12_000_000)] = 115_200  #: Serial: the speed, 8N1.
+    #: Serial and UDP: status packets sent back to the sender per second; 0 for none.
+    status_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0
+    #: Serial and UDP: ask the sender for its time. A sender that does not answer is followed by its packets alone.
+    time_requests: bool = True
+    #: `"estimated"`: the offset of the sender's clock is estimated. `"shared"`: the sender runs on this machine and `t_ns` is
+    #: its CLOCK_MONOTONIC; nothing is estimated, and latency is absolute. `"unix"`: `t_ns` is Unix time of a machine that PTP
+    #: or NTP disciplines, as this one; the offset is that of this machine's own clock, with the error that its kernel states.
+    clock: Literal["estimated", "shared", "unix"] = "estimated"
+    #: The age at which an attitude counts as stale; below half of that it counts as fresh again.
+    stale_after_ms: NotNegative = 250.0
+    #: How long the rate of the newest sample carries the attitude on; after that the attitude stands still.
+    max_extrapolation_ms: NotNegative = 250.0
+    #: What is shown while the attitude is stale. `"hold"`: the last attitude. `"blank"`: no stars.
+    on_stale: Literal["hold", "blank"] = "hold"
+    #: A packet or a log entry with a faster rate is refused (reason `rate`; rates in packets are rad/s), and two samples that
+    #: would need a faster turn between them are a jump, never a turn.
+    max_rate_deg_s: Annotated[float, Meta(ge=1e-3, le=1e9)] = 60.0
+    #: How the newest attitude is carried on to the moment of light. `"rate"`: by its rate, which is exact for a steady turn and
+    #: amplifies jitter from about 0.3 / age on (15 Hz at 20 ms). `"auto"`: a steady turn as before, and of the jitter as much
+    #: as the last second's samples show to go on ([On time](on-time.md#prediction-and-jitter)).
+    prediction: Literal["rate", "auto"] = "rate"
+    #: Rates that are not those of the packets' own quaternions (in deg/s, of the wrong sign, axes or frame, or zero) are
+    #: reported (`rates-wrong`). `"use-quaternions"`: and the sky is drawn by the quaternions' own turn until the rates are
+    #: right. `"warn"`: they are used all the same. `"off"`: nothing is compared. At rest nothing can be told. A log's rates are
+    #: used only where they fit its attitudes.
+    check_rates: Literal["use-quaternions", "warn", "off"] = "use-quaternions"
 
     @property
     def address(self) -> str:
@@ -238,28 +149,13 @@ def nasa42_road(settings: AttitudeSettings) -> tuple[int, AllowedSenders]:
 
 
 class FaultSettings(Table, frozen=True):
-    """Where faults come from beside a scenario file: a second ZeroMQ stream, of JSON (see [faults](faults.md)).
+    """Where faults come from beside a scenario file: a second ZeroMQ stream, of JSON (see [faults](faults.md))."""
 
-    As with the attitude, an endpoint that is not loopback is refused without CURVE keys (`hilstar keys`).
-    """
-
-    endpoint: Annotated[
-        str | None,
-        Meta(
-            description="The address to which hilstar's SUB socket connects, as in `[attitude]`: `tcp://HOST:PORT` or "
-            "`ipc:///WHOLE/PATH`. Without it there is no stream of faults.",
-            extra={"default": "none"},
-        ),
-    ] = None
-    bind: Annotated[bool, Meta(description="`true` when hilstar binds and the senders connect.")] = False
-    curve_secret_key: Annotated[
-        str | None, Meta(description="The file of this side's secret key.", extra={"default": "none"})
-    ] = None
-    curve_server_key: Annotated[
-        str | None,
-        Meta(description="The file of the binding side's public key, when hilstar connects.", extra={"default": "none"}),
-    ] = None
-    allowed_clients: Annotated[
-        str | None,
-        Meta(description="The directory with the public keys that may connect, when hilstar binds.", extra={"default": "none"}),
-    ] = None
+    #: The address to which hilstar's SUB socket connects, as in `[attitude]`: `tcp://HOST:PORT` or `ipc:///WHOLE/PATH`. Without
+    #: it there is no stream of faults. Default: none
+    endpoint: str | None = None
+    bind: bool = False  #: `true` when hilstar binds and the senders connect.
+    curve_secret_key: str | None = None  #: The file of this side's secret key. Default: none
+    curve_server_key: str | None = None  #: The file of the binding side's public key, when hilstar connects. Default: none
+    #: The directory with the public keys that may connect, when hilstar binds. Default: none
+    allowed_clients: str | None = None

@@ -11,19 +11,10 @@ import numpy as np
 
 from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.bench.config import hardware
 from hilstar.bench.config.answers import AnswersSettings, check_answers
 from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
 from hilstar.bench.config.certify import CertifySettings
-from hilstar.bench.config.hardware import (
-    Collimator,
-    Monitor,
-    SyncSettings,
-    Tracker,
-    Verify,
-    check_channels,
-    check_primaries,
-    check_sync,
-)
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES, RenderSettings
 from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SiteSettings, SkySettings, SpacecraftSettings
 from hilstar.errors import InputError, shortened
@@ -45,16 +36,16 @@ HEADS = "heads"  # the key of a file that names bench files (see `HeadsFile`)
 class BenchConfig(Table, frozen=True):
     """A whole bench file."""
 
-    tracker: Tracker
-    monitor: Monitor
-    collimator: Collimator
+    tracker: hardware.Tracker
+    monitor: hardware.Monitor
+    collimator: hardware.Collimator
     sky: SkySettings = msgspec.field(default_factory=SkySettings)
     spacecraft: SpacecraftSettings = msgspec.field(default_factory=SpacecraftSettings)
     attitude: AttitudeSettings = msgspec.field(default_factory=AttitudeSettings)
     render: RenderSettings = msgspec.field(default_factory=RenderSettings)
     background: Background = msgspec.field(default_factory=Background)
-    verify: Verify = msgspec.field(default_factory=Verify)
-    sync: SyncSettings = msgspec.field(default_factory=SyncSettings)
+    verify: hardware.Verify = msgspec.field(default_factory=hardware.Verify)
+    sync: hardware.SyncSettings = msgspec.field(default_factory=hardware.SyncSettings)
     faults: FaultSettings = msgspec.field(default_factory=FaultSettings)
     certify: CertifySettings = msgspec.field(default_factory=CertifySettings)
     answers: AnswersSettings | None = None
@@ -224,7 +215,6 @@ def _check_finite(value: Any, where: str = "") -> None:
 
 
 def _check_meaning(config: BenchConfig) -> None:
-    """Refuse (InputError) values that contradict each other."""
     for where, q in (
         ("[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon),
         ("[tracker] q_body_to_cam", config.tracker.q_body_to_cam),
@@ -246,10 +236,10 @@ def _check_meaning(config: BenchConfig) -> None:
         raise InputError(f"[verify] true_geometry takes the place of {beside}; leave one of them out")
     if faults.endpoint is not None and faults.endpoint == config.attitude.address:
         raise InputError(f"[faults] endpoint = {faults.endpoint}: the attitude comes from there; write another port")
-    check_channels(config.tracker)
-    check_primaries(config.monitor.primaries)
+    hardware.check_channels(config.tracker)
+    hardware.check_primaries(config.monitor.primaries)
     _check_colour(config)
-    check_sync(config.sync, config.tracker, config.monitor, config.attitude)
+    hardware.check_sync(config.sync, config.tracker, config.monitor, config.attitude)
     try:
         check_road(config.attitude)
     except InputError as error:
@@ -281,7 +271,6 @@ def _check_answers(config: BenchConfig) -> None:
 
 
 def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
-    """Refuse (InputError) a sky that lacks a date, a place or a velocity, or has two of them."""
     sky, background, attitude = config.sky, config.background, config.attitude
     room_km_s = MAX_SPEED_KM_S if attitude.source == "vizard" else 0.0
     if math.hypot(*sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
@@ -312,7 +301,6 @@ def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:
 
 
 def _check_site(config: BenchConfig) -> None:
-    """Refuse (InputError) a place on the ground that is to be in orbit too."""
     if config.site is None:
         return
     if config.spacecraft.orbit is not None or config.sky.bodies.earth:
@@ -326,7 +314,6 @@ def _check_site(config: BenchConfig) -> None:
 
 
 def _check_orbit(config: BenchConfig) -> None:
-    """Refuse (InputError) a place that nobody gives, two velocities, and the Earth from its own centre."""
     attitude, orbit = config.attitude, config.spacecraft.orbit
     if config.sky.bodies.earth and orbit in {None, GEOCENTRE}:
         raise InputError(

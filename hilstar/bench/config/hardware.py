@@ -14,12 +14,9 @@ from hilstar.toml_tables import Table
 from hilstar.tracker.settings import DetectorSettings, PixelPitch
 
 MS_PER_S = 1000.0
-ONE_PERIOD = {"default": "one refresh period"}
 NETWORK_PORT = "rfc2217://"
 ROUNDING = 1e-6  # relative: 0.1 s at 10 Hz is one exposure after the other
 QUANTUM_EFFICIENCY = "quantum_efficiency"
-ONE_CHANNEL = {"default": "one channel"}
-AS_ASSUMED = {"default": "as the bench assumes"}
 
 
 GAUSSIAN = "gaussian"
@@ -45,43 +42,25 @@ Offset = tuple[Annotated[float, Meta(ge=-1, le=1)], Annotated[float, Meta(ge=-1,
 
 
 class TrackerOptics(Table, frozen=True):
-    """How the tracker's lens spreads a star over the detector.
+    """How the tracker's lens spreads a star over the detector."""
 
-    The file's first image has odd sides, x right and y down, its first row on top, and the chief ray in its middle, where it
-    stays: with coma a star's centroid lies beside its place. hilstar integrates the pixel. Give at least 1.2 samples a sigma,
-    and all of the light: a star's pixels sum to its rate, whatever lies outside ([errors](where-it-fails.md#the-light)). Large
-    discs are spread by the Gaussian nearest to it.
-    """
-
-    psf: Annotated[
-        str,
-        Meta(
-            description='`"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file. That of '
-            "[`hilstar optics`](optics.md) has point spread functions over field, wavelength and focus. Or it has one image of "
-            "the point spread function, the same all over the field and for all colours. Its header has `OVERSAMP`, samples a "
-            "tracker pixel (1 where it is missing), and `PIXINT`, whether the pixel is integrated (F where it is missing)."
-        ),
-    ] = GAUSSIAN
-    focus_um: Annotated[
-        float, Meta(ge=-1e6, le=1e6, description="Where the detector stands along the axis, as the file of `psf` counts it.")
-    ] = 0.0
-    temperature_k: Annotated[float, Meta(ge=50, le=500, description="Temperature of the lens.")] = LENS_K
-    reference_temperature_k: Annotated[
-        float, Meta(ge=50, le=500, description="Temperature at which `focus_um` and `focal_length_mm` hold.")
-    ] = LENS_K
-    focus_um_per_k: Annotated[
-        float, Meta(ge=-1e4, le=1e4, description="What each kelvin above that adds to `focus_um`; needs a file of `psf`.")
-    ] = 0.0
-    focal_length_ppm_per_k: Annotated[
-        float, Meta(ge=-1e4, le=1e4, description="What each kelvin above that adds to the focal length, in millionths.")
-    ] = 0.0
-    decentre_x_um: Annotated[
-        float,
-        Meta(
-            ge=-1e4, le=1e4, description="How far the lens stands to the right of its place: principal point and PSFs with it."
-        ),
-    ] = 0.0
-    decentre_y_um: Annotated[float, Meta(ge=-1e4, le=1e4, description="The same, down.")] = 0.0
+    #: `"gaussian"`, of `[tracker] psf_sigma_px`, or the path of a FITS file. That of [`hilstar optics`](optics.md) has point
+    #: spread functions over field, wavelength and focus. Or it has one image of the point spread function, the same all over
+    #: the field and for all colours. Its header has `OVERSAMP`, samples a tracker pixel (1 where it is missing), and `PIXINT`,
+    #: whether the pixel is integrated (F where it is missing).
+    psf: str = GAUSSIAN
+    #: Where the detector stands along the axis, as the file of `psf` counts it.
+    focus_um: Annotated[float, Meta(ge=-1e6, le=1e6)] = 0.0
+    temperature_k: Annotated[float, Meta(ge=50, le=500)] = LENS_K  #: Temperature of the lens.
+    #: Temperature at which `focus_um` and `focal_length_mm` hold.
+    reference_temperature_k: Annotated[float, Meta(ge=50, le=500)] = LENS_K
+    #: What each kelvin above that adds to `focus_um`; needs a file of `psf`.
+    focus_um_per_k: Annotated[float, Meta(ge=-1e4, le=1e4)] = 0.0
+    #: What each kelvin above that adds to the focal length, in millionths.
+    focal_length_ppm_per_k: Annotated[float, Meta(ge=-1e4, le=1e4)] = 0.0
+    #: How far the lens stands to the right of its place: principal point and PSFs with it.
+    decentre_x_um: Annotated[float, Meta(ge=-1e4, le=1e4)] = 0.0
+    decentre_y_um: Annotated[float, Meta(ge=-1e4, le=1e4)] = 0.0  #: The same, down.
 
     @property
     def warmer_k(self) -> float:
@@ -90,102 +69,46 @@ class TrackerOptics(Table, frozen=True):
 
 
 class Tracker(Table, frozen=True):
-    """The star tracker under test.
+    """The star tracker under test."""
 
-    Its aperture, quantum efficiency and transmission turn a star's light into electrons. Focal length, pixels, exposure,
-    point spread function and detector describe the *virtual* tracker of `simulate` and `verify`; the display adds nothing of
-    them, because the real tracker brings its own.
-
-    A curve (`quantum_efficiency`, `transmission`) is interpolated linearly between its points and is zero outside them. Where
-    both curves are plain numbers, light from 300 to 1100 nm counts.
-
-    A tracker that tells colours apart has `quantum_efficiency_r`, `_g` and `_b` in place of `quantum_efficiency`. Then
-    `hilstar frame -o` writes the linear image as a cube of three channels, and a bench's full scale and magnitudes are those of
-    all channels together. Each pixel of the virtual tracker has its own colour, by `[tracker.detector] bayer`; without that,
-    it adds up its channels, and says so.
-    """
-
-    aperture_mm: Annotated[Positive, Meta(description="Diameter of the entrance pupil.")]
-    focal_length_mm: Annotated[Positive, Meta(description="Focal length of the tracker's lens.")]
-    pixel_pitch_um: Annotated[PixelPitch, Meta(description="Distance between the centres of adjacent pixels.")]
-    resolution_px: Annotated[Size, Meta(description="Size of the detector.")]
-    quantum_efficiency: Annotated[
-        str | float | None,
-        Meta(
-            description='`"ccd47-20"` (back-illuminated, as measured), `"kai-4021"` (approximate), the path of a CSV file with '
-            "the header `wavelength_nm,value`, or one number for all wavelengths.",
-            extra={"default": "**required**, or the next three"},
-        ),
-    ] = None
-    quantum_efficiency_r: Annotated[
-        str | float | None, Meta(description="The same of the red channel alone.", extra=ONE_CHANNEL)
-    ] = None
-    quantum_efficiency_g: Annotated[str | float | None, Meta(description="Of the green channel.", extra=ONE_CHANNEL)] = None
-    quantum_efficiency_b: Annotated[str | float | None, Meta(description="Of the blue channel.", extra=ONE_CHANNEL)] = None
-    transmission: Annotated[
-        str | float,
-        Meta(
-            description='Of the tracker\'s optics: `"n-bk7-10mm"` (10 mm of uncoated glass), the path of a CSV file as above, '
-            "or one number."
-        ),
-    ] = 1.0
-    exposure_s: Annotated[NotNegative, Meta(description="Exposure time.")] = 0.1
-    frame_hz: Annotated[
-        Frequency | None,
-        Meta(
-            description="How many exposures the tracker takes in a second: with `refresh_hz` it makes the period of their beat "
-            "(see [sync](#sync)).",
-            extra={"default": "one exposure after the other"},
-        ),
-    ] = None
-    trigger: Annotated[
-        Literal["free", "external"],
-        Meta(
-            description='`"free"`: the tracker exposes by its own clock. `"external"`: each exposure begins with a frame of '
-            "the monitor (see [sync](#sync)): nothing beats."
-        ),
-    ] = "free"
-    psf_sigma_px: Annotated[
-        Sigma,
-        Meta(
-            description="Gaussian sigma of the tracker's own point spread function, in tracker pixels; not used where "
-            "`[tracker.optics] psf` names a file. It never widens the stars on the monitor."
-        ),
-    ] = DEFAULT_PSF_SIGMA_PX
-    principal_point_px: Annotated[
-        Point | None,
-        Meta(
-            description="Where the boresight meets the detector, in tracker pixels.",
-            extra={"default": "the middle of the detector"},
-        ),
-    ] = None
-    distortion: Annotated[
-        str | None,
-        Meta(
-            description="The path of the tracker's flight model: a TOML file with the Brown-Conrady coefficients `k1`, `k2`, "
-            "`k3`, `p1` and `p2` of tangents of field angles, from direction to pixel; those not given are 0.",
-            extra={"default": "an ideal lens"},
-        ),
-    ] = None
-    q_body_to_cam: Annotated[
-        Rotation | None,
-        Meta(
-            description="How the tracker sits in the spacecraft: turns body components into camera components. Applied to each "
-            "source whose attitude is the body's (see [attitude in](attitude-in.md)); packets, JSON and CSV hold the camera's.",
-            extra={"default": "the body's axes, with a notice"},
-        ),
-    ] = None
-    effort: Annotated[
-        Literal["full", "auto"],
-        Meta(
-            description='`"auto"`: of the point spread functions of `[tracker.optics] psf` as few as keep flux and centroid of '
-            'a star within the next two, a Gaussian first; a notice says which. `"full"`: all of the file.'
-        ),
-    ] = "full"
-    tolerance_mag: Annotated[Positive, Meta(description='Flux error that a star may then have, for `effort = "auto"`.')] = 0.02
-    tolerance_px: Annotated[Positive, Meta(description="Centroid error that it may have, in tracker pixels.")] = 0.02
-    optics: Annotated[TrackerOptics, Meta(description="See below.")] = msgspec.field(default_factory=TrackerOptics)
-    detector: Annotated[DetectorSettings, Meta(description="See below.")] = msgspec.field(default_factory=DetectorSettings)
+    aperture_mm: Positive  #: Diameter of the entrance pupil.
+    focal_length_mm: Positive  #: Focal length of the tracker's lens.
+    pixel_pitch_um: PixelPitch  #: Distance between the centres of adjacent pixels.
+    resolution_px: Size  #: Size of the detector.
+    #: `"ccd47-20"` (back-illuminated, as measured), `"kai-4021"` (approximate), the path of a CSV file with the header
+    #: `wavelength_nm,value`, or one number for all wavelengths. Default: **required**, or the next three
+    quantum_efficiency: str | float | None = None
+    quantum_efficiency_r: str | float | None = None  #: The same of the red channel alone. Default: one channel
+    quantum_efficiency_g: str | float | None = None  #: Of the green channel. Default: one channel
+    quantum_efficiency_b: str | float | None = None  #: Of the blue channel. Default: one channel
+    #: Of the tracker's optics: `"n-bk7-10mm"` (10 mm of uncoated glass), the path of a CSV file as above, or one number.
+    transmission: str | float = 1.0
+    exposure_s: NotNegative = 0.1  #: Exposure time.
+    #: How many exposures the tracker takes in a second: with `refresh_hz` it makes the period of their beat (see
+    #: [sync](#sync)). Default: one exposure after the other
+    frame_hz: Frequency | None = None
+    #: `"free"`: the tracker exposes by its own clock. `"external"`: each exposure begins with a frame of the monitor (see
+    #: [sync](#sync)): nothing beats.
+    trigger: Literal["free", "external"] = "free"
+    #: Gaussian sigma of the tracker's own point spread function, in tracker pixels; not used where `[tracker.optics] psf` names
+    #: a file. It never widens the stars on the monitor.
+    psf_sigma_px: Sigma = DEFAULT_PSF_SIGMA_PX
+    #: Where the boresight meets the detector, in tracker pixels. Default: the middle of the detector
+    principal_point_px: Point | None = None
+    #: The path of the tracker's flight model: a TOML file with the Brown-Conrady coefficients `k1`, `k2`, `k3`, `p1` and `p2`
+    #: of tangents of field angles, from direction to pixel; those not given are 0. Default: an ideal lens
+    distortion: str | None = None
+    #: How the tracker sits in the spacecraft: turns body components into camera components. Applied to each source whose
+    #: attitude is the body's (see [attitude in](attitude-in.md)); packets, JSON and CSV hold the camera's. Default: the body's
+    #: axes, with a notice
+    q_body_to_cam: Rotation | None = None
+    #: `"auto"`: of the point spread functions of `[tracker.optics] psf` as few as keep flux and centroid of a star within the
+    #: next two, a Gaussian first; a notice says which. `"full"`: all of the file.
+    effort: Literal["full", "auto"] = "full"
+    tolerance_mag: Positive = 0.02  #: Flux error that a star may then have, for `effort = "auto"`.
+    tolerance_px: Positive = 0.02  #: Centroid error that it may have, in tracker pixels.
+    optics: TrackerOptics = msgspec.field(default_factory=TrackerOptics)
+    detector: DetectorSettings = msgspec.field(default_factory=DetectorSettings)
 
     @property
     def quantum_efficiencies(self) -> dict[str, str | float]:
@@ -212,54 +135,25 @@ def check_channels(tracker: Tracker) -> None:
 
 
 class PrimariesSettings(Table, frozen=True):
-    """The light of the monitor's red, green and blue, and where it lies within a pixel.
+    """The light of the monitor's red, green and blue, and where it lies within a pixel."""
 
-    With it `hilstar budget` says how many electrons per second each channel of the tracker has of each primary at full light:
-    all of them together are full scale. The condition number says how much larger an error of the primaries' mixture can be
-    than that of the channels' light. `[render] colour = "star"` mixes each star's light of them ([colour](colour.md)).
-
-    A primary's response is that of its column in the calibration file, or the grey one. Light that one primary's drive adds
-    to another's is part of its spectrum, as measured at full drive.
-    """
-
-    file: Annotated[
-        str | None,
-        Meta(
-            description="The path of a CSV file with the header `wavelength_nm,r,g,b`: the relative spectral power per nm of "
-            "each primary at full drive, all in one unit. Or that of an ArgyllCMS `.ccss` with the display's own samples: its "
-            "primaries are those three of which all others are mixtures.",
-            extra={"default": "not known"},
-        ),
-    ] = None
-    xy_r: Annotated[
-        Chromaticity | None,
-        Meta(
-            description="In place of `file`, with the next two: CIE 1931 x and y of each primary. Its spectrum is a Gaussian "
-            "of about that chromaticity, and all three together are D65: approximate, as every run says.",
-            extra={"default": "by `file`"},
-        ),
-    ] = None
-    xy_g: Annotated[Chromaticity | None, Meta(description="Of green.", extra={"default": "by `file`"})] = None
-    xy_b: Annotated[Chromaticity | None, Meta(description="Of blue.", extra={"default": "by `file`"})] = None
-    width_nm: Annotated[
-        float, Meta(ge=1, le=200, description="Full width at half maximum of each primary that is given by `xy_`.")
-    ] = 30.0
-    layout: Annotated[
-        str,
-        Meta(
-            description='`"white"`: all three have their light in the pixel\'s middle. `"rgb-stripe"`, `"bgr-stripe"`: side by '
-            'side, a third of a pixel apart. `"vertical"`: red above green above blue. A pixel with a fourth subpixel, or that '
-            "shares subpixels, is refused."
-        ),
-    ] = "white"
-    offsets_px: Annotated[
-        tuple[Offset, Offset, Offset] | None,
-        Meta(
-            description="In place of `layout`: where the light of red, green and blue lies, in pixels from the middle, right "
-            "and down on the screen.",
-            extra={"default": "by `layout`", "form": "[[x, y], [x, y], [x, y]]"},
-        ),
-    ] = None
+    #: The path of a CSV file with the header `wavelength_nm,r,g,b`: the relative spectral power per nm of each primary at full
+    #: drive, all in one unit. Or that of an ArgyllCMS `.ccss` with the display's own samples: its primaries are those three of
+    #: which all others are mixtures. Default: not known
+    file: str | None = None
+    #: In place of `file`, with the next two: CIE 1931 x and y of each primary. Its spectrum is a Gaussian of about that
+    #: chromaticity, and all three together are D65: approximate, as every run says. Default: by `file`
+    xy_r: Chromaticity | None = None
+    xy_g: Chromaticity | None = None  #: Of green. Default: by `file`
+    xy_b: Chromaticity | None = None  #: Of blue. Default: by `file`
+    width_nm: Annotated[float, Meta(ge=1, le=200)] = 30.0  #: Full width at half maximum of each primary that is given by `xy_`.
+    #: `"white"`: all three have their light in the pixel's middle. `"rgb-stripe"`, `"bgr-stripe"`: side by side, a third of a
+    #: pixel apart. `"vertical"`: red above green above blue. A pixel with a fourth subpixel, or that shares subpixels, is
+    #: refused.
+    layout: str = "white"
+    #: In place of `layout`: where the light of red, green and blue lies, in pixels from the middle, right and down on the
+    #: screen. Default: by `layout`
+    offsets_px: Annotated[tuple[Offset, Offset, Offset] | None, Meta(extra={"form": "[[x, y], [x, y], [x, y]]"})] = None
 
     @property
     def known(self) -> bool:
@@ -293,83 +187,32 @@ def check_primaries(primaries: PrimariesSettings) -> None:
 
 
 class Monitor(Table, frozen=True):
-    """The screen behind the collimator.
+    """The screen behind the collimator."""
 
-    The window opens for `serve` and `replay` unless `--headless` is given; `--windowed` keeps it on the desktop. At the start
-    120 frames are measured. A display is refused (exit code 3), unless `--force` is given, when its size or refresh rate
-    differs from the bench file, when it has fewer bits, when it is scaled, composited or mirrored by another display, when it
-    drops frames, or when it does not wait for its refresh. So is a monitor that is not the one, or not as it was, when the
-    files of `calibration` and `[collimator] geometry` were measured ([which monitor](first-day.md#which-monitor-this-is)). A
-    display that is unplugged is filled again when it returns.
-
-    Keys in the window: q quit, b blank, space pause, c crosshair, g grid, t next test pattern, h help. Frames whose sky was
-    changed with these keys are counted as `operator`; frames while the window was minimised, covered, moved off its display,
-    or on a display that slept are counted as `hidden`. The status, the ledger's frames and events, and `--json` have both
-    counts, in frames and in seconds.
-
-    A frame is drawn for the moment at which the middle row lights: the buffer swap plus `panel_delay_ms` plus half of
-    `scanout_ms`. A star on another row is drawn where it is when that row lights, and along its path for `hold_ms`.
-
-    To measure `panel_delay_ms`, put a photodiode in front of the square that `photodiode_px` draws, run
-    `serve --ledger RUN.mcap`, and meanwhile `hilstar latency RUN.mcap --diode serial:/dev/ttyACM0@115200 --write BENCH.toml`.
-    The photodiode's device sends a line `1` at each edge from dark to light and `0` at each edge back, or `1,MICROSECONDS`
-    by its own clock. `--edges FILE.csv` takes recorded edges instead (`host_ns,level`, on the host's monotonic clock).
-    """
-
-    resolution_px: Annotated[Size, Meta(description="Size of the screen.")]
-    pixel_pitch_um: Annotated[Positive, Meta(description="Distance between the centres of adjacent pixels.")]
-    refresh_hz: Annotated[float, Meta(ge=0.01, le=1000, description="Refresh rate; headless, the frame rate.")] = 60.0
-    bits: Annotated[int, Meta(ge=1, le=16, description="Bits of a code value.")] = 8
-    calibration: Annotated[
-        str,
-        Meta(
-            description='Light as a function of the code value: `"srgb"`, `"gamma2.2"`, `"lcd-example"` (invented, with a '
-            "black level and vignetting), or the path of a file that `hilstar calibrate photometric` wrote (see "
-            "[CALIBRATION.md](../configs/CALIBRATION.md))."
-        ),
-    ] = "srgb"
-    calibration_valid_days: Annotated[
-        float,
-        Meta(
-            gt=0,
-            le=36500,
-            description="How long the files of `calibration` and `[collimator] geometry` hold: with older ones a screen is "
-            "refused.",
-        ),
-    ] = 180
-    display: Annotated[
-        int | str,
-        Meta(description="Which display the window fills: its index, or a part of its name. `hilstar doctor` lists them."),
-    ] = 0
-    flip_x: Annotated[bool, Meta(description="The optics mirror left and right: the columns of the screen are reversed.")] = (
-        False
-    )
-    flip_y: Annotated[bool, Meta(description="The optics mirror up and down: the rows of the screen are reversed.")] = False
-    rotate_deg: Annotated[Literal[0, 90, 180, 270], Meta(description="Turns the image clockwise on the screen.")] = 0
-    panel_delay_ms: Annotated[
-        NotNegative, Meta(description="From the buffer swap to the light of the first row. `hilstar latency` measures it.")
-    ] = 0.0
-    scanout_ms: Annotated[
-        NotNegative | None,
-        Meta(
-            description="How long the panel takes to light its rows, first to last; 0 where all rows light at once.",
-            extra=ONE_PERIOD,
-        ),
-    ] = None
-    hold_ms: Annotated[
-        NotNegative | None, Meta(description="How long a row stays lit; 0 for a panel that flashes.", extra=ONE_PERIOD)
-    ] = None
-    photodiode_px: Annotated[
-        int, Meta(ge=0, le=1000, description="Side of a square for a photodiode in the lower left corner; 0 for none.")
-    ] = 0
-    photodiode: Annotated[
-        Literal["toggle", "code"],
-        Meta(
-            description='`"toggle"`: the square is white in every other frame. `"code"`: it follows a sequence in which any '
-            "7 consecutive frames identify themselves."
-        ),
-    ] = "toggle"
-    primaries: Annotated[PrimariesSettings, Meta(description="See below.")] = msgspec.field(default_factory=PrimariesSettings)
+    resolution_px: Size  #: Size of the screen.
+    pixel_pitch_um: Positive  #: Distance between the centres of adjacent pixels.
+    refresh_hz: Annotated[float, Meta(ge=0.01, le=1000)] = 60.0  #: Refresh rate; headless, the frame rate.
+    bits: Annotated[int, Meta(ge=1, le=16)] = 8  #: Bits of a code value.
+    #: Light as a function of the code value: `"srgb"`, `"gamma2.2"`, `"lcd-example"` (invented, with a black level and
+    #: vignetting), or the path of a file that `hilstar calibrate photometric` wrote (see
+    #: [CALIBRATION.md](../configs/CALIBRATION.md)).
+    calibration: str = "srgb"
+    #: How long the files of `calibration` and `[collimator] geometry` hold: with older ones a screen is refused.
+    calibration_valid_days: Annotated[float, Meta(gt=0, le=36500)] = 180
+    display: int | str = 0  #: Which display the window fills: its index, or a part of its name. `hilstar doctor` lists them.
+    flip_x: bool = False  #: The optics mirror left and right: the columns of the screen are reversed.
+    flip_y: bool = False  #: The optics mirror up and down: the rows of the screen are reversed.
+    rotate_deg: Literal[0, 90, 180, 270] = 0  #: Turns the image clockwise on the screen.
+    panel_delay_ms: NotNegative = 0.0  #: From the buffer swap to the light of the first row. `hilstar latency` measures it.
+    #: How long the panel takes to light its rows, first to last; 0 where all rows light at once. Default: one refresh period
+    scanout_ms: NotNegative | None = None
+    hold_ms: NotNegative | None = None  #: How long a row stays lit; 0 for a panel that flashes. Default: one refresh period
+    #: Side of a square for a photodiode in the lower left corner; 0 for none.
+    photodiode_px: Annotated[int, Meta(ge=0, le=1000)] = 0
+    #: `"toggle"`: the square is white in every other frame. `"code"`: it follows a sequence in which any 7 consecutive frames
+    #: identify themselves.
+    photodiode: Literal["toggle", "code"] = "toggle"
+    primaries: PrimariesSettings = msgspec.field(default_factory=PrimariesSettings)
 
     @property
     def period_ms(self) -> float:
@@ -390,66 +233,30 @@ class Monitor(Table, frozen=True):
 class Collimator(Table, frozen=True):
     """The lens between monitor and tracker, and the tracker's alignment with it."""
 
-    focal_length_mm: Annotated[Positive, Meta(description="Focal length of the collimating lens.")]
-    q_cam_to_mon: Annotated[
-        Rotation, Meta(description="Misalignment: the unit quaternion that turns cam components into mon components.")
-    ] = (1.0, 0.0, 0.0, 0.0)
-    principal_point_px: Annotated[
-        Point | None,
-        Meta(
-            description="Where the optical axis of the collimator meets the monitor, in monitor pixels.",
-            extra={"default": "the middle of the screen"},
-        ),
-    ] = None
-    psf_sigma_px: Annotated[
-        NotNegative,
-        Meta(description="Gaussian sigma of the collimator's or relay's own blur, in monitor pixels, as the twin sees it."),
-    ] = 0.0
-    geometry: Annotated[
-        str | None,
-        Meta(
-            description="The path of a file that `hilstar calibrate geometric` or `alignment` wrote: the lens and "
-            "the real alignment. It takes the place of the other keys of this table but `psf_sigma_px`.",
-            extra={"default": "an ideal lens"},
-        ),
-    ] = None
+    focal_length_mm: Positive  #: Focal length of the collimating lens.
+    #: Misalignment: the unit quaternion that turns cam components into mon components.
+    q_cam_to_mon: Rotation = (1.0, 0.0, 0.0, 0.0)
+    #: Where the optical axis of the collimator meets the monitor, in monitor pixels. Default: the middle of the screen
+    principal_point_px: Point | None = None
+    #: Gaussian sigma of the collimator's or relay's own blur, in monitor pixels, as the twin sees it.
+    psf_sigma_px: NotNegative = 0.0
+    #: The path of a file that `hilstar calibrate geometric` or `alignment` wrote: the lens and the real alignment. It takes the
+    #: place of the other keys of this table but `psf_sigma_px`. Default: an ideal lens
+    geometry: str | None = None
 
 
 class SyncSettings(Table, frozen=True):
-    """The tracker's exposures and the monitor's refresh: how they beat, and a pulse for a tracker that takes a trigger.
+    """The tracker's exposures and the monitor's refresh: how they beat, and a pulse for a tracker that takes a trigger."""
 
-    An exposure of whole refreshes sees whole frames; of one that is not, the parts at both ends are counted where their frames'
-    middles are, and a star of a turning camera is off by an amount that depends on the phase between the two. A panel that
-    flashes (`[monitor] hold_ms`) is seen at its flashes alone, and whole refreshes cure its light, not its places.
-    `serve`, when it starts, and `first-light` say how much that is where it is over `[render] tolerance_px` or `tolerance_mag`,
-    and the nearest refresh rate and exposure without it.
-
-    With `port`, `serve` and `replay` raise the line RTS of a serial port at each frame: on a screen after its swap, headless at
-    the frame's moment. The host's scheduling and a USB adapter's own time are in the pulse's delay; `--json` has its mean and
-    standard deviation against the frames' time stamps as far as this machine sees them. A line that is lost is tried again and
-    never stops the display. Write `[tracker] trigger = "external"` for a tracker that exposes by it.
-    """
-
-    port: Annotated[
-        str | None,
-        Meta(
-            description='The serial port whose RTS is pulsed, such as `"/dev/ttyUSB0"`, or `"rfc2217://HOST:PORT"`. Not the '
-            "attitude's.",
-            extra={"default": "none"},
-        ),
-    ] = None
-    pulse_ms: Annotated[Positive, Meta(description="Width of the pulse, at least.")] = 1.0
-    active: Annotated[
-        Literal["high", "low"],
-        Meta(
-            description='`"high"`: RTS is set (positive on RS-232) in the pulse and cleared between. `"low"`: the other way '
-            "round. Adapters with TTL levels have their lines inverted: set is 0 V."
-        ),
-    ] = "high"
-    every_frames: Annotated[int, Meta(ge=1, le=1_000_000, description="A pulse at every so many frames.")] = 1
-    turn_deg_s: Annotated[
-        Positive, Meta(description="Rate of turn at which `serve` and `first-light` judge what a beat costs.")
-    ] = 1.0
+    #: The serial port whose RTS is pulsed, such as `"/dev/ttyUSB0"`, or `"rfc2217://HOST:PORT"`. Not the attitude's. Default:
+    #: none
+    port: str | None = None
+    pulse_ms: Positive = 1.0  #: Width of the pulse, at least.
+    #: `"high"`: RTS is set (positive on RS-232) in the pulse and cleared between. `"low"`: the other way round. Adapters with
+    #: TTL levels have their lines inverted: set is 0 V.
+    active: Literal["high", "low"] = "high"
+    every_frames: Annotated[int, Meta(ge=1, le=1_000_000)] = 1  #: A pulse at every so many frames.
+    turn_deg_s: Positive = 1.0  #: Rate of turn at which `serve` and `first-light` judge what a beat costs.
 
 
 def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude: AttitudeSettings) -> None:
@@ -476,84 +283,33 @@ def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude:
 
 class Verify(Table, frozen=True):
     """The digital twin: what `hilstar verify` takes as true where the bench assumes otherwise, and the limits within which
-    the bench passes.
+    the bench passes."""
 
-    The bench draws random attitudes as it believes itself to be; the monitor as it truly is turns the codes into light, and
-    the tracker measures each star without noise. `flux_error_mag` and `centroid_error_px` compare that with the same
-    measurement of the tracker's image of the linear image, so that the errors of the estimator itself (`estimator_floor`,
-    against the catalogue) are not charged to the display.
-
-    A star is **lost** when nothing is found within 3 px of its true place. Counted, but not part of the errors: `blended`
-    (others put more than 2 % of its light into its window), `clipped`, `not_shown` (too faint for the monitor), `at_edge` (of
-    the detector or the monitor). Stars that the tracker cannot part, within 1.5 sigmas of what it sees of a star, are measured
-    as one of the sum at the centre of their light; `summed` counts those added to a brighter one. `codes_alone` is what the
-    codes would cost were everything else as assumed; `noisy` is the same with all of `[tracker.detector]`. `scale_error`,
-    `rotation_arcsec`, `offset_px`, `tilt_deg`, `k1` and `distortion_px` (by the lens, the largest in the field) are those of
-    the smallest model that explains the centroids, true minus assumed; what it does not need is 0. `reasons` names what failed
-    and its likely cause.
-
-    `-o DIR` writes `errors.png`, `field.png` and `stars.csv` (a row per star, with `nan` for the errors of a lost one). The
-    exit code is 0 whatever the verdict; with `--strict` it is 1 when the bench does not pass.
-    """
-
-    true_calibration: Annotated[
-        str | None, Meta(description="The monitor's true light: a built-in name or a calibration file.", extra=AS_ASSUMED)
-    ] = None
-    true_flux_at_white_e_per_s: Annotated[Positive | None, Meta(description="The true full scale.", extra=AS_ASSUMED)] = None
-    true_focal_length_mm: Annotated[
-        Positive | None, Meta(description="The collimator's true focal length.", extra=AS_ASSUMED)
-    ] = None
-    true_pixel_pitch_um: Annotated[Positive | None, Meta(description="The monitor's true pixel pitch.", extra=AS_ASSUMED)] = (
-        None
-    )
-    true_q_cam_to_mon: Annotated[Rotation | None, Meta(description="The true misalignment.", extra=AS_ASSUMED)] = None
-    true_geometry: Annotated[
-        str | None,
-        Meta(
-            description="The true lens and the true alignment: a file as `hilstar calibrate geometric` writes it. Not beside "
-            "`true_focal_length_mm`, `true_pixel_pitch_um` or `true_q_cam_to_mon`, which are of an ideal lens.",
-            extra=AS_ASSUMED,
-        ),
-    ] = None
-    true_mirror: Annotated[
-        Literal["none", "x", "y", "swap"],
-        Meta(
-            description='What the screen truly does: `"none"`, reverses columns (`"x"`), reverses rows (`"y"`), or swaps its '
-            'axes (`"swap"`).'
-        ),
-    ] = "none"
-    centroider: Annotated[
-        Literal["window", "wide", "moment", "fit", "psf", "box3", "box5"] | None,
-        Meta(
-            description='What the tracker finds its stars by: `"window"`, a Gaussian that follows the star and is as wide; '
-            '`"wide"`, one half as wide again; `"moment"`, the plain first moment; `"fit"`, the least squares of a Gaussian; '
-            '`"psf"`, that of the PSF of `[tracker.optics]`, which is `fit` where codes are judged; '
-            '`"box3"` or `"box5"`, the centre of mass of so many pixels a side. '
-            '`quantisation = "auto"` judges codes by it, too.',
-            extra={"default": '`"window"`; to judge codes, all of them'},
-        ),
-    ] = None
-    flux_mag: Annotated[
-        Positive,
-        Meta(
-            description="Limit for the flux error of 95 % of stars, with their common zero point taken out; also the limit of "
-            "that zero point."
-        ),
-    ] = 0.05
-    centroid_px: Annotated[Positive, Meta(description="Limit for the centroid error of 95 % of stars, in tracker pixels.")] = (
-        0.1
-    )
-    lost_share: Annotated[
-        NotNegative,
-        Meta(description="Limit for the share of lost stars among those that stand alone, are shown, and are not clipped."),
-    ] = 0.02
-    black_e_per_s_px: Annotated[
-        NotNegative | None,
-        Meta(
-            description="Limit for the screen's black level in a tracker pixel, seen minus assumed.",
-            extra={"default": "a tenth of the faintest star's light over its disc (4 pi sigma^2)"},
-        ),
-    ] = None
+    #: The monitor's true light: a built-in name or a calibration file. Default: as the bench assumes
+    true_calibration: str | None = None
+    true_flux_at_white_e_per_s: Positive | None = None  #: The true full scale. Default: as the bench assumes
+    true_focal_length_mm: Positive | None = None  #: The collimator's true focal length. Default: as the bench assumes
+    true_pixel_pitch_um: Positive | None = None  #: The monitor's true pixel pitch. Default: as the bench assumes
+    true_q_cam_to_mon: Rotation | None = None  #: The true misalignment. Default: as the bench assumes
+    #: The true lens and the true alignment: a file as `hilstar calibrate geometric` writes it. Not beside
+    #: `true_focal_length_mm`, `true_pixel_pitch_um` or `true_q_cam_to_mon`, which are of an ideal lens. Default: as the bench
+    #: assumes
+    true_geometry: str | None = None
+    #: What the screen truly does: `"none"`, reverses columns (`"x"`), reverses rows (`"y"`), or swaps its axes (`"swap"`).
+    true_mirror: Literal["none", "x", "y", "swap"] = "none"
+    #: What the tracker finds its stars by: `"window"`, a Gaussian that follows the star and is as wide; `"wide"`, one half as
+    #: wide again; `"moment"`, the plain first moment; `"fit"`, the least squares of a Gaussian; `"psf"`, that of the PSF of
+    #: `[tracker.optics]`, which is `fit` where codes are judged; `"box3"` or `"box5"`, the centre of mass of so many pixels a
+    #: side. `quantisation = "auto"` judges codes by it, too. Default: `"window"`; to judge codes, all of them
+    centroider: Literal["window", "wide", "moment", "fit", "psf", "box3", "box5"] | None = None
+    #: Limit for the flux error of 95 % of stars, with their common zero point taken out; also the limit of that zero point.
+    flux_mag: Positive = 0.05
+    centroid_px: Positive = 0.1  #: Limit for the centroid error of 95 % of stars, in tracker pixels.
+    #: Limit for the share of lost stars among those that stand alone, are shown, and are not clipped.
+    lost_share: NotNegative = 0.02
+    #: Limit for the screen's black level in a tracker pixel, seen minus assumed. Default: a tenth of the faintest star's light
+    #: over its disc (4 pi sigma^2)
+    black_e_per_s_px: NotNegative | None = None
 
     @property
     def judge(self) -> Literal["window", "wide", "moment", "fit", "box3", "box5"] | None:

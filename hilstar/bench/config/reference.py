@@ -1,10 +1,16 @@
 """The reference of the bench file, docs/bench-file.md: `python -m hilstar.bench.config.reference` prints it.
 
-All of it comes from the classes of the tables: keys, types, units, limits, defaults and meanings.
+All of it comes from the classes of the tables: keys, types, units, limits and defaults, and their meanings from the comments
+`#:` above or beside each key, which may end in a default in words (`Default: the middle of the screen`). What is to be said
+of a whole table stands in bench-file.md beside this file.
 """
 
+import ast
 import inspect
+import re
+import textwrap
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -12,7 +18,9 @@ from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
 from hilstar.bench.config.bench_config import TYPE_WORDS, BenchConfig
+from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
+from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.toml_tables import plain
 
 # The unit that the end of a key's name says, the longest end first.
@@ -41,41 +49,21 @@ UNITS = {
     "_k": "K",
     "_s": "s",
 }
-
-HEAD = """\
-# Bench file
-
-A bench file is TOML: it describes the star tracker, the monitor and the lens between them, and how hilstar draws. This page
-is generated from the definitions that hilstar reads the file with (`python tools/make_pages.py`).
-
-The shortest file that works:
-
-```toml
-[tracker]
-aperture_mm = 30
-focal_length_mm = 70
-pixel_pitch_um = 13
-resolution_px = [1024, 1024]
-quantum_efficiency = "ccd47-20"
-[monitor]
-resolution_px = [1920, 1080]
-pixel_pitch_um = 57.65
-[collimator]
-focal_length_mm = 350
-```
-
-Every other key has the default shown below. Unknown keys are refused. Paths are relative to the bench file.
-
-**Frames.** `icrs` is the sky. `cam` has +z along the boresight, +x right and +y down in the image. `mon`, the monitor, has the
-same axes. Quaternions are unit, Hamilton, scalar first: `[w, x, y, z]`. Pixel (0, 0) is the centre of the top-left pixel.
-
-**Units** are in the names of the keys.
-"""
+FILLED_IN = {
+    "QUANTISERS": "".join(f'`"{name}"`: {quantiser.words} ' for name, quantiser in QUANTISERS.items()),
+    "MAX_JUDGED_FRAMES": f"{MAX_JUDGED_FRAMES}",
+    "DEFAULT_BRIGHTEST_V_MAG": f"{DEFAULT_BRIGHTEST_V_MAG}",
+}
+WORDS = Path(__file__).with_name("bench-file.md")  # what the page says beside the tables of keys
 
 
 def page() -> str:
     """The whole page."""
-    return "\n".join([HEAD, *(section(name, table) for name, table in tables_of(BenchConfig, ""))])
+    head, *sections = re.split(r"^## `\[(.*)\]`$", WORDS.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    notes = dict(zip(sections[::2], sections[1::2], strict=True))
+    return "\n".join(
+        [f"{head.rstrip()}\n", *(section(name, table, notes.get(name, "")) for name, table in tables_of(BenchConfig, ""))]
+    )
 
 
 def tables_of(table: Any, prefix: str) -> Iterator[tuple[str, Any]]:
@@ -95,29 +83,44 @@ def table_in(hint: Any) -> type[msgspec.Struct] | None:
     return only if isinstance(only, type) and issubclass(only, msgspec.Struct) else None
 
 
-def section(name: str, table: Any) -> str:
+def section(name: str, table: Any, notes: str) -> str:
     """A table of the file: what it is for, its keys, and what else there is to know."""
-    summary, _, notes = (inspect.getdoc(table) or "").partition("\n\n")
-    hints = get_type_hints(table, include_extras=True)
-    rows = [row(field, hints[field.name]) for field in msgspec.structs.fields(table) if table_in(field.type) is None]
-    lines = [f"## `[{name}]`", "", summary, "", "| key | value | default | meaning |", "|---|---|---|---|", *rows, ""]
-    return "\n".join([*lines, notes, ""] if notes else lines)
+    hints, meanings = get_type_hints(table, include_extras=True), meanings_of(table)
+    keys = [field for field in msgspec.structs.fields(table) if table_in(field.type) is None]
+    rows = [row(field, hints[field.name], meanings[field.name]) for field in keys]
+    lines = [f"## `[{name}]`", "", inspect.getdoc(table) or "", "", "| key | value | default | meaning |", "|---|---|---|---|"]
+    return "\n".join([*lines, *rows, "", *([notes.strip(), ""] if notes else [])])
 
 
-def row(field: FieldInfo, hint: Any) -> str:
-    """A key: its name, what it may hold, what it holds otherwise, and what it means."""
-    notes = notes_of(hint)
-    meaning = next(note.description for note in reversed(notes) if note.description)
-    return f"| `{field.name}` | {value_text(field.name, hint)} | {default_text(field, notes)} | {meaning} |"
+def meanings_of(table: type) -> dict[str, str]:
+    """The meaning of each key of a table: the comments `#:` above it and beside it."""
+    source = textwrap.dedent(inspect.getsource(table))
+    lines, meanings, (definition,) = source.splitlines(), {}, ast.parse(source).body
+    for key in definition.body if isinstance(definition, ast.ClassDef) else []:
+        if isinstance(key, ast.AnnAssign) and isinstance(key.target, ast.Name):
+            first = key.lineno - 1
+            while lines[first - 1].lstrip().startswith("#:"):
+                first -= 1
+            told = " ".join(line.partition("#:")[2].strip() for line in lines[first : key.end_lineno] if "#:" in line)
+            for name, words in FILLED_IN.items():
+                told = told.replace(f"{{{name}}}", words)
+            meanings[key.target.id] = told
+    return meanings
+
+
+def row(field: FieldInfo, hint: Any, told: str) -> str:
+    """A key: its name, what it may hold, what it holds otherwise, and what it means by its comment (see `meanings_of`)."""
+    meaning, _, default = told.partition(" Default: ")
+    if field.default is NODEFAULT:
+        default = "**required**"
+    return f"| `{field.name}` | {value_text(field.name, hint)} | {default or f'`{toml(field.default)}`'} | {meaning} |"
 
 
 def notes_of(hint: Any) -> list[Meta]:
     """The notes in the annotations of a type, inner ones first; those of `X | None` are X's too."""
-    if get_origin(hint) is not Annotated:
-        return []
-    inner, *notes = get_args(hint)
-    optional = [choice for choice in get_args(inner) if get_origin(choice) is Annotated] if is_optional(inner) else []
-    return [note for choice in optional for note in notes_of(choice)] + [note for note in notes if isinstance(note, Meta)]
+    kind, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    inner = [note for choice in get_args(kind) if get_origin(choice) is Annotated for note in notes_of(choice)]
+    return (inner if is_optional(kind) else []) + [note for note in notes if isinstance(note, Meta)]
 
 
 def is_optional(kind: Any) -> bool:
@@ -147,14 +150,6 @@ def limits_text(notes: list[Meta]) -> str:
         return ""
     above = "above 0" if low == MIN_POSITIVE else f"{low:g} or more"
     return above if high is None or high >= MAX_NUMBER else f"{low:g} to {high:.12g}"
-
-
-def default_text(field: FieldInfo, notes: list[Meta]) -> str:
-    """The value where the file has no such key."""
-    told = next((note.extra["default"] for note in notes if note.extra and "default" in note.extra), None)
-    if field.default is NODEFAULT:
-        return "**required**"
-    return str(told) if told is not None else f"`{toml(field.default)}`"
 
 
 def toml(value: Any) -> str:

@@ -1,11 +1,11 @@
-"""[render]."""
+"""The table [render]. Words in braces are filled in by reference.py."""
 
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from hilstar.bench.config.values import Magnitude, NotNegative, Positive, Sigma
-from hilstar.monitor.quantisers import QUANTISERS, Quantisation
+from hilstar.monitor.quantisers import Quantisation
 from hilstar.toml_tables import Table
 
 # White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is 100 in the median (38 with
@@ -15,129 +15,54 @@ MAX_JUDGED_FRAMES = 16  # without `cycle_frames`; errors of longer exposures are
 
 
 class RenderSettings(Table, frozen=True):
-    """From electrons to code values.
-
-    Full scale (white) is fixed when the bench is loaded, and no frame changes it. It trades bright stars for faint ones. On
-    8 bits and a field of 18 by 10 degrees (`demo.toml` with `round`), over 200 random fields:
-
-    | `brightest_v_mag` | stars that clip | fields with one | median brightest code | flux error, 95 % | centroid error, 95 % |
-    |---|---|---|---|---|---|
-    | `-2` (full scale is Sirius) | none | none | 38 | 0.41 mag | 0.29 px |
-    | `1.5` | 13 of 25 688 | 8 % | 100 | 0.064 mag | 0.063 px |
-    | `2.5` | 50 | 15 % | 167 | 0.025 mag | 0.022 px |
-
-    A clipped star keeps its place and loses the flux that `hilstar frame` reports; `serve` and `replay` name the stars of the
-    whole sky that clip when they start, and `budget` lists all of them. Where none may clip, write `brightest_v_mag = -2`.
-    Stars too faint to light a pixel are not drawn; `hilstar frame` says how many, and their share of the light.
-    `hilstar study quantisation` shows what each method costs and achieves.
-    """
+    """From electrons to code values."""
 
     # results/tradeoff.csv, quantisation: `exact` is 9 times as right as `round`, which does where a panel has levels enough.
-    quantisation: Annotated[
-        Literal[Quantisation, "auto"],
-        Meta(
-            description="How light becomes codes. "
-            + "".join(f'`"{name}"`: {quantiser.words} ' for name, quantiser in QUANTISERS.items())
-            + '`"auto"`: `round` where that stays within the tolerance, '
-            "else `exact`, unless an average field, turning at 1 deg/s, would take it more than half a refresh and would not "
-            "take `round` as long; `--explain` of `frame`, `serve` and `replay` says which. `serve` and `replay` in real time "
-            "measure that when they start; lockstep and all other commands take the time on two cores without a GPU."
-        ),
-    ] = "auto"
-    codes_ms: Annotated[
-        tuple[Positive, Positive] | None,
-        Meta(
-            description="What a frame of an average field takes by `round` and by `exact`, for `auto` of every command: "
-            "nothing is measured then. `--explain` of a run that measured prints the line to write.",
-            extra={"default": "measured, or tabulated", "form": "[round, exact]"},
-        ),
-    ] = None
-    bit_stealing: Annotated[
-        bool,
-        Meta(
-            description="Lets the codes of r, g and b differ by one: seven times as many levels, weighted as the tracker sees "
-            "the primaries: by `[weights]` of the calibration file. Formulas, such as sRGB, assume Rec. 709's, a photometer's, "
-            "and `serve`, `replay` and `budget` say so."
-        ),
-    ] = False
-    colour: Annotated[
-        Literal["white", "star", "depth"] | None,
-        Meta(
-            description='What the primaries are mixed for. `"white"`: one code for all three. `"star"`: each star\'s light is '
-            "the mixture that is nearest to its own as the tracker sees it: with the same electrons in each channel of three; "
-            "of one channel with the same electrons and the same mean wavelength of those, as far as the primaries reach "
-            '([colour](colour.md)). It needs `[monitor.primaries]`. `"depth"`: as `bit_stealing = true`.',
-            extra={"default": '`"depth"` with `bit_stealing`, else `"star"` with `[tracker.detector] bayer`, else `"white"`'},
-        ),
-    ] = None
-    cycle_frames: Annotated[
-        Annotated[int, Meta(ge=1, le=256)] | None,
-        Meta(
-            description="Frames of the tracker's exposure, by which `budget`, `--explain` and `first-light` judge `temporal`. "
-            "The codes do not depend on it.",
-            extra={"default": f"as many as `exposure_s` has, at most {MAX_JUDGED_FRAMES}"},
-        ),
-    ] = None
-    sprite_sigma_px: Annotated[Sigma, Meta(description="Gaussian sigma of a star on the monitor, in monitor pixels.")] = (
-        0.85,
-        0.85,
-    )
-    psf: Annotated[
-        Literal["gaussian", "tracker"],
-        Meta(
-            description='How a star is drawn: `"gaussian"`, of `sprite_sigma_px`, for a tracker that brings its objective. '
-            '`"tracker"`: by the point spread function of `[tracker.optics]`, for a detector without its objective; the '
-            "virtual tracker before the display has none then. See [real glass](optics.md#the-display)."
-        ),
-    ] = "gaussian"
-    flux_at_white_e_per_s: Annotated[
-        Positive | None,
-        Meta(
-            description="Full scale: the light of one monitor pixel at the white code, in the tracker's electrons per second. "
-            "`hilstar calibrate scale` measures it.",
-            extra={"default": "set by `brightest_v_mag`"},
-        ),
-    ] = None
-    brightest_v_mag: Annotated[
-        Magnitude | None,
-        Meta(
-            description="Full scale, where `flux_at_white_e_per_s` is not given: the peak pixel of the brightest star whose V "
-            "is not below this. Brighter stars clip, and are listed.",
-            extra={"default": f"`{DEFAULT_BRIGHTEST_V_MAG}`"},
-        ),
-    ] = None
-    effort: Annotated[
-        Literal["full", "auto"],
-        Meta(
-            description='`"auto"`: sprites no larger and paths no finer than the tolerance requires; `--explain` of `frame`, '
-            '`serve` and `replay` says what was chosen. `"full"`: no such economy.'
-        ),
-    ] = "full"
-    tolerance_mag: Annotated[
-        Positive,
-        Meta(description='Flux error that a star may have, codes included, for `effort = "auto"` and `quantisation = "auto"`.'),
-    ] = 0.02
-    tolerance_px: Annotated[Positive, Meta(description="Centroid error that a star may have, likewise.")] = 0.02
+    #: How light becomes codes. {QUANTISERS}`"auto"`: `round` where that stays within the tolerance, else `exact`, unless an
+    #: average field, turning at 1 deg/s, would take it more than half a refresh and would not take `round` as long; `--explain`
+    #: of `frame`, `serve` and `replay` says which. `serve` and `replay` in real time measure that when they start; lockstep and
+    #: all other commands take the time on two cores without a GPU.
+    quantisation: Literal[Quantisation, "auto"] = "auto"
+    #: What a frame of an average field takes by `round` and by `exact`, for `auto` of every command: nothing is measured then.
+    #: `--explain` of a run that measured prints the line to write. Default: measured, or tabulated
+    codes_ms: Annotated[tuple[Positive, Positive] | None, Meta(extra={"form": "[round, exact]"})] = None
+    #: Lets the codes of r, g and b differ by one: seven times as many levels, weighted as the tracker sees the primaries: by
+    #: `[weights]` of the calibration file. Formulas, such as sRGB, assume Rec. 709's, a photometer's, and `serve`, `replay` and
+    #: `budget` say so.
+    bit_stealing: bool = False
+    #: What the primaries are mixed for. `"white"`: one code for all three. `"star"`: each star's light is the mixture that is
+    #: nearest to its own as the tracker sees it: with the same electrons in each channel of three; of one channel with the same
+    #: electrons and the same mean wavelength of those, as far as the primaries reach ([colour](colour.md)). It needs
+    #: `[monitor.primaries]`. `"depth"`: as `bit_stealing = true`. Default: `"depth"` with `bit_stealing`, else `"star"` with
+    #: `[tracker.detector] bayer`, else `"white"`
+    colour: Literal["white", "star", "depth"] | None = None
+    #: Frames of the tracker's exposure, by which `budget`, `--explain` and `first-light` judge `temporal`. The codes do not
+    #: depend on it. Default: as many as `exposure_s` has, at most {MAX_JUDGED_FRAMES}
+    cycle_frames: Annotated[int, Meta(ge=1, le=256)] | None = None
+    sprite_sigma_px: Sigma = (0.85, 0.85)  #: Gaussian sigma of a star on the monitor, in monitor pixels.
+    #: How a star is drawn: `"gaussian"`, of `sprite_sigma_px`, for a tracker that brings its objective. `"tracker"`: by the
+    #: point spread function of `[tracker.optics]`, for a detector without its objective; the virtual tracker before the display
+    #: has none then. See [real glass](optics.md#the-display).
+    psf: Literal["gaussian", "tracker"] = "gaussian"
+    #: Full scale: the light of one monitor pixel at the white code, in the tracker's electrons per second. `hilstar calibrate
+    #: scale` measures it. Default: set by `brightest_v_mag`
+    flux_at_white_e_per_s: Positive | None = None
+    #: Full scale, where `flux_at_white_e_per_s` is not given: the peak pixel of the brightest star whose V is not below this.
+    #: Brighter stars clip, and are listed. Default: `{DEFAULT_BRIGHTEST_V_MAG}`
+    brightest_v_mag: Magnitude | None = None
+    #: `"auto"`: sprites no larger and paths no finer than the tolerance requires; `--explain` of `frame`, `serve` and `replay`
+    #: says what was chosen. `"full"`: no such economy.
+    effort: Literal["full", "auto"] = "full"
+    #: Flux error that a star may have, codes included, for `effort = "auto"` and `quantisation = "auto"`.
+    tolerance_mag: Positive = 0.02
+    tolerance_px: Positive = 0.02  #: Centroid error that a star may have, likewise.
     # results/timing.csv: 69 arcsec at 2 deg/s without, 0.1 with it.
-    motion: Annotated[
-        Literal["auto", "on", "off"],
-        Meta(
-            description='Whether stars are drawn along their paths, each row at its own moment. `"auto"`: on a screen only. '
-            '`"on"`: headless too. `"off"`: never.'
-        ),
-    ] = "auto"
-    motion_above_px: Annotated[
-        NotNegative,
-        Meta(
-            description="Stars that move less than this, from the light of the middle row to the end of the frame's light, are "
-            "drawn as points at one moment."
-        ),
-    ] = 0.01
-    gpu: Annotated[
-        Annotated[int, Meta(ge=0)] | str | None,
-        Meta(
-            description="Which GPU draws headless frames: its index in EGL's list, or a part of its name. `hilstar doctor` "
-            "lists them. A window is drawn by its display's GPU.",
-            extra={"default": "the first of EGL's list"},
-        ),
-    ] = None
+    #: Whether stars are drawn along their paths, each row at its own moment. `"auto"`: on a screen only. `"on"`: headless too.
+    #: `"off"`: never.
+    motion: Literal["auto", "on", "off"] = "auto"
+    #: Stars that move less than this, from the light of the middle row to the end of the frame's light, are drawn as points at
+    #: one moment.
+    motion_above_px: NotNegative = 0.01
+    #: Which GPU draws headless frames: its index in EGL's list, or a part of its name. `hilstar doctor` lists them. A window is
+    #: drawn by its display's GPU. Default: the first of EGL's list
+    gpu: Annotated[int, Meta(ge=0)] | str | None = None

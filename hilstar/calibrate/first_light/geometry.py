@@ -12,9 +12,16 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.calibrate.effective_psf import dots_of_image, draw_effective, fit_effective
-from hilstar.calibrate.first_light.context import DarkSubtracted, StepContext
+from hilstar.calibrate.first_light.context import (
+    DarkSubtracted,
+    Figure,
+    KeyChange,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    with_changes,
+)
 from hilstar.calibrate.first_light.image_sources import Pattern, black
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, with_changes
 from hilstar.calibrate.geometric.calibration import calibrate_files, notes_for_a_person, parameters_of, write_calibrated
 from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, dot_image, plan_dots, write_plan
 from hilstar.charts import DARK, ORANGE, TEXT_PT, chart
@@ -259,8 +266,8 @@ def orientation(context: StepContext) -> StepOutcome:
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
     first, measured = _way(context, "figure_000")
     after = corrected(before, first)
-    pairs = [(key, getattr(before, key), getattr(after, key)) for key in ("flip_x", "flip_y", "rotate_deg")]
-    changes = tuple(KeyChange(table="monitor", key=key, before=old, after=new) for key, old, new in pairs if old != new)
+    keys = ("flip_x", "flip_y", "rotate_deg")
+    changes = tuple(change for key in keys for change in context.change("monitor", key, getattr(after, key)))
     if (before.rotate_deg - after.rotate_deg) % 180:
         width, height = monitor.resolution_px
         changes += (KeyChange(table="monitor", key="resolution_px", before=[width, height], after=[height, width]),)

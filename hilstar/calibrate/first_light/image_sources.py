@@ -21,14 +21,14 @@ from msgspec.structs import replace
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import open_bench, orientation_of
+from hilstar.bench.build import calibration_source, open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.bench.measured_on import check_monitor
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.files import written
-from hilstar.monitor.calibration import BUILT_IN, primary_lights
+from hilstar.monitor.calibration import primary_lights
 from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.window.this_monitor import identity_here
 from hilstar.process.closing import Closing
@@ -314,7 +314,6 @@ class _ShownHere(ImageSource):
         self.forced = self._display.forced
 
     def find_monitor(self, file: BenchFile, today: datetime.date, *, force: bool) -> None:
-        """Compare the display's monitor with the one of the bench's files; nothing where a command shows the patterns."""
         if self._shows:
             return
         self._display.force = force
@@ -324,19 +323,15 @@ class _ShownHere(ImageSource):
         self._display.forced += found.told(log)
 
     def gate(self, file: BenchFile) -> Timing | None:
-        """The display's timing."""
         return None if self._shows else self._display.gate(file)
 
     def unlit(self, stem: Path) -> Path | None:
-        """The image that the user gave, if any."""
         return self._dark
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
-        """Record the user's photodiode."""
         return None if self._diode is None else self._diode.watch(self._display, file, seconds)
 
     def hold(self, file: BenchFile, pattern: Pattern, seconds: float) -> None:
-        """Go on showing a pattern, or wait where a command shows it."""
         if self._shows:
             super().hold(file, pattern, seconds)
         else:
@@ -344,7 +339,6 @@ class _ShownHere(ImageSource):
             self._display.show_until(file, pattern, lambda: time.monotonic() > end_s)
 
     def close(self) -> None:
-        """Close the window."""
         self._display.close()
 
 
@@ -553,7 +547,6 @@ class VirtualBench(ImageSource):
         return path
 
     def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:
-        """Mean electrons per second (h, w) of frames."""
         lights = np.mean([self._lights(codes) for codes in frames], axis=0)
         return self._mosaic.shown(np.array([self._primary_image(light, number) for number, light in enumerate(lights)]))
 
@@ -589,8 +582,7 @@ class VirtualBench(ImageSource):
             white = self._panel.flux_at_white_e_per_s
             return np.array([one.response.light * (one.flux_at_white_e_per_s / white) for one in self._panel.primaries])
         monitor = self.truth.config.monitor
-        source = monitor.calibration if monitor.calibration in BUILT_IN else self.truth.folder / monitor.calibration
-        return primary_lights(source, monitor.bits)
+        return primary_lights(calibration_source(monitor, self.truth.folder), monitor.bits)
 
     def close(self) -> None:
         """Free the GL context."""

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterator
 from pathlib import Path
 
-from hilstar.calibrate.first_light.records import SessionFile, StepRecord
+from hilstar.calibrate.first_light.context import SessionFile, StepRecord
 from hilstar.calibrate.first_light.session import STEPS, SessionStep
 from hilstar.charts import capital
 from hilstar.errors import InputError

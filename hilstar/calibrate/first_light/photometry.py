@@ -12,11 +12,10 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_primaries, named_channels
+from hilstar.bench.build import bench_calibration, bench_primaries, calibration_source, named_channels
 from hilstar.bench.config.bench_config import drives_apart
-from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
+from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, Figure, StepContext, StepNumber, StepOutcome
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
-from hilstar.calibrate.first_light.records import Figure, StepNumber, StepOutcome
 from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
 from hilstar.calibrate.plan import Patch, PlanSettings, in_channel, plan_patches
@@ -24,7 +23,6 @@ from hilstar.charts import INK, MUTED, chart
 from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.monitor.calibration import (
-    BUILT_IN,
     Calibration,
     add_uniformity,
     load_calibration,
@@ -317,11 +315,13 @@ def photometry(context: StepContext) -> StepOutcome:
     planned = plan_for(monitor.bits, context.patches, channels)
     by_channel = {"w": assumed.response.light}
     if apart:
-        responses = primary_responses(calibration_source(context.file), monitor.bits)
+        responses = primary_responses(calibration_source(monitor, context.file.folder), monitor.bits)
         shares = shares_of_white(context.file)
         by_channel = {name: share * one.light for name, share, one in zip(channels, shares, responses, strict=True)}
     elif channels != "w":
-        by_channel = dict(zip(channels, primary_lights(calibration_source(context.file), monitor.bits), strict=True))
+        by_channel = dict(
+            zip(channels, primary_lights(calibration_source(monitor, context.file.folder), monitor.bits), strict=True)
+        )
     readings = Photometer(context, sigma_px, Assumed(by_channel, assumed.response.black)).read(planned)
     measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
     readings.write(measured)
@@ -371,13 +371,8 @@ def shares_of_white(file: BenchFile) -> FloatArray:
 
 def calibration_of(context: StepContext) -> Calibration:
     """The calibration that the bench file names."""
-    return load_calibration(calibration_source(context.file), context.file.config.monitor.bits)
-
-
-def calibration_source(file: BenchFile) -> str | Path:
-    """What [monitor] calibration names: a built-in name, or a path."""
-    name = file.config.monitor.calibration
-    return name if name in BUILT_IN else file.folder / name
+    monitor = context.file.config.monitor
+    return load_calibration(calibration_source(monitor, context.file.folder), monitor.bits)
 
 
 def _response_figures(
@@ -406,7 +401,7 @@ def _response_figures(
         **{f"error_at_{decade}_percent": value for decade, value in found["error_percent"].items()},
     }
     if context.truth is not None:
-        true = load_calibration(calibration_source(context.truth), context.truth.config.monitor.bits).response
+        true = bench_calibration(context.truth.config, context.truth.folder).response
         figures["truth_max_mag"] = float(np.abs(response_error_mag(now, true)).max())
         figures["truth_black_level"] = true.black
     return figures

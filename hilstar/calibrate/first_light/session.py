@@ -15,15 +15,11 @@ from typing import Any
 import msgspec
 
 from hilstar.bench.bench_file import BenchFile
-from hilstar.calibrate.first_light.context import StepContext
-from hilstar.calibrate.first_light.geometry import focus, geometry, orientation
-from hilstar.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
-from hilstar.calibrate.first_light.photometry import photometry
-from hilstar.calibrate.first_light.records import (
+from hilstar.calibrate.first_light.context import (
     KIND,
     Figure,
-    KeyChange,
     SessionFile,
+    StepContext,
     StepNumber,
     StepOutcome,
     StepRecord,
@@ -32,6 +28,9 @@ from hilstar.calibrate.first_light.records import (
     sha256_of,
     write_session,
 )
+from hilstar.calibrate.first_light.geometry import focus, geometry, orientation
+from hilstar.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
+from hilstar.calibrate.first_light.photometry import photometry
 from hilstar.calibrate.first_light.stars import scale, verify
 from hilstar.calibrate.first_light.uniformity import uniformity, warm_up
 from hilstar.calibrate.latency import checked_delay_ms, draw_latency, pair, summarise
@@ -81,10 +80,9 @@ def latency(context: StepContext) -> StepOutcome:
         f" jitter {found['jitter_ms']:.3f}, {found['edges']} edges"
     )
     agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
-    before, u_ms = context.file.config.certify.panel_delay_u_ms, float(f"{error_ms:.3g}")
     changes = (
-        KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms),
-        KeyChange(table="certify", key="panel_delay_u_ms", before=before, after=u_ms),
+        *context.change("monitor", "panel_delay_ms", delay_ms),
+        *context.change("certify", "panel_delay_u_ms", float(f"{error_ms:.3g}")),
     )
     number = StepNumber(delay_ms, error_ms, "ms", "from the buffer swap to the light of the first row")
     return StepOutcome("done", line, figures, (picture,), (picture,), () if agrees else changes, number)
@@ -312,7 +310,6 @@ class FirstLightSession:
         return all(_is_file(path) and sha256_of(path) == digest for path, digest in paths)
 
     def _unmet(self, step: SessionStep) -> str | None:
-        """The first missing step that this one needs."""
         for name in step.needs:
             record = self.records.get(name)
             if record is None or record.verdict == "failed" or (record.verdict == "skipped" and name != "display"):
@@ -349,7 +346,6 @@ class FirstLightSession:
         )
 
     def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
-        """Run a step and write its keys into the bench file; a refusal makes it a failed step."""
         try:
             outcome = step.run(context)
             self.file = rewrite(self.file, outcome.changes)

@@ -12,17 +12,23 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import open_bench
+from hilstar.bench.build import calibration_source, open_bench
 from hilstar.bench.cameras import bench_camera, display_psf, tracker_camera
 from hilstar.bench.config import Verify
 from hilstar.bench.frame import Bench, Frame
-from hilstar.calibrate.first_light.context import MAX_FILL, DarkSubtracted, StepContext
+from hilstar.calibrate.first_light.context import (
+    MAX_FILL,
+    DarkSubtracted,
+    Figure,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    Verdict,
+)
 from hilstar.calibrate.first_light.image_sources import Pattern
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, Verdict
 from hilstar.calibrate.scale import UNSURE_MAG, MeasuredScale
 from hilstar.charts import BLUE, INK, MUTED, SMALL_PT, chart
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import BUILT_IN
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import Levels
 from hilstar.rotation import to_matrix
@@ -320,10 +326,10 @@ def _twin_file(context: StepContext) -> BenchFile:
     if truth is None:
         return file
     monitor, collimator, folder = truth.config.monitor, truth.config.collimator, truth.folder.resolve()
-    named = monitor.calibration in BUILT_IN
-    calibration = monitor.calibration if named else str(folder / monitor.calibration)
     limits = {name: getattr(file.config.verify, name) for name in LIMITS}
-    known = Verify(**limits, true_calibration=calibration, true_flux_at_white_e_per_s=_white_e_per_s(truth))
+    known = Verify(
+        **limits, true_calibration=str(calibration_source(monitor, folder)), true_flux_at_white_e_per_s=_white_e_per_s(truth)
+    )
     if collimator.geometry is not None:
         known = replace(known, true_geometry=str(folder / collimator.geometry))
     else:
@@ -447,11 +453,9 @@ def scale(context: StepContext) -> StepOutcome:
         return StepOutcome("failed", f"{line}, but {' and '.join(wrong)}: {why}", figures, files, (picture,), number=number)
     verdict: Verdict = "failed" if scatter.finding else "done"
     line += f", but {scatter.finding}" if scatter.finding else ""
-    key, before = "flux_at_white_e_per_s", context.file.config.render.flux_at_white_e_per_s
-    relative, stated = float(f"{error_mag / MAG_PER_RELATIVE:.3g}"), context.file.config.certify.flux_at_white_relative
     changes = (
-        KeyChange(table="render", key=key, before=before, after=float(f"{found.flux_at_white_e_per_s:.6g}")),
-        KeyChange(table="certify", key="flux_at_white_relative", before=stated, after=relative),
+        *context.change("render", "flux_at_white_e_per_s", float(f"{found.flux_at_white_e_per_s:.6g}")),
+        *context.change("certify", "flux_at_white_relative", float(f"{error_mag / MAG_PER_RELATIVE:.3g}")),
     )
     agrees = abs(by_mag) < AGREE_SIGMAS * error_mag
     return StepOutcome(verdict, line, figures, files, (picture,), () if agrees else changes, number)

@@ -10,16 +10,25 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.calibrate.first_light.context import HOT_FILL, DarkSubtracted, StepContext
+from hilstar.bench.build import bench_calibration, calibration_source
+from hilstar.calibrate.first_light.context import (
+    HOT_FILL,
+    DarkSubtracted,
+    Figure,
+    KeyChange,
+    StepContext,
+    StepNumber,
+    StepOutcome,
+    Verdict,
+)
 from hilstar.calibrate.first_light.geometry import sharp_dots
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
-from hilstar.calibrate.first_light.photometry import calibration_of, calibration_source
-from hilstar.calibrate.first_light.records import Figure, KeyChange, StepNumber, StepOutcome, Verdict
+from hilstar.calibrate.first_light.photometry import calibration_of
 from hilstar.calibrate.geometric.dots import DOT_PX
 from hilstar.calibrate.warm_up import AHEAD_S, S_PER_H, fitted_white, judge_warm_up, watch_white
 from hilstar.charts import BLUE, MUTED, chart, label_ends, write_csv
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import load_calibration, weights_of_grid, with_uniformity
+from hilstar.monitor.calibration import weights_of_grid, with_uniformity
 from hilstar.tracker.centroids import noisiest_background
 from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, NS_PER_S, magnitude
 
@@ -98,7 +107,7 @@ def uniformity(context: StepContext) -> StepOutcome:
     if against.is_even:
         line += "; the bench file has it so" if known is not None else "; nothing was written"
     else:
-        source, path = calibration_source(context.file), context.session / FILE
+        source, path = calibration_source(context.file.config.monitor, context.file.folder), context.session / FILE
         grid, today = None if found.is_even else found.grid, datetime.datetime.now(datetime.UTC).date().isoformat()
         relative, bits = float(figures["map_error_mag"]) / MAG_PER_RELATIVE, context.file.config.monitor.bits
         files += with_uniformity(source, bits, path, grid, context.source.monitor, today, relative=relative)
@@ -162,10 +171,7 @@ def warm_up(context: StepContext) -> StepOutcome:
         figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
         stable_s = tau_s * math.log(max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
         figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)  # of its exponential alone
-    before: float | None = context.file.config.certify.warm_up_percent
-    changes: tuple[KeyChange, ...] = ()
-    if found.is_stable and (after := float(f"{100 * found.bound:.3g}")) != before:
-        changes = (KeyChange(table="certify", key="warm_up_percent", before=before, after=after),)
+    changes = context.change("certify", "warm_up_percent", float(f"{100 * found.bound:.3g}")) if found.is_stable else ()
     per_h = StepNumber(found.drift_percent_per_h, found.drift_error_percent_per_h, "%/h", "drift of white at the last reading")
     return StepOutcome(
         "done" if found.is_stable else "failed",
@@ -229,7 +235,7 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
     }
     if context.truth is not None:
         monitor = context.truth.config.monitor
-        true = load_calibration(calibration_source(context.truth), monitor.bits).uniformity_map(monitor.resolution_px)
+        true = bench_calibration(context.truth.config, context.truth.folder).uniformity_map(monitor.resolution_px)
         if monitor.resolution_px == context.resolution_px:
             its = np.ones(len(dots.light)) if true is None else true[dots.y, dots.x].astype(np.float64)
             figures["truth_rms_mag"] = float(np.std(magnitude(found.at_dots / its)))

@@ -108,7 +108,6 @@ def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
 
 
 def _centroids(path: Path, resolution_px: tuple[int, int], under: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """The centroids of an image above its dark frame, if any, px (n,). Raises InputError, also for saturated dots."""
     image = read_image(path, resolution_px)
     top = float(image.max())
     saturated = int((image == top).sum())

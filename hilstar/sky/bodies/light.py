@@ -24,16 +24,7 @@ from numpy.polynomial.polynomial import polyval
 
 from hilstar.arrays import FloatArray
 from hilstar.rotation import direction_of
-from hilstar.sky.electrons import (
-    BrightnessModel,
-    Library,
-    Optics,
-    Photometry,
-    ags_electrons_per_s,
-    band_mean,
-    library_electrons_per_s,
-    load_library,
-)
+from hilstar.sky import electrons
 from hilstar.sky.spectrum import load_curve
 from hilstar.units import magnitude
 
@@ -124,24 +115,24 @@ _POLES = {"Saturn": direction_of(*SATURN_POLE_DEG), "Uranus": direction_of(*URAN
 
 
 def bodies_electrons_per_s(
-    names: tuple[str, ...], model: BrightnessModel, optics: Optics, photometry: Photometry
+    names: tuple[str, ...], model: electrons.BrightnessModel, optics: electrons.Optics, photometry: electrons.Photometry
 ) -> FloatArray:
     """Electron rates of bodies of V = 0, shape (n,). Raises InputError as `tabulate_pickles` does."""
     if model == "ags":
-        return np.full(len(names), ags_electrons_per_s(optics, photometry))
-    return library_electrons_per_s(reflected(names), optics, photometry)
+        return np.full(len(names), electrons.ags_electrons_per_s(optics, photometry))
+    return electrons.library_electrons_per_s(reflected(names), optics, photometry)
 
 
-def reflected(names: tuple[str, ...]) -> Library:
+def reflected(names: tuple[str, ...]) -> electrons.Library:
     """The spectra of bodies, as a library of their own."""
-    stars = load_library()
+    stars = electrons.load_library()
     sunlight = stars.flux[stars.spectral_type.index(SUNLIGHT)]
     lit = [sunlight * albedo(name, stars.wavelength_nm) for name in names]
     flux = np.array(lit).reshape(len(names), len(stars.wavelength_nm))  # also without bodies
     colour = bodies_bv_mag(names)
-    unscaled = Library(stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan))
-    mean = band_mean(unscaled, load_curve("johnson-v", "johnson-v"))
-    return Library(stars.wavelength_nm, flux / mean[:, None], names, colour, unscaled.vi_mag)
+    unscaled = electrons.Library(stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan))
+    mean = electrons.band_mean(unscaled, load_curve("johnson-v", "johnson-v"))
+    return electrons.Library(stars.wavelength_nm, flux / mean[:, None], names, colour, unscaled.vi_mag)
 
 
 def bodies_bv_mag(names: tuple[str, ...]) -> FloatArray:

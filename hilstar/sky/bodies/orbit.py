@@ -97,7 +97,6 @@ class TleOrbit:
 
 
 def _checked(name: str, text: str) -> tuple[str, str]:
-    """The two lines of elements. Raises InputError."""
     found = [line for line in map(str.rstrip, text.splitlines()) if line[:2] in {"1 ", "2 "} and len(line) == LINE_LENGTH]
     if [line[0] for line in found] != ["1", "2"]:
         raise InputError(f"{name}: not one set of two lines of {LINE_LENGTH} characters that begin with 1 and 2; {TLE_ADVICE}")
@@ -276,7 +275,6 @@ def _epoch_ns(text: str, where: str) -> int:
 
 
 def _time(scale: str, utc_ns: int) -> int:
-    """The time of a scale, ns since 1970 in days of 86400 s, at a UTC."""
     if scale == "UTC":
         return utc_ns
     year, month, day = (int(part) for part in _date(utc_ns)[:10].split("-"))

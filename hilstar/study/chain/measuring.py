@@ -19,18 +19,7 @@ from hilstar.bench.frame import Bench
 from hilstar.rotation import propagate
 from hilstar.scene.frame_motion import CameraTurn, swept_sprites
 from hilstar.sky.stars import Stars
-from hilstar.study.chain.choices import (
-    ChainScene,
-    Combination,
-    Lit,
-    Marks,
-    PanelExposure,
-    Parts,
-    combinations,
-    exposure,
-    filled_timeline,
-    lead_ns,
-)
+from hilstar.study.chain import choices
 from hilstar.study.chain.tracker import Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off, points
 from hilstar.study.predictors import Movement, attitude_at
 from hilstar.study.sweep import Spent, spent
@@ -55,15 +44,15 @@ DIGITS, MS_PLACES = 4, 4  # significant digits of an error, decimal places of a 
 class DrawingChain:
     """A combination on its bench, before a moving sky; `timed_frames` of its frames were timed, from samples to codes."""
 
-    combination: Combination
+    combination: choices.Combination
     bench: Bench
     movement: Movement
     timed_frames: int = 0
 
     def timeline(self, movement: Movement, light_ns: int) -> Timeline:
         """The samples received when the frame is started whose light is at `light_ns`."""
-        samples = movement.samples(light_ns - lead_ns(self.bench.config))
-        return filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
+        samples = movement.samples(light_ns - choices.lead_ns(self.bench.config))
+        return choices.filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
 
     def attitude(self, light_ns: int) -> Attitude:
         """The attitude at a frame's light, predicted from the samples received when the frame is started."""
@@ -73,7 +62,7 @@ class DrawingChain:
         """The rate along which stars are drawn as paths, rad/s; None where they are drawn as points."""
         return attitude.rate_cam_rad_s if self.combination.smear == "path" else None
 
-    def lit(self, number: int, light_ns: int) -> Lit:
+    def lit(self, number: int, light_ns: int) -> choices.Lit:
         """The pixels that a frame's codes light, and the light of each, electrons per second."""
         attitude, panel = self.attitude(light_ns), self.bench.panel
         levels = self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude)).levels.ravel()
@@ -81,7 +70,7 @@ class DrawingChain:
         light = panel.response.light[levels[place]] * panel.flux_at_white_e_per_s
         return place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
 
-    def exposed(self, seen: PanelExposure) -> FloatArray:
+    def exposed(self, seen: choices.PanelExposure) -> FloatArray:
         """The mean light (H, W) over an exposure; at rest one frame stands for all, except with `temporal`."""
         alike = not self.movement.turns and self.combination.quantisation != "temporal"
         return (seen.at_rest if alike else seen.mean)(self.lit, self.bench.camera.resolution_px)
@@ -230,11 +219,11 @@ def said(flag: bool) -> str:
 class SceneMeasurement:
     """A scene on a study's benches: its judges, one an exposure, and its combinations."""
 
-    def __init__(self, parts: Parts, tracker: StudyTracker, scene: ChainScene, plan: Rounds) -> None:
+    def __init__(self, parts: choices.Parts, tracker: StudyTracker, scene: choices.ChainScene, plan: Rounds) -> None:
         self.parts, self.tracker, self.scene, self.plan = parts, tracker, scene, plan
         self.movement = Movement(scene.q_icrs_to_cam, scene.rate_deg_s)
-        self.marks: Marks = parts.marks(self.movement)
-        found = combinations(self.movement.turns, parts.can_steal_bits, parts.faintest_v_mag)
+        self.marks: choices.Marks = parts.marks(self.movement)
+        found = choices.combinations(self.movement.turns, parts.can_steal_bits, parts.faintest_v_mag)
         marked = (self.marks.default, self.marks.auto, self.marks.as_filed)
         self.combinations = list(dict.fromkeys([*found, *marked]))
         # At rest each exposure has its stars at other sub-pixel phases.
@@ -242,14 +231,14 @@ class SceneMeasurement:
         self.judges = []
         for k, number in enumerate(FIRST_FRAMES[: plan.exposures]):
             moved = replace(self.movement, q_icrs_to_cam=propagate(scene.q_icrs_to_cam, step_rad, k))
-            self.judges.append(StarJudge(tracker, moved, exposure(parts.own, number)))
+            self.judges.append(StarJudge(tracker, moved, choices.exposure(parts.own, number)))
 
     @property
     def star_count(self) -> int:
         """The stars that are judged, over all exposures."""
         return sum(len(judge) for judge in self.judges)
 
-    def chain(self, combination: Combination, exposure_number: int = 0) -> DrawingChain:
+    def chain(self, combination: choices.Combination, exposure_number: int = 0) -> DrawingChain:
         """A combination with the movement of one exposure."""
         return DrawingChain(combination, self.parts.bench(combination), self.judges[exposure_number].movement)
 
@@ -279,7 +268,7 @@ class SceneMeasurement:
             StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES)) for stage, ms in zip(STAGES, stages, strict=True)
         ]
 
-    def error(self, combination: Combination) -> Error:
+    def error(self, combination: choices.Combination) -> Error:
         """A combination's error over all exposures."""
         found, turns = [], []
         for number, judge in enumerate(self.judges):
@@ -344,7 +333,7 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else value
 
 
-def error_budget(scene: SceneMeasurement, combination: Combination) -> list[ErrorPart]:
+def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> list[ErrorPart]:
     """The parts of the error of the combination that `auto` takes, by STEPS, then RSS and WHOLE."""
     found = [
         [judge.sky, *(judge.measure(scene.tracker.image_e(light, judge.seen)) for light in _lights(scene, combination, number))]
@@ -360,24 +349,24 @@ def error_budget(scene: SceneMeasurement, combination: Combination) -> list[Erro
     return [ErrorPart(scene.scene.name, AUTO, step, rounded(a), rounded(m)) for step, (a, m) in named]
 
 
-def _lights(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[FloatArray]:
+def _lights(scene: SceneMeasurement, combination: choices.Combination, number: int) -> Iterator[FloatArray]:
     """The mean light (H, W) of an exposure after each of STEPS."""
     chain, seen = scene.chain(combination, number), scene.judges[number].seen
     movement, bench, every = chain.movement, chain.bench, scene.parts.own.stars
 
-    def exposed(light_of: Callable[[int, int], Lit]) -> FloatArray:
+    def exposed(light_of: Callable[[int, int], choices.Lit]) -> FloatArray:
         return (seen.mean if movement.turns else seen.at_rest)(light_of, bench.camera.resolution_px)
 
-    def whole(stars: Stars, turn: CameraTurn, along_paths: bool) -> Lit:
+    def whole(stars: Stars, turn: CameraTurn, along_paths: bool) -> choices.Lit:
         if along_paths:
             return linear_light(bench, swept_sprites(stars, turn, bench.scan, bench.camera, bench.psf))
         return linear_light(bench, points(bench, turn.q_icrs_to_cam, stars))
 
-    def true(_: int, light_ns: int) -> Lit:
+    def true(_: int, light_ns: int) -> choices.Lit:
         return whole(every, CameraTurn(movement.at(light_ns), movement.rate_rad_s(light_ns)), movement.turns)
 
     def shown_as(stars: Stars, along_paths: bool) -> FloatArray:
-        def light_of(_: int, light_ns: int) -> Lit:
+        def light_of(_: int, light_ns: int) -> choices.Lit:
             attitude = chain.attitude(light_ns)
             rate = attitude.rate_cam_rad_s
             turn = CameraTurn(attitude.q_icrs_to_cam, np.zeros(3) if rate is None else rate)

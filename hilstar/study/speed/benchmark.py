@@ -37,22 +37,7 @@ from hilstar.scene.psf import SQRT2, GaussianPsf
 from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, pack_sprites
 from hilstar.sky.stars import Stars, cell_grid
 from hilstar.study.settings import FULL_HD, Table, Value, bench_text
-from hilstar.study.speed import tracker
-from hilstar.study.speed.report import (
-    REFERENCE_PX,
-    Agreement,
-    Aim,
-    Cell,
-    Machine,
-    MethodTiming,
-    ProcessStart,
-    PythonTime,
-    Result,
-    SceneOrigin,
-    Size,
-    Skipped,
-    Spread,
-)
+from hilstar.study.speed import report, tracker
 from hilstar.study.sweep import OtherWork, is_busy
 
 # A cap this much wider than the monitor's own: culling must have something to throw away.
@@ -83,13 +68,13 @@ STAGES = ("cull", "project", "erase", "upload", "splat", "encode", "read_back")
 GPU_STAGES = ("gpu_splat", "gpu_encode")
 # 10 deg/s about an axis across and along the boresight: each star is drawn along its path while its row is lit.
 TURN_RAD_S = np.radians(10.0) * np.array([0.64, -0.74, 0.21])
-SIZES: tuple[Size, ...] = ((1024, 1024), REFERENCE_PX, (2560, 2048), (3840, 2160))
+SIZES: tuple[report.Size, ...] = ((1024, 1024), report.REFERENCE_PX, (2560, 2048), (3840, 2160))
 COUNTS = (100, 1000, 10_000, 50_000)
 MAX_STARS = 200_000  # NumPy's method takes 2.9 kB of memory for each
 RADEC_ROLL_DEG = (84.057, -1.2, 10.0)
 # What the project set itself on two cores, ms: whole frames by image and stars, Python at REFERENCE_PX by stars; how many times
 # a still frame one may take that turns by 10 deg/s.
-AIMS_MS = {(REFERENCE_PX, 1000): 3.5, (REFERENCE_PX, 10_000): 10.0, ((3840, 2160), 50_000): 40.0}
+AIMS_MS = {(report.REFERENCE_PX, 1000): 3.5, (report.REFERENCE_PX, 10_000): 10.0, ((3840, 2160), 50_000): 40.0}
 PYTHON_AIMS_MS = {1000: 0.2, 10_000: 1.0}
 TURNING_TIMES = 2.0
 START_AIM_MS = 1500.0
@@ -251,20 +236,20 @@ METHODS: tuple[tuple[str, str, Callable[[], Draw]], ...] = (
 )
 
 
-def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: Size) -> ProcessStart:
+def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: report.Size) -> report.ProcessStart:
     """Start a process that imports hilstar and draws one frame of the bench file."""
     command = [sys.executable, "-c", FRESH, str(path), *map(repr, q_icrs_to_cam.tolist())]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     import_ms, first_frame_ms, memory_mb = map(float, done.stdout.split())
-    return ProcessStart(*size, import_ms, first_frame_ms, memory_mb)
+    return report.ProcessStart(*size, import_ms, first_frame_ms, memory_mb)
 
 
-def this_machine() -> Machine:
+def this_machine() -> report.Machine:
     """The processor, and the versions that the times depend on."""
     cpus = Path("/proc/cpuinfo")
     lines = cpus.read_text(encoding="utf-8").splitlines() if cpus.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return Machine(
+    return report.Machine(
         cpu=next(iter(names), platform.machine()),
         cores=len(os.sched_getaffinity(0)),
         load=round(os.getloadavg()[0], 2),
@@ -276,7 +261,7 @@ def this_machine() -> Machine:
 class CellMeasurement(Closing):
     """One image size and star count, measured into `result`; close it to free its two GL contexts."""
 
-    def __init__(self, bench: Bench, q_icrs_to_cam: FloatArray, cell: Cell, result: Result) -> None:
+    def __init__(self, bench: Bench, q_icrs_to_cam: FloatArray, cell: report.Cell, result: report.Result) -> None:
         self.bench, self.q, self.result = bench, q_icrs_to_cam, result
         self.cell_key = cell.width, cell.height, cell.stars
         self.shape = cell.height, cell.width
@@ -300,7 +285,7 @@ class CellMeasurement(Closing):
         images: dict[str, Float32Array] = {}
         for name, draw in methods.items():
             if (why := self._too_long(draw, budget_s)) is not None:
-                self.result.skipped.append(Skipped(*self.cell_key, name, why))
+                self.result.skipped.append(report.Skipped(*self.cell_key, name, why))
                 continue
             whole = partial(draw, self.sprites, self.sigma_px, self.shape)
             works[name] = lambda name=name, whole=whole: images.update({name: whole()})  # type: ignore[misc]
@@ -308,10 +293,10 @@ class CellMeasurement(Closing):
         ours = self._draw_linear()
         for name, image in images.items():
             worst = float(np.abs(image - ours).max() / ours.max())
-            self.result.agreement.append(Agreement(*self.cell_key, name, worst))
+            self.result.agreement.append(report.Agreement(*self.cell_key, name, worst))
 
     def _keep(self, times_ms: dict[str, list[float]]) -> None:
-        self.result.python_ms.append(PythonTime(*self.cell_key, _spread(times_ms.pop("python"))))
+        self.result.python_ms.append(report.PythonTime(*self.cell_key, _spread(times_ms.pop("python"))))
         del times_ms["stages"]  # with its waits; its parts are kept
         rows = [("hilstar", kind, times_ms.pop(kind)) for kind in ("whole_frame", "turning", "linear_only")]
         for kind in (*STAGES, *GPU_STAGES):
@@ -319,7 +304,7 @@ class CellMeasurement(Closing):
                 rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))  # without the first turn, as in `interleaved`
         rows += [(name, "linear_only", times) for name, times in times_ms.items()]
         for method, kind, times in rows:
-            self.result.rows.append(MethodTiming(*self.cell_key, method, kind, _spread(times)))
+            self.result.rows.append(report.MethodTiming(*self.cell_key, method, kind, _spread(times)))
 
     def _too_long(self, draw: Draw, budget_s: float) -> str | None:
         """Why a method is skipped here: its time for all stars, estimated from that for one star and for a hundred more."""
@@ -388,8 +373,8 @@ def _seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def _spread(times_ms: list[float]) -> Spread:
-    return Spread(float(np.median(times_ms)), min(times_ms), max(times_ms))
+def _spread(times_ms: list[float]) -> report.Spread:
+    return report.Spread(float(np.median(times_ms)), min(times_ms), max(times_ms))
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,7 +384,7 @@ class BenchmarkPlan:
     `file` replaces the benchmark's own bench file; `sizes` is then that file's image size.
     """
 
-    sizes: tuple[Size, ...] = SIZES
+    sizes: tuple[report.Size, ...] = SIZES
     counts: tuple[int, ...] = COUNTS
     rounds: int = 100
     budget_s: float = 10.0
@@ -408,15 +393,15 @@ class BenchmarkPlan:
     file: BenchFile | None = None
 
 
-QUICK = BenchmarkPlan(sizes=(REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0, exposures=1)
+QUICK = BenchmarkPlan(sizes=(report.REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0, exposures=1)
 
 
-def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], object]) -> Result:
+def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], object]) -> report.Result:
     """Measure every cell of a plan; `advance` hears how many are done. Raises InputError, MachineError."""
     methods, missing = other_methods()
     others = OtherWork()
-    result = Result(this_machine(), does={name: does for name, does, _ in METHODS if name in methods})
-    result.skipped += [Skipped(method=name, why=why) for name, why in missing.items()]
+    result = report.Result(this_machine(), does={name: does for name, does, _ in METHODS if name in methods})
+    result.skipped += [report.Skipped(method=name, why=why) for name, why in missing.items()]
     q_icrs_to_cam = from_radec_roll_deg(*RADEC_ROLL_DEG)
     with TemporaryDirectory() as folder:
         for place, size in enumerate(plan.sizes):
@@ -426,15 +411,17 @@ def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], 
                 every = bench.shown_stars
                 for k, count in enumerate(plan.counts):
                     shown = scene(bench, every, q_icrs_to_cam, count, rng)
-                    result.scenes.append(SceneOrigin(*size, count, shown.catalogue_count, count - shown.catalogue_count))
-                    with CellMeasurement(bench.with_stars(shown.stars), q_icrs_to_cam, Cell(*size, count), result) as cell:
+                    result.scenes.append(report.SceneOrigin(*size, count, shown.catalogue_count, count - shown.catalogue_count))
+                    with CellMeasurement(
+                        bench.with_stars(shown.stars), q_icrs_to_cam, report.Cell(*size, count), result
+                    ) as cell:
                         cell.measure(methods, plan.rounds, plan.budget_s)
                     advance(place * len(plan.counts) + k + 1)
             result.startup += [fresh_start(file.path, q_icrs_to_cam, size) for _ in range(plan.starts)]
     if plan.exposures:
         result.tracker, without = tracker.tracker_rows(plan.exposures, plan.budget_s)
         result.skipped += without
-    size = REFERENCE_PX if REFERENCE_PX in plan.sizes else plan.sizes[0]
+    size = report.REFERENCE_PX if report.REFERENCE_PX in plan.sizes else plan.sizes[0]
     here = [start for start in result.startup if start.size == size]
     for name in ("import_ms", "first_frame_ms", "memory_mb"):
         setattr(result, name, float(np.median([getattr(start, name) for start in here])))
@@ -443,7 +430,7 @@ def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], 
     return result
 
 
-def own_bench_file(path: Path, size_px: Size, **render: Value) -> BenchFile:
+def own_bench_file(path: Path, size_px: report.Size, **render: Value) -> BenchFile:
     """The benchmark's own bench file for an image size, written to `path`; `render` are further keys of [render]."""
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
@@ -456,7 +443,7 @@ def own_bench_file(path: Path, size_px: Size, **render: Value) -> BenchFile:
     return read_bench_file(path)
 
 
-def _aims(result: Result) -> list[Aim]:
+def _aims(result: report.Result) -> list[report.Aim]:
     at = {(row.size, row.stars, row.method, row.kind): row.ms.median for row in result.rows}
     aims = []
     for (size, stars, method, kind), ms in at.items():
@@ -469,10 +456,10 @@ def _aims(result: Result) -> list[Aim]:
         elif kind == "linear_only" and method == "hilstar" and numba is not None:
             aims.append((f"linear image, {where}, numba's time", numba, ms))
     for python in result.python_ms:
-        if python.size == REFERENCE_PX and python.stars in PYTHON_AIMS_MS:
+        if python.size == report.REFERENCE_PX and python.stars in PYTHON_AIMS_MS:
             aims.append((f"Python outside GL, {python.stars} stars", PYTHON_AIMS_MS[python.stars], python.ms.median))
-    starts = [start.import_ms + start.first_frame_ms for start in result.startup if start.size == REFERENCE_PX]
+    starts = [start.import_ms + start.first_frame_ms for start in result.startup if start.size == report.REFERENCE_PX]
     if starts:
         aims.append(("import and first frame", START_AIM_MS, float(np.median(starts))))
     judged = not is_busy(result.others_cores)
-    return [Aim(what, aim_ms, ms, ms <= aim_ms if judged else None) for what, aim_ms, ms in aims]
+    return [report.Aim(what, aim_ms, ms, ms <= aim_ms if judged else None) for what, aim_ms, ms in aims]

@@ -168,7 +168,6 @@ def lines(result: Result) -> Iterator[str]:
 
 
 def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
-    """The virtual tracker's works, by whom, their medians, and each peer's ratio to hilstar."""
     own = {row.kind: row.ms.median for row in rows if row.method == "hilstar"}
     if rows:
         yield f"the virtual tracker, {_words(rows[0].size)}, {rows[0].stars} stars, ms of the processor (median)"

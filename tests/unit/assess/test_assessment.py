@@ -12,11 +12,10 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from hilstar import charts
+from hilstar import charts, html_pages
 from hilstar.arrays import FloatArray
-from hilstar.assess import report
+from hilstar.assess.assessment import lock_of
 from hilstar.assess.bench_effects import display_cost, slices_of, turn_between
-from hilstar.assess.lock import lock_of
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.bench.build import bench_stars
 from hilstar.bench.cameras import tracker_camera
@@ -42,7 +41,7 @@ def planted() -> Planted:
 
 def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path: Path, planted: Planted, monkeypatch) -> None:
     drawn: list[Figure] = []
-    monkeypatch.setattr(report, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
+    monkeypatch.setattr(html_pages, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
     ledger, telemetry = write_run(tmp_path, planted)
     out = tmp_path / "out"
     run = run_hilstar_here("assess", ledger, telemetry, "-o", out, "--json", "--display-attitudes", "0")

@@ -11,6 +11,7 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
+from hilstar.calibrate.first_light.context import KeyChange, StepOutcome, rewrite
 from hilstar.calibrate.first_light.geometry import (
     UPRIGHT,
     WAYS,
@@ -23,7 +24,6 @@ from hilstar.calibrate.first_light.geometry import (
     sharpness,
 )
 from hilstar.calibrate.first_light.image_sources import GrabCommand, ImageSource, NoImage, Pattern, black, off_screen, on_screen
-from hilstar.calibrate.first_light.records import KeyChange, StepOutcome, rewrite
 from hilstar.calibrate.first_light.session import FirstLightSession, SessionStep
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.calibrate.first_light.context import StepContext
+from hilstar.calibrate.first_light.context import StepContext, rewrite
 from hilstar.calibrate.first_light.image_sources import VirtualBench
 from hilstar.calibrate.first_light.photometry import photometry
-from hilstar.calibrate.first_light.records import rewrite
 from hilstar.calibrate.first_light.stars import scale, verify
 from hilstar.calibrate.first_light.uniformity import DotLight, map_of, uniformity
 from hilstar.monitor.calibration import load_calibration, with_uniformity

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.bench.fault_schedule import MAX_ON, FaultSchedule
-from hilstar.bench.scenario import Scenario
+from hilstar.bench.scenario import MAX_ON, FaultSchedule, Scenario
 from hilstar.errors import InputError
 from hilstar.frame.fault_kinds import fault_of
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from hilstar.bench.fault_schedule import FaultSchedule
-from hilstar.bench.scenario import parse_scenario
+from hilstar.bench.scenario import FaultSchedule, parse_scenario
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.faults import MAX_BURST, MAX_MESSAGE_BYTES, MAX_PER_S, FaultStream, act

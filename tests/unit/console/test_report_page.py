@@ -11,12 +11,12 @@ import pytest
 
 from hilstar.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
 from hilstar.run.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
-from hilstar.run.record.report import MAX_EVENTS, RunFigures, SpanTable, TimeBins, summarise
+from hilstar.run.record.report import BLOCK, MAX_EVENTS, RunFigures, SpanTable, TimeBins, summarise
 from tests.support.run_page import run_data_of
 
 PERIOD_NS = 16_666_667
 MAX_PAGE_BYTES = 3_000_000  # "a few MB", without pictures
-FRAMES = 60_000
+FRAMES = 32_000  # nearly as many spans as there may be, of 4 frames each
 
 
 def frame(k: int, **more: object) -> FrameRecord:
@@ -30,9 +30,11 @@ def frame(k: int, **more: object) -> FrameRecord:
 @pytest.fixture(scope="module")
 def run() -> RunFigures:
     figures = RunFigures({"unix_ns": str(1_800_000_000 * 10**9), "monotonic_ns": str(10**12), "bench_text": "</script>"})
-    for k in range(FRAMES):
-        figures.add(frame(k, **({"age_ns": 900_000_000, "stale": True, "missed_before": 3} if k == 31_415 else {})))
-        figures.add(PacketForm(True, None, 10**12 + k * PERIOD_NS))
+    for begin in range(0, FRAMES, BLOCK):
+        block = range(begin, min(begin + BLOCK, FRAMES))
+        late = {31_415: {"age_ns": 900_000_000, "stale": True, "missed_before": 3}}
+        figures.add(*(frame(k, **late.get(k, {})) for k in block))
+        figures.add(*(PacketForm(True, None, 10**12 + k * PERIOD_NS) for k in block))
     figures.add(CountRecord(host_ns=10**12 + 500 * 10**9, kind="packet", reason="crc", count=77))
     figures.add(EventRecord(host_ns=10**12 + 90 * 10**9, kind="mark", detail="<b>cover off</b>"))
     return figures

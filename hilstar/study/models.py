@@ -467,8 +467,10 @@ def choices(directory: Path) -> ChartFinding:
     optics, stars = study_optics("ccd47-20"), load_catalog().brighter_than(BRIGHT_V_MAG)
     cost = choice_costs_mag(BV_MAG, optics)
     real = tabulate_pickles(optics, Photometry()).electrons_per_s(np.zeros(len(stars)), stars.bv_mag, stars.vi_mag)
-    body = dgs_electrons_per_s(star_temperatures_k(stars.bv_mag, "ballesteros2012"), optics, Photometry())
-    on_stars = choice_costs_mag(stars.bv_mag, optics) | {"spectrum pickles": magnitude(real / body)}
+    bv_mag, star = np.unique(stars.bv_mag, return_inverse=True)  # a spectrum for each colour, of which there are few
+    body = dgs_electrons_per_s(star_temperatures_k(bv_mag, "ballesteros2012"), optics, Photometry())[star]
+    on_stars = {name: mag[star] for name, mag in choice_costs_mag(bv_mag, optics).items()}
+    on_stars["spectrum pickles"] = magnitude(real / body)
     low, middle, high, _ = percentiles = running_percentiles(stars.bv_mag, on_stars["spectrum pickles"], BV_MAG)
     paid = {name: np.percentile(np.abs(mag), (50, 95)) for name, mag in on_stars.items()}
     text = "What each choice costs half of Hipparcos to V = 7.5 (95 %), CCD47-20, mag: " + ", ".join(

@@ -6,6 +6,7 @@ Primaries that are driven apart are planes of one image, whose pixels and sprite
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import moderngl
@@ -49,10 +50,15 @@ def build_compute(
         return ctx.compute_shader(_source(main, defines, parts, last))
 
 
+@cache
+def _shader(name: str) -> str:
+    return resource_path("shaders", name).read_text()
+
+
 def _source(main: str, defines: Sequence[str], before: Sequence[str] = (), after: Sequence[str] = ()) -> str:
     """A file of shaders/ after `defines`, between others."""
-    version, body = resource_path("shaders", main).read_text().split("\n", 1)
-    first, last = ([resource_path("shaders", name).read_text() for name in names] for names in (before, after))
+    version, body = _shader(main).split("\n", 1)
+    first, last = ([_shader(name) for name in names] for names in (before, after))
     return "\n".join([version, *(f"#define {name}" for name in defines), *first, body, *last])
 
 

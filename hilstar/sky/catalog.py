@@ -108,8 +108,8 @@ class Catalog:
 
     def brighter_than(self, faintest_v_mag: float) -> "Catalog":
         """The stars with v_mag <= `faintest_v_mag` (inclusive)."""
-        kept = self.v_mag <= faintest_v_mag
-        return self if kept.all() else self.taken(kept)
+        kept = np.flatnonzero(self.v_mag <= faintest_v_mag)  # places: a mask is searched again for each column
+        return self if len(kept) == len(self) else self.taken(kept)
 
     def name(self, row: int) -> str:
         """The designation of the star at `row`: "HIP 26311", "Gaia DR3 4295806720", "TYC 1-2-3"."""

@@ -37,9 +37,10 @@ def assert_legible(figure: Figure) -> None:
         assert not re.search(r"\de[+-]\d\d", words), f"{words!r} is a computer's figure"
     for (one, a), (other, b) in itertools.combinations(texts, 2):
         assert not touch(a, b), f"{one.get_text()!r} lies over {other.get_text()!r}"
+    named = named_colours(figure, [text for text, _ in texts])
     for axes in figure.axes:
         assert_capital(axes)
-        assert_lines(axes, named_colours(figure))
+        assert_lines(axes, named)
 
 
 def seen(figure: Figure) -> Iterator[Text]:
@@ -72,9 +73,9 @@ def assert_capital(axes: Axes) -> None:
         assert words == charts.capital(words), words
 
 
-def named_colours(figure: Figure) -> set[str]:
+def named_colours(figure: Figure, texts: list[Text]) -> set[str]:
     """Colours that a text has, or a legend names."""
-    found = {to_hex(text.get_color()) for text in seen(figure)}
+    found = {to_hex(text.get_color()) for text in texts}
     for legend in legends(figure):
         found |= {to_hex(colour) for handle in legend.legend_handles for colour in handle_colours(handle)}
     return found

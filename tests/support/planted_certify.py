@@ -9,9 +9,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import pytest
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.certify.certificate import certify
+from hilstar.certify import assembly, certificate
+from hilstar.certify.budget import BATCH
 from hilstar.certify.readings import VirtualReader
 
 NOW = datetime.datetime(2026, 11, 26, tzinfo=datetime.UTC)
@@ -117,15 +119,18 @@ def plant(folder: Path, one: Plant, bench_keys: str = "", truth_keys: str = "") 
 
 def coverage(benches: int, seed: int, keys: str = "") -> dict[tuple[str, str], list[bool]]:
     """By quantity and region, whether each stated interval holds the truth."""
-    rng, held, stars = np.random.default_rng(seed), defaultdict(list), cache(lambda _: assembly.reference_stars(bench))
+    rng, held = np.random.default_rng(seed), defaultdict(list)
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         # Every bench file is the same, so that its stars are; one batch of trials knows an end within 2 % of the half width.
-        patch.setattr(assembly, "reference_stars", lambda file: stars(file.sha256))
+        first = read_bench_file(plant(Path(folder), drawn(np.random.default_rng(0)), f"[certify]\nfields = 1\n{keys}")[0])
+        stars = assembly.reference_stars(first)
+        patch.setattr(assembly, "reference_stars", lambda file: stars)
         patch.setattr(certificate, "QUICK_TRIALS", BATCH)
         for number in range(benches):
             paths = plant(Path(folder), drawn(rng), f"[certify]\nfields = 1\n{keys}")
             bench, truth = (read_bench_file(path) for path in paths)
-            found, _ = certify(bench, VirtualReader(bench, truth, 1_000_003 * seed + number), NOW, quick=True)
+            assert bench.sha256 == first.sha256
+            found, _ = certificate.certify(bench, VirtualReader(bench, truth, 1_000_003 * seed + number), NOW, quick=True)
             for each in found.figures:
                 if each.truth is not None:
                     region = "field" if each.region.startswith("field") else each.region

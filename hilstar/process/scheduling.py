@@ -153,14 +153,12 @@ def steady_loop() -> Iterator[str]:
     scheduling = raise_priority()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
-    gc.freeze()
     gc.disable()
     try:
         yield scheduling
     finally:
         if collecting:
             gc.enable()
-        gc.unfreeze()
         sys.setswitchinterval(interval_s)
         if scheduling.startswith("SCHED_FIFO"):
             os.sched_setscheduler(0, *policy)

@@ -59,7 +59,7 @@ def bench(folder, panel, sensor, **render):
         "monitor": {"bits": BITS},
         "monitor.primaries": {"file": "panel.csv", "layout": "rgb-stripe"},
         "render": {"colour": "star", "quantisation": "exact"} | render,
-        "sky": {"spectrum": "blackbody", "faintest_v_mag": 6.0},
+        "sky": {"spectrum": "blackbody", "faintest_v_mag": 5.5},
     }
     (folder / "bench.toml").write_text(bench_text(changes))
     return load(folder / "bench.toml"), np.array(curves)
@@ -119,7 +119,7 @@ def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, 
         if clearly.any():  # no other mixture without negative light is nearer in electrons
             rng = np.random.default_rng(36)
             residual = np.square(shown - wanted).sum(axis=1)[clearly]
-            for _ in range(200):
+            for _ in range(40):  # of a thousand stars: one that is not at its best is found by half of them
                 other = np.maximum(stars.primaries[clearly] * rng.normal(1, 0.05, (clearly.sum(), 3)), 0)
                 assert (
                     np.square((other / matrix.sum(axis=0)) @ matrix.T - wanted[clearly]).sum(axis=1) >= residual - 1e-12

@@ -137,9 +137,10 @@ def test_stars_of_five_spectra_over_field_and_focus_are_as_poppy_diffracts_them(
     keys |= {"pixel_pitch_um": 3.0}
     pupil = Pupil(**keys)
     glass, field = glass_of(diffracted(pupil, 8), 3e-4), PupilField(pupil)
-    for focus_um in (0.0, 8.0):
-        psf = glass_psf(glass, focus_um, np.full(5, 0.2))
-        for temperature_k, place in zip(TEMPERATURES_K, rng.integers(0, 512, (5, 2)).astype(float), strict=True):
+    places = rng.integers(0, 512, (5, 2)).astype(float)
+    for number, (temperature_k, place) in enumerate(zip(TEMPERATURES_K, places, strict=True)):
+        for focus_um in (0.0, 8.0)[number % 2 :][:1]:
+            psf = glass_psf(glass, focus_um, np.full(5, 0.2))
             light = blackbody_exitance_w_m2_m(fine_nm, np.array([temperature_k])[:, None])[0] * fine_nm
             light /= light.sum()
             found = psf.of_stars(*place[:, None], light @ NodeSpline(np.array(nodes_nm))(fine_nm), np.ones(1))[0]

@@ -1,4 +1,4 @@
-"""NumPy draws what OpenGL draws: eleven benches, four frames of each."""
+"""NumPy draws what OpenGL draws: eleven benches, three frames of each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hilstar.render.numpy_backend import NumpyBackend
 from hilstar.units import NS_PER_S
 from tools import same_codes
 
-FRAMES = 4
+EVERY, FRAMES = 4, 3  # of a log of ten attitudes: of bodies one before each of three
 LINEAR = 1e-6  # of a frame's brightest pixel, from stars: float32 and the GPU's erf
 BLOCK_PX = 16  # two stars wide: their light, whichever pixels show it
 # Lit pixels that may have another level. Without a choice between pixels only light within rounding of a threshold has one.
@@ -55,7 +55,7 @@ def both(name: str, folder):
         rows = list(csv.DictReader((folder / "log.csv").read_text().splitlines()))
         by_numpy = replace(bench, renderer=NumpyBackend(bench.renderer.target))
         frames = []
-        for number, row in enumerate(rows[:: len(rows) // FRAMES][:FRAMES]):
+        for number, row in enumerate(rows[::EVERY][:FRAMES]):
             q, rate = (np.array([float(row[key]) for key in keys]) for keys in (("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")))
             sprites = bench.light(bench.view(q, rate, round(float(row["t_s"]) * NS_PER_S)))
             drawn = []

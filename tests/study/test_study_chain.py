@@ -16,7 +16,7 @@ from hilstar import charts
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.study import predictors
-from hilstar.study.chain import choices, run
+from hilstar.study.chain import choices, measuring, run
 from hilstar.study.chain import glass as chain_glass
 from hilstar.study.chain.choices import ChainScene, Combination, Parts, five_scenes, lead_ns
 from hilstar.study.chain.glass import draw_glass, glass_rows
@@ -83,7 +83,11 @@ def study(tmp_path_factory):
     """What the command prints of the small bench, and the folder of its files."""
     folder = tmp_path_factory.mktemp("chain")
     (folder / "bench.toml").write_text(SMALL)
-    result = run_hilstar_here("study", "chain", folder / "bench.toml", "-o", folder / "out", "--quick", "--json")
+    with pytest.MonkeyPatch.context() as patch:  # two frames of each combination: no claim here is of a time
+        patch.setattr(measuring, "MIN_ROUNDS", 2)
+        patch.setattr(measuring, "FRAMES_A_VISIT", 1)
+        patch.setattr(run, "QUICK", Rounds(exposures=1, time_s=0.0))
+        result = run_hilstar_here("study", "chain", folder / "bench.toml", "-o", folder / "out", "--quick", "--json")
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout), folder / "out"
 

@@ -133,7 +133,7 @@ def test_stars_of_five_spectra_over_field_and_focus_are_as_poppy_diffracts_them(
     terms = (Term(kind="W131", nm=300.0), Term(kind="W222", nm=150.0), Term(kind="W220", nm=120.0), Term(kind="W040", nm=80.0))
     terms += (Term(kind="W020", nm=0.0, per_nm=0.8), Term(kind="zernike", noll=7, nm=40.0))  # axial colour; decentred
     nodes_nm, fine_nm = (450.0, 525.0, 600.0, 675.0, 750.0), np.linspace(450, 750, 13)
-    keys = BASE | {"points": 5, "wavelengths_nm": nodes_nm, "half_px": 6, "terms": terms, "focuses_um": (-8.0, 0.0, 8.0)}
+    keys = BASE | {"points": 5, "wavelengths_nm": nodes_nm, "half_px": 6, "terms": terms, "focuses_um": (0.0, 8.0)}
     keys |= {"pixel_pitch_um": 3.0}
     pupil = Pupil(**keys)
     glass, field = glass_of(diffracted(pupil, 8), 3e-4), PupilField(pupil)

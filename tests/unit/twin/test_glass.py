@@ -13,7 +13,9 @@ from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import say_once
 from hilstar.campaign.cases import attitude_error_arcsec
 from hilstar.campaign.plan import Centroiding, parse_plan
-from hilstar.campaign.solvers import choose_solver
+from hilstar.campaign.run import Campaign
+from hilstar.campaign.session import Session
+from hilstar.campaign.solvers import CENTROIDS, choose_solver
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
@@ -27,8 +29,8 @@ from hilstar.twin.glass import told_psf
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.simulator import Simulator
 from tests.support.benches import ORION_Q, bench_text
-from tests.support.campaigns import plan_text, read_columns
-from tests.support.commands import run_hilstar, run_hilstar_here
+from tests.support.campaigns import plan_text
+from tests.support.commands import run_hilstar_here
 from tests.support.glass import SIDE_PX, WAVELENGTHS_NM, illumination, moments, stack, truth
 
 SHARES = 1e-3  # bands of 25 nm against the integral: measured 4e-4
@@ -147,9 +149,13 @@ def test_a_campaign_varies_the_focus(bench, tmp_path):
             cases=2,
         )
     )
-    result = run_hilstar("campaign", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1")
-    assert result.returncode == 0, result.stderr
-    assert len(read_columns(tmp_path / "out" / "cases.parquet")["case"]) == 2
+    campaign = Campaign(tmp_path / "plan.toml", tmp_path / "out", CENTROIDS, 1.0, False)
+    session = Session(campaign.job)  # as a worker has it
+    rows = session.run(0, campaign.design.points(0, 2)).rows
+    session.close()
+    assert [row["status"] for row in rows] == ["done", "done"]
+    assert {row["tracker.optics.focus_um"] for row in rows} <= {0.0, 8.0}
+    assert rows[0]["tracker.optics.temperature_k"] != rows[1]["tracker.optics.temperature_k"]
 
 
 def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_none(bench, caplog):

@@ -154,8 +154,8 @@ def test_a_campaign_varies_the_focus(bench, tmp_path):
     rows = session.run(0, campaign.design.points(0, 2)).rows
     session.close()
     assert [row["status"] for row in rows] == ["done", "done"]
-    assert {row["tracker.optics.focus_um"] for row in rows} <= {0.0, 8.0}
-    assert rows[0]["tracker.optics.temperature_k"] != rows[1]["tracker.optics.temperature_k"]
+    assert {row["vary.tracker.optics.focus_um"] for row in rows} <= {0.0, 8.0}
+    assert rows[0]["bench_sha256"] != rows[1]["bench_sha256"]
 
 
 def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_none(bench, caplog):

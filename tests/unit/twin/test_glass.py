@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,12 +38,15 @@ SHARES = 1e-3  # bands of 25 nm against the integral: measured 4e-4
 TRACKER = {"resolution_px": [SIDE_PX, SIDE_PX], "focal_length_mm": 12, "exposure_s": 0.2, "transmission": None}
 
 
+usual_glass = cache(lambda **more: glass_of(stack(), **more))
+
+
 @pytest.fixture
 def bench(tmp_path):
     say_once.cache_clear()
 
     def make(*changes, **glass):
-        write_glass(tmp_path / "psf.fits", glass_of(stack(), **glass))
+        write_glass(tmp_path / "psf.fits", usual_glass(**glass))
         tables = {"tracker": TRACKER, "tracker.optics": {"psf": "psf.fits"}, "sky": {"spectrum": "blackbody"}}
         (tmp_path / "bench.toml").write_text(bench_text(tables, *changes))
         return read_bench_file(tmp_path / "bench.toml")

@@ -32,7 +32,7 @@ Share = Literal["row", "col"]
 
 WIDTH_INCH = 7.6  # 730 CSS pixels: a column of text
 PANEL_INCH, MARGIN_INCH = 2.6, 1.1  # height of each row of panels, and of title and labels
-DPI, PNG_DPI = 100, 150
+PNG_DPI = 150
 TITLE_PT, TEXT_PT, SMALL_PT = 11.5, 10, 9
 TITLE_COLUMNS, NOTE_COLUMNS = 80, 105
 ENDINGS = (".png", ".svg")
@@ -136,7 +136,7 @@ def panels_of(
 
     with rc_context({**STYLE, "axes.prop_cycle": cycler(color=SERIES)}):
         high = MARGIN_INCH + PANEL_INCH * rows if height_inch is None else height_inch
-        figure = Figure(figsize=(WIDTH_INCH, high), dpi=DPI, layout="constrained")
+        figure = Figure(figsize=(WIDTH_INCH, high), layout="constrained")
         figure.get_layout_engine().set(h_pad=0.07)  # type: ignore[call-arg,union-attr]
         grid = figure.subplots(rows, columns, sharex=share_x, sharey=share_y, squeeze=False, height_ratios=heights)
         figure.suptitle(title_lines(capital(finding)), x=0.01, ha="left", fontsize=TITLE_PT)
@@ -315,23 +315,18 @@ def save(figure: "Figure", path: Path) -> None:
 
 def png(figure: "Figure") -> bytes:
     """A figure as PNG, in the light colours."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    data, figure.dpi = io.BytesIO(), PNG_DPI
-    FigureCanvasAgg(figure).print_png(data)  # type: ignore[no-untyped-call]  # `savefig` draws it twice
-    figure.dpi = DPI
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=PNG_DPI)
     return data.getvalue()
 
 
 def svg(figure: "Figure") -> str:
     """A figure as SVG with both sets of colours: dark ones where the reader, or the page around it, prefers them."""
     from matplotlib import rc_context
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     data = io.StringIO()
     with rc_context({"svg.hashsalt": "hilstar"}):  # the same figure is the same file
-        FigureCanvasSVG(figure).print_svg(data, metadata={"Date": None})  # type: ignore[no-untyped-call]
-    figure.dpi = DPI
+        figure.savefig(data, format="svg", metadata={"Date": None})
     rules = "".join(
         f'[style*="{what}: {light}"]{{{what}:{dark}!important}}' for light, dark in DARK.items() for what in ("fill", "stroke")
     )

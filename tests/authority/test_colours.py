@@ -14,7 +14,7 @@ from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.unit.monitor.test_primaries import NM, PANELS, bump, written
 
-GRID_NM = np.arange(350.0, 1000.01, 0.25)
+GRID_NM = np.arange(350.0, 1000.01, 0.5)
 SENSOR_NM = np.arange(350.0, 1001.0, 10.0)
 # Three sensors of three channels, the red of which reach the near infrared, as a colour camera's behind its cut filter do more
 # or less; the first channel of each is also a tracker of its own, as "mono" all of them are.

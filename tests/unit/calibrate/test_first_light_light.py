@@ -105,6 +105,7 @@ def read(tmp_path, camera, codes=(0, 100, 300, 511, 700, 900, 1023, 0)):
     return photometer.read([Patch(code, "w") for code in codes])
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_light_is_read_on_lattices_and_black_against_a_monitor_that_is_off(tmp_path):
     true = gamma_response(10, 2.35).light
     found = read(tmp_path, Camera(true, 20_000))
@@ -119,6 +120,7 @@ def test_light_is_read_on_lattices_and_black_against_a_monitor_that_is_off(tmp_p
     assert [abs(link.ratio - 1) < 0.01 for link in found.links] == [True, True]
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_the_exposure_is_shortened_until_white_fits_where_that_can_be(tmp_path):
     true = srgb_response(10).light
     found = read(tmp_path, Camera(true, 2e6))
@@ -129,6 +131,7 @@ def test_the_exposure_is_shortened_until_white_fits_where_that_can_be(tmp_path):
         read(tmp_path, Camera(true, 2e6, sets_exposure=False))
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_a_response_that_is_far_brighter_than_assumed_is_read_by_a_sparser_lattice(tmp_path):
     true = gamma_response(10, 0.7).light
     found = read(tmp_path, Camera(true, 20_000))
@@ -137,11 +140,13 @@ def test_a_response_that_is_far_brighter_than_assumed_is_read_by_a_sparser_latti
     assert found.light[lit] - found.light[~lit].mean() == pytest.approx(20_000 * true[codes[lit]], rel=0.01)
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_a_pixel_that_is_brighter_among_lit_ones_is_seen_by_the_links(tmp_path):
     found = read(tmp_path, Camera(srgb_response(10).light, 20_000, neighbours=0.08))
     assert max(link.ratio for link in found.links) == pytest.approx(1.08, abs=0.01)
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_a_screen_whose_pixels_depend_on_their_neighbours_is_no_calibration(tmp_path):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
     camera = Camera(srgb_response(10).light, 20_000, neighbours=0.08)
@@ -151,6 +156,7 @@ def test_a_screen_whose_pixels_depend_on_their_neighbours_is_no_calibration(tmp_
     assert "local dimming" in outcome.line
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_without_an_image_of_a_monitor_that_is_off_black_is_the_bench_files(tmp_path):
     found = read(tmp_path, Camera(srgb_response(10).light, 20_000, unlit=False))
     assert not found.black_known
@@ -213,6 +219,7 @@ def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):
     assert load_calibration(tmp_path / "response.toml", 8, bit_stealing=True).response.rgb is not None
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_a_mosaic_before_a_coloured_panel_finds_the_response_of_each_primary(tmp_path):
     """Three powers, of a panel whose primaries the channels see as they do here: a channel's light is of one of them."""
     nm, powers = np.arange(400.0, 701.0, 10.0), {"r": 2.1, "g": 2.35, "b": 2.5}
@@ -239,6 +246,7 @@ def test_a_mosaic_before_a_coloured_panel_finds_the_response_of_each_primary(tmp
         assert found.light[shown] / wanted[shown] == pytest.approx(np.ones(shown.sum()), abs=0.01)
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_stars_of_temporal_frames_are_seen_over_their_whole_turn(tmp_path):
     """With 5 bits a turn of four frames leaves 0.012 mag between the stars, its first frame alone 0.036."""
     bench = {"monitor": {"bits": 5}, "render": {"quantisation": "temporal", "cycle_frames": 4}}
@@ -249,6 +257,7 @@ def test_stars_of_temporal_frames_are_seen_over_their_whole_turn(tmp_path):
     assert outcome.figures["scatter_mag"] < 0.02
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_a_truth_whose_primaries_are_not_known_cannot_stand_in_for_bit_stealing(tmp_path):
     head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
     write_calibration(tmp_path / "true-response.toml", head, {"w": gamma_response(8).light}, 0.0, NotesTable())
@@ -261,6 +270,7 @@ def test_a_truth_whose_primaries_are_not_known_cannot_stand_in_for_bit_stealing(
         )
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_too_few_readings_of_a_response_that_needs_more_are_no_calibration(tmp_path):
     """The example's S-curve by 12 levels: held out of the fit they are 0.1 mag off, and the bench file is left alone."""
     bench = {"monitor": {"bits": 8, "calibration": "lcd-example"}}

@@ -34,6 +34,13 @@ def planted(folder, grid, name="srgb", bench=None):
     return folder
 
 
+@pytest.fixture
+def charts_of_one(request, grid):
+    """The first case has charts."""
+    if grid is not VIGNETTING:
+        request.getfixturevalue("without_charts")
+
+
 def did(folder, step, patches=0):
     """What a step comes to, with the bench file rewritten as a session does it."""
     file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
@@ -47,6 +54,7 @@ def did(folder, step, patches=0):
 
 
 @pytest.mark.parametrize(("grid", "seen"), [(VIGNETTING, 0.1), (PANEL, 0.03)], ids=["vignetting", "panel"])
+@pytest.mark.usefixtures("charts_of_one")
 def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp_path, grid, seen):
     folder = planted(tmp_path, grid)
     before = did(folder, verify)
@@ -68,6 +76,7 @@ def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp
     assert before.figures["flux_scatter_mag"] > 3 * after.figures["flux_scatter_mag"]
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_an_even_screen_has_nothing_written(tmp_path):
     folder = planted(tmp_path, None)
     found = did(folder, uniformity)
@@ -77,6 +86,7 @@ def test_an_even_screen_has_nothing_written(tmp_path):
     assert did(folder, verify).verdict == "done"
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_a_map_that_holds_stays_and_one_that_does_not_goes(tmp_path):
     folder = planted(tmp_path, VIGNETTING)
     did(folder, uniformity)
@@ -90,6 +100,7 @@ def test_a_map_that_holds_stays_and_one_that_does_not_goes(tmp_path):
     assert load_calibration(folder / "light.toml", 10).uniformity is None
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_the_example_monitor_keeps_its_shares_and_its_response(tmp_path):
     """By 8 bits, with the response measured after the map: both are in the file that the bench names."""
     folder = planted(tmp_path, VIGNETTING, "lcd-example")
@@ -103,6 +114,7 @@ def test_the_example_monitor_keeps_its_shares_and_its_response(tmp_path):
     assert np.allclose(measured.uniformity, load_calibration(folder / "light.toml", 8).uniformity)
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_noise_of_the_tracker_is_in_the_errors_of_its_stars(tmp_path):
     folder = planted(tmp_path, None, bench=NOISE)
     found = did(folder, uniformity)
@@ -127,6 +139,7 @@ def test_wild_dots_do_not_bend_the_map():
     assert np.std(found.at_dots / true) < 0.002
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_dots_that_differ_from_one_to_the_next_are_a_finding(tmp_path):
     """A panel of 80 x 60 fields with 8 % between neighbours: no map of at most 18 x 24 has them."""
     folder = planted(tmp_path, 1 + np.random.default_rng(2).normal(0, 0.08, (60, 80)))

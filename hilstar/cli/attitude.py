@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
+from typer import Argument, Option
 
 from hilstar.cli import options
-from hilstar.console.terminal import print_json, say
+from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError
 from hilstar.resources import resource_path
 
@@ -21,21 +21,20 @@ SHOWN_STARS = 3
 
 def attitude(
     source: Annotated[
-        Path, typer.Argument(metavar="INPUT", help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
+        Path, Argument(metavar="INPUT", help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
     ],
     at: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--at",
             metavar="T",
             help="Seconds after the log's first sample, or a date and time as the log has them; by default its first sample.",
         ),
     ] = None,
     bench: Annotated[
-        Path | None,
-        typer.Option(metavar="BENCH.toml", help="Whose tracker, mounting and sky to use; by default the demo's tracker."),
+        Path | None, Option(metavar="BENCH.toml", help="Whose tracker, mounting and sky to use; by default the demo's tracker.")
     ] = None,
-    wait: Annotated[float, typer.Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)] = 10.0,
+    wait: Annotated[float, Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)] = 10.0,
     kernel: options.KernelFiles = None,
     topic: options.TopicName = None,
     body: options.BodyName = None,
@@ -44,7 +43,7 @@ def attitude(
     place: options.PlaceText = None,
     mounting: options.MountingText = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
+        bool, Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
     ] = False,
     as_json: options.Json = False,
 ) -> None:
@@ -69,11 +68,7 @@ def attitude(
     file = dated(file, conventions.scale, sample.t_ns)
     told = {"source": conventions.source, "held": held, **_pointing(sample, file)}
     meaning = conventions.lines(mounted)
-    if as_json:
-        print_json({**told, "conventions": meaning})
-        return
-    for line in [*(meaning if explain else ()), *_lines(told)]:
-        typer.echo(line)
+    print_found(as_json, told | {"conventions": meaning}, [*(meaning if explain else ()), *_lines(told)])
 
 
 class _Found(NamedTuple):

@@ -53,6 +53,10 @@ class Check:
     detail: str
     required: bool = True
 
+    def line(self) -> str:
+        """For a person."""
+        return f"{'ok' if self.ok else 'MISSING' if self.required else 'none':8}{self.name:12}{self.detail}"
+
 
 @dataclass(frozen=True, slots=True)
 class OutputReport:

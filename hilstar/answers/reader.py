@@ -191,7 +191,6 @@ class AnswersApart(Closing):
         plan.decoder(messages)
         self._refused: Counter[str] = Counter()
         self.details: dict[str, str] = {}
-        self._notices = notices
         self._decode = msgspec.msgpack.Decoder(HandedOver).decode
         self._process = ReaderProcess(notices, clock=clock, name="the reader of the tracker's answers")
         self._process.read(stream=partial(DecodingLink, plan))
@@ -204,12 +203,6 @@ class AnswersApart(Closing):
         """The answers since the last call, oldest first; waits at most `timeout_ms` for the first."""
         found: list[Answer] = []
         for record in self._process.take() if self._process.wait(timeout_ms) else ():
-            if record.notice is not None:
-                kind, detail, who = record.notice
-                if record.lasting:
-                    self._notices.tell(kind, detail, who)
-                else:
-                    self._notices.mention(kind, detail)
             if record.message is None:
                 continue
             raw, packed = record.message.parts

@@ -149,7 +149,7 @@ def nobody_watches(host_ns: int, raw: bytes, sample: wire.AttitudeSample | None,
 
 
 class Receiver:
-    """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it.
+    """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it. `back` leads back.
 
     What arrives before `learn` is called fills the timeline, and teaches the clock little. `now_ns` is the host's clock.
     """
@@ -181,7 +181,7 @@ class Receiver:
         self.latency_ms = RunningStatistics()
         self._link = link
         self._timeline = timeline
-        self._back = BackChannel(link, traffic, now_ns)
+        self.back = BackChannel(link, traffic, now_ns)
         self._watch = watch
         self._repeats = Repeats(self._notices)
         self._rates = RateCheck(wrong_rates, self._notices)
@@ -225,14 +225,6 @@ class Receiver:
         """Stop listening; the caller closes the link."""
         self._stop.set()
         self._thread.join()
-
-    def post(self, status: wire.Status) -> None:
-        """Hand in the newest status; it leaves when it is due."""
-        self._back.post(status)
-
-    def pass_on(self, answer: wire.AnswerPacket) -> None:
-        """Hand in an answer of the tracker, for the sender."""
-        self._back.pass_on(answer)
 
     def sender_ns(self, continuous_ns: int) -> int:
         """A time of the timeline on the sender's own clock."""
@@ -285,7 +277,7 @@ class Receiver:
             self._take_decided(self._senders.expire(now_ns))
         self._settle(self.jumps.expire(now_ns))
         if self._link.two_way:
-            self._back.talk(now_ns, ask=self._learn_from_ns is not None)
+            self.back.talk(now_ns, ask=self._learn_from_ns is not None)
 
     def _doubt(self, known: UnixOffset) -> None:
         """Say while nothing keeps this machine's clock of Unix time."""
@@ -297,9 +289,9 @@ class Receiver:
     def _take(self, arrival: Arrival[wire.Event], waited_ns: int) -> None:
         match arrival.event:
             case wire.TimeRequest() as request if self._link.two_way:
-                self._back.answer(request, arrival)
+                self.back.answer(request, arrival)
             case wire.TimeReply() as reply if self._link.two_way:
-                exchange = self._back.exchange(reply, arrival.host_ns, self.jumps.correction_ns)
+                exchange = self.back.exchange(reply, arrival.host_ns, self.jumps.correction_ns)
                 if exchange is not None:
                     self.clock.exchange(exchange)
             case wire.AttitudeSample() as sample:
@@ -327,7 +319,7 @@ class Receiver:
             if self._learn_from_ns is None or arrival.host_ns < self._learn_from_ns:
                 arrival = replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
             elif self.clock.unheard:
-                self._back.ask_quickly(arrival.host_ns)
+                self.back.ask_quickly(arrival.host_ns)
             self._settle(self.jumps.take(arrival))
             slowness = self.jumps.slowness
             if slowness and not self.clock.synchronised:
@@ -343,7 +335,7 @@ class Receiver:
             if refusal is not None:
                 self._refuse(arrival, refusal)
                 continue
-            self._back.follow(arrival)
+            self.back.follow(arrival)
             if arrival.waited_ns != WAITED_UNKNOWN_NS:
                 latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
                 self.latency_ms.add((latency_ns or 0.0) / NS_PER_MS)

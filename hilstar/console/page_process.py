@@ -24,6 +24,7 @@ from hilstar.console.messages import Order, OrderAnswer, RunEvent, RunState, Set
 from hilstar.errors import one_line
 from hilstar.notices import Notice, Notices
 from hilstar.process.closing import Closing
+from hilstar.process.scheduling import HOST_CLOCK, BackOff
 
 TICK_S = 0.1
 FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # before the page's process is started again
@@ -69,7 +70,7 @@ class PageProcess(Closing):
         notices.listen(self._events.append)
         self._stop = threading.Event()
         self._page: _Page | None = None
-        self._start_s, self._wait_s = 0.0, FIRST_WAIT_S
+        self._again = BackOff(FIRST_WAIT_S, MAX_WAIT_S, HOST_CLOCK)
         self._workers = ThreadPoolExecutor(MAX_ORDERS, thread_name_prefix="hilstar-order")
         self._thread = threading.Thread(target=self._run, name="hilstar-console", daemon=True)
         self._thread.start()
@@ -116,14 +117,13 @@ class PageProcess(Closing):
             self._memory.states.put(msgspec.json.encode(RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
         page = self._page
         if page is None:
-            if now_s >= self._start_s:
+            if self._again.over:
                 self._start_page(now_s)
         elif (code := page.process.poll()) is not None:
             page.channel.close()
             self._page = None
-            if now_s - page.begun_s > STEADY_S:
-                self._wait_s = FIRST_WAIT_S
-            self._put_off(now_s, f"the operator's page ended ({f'signal {-code}' if code < 0 else f'exit code {code}'})")
+            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            self._lose(f"the operator's page ended ({how})", anew=now_s - page.begun_s > STEADY_S)
 
     def _start_page(self, now_s: float) -> None:
         channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -139,16 +139,16 @@ class PageProcess(Closing):
             )
         except OSError as error:
             channel.close()
-            self._put_off(now_s, f"the operator's page cannot be started ({error.strerror})")
+            self._lose(f"the operator's page cannot be started ({error.strerror})")
             return
         finally:
             its_end.close()
         channel.setblocking(False)
         self._page = _Page(process, channel, now_s)
 
-    def _put_off(self, now_s: float, what: str) -> None:
+    def _lose(self, what: str, *, anew: bool = False) -> None:
         self._notices.tell("console-lost", f"{what}; it is started again")
-        self._start_s, self._wait_s = now_s + self._wait_s, min(2 * self._wait_s, MAX_WAIT_S)
+        self._again.put_off(anew=anew)
 
     def _listen(self, seconds: float) -> None:
         page = self._page

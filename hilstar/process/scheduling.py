@@ -137,6 +137,20 @@ class Deadline:
         return self._clock.now_ns() >= self._due_ns
 
 
+class BackOff(Deadline):
+    """The moment of the next try: at once, then `min_s` after a failure, and twice as long after each further one."""
+
+    def __init__(self, min_s: float, max_s: float, clock: HostClock) -> None:
+        super().__init__(clock, clock.now_ns())
+        self._min_s, self._max_s, self._wait_s = min_s, max_s, min_s
+
+    def put_off(self, *, anew: bool = False) -> None:
+        """The try failed; `anew` for the first failure after all was well."""
+        wait_s = self._min_s if anew else self._wait_s
+        self._due_ns = self._clock.now_ns() + round(wait_s * 1e9)
+        self._wait_s = min(2 * wait_s, self._max_s)
+
+
 HOST_CLOCK = HostClock()
 
 

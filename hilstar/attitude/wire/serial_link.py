@@ -16,7 +16,7 @@ from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.links import Arrival, RawMessage, StreamLink
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
 from hilstar.units import NS_PER_S
 
 DEFAULT_BAUD = 115_200
@@ -54,6 +54,14 @@ def adapters() -> list[str]:
     return [f"{words.count(word)} x {word}" if words.count(word) > 1 else word for word in dict.fromkeys(words)]
 
 
+def open_port(port: str, baud: int) -> serial.Serial:
+    """A port of its own, whose bytes come at once. Raises OSError, ValueError or OverflowError."""
+    device = serial.Serial(port, baud, timeout=0, exclusive=True)
+    with contextlib.suppress(OSError, ValueError):  # else a USB adapter buffers for 16 ms; a pty has no such mode
+        device.set_low_latency_mode(True)
+    return device
+
+
 class SerialLink(StreamLink):
     """A serial port that is reopened, with back-off, whenever it disappears.
 
@@ -69,8 +77,7 @@ class SerialLink(StreamLink):
         self._port, self._baud = port, baud
         self._reopened = 0
         self._decoder = wire.StreamDecoder()
-        self._back_off_s = MIN_BACK_OFF_S
-        self._retry = clock.within(0.0)
+        self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
@@ -82,11 +89,8 @@ class SerialLink(StreamLink):
         return self._reopened
 
     def _open(self) -> serial.Serial:
-        device = serial.Serial(self._port, self._baud, timeout=0, exclusive=True)
-        with contextlib.suppress(OSError, ValueError):  # else a USB adapter buffers for 16 ms; a pty has no such mode
-            device.set_low_latency_mode(True)
         self._decoder = wire.StreamDecoder()
-        return device
+        return open_port(self._port, self._baud)
 
     def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
         """The frames that have arrived, and only the newest of a flood; waits at most `timeout_ms` for the first byte."""
@@ -165,8 +169,7 @@ class SerialLink(StreamLink):
         self.link_counts.lost += 1
         self._notices.tell("lost", f"{self.endpoint} disconnected ({one_line(why)}); waiting for it to come back")
         self._shut()
-        self._back_off_s = MIN_BACK_OFF_S
-        self._retry = self._clock.within(self._back_off_s)
+        self._retry.put_off(anew=True)
 
     def _reopen(self, timeout_ms: int) -> None:
         if not self._retry.over:
@@ -175,8 +178,7 @@ class SerialLink(StreamLink):
         try:
             self._device = self._open()
         except (OSError, ValueError):
-            self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
-            self._retry = self._clock.within(self._back_off_s)
+            self._retry.put_off()
             return
         self._reopened += 1
         self._notices.tell("back", f"{self.endpoint} is back")

@@ -157,10 +157,6 @@ class ZmqApart(StreamLink):
                     self._waiting.append(record.message)
                 if record.counts is not None:
                     self.link_counts += record.counts
-                if record.notice is not None and record.lasting:
-                    self._notices.tell(*record.notice)
-                elif record.notice is not None:
-                    self._notices.mention(*record.notice[:2])
         return bool(self._waiting)
 
     def close(self) -> None:

@@ -152,7 +152,6 @@ class DecodingLink:
         return given
 
     def _pieces(self, chunks: list[RawMessage]) -> Iterator[tuple[RawMessage, bytes]]:
-        """What came, a message or some bytes of a stream at a time."""
         for chunk in chunks:
             data = chunk.parts[-1]
             size = max(len(data), 1) if self._link.messages else PIECE_BYTES

@@ -131,7 +131,6 @@ def _shown_by_page() -> "FloatArray | None":
 
 
 def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]":
-    """The answers of the live link, read here."""
     import threading
 
     from hilstar.answers.reader import live_answers
@@ -150,13 +149,11 @@ def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iter
 
 
 def _row(found: "Answer") -> dict[str, Any]:
-    """For a program."""
     names = ("t_ns", "q_icrs_to_cam", "rate_cam_rad_s", "valid", "mode", "rms_arcsec", "centroids")
     return {name: getattr(found, name) for name in names} | {"stars": found.star_count}
 
 
 def _line(found: "Answer") -> str:
-    """For a person."""
     from hilstar.rotation import to_radec_roll_deg
 
     words = [f"t {'-' if found.t_ns is None else f'{found.t_ns / 1e9:.6f}'} s"]

@@ -72,15 +72,12 @@ def attitude(
 
 
 class _Found(NamedTuple):
-    """An attitude, its source's conventions, and whether it is held over a gap of the log."""
-
     sample: "AttitudeSample"
     conventions: "Conventions"
     held: bool = False
 
 
 def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
-    """The first attitude of the stream that a bench file names."""
     from hilstar.run.open_link import first_attitude, open_link
 
     if at is not None:
@@ -92,7 +89,6 @@ def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
 
 
 def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
-    """The attitude of a log at a time."""
     from hilstar.attitude.clock.timeline import Policy
     from hilstar.attitude.logs.entries import log_joins
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
@@ -112,7 +108,6 @@ def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
 
 
 def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
-    """Where the camera looks, and what it sees."""
     import numpy as np
 
     from hilstar.bench.build import brightest_seen
@@ -135,7 +130,6 @@ def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
 
 
 def _lines(told: dict[str, Any]) -> list[str]:
-    """The same as lines of text."""
     q = ", ".join(f"{c:.7f}" for c in told["q_icrs_to_cam"])
     width, height = told["tracker"]["resolution_px"]
     lines = [
@@ -155,5 +149,4 @@ def _lines(told: dict[str, Any]) -> list[str]:
 
 
 def _turn(angle_deg: float) -> str:
-    """An angle in [0, 360) degrees, also after rounding."""
     return f"{round(angle_deg, 4) % 360:.4f}"

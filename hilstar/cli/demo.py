@@ -110,7 +110,6 @@ def _watching(
     advance: "FrameSink",
     tracker: "TrackerBeside | None",
 ) -> "Iterator[tuple[FrameSink, Outlet]]":
-    """Follow the demo with a progress bar, its page and, if there is one, its tracker."""
     from hilstar.console.publisher import RunDescription
     from hilstar.run.record.ledger import NO_SPLIT
     from hilstar.run.serve import Outlet

@@ -38,7 +38,6 @@ def fmu(
 
 
 def _address(path: Path, settings: object) -> str:
-    """Where the FMU is to send, HOST:PORT. Raises InputError for a bench that no FMU can drive."""
     from hilstar.bench.config.attitude import AttitudeSettings, udp_road
 
     assert isinstance(settings, AttitudeSettings)

@@ -110,7 +110,6 @@ def lens(
 
 
 def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, float] | None = None) -> None:
-    """Write a glass and say what it holds."""
     import numpy as np
 
     from hilstar.optics.psf_file import write_glass

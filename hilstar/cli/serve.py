@@ -72,7 +72,6 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
 
 
 def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, ...]:
-    """The address of each head's page. Raises InputError where one is taken, before a head is started."""
     from hilstar.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
 
     if console is None:

@@ -143,7 +143,6 @@ def uninstall(
 
 
 def _systemctl(*words: str) -> bool:
-    """Run systemctl. Returns whether it succeeded; False without systemd."""
     try:
         done = subprocess.run(["systemctl", "--user", *words], capture_output=True, timeout=SYSTEMD_S, check=False)
     except (OSError, subprocess.TimeoutExpired):
@@ -152,7 +151,6 @@ def _systemctl(*words: str) -> bool:
 
 
 def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAddress | None]":
-    """The options, checked by `hilstar serve`, and the address of its page. Raises InputError."""
     from hilstar.console.listener import parse_address
 
     words = with_values(options)
@@ -228,6 +226,5 @@ def _literal(text: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A word of a unit's command line."""
     text = _literal(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
     return text if re.fullmatch(r"[A-Za-z0-9_@%+=:,./{}-]+", text) else f'"{text}"'

@@ -67,7 +67,6 @@ def verify(
 
 
 def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> None:
-    """Print the angles between the heads of a file with `heads`, solved from what their trackers would see."""
     import numpy as np
 
     from hilstar.twin.heads import verify_heads

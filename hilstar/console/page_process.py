@@ -48,8 +48,6 @@ Do = Callable[[Order], OrderAnswer]  # on a thread of its own
 
 @dataclass(slots=True)
 class _Page:
-    """A page's process, and the channel to it."""
-
     process: "subprocess.Popen[bytes]"
     channel: socket.socket
     begun_s: float

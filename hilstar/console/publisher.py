@@ -110,7 +110,6 @@ class FramePublisher:
                 self._copy(shown)
 
     def _copy(self, shown: "Shown") -> None:
-        """Copy a picture: levels, attitude, and the places of its stars."""
         drawn, sprites = shown.drawn.levels, shown.drawn.sprites
         levels = drawn if drawn.ndim == 2 else drawn.max(axis=2)  # the page's picture is grey
         height, width = levels.shape
@@ -279,7 +278,6 @@ class OrderHandler:
         return 504, f"the frame loop did not take it within {LOOP_WAITS_S:g} s; nothing changed"
 
     def _waits_for(self, holds: Callable[[], bool]) -> bool:
-        """Wait for a condition for at most LOOP_WAITS_S; whether it came to hold."""
         end_s = time.monotonic() + LOOP_WAITS_S
         while not holds():
             if time.monotonic() > end_s:
@@ -306,7 +304,6 @@ class OrderHandler:
             return 200, f"ledger off: {ledger_now.path} is whole"
 
     def _free_path(self) -> Path:
-        """A new file name, beside the newest ledger if there was one."""
         folder = Path.cwd() if self._ledger.last is None else self._ledger.last.path.parent
         now = datetime.now(UTC)
         for k in range(100):

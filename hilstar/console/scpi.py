@@ -136,7 +136,6 @@ class Headers:
 
 
 def _forms(pattern: str) -> Iterator[str]:
-    """Every spelling of a pattern, upper case."""
     if pattern.startswith("*"):
         yield pattern
         return

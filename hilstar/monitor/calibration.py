@@ -221,7 +221,6 @@ def with_uniformity(
 def _response(
     path: Path, bits: int, columns: dict[str, FloatArray], weights: responses.Weights | None, bit_stealing: bool
 ) -> tuple[responses.Response, responses.Weights | None]:
-    """The grey (or bit-stealing) response of measured light, and the primaries' shares of white."""
     whites = {name: float(light[-1] - light[0]) for name, light in columns.items()}
     if weights is None and "r" in columns:
         weights = whites["r"], whites["g"], whites["b"]
@@ -337,7 +336,6 @@ def read_toml(path: Path, read: list[bytes] | None = None) -> CalibrationFile:
 
 
 def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> FloatArray:
-    """Rows of finite, non-negative numbers, all of the same length."""
     rows = []
     for number, line in lines:
         try:

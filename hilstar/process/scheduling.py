@@ -256,7 +256,6 @@ def drawing_threads_apart() -> Iterator[None]:
 
 
 def _threads() -> dict[int, str]:
-    """The names of this process's threads; none where there is no /proc."""
     names: dict[int, str] = {}
     with contextlib.suppress(OSError):
         for task in TASKS.iterdir():
@@ -266,12 +265,10 @@ def _threads() -> dict[int, str]:
 
 
 def _cores() -> list[int]:
-    """The cores that this process may run on; none where the system does not say."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 def _spread(threads: list[int]) -> None:
-    """A core for each thread, if there are as many cores as threads."""
     cores = _cores()
     if len(threads) < 2 or len(threads) != len(cores):
         return

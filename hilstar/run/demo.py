@@ -76,7 +76,6 @@ def scan_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
 
 
 def _jittered(path: Callable[[float], FloatArray], duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
-    """Attitudes along a path at SEND_HZ, with jitter and rates, until REST_S after a duration."""
     count = round((duration_s + REST_S) * SEND_HZ) + 1
     times_s = np.arange(count) / SEND_HZ
     # Jitter about cam axes: first-order Gauss-Markov noise.
@@ -138,14 +137,11 @@ def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watchin
 
 
 class _DemoSender:
-    """A process of hilstar's that begins when it is first tended, and ends with this."""
-
     def __init__(self, arguments: list[str]) -> None:
         self._command = [sys.executable, "-m", "hilstar", *arguments]
         self._process: subprocess.Popen[bytes] | None = None
 
     def tend(self) -> None:
-        """Begin it. Raises MachineError where it has ended."""
         if self._process is None:
             self._process = subprocess.Popen(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         elif self._process.poll() is not None:

@@ -49,7 +49,6 @@ class _Damped(NamedTuple):
     ahead_s: float
 
     def by(self, seconds: float) -> Vector:
-        """The part of the rate, rad/s, to leave out of a prediction over `seconds`."""
         share = 1.0 if seconds >= self.ahead_s else (seconds / self.ahead_s) ** 2  # 1 - sin(x) / x goes with the square
         x, y, z = self.excess
         return share * x, share * y, share * z
@@ -73,7 +72,6 @@ class _Damping:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the samples so far: what follows does not continue them."""
         self._seen: deque[_SeenSample] = deque(maxlen=MAX_KEPT)
         self._trend = [0.0, 0.0, 0.0]
         self._weight = 0.0

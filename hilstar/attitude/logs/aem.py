@@ -405,7 +405,6 @@ def _kvn(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
 
 
 def _xml(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
-    """The lines; nothing in them needs an entity."""
     yield from ('<?xml version="1.0" encoding="UTF-8"?>', f'<aem id="{ccsds.VERSION_KEY}" version="1.0">')
     yield from ("  <header>", *_elements(4, header), "  </header>", "  <body>")
     for segment in segments:

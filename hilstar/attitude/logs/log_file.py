@@ -103,7 +103,6 @@ def ns_of_seconds(seconds: str) -> int:
 
 
 def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    """Write samples with every column; a rate that is not known is an empty cell. Raises OSError."""
     file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
     for sample in samples:
         rate = sample.rate_cam_rad_s
@@ -114,7 +113,6 @@ def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
 
 
 def _read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
-    """The entries of a log's lines; blank ones are ignored."""
     for number, line in enumerate(lines, start=1):
         if line.strip():
             event = decode(line.strip().encode())
@@ -124,7 +122,6 @@ def _read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
 
 
 def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    """Write one object for each sample; a rate that is not known has no key. Raises OSError."""
     encoder = msgspec.json.Encoder()
     for sample in samples:
         form: dict[str, object] = {"t_ns": sample.t_ns, "q": sample.q_icrs_to_cam.tolist()}

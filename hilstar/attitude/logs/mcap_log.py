@@ -263,7 +263,6 @@ def _unpacked(chunk: kinds.Chunk, room: int) -> bytes:
 
 
 def _inside(data: bytes) -> Iterator[kinds.McapRecord]:
-    """The schemas, channels and messages of a chunk."""
     place = 0
     while place < len(data):
         opcode, length = _record_head.unpack_from(data, place)
@@ -291,8 +290,6 @@ class JsonTopic:
 
 
 class _Pending(NamedTuple):
-    """A message that is not written yet."""
-
     channel: int
     time_ns: int
     record: bytes
@@ -406,7 +403,6 @@ class McapWriter:
         self._append(end + summary + _bytes_of(kinds.Footer(start, offset_start, crc)) + MCAP_MAGIC)
 
     def _append(self, data: bytes) -> None:
-        """Write at the end, all or nothing."""
         try:
             rest = memoryview(data)
             while rest:

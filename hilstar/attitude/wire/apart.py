@@ -247,7 +247,6 @@ class ReaderProcess:
         self._notices.tell("receiver-failed", f"{self._name} stopped ({why}); restarting it")
 
     def _stop(self, patience_s: float) -> int:
-        """Let the process end, within `patience_s` in order; its exit code."""
         wire, self._wire = self._wire, None
         if wire is not None:
             wire.close()

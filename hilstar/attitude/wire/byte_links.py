@@ -303,7 +303,6 @@ class FileBytes(ByteLink):
             self._clock.sleep(min(FILE_LOOK_S, end.left_s))
 
     def _follow(self) -> None:
-        """Look whether the file was made anew or cut."""
         named = self._path.stat()
         if self._file < 0:
             self._open()

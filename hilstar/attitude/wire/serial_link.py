@@ -112,7 +112,6 @@ class SerialLink(StreamLink):
         return [Arrival(each.host_ns, wire.decode_frame(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
-        """What has come, read now."""
         if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
             device.timeout = timeout_ms / 1000
         data = device.read(1)

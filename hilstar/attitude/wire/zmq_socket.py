@@ -278,7 +278,6 @@ class ZmqSocket(Link):
             raise
 
     def _open(self, patience_s: float = REBIND_S) -> zmq.Socket[bytes]:
-        """The socket, opened. Raises InputError where it cannot be bound within `patience_s`."""
         made: zmq.Socket[bytes] = self._context.socket(self._kind)
         self._configure(made)
         self._socket = made
@@ -315,7 +314,6 @@ class ZmqSocket(Link):
             return
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
-        """Set the options that must come before bind or connect."""
         made.setsockopt(zmq.LINGER, 0)
         made.setsockopt(zmq.IPV6, "[" in self._address)
         made.setsockopt(zmq.MAXMSGSIZE, self._max_part_bytes)
@@ -359,7 +357,6 @@ class ZmqSocket(Link):
             self._reset(f"memory grew by more than {MAX_GROWTH_BYTES / 1e6:.0f} MB, as by a message that never ends")
 
     def _take(self) -> bytes | None:
-        """The last part of the next message; None as for `_take_parts`."""
         parts = self._take_parts()
         return None if parts is None else parts[-1]
 

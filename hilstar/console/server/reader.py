@@ -94,7 +94,6 @@ def _of_rest(seen: messages.RunState, lately: RecentFrames) -> Iterator[str]:
 
 
 def _s(time_ns: int) -> str:
-    """A duration as the page writes it."""
     s = time_ns / NS_PER_S
     if s < 60:
         return f"{s:.1f} s"

@@ -130,7 +130,6 @@ class ScpiServer:
                 self._look()
 
     def _look(self) -> None:
-        """Bring every connection's registers up to date."""
         self.pending()  # what is shown while nobody waits counts, too
         for client in self._clients:
             client.look()
@@ -372,8 +371,6 @@ def _numbers(values: tuple[float, ...] | list[float] | None, places: int) -> str
 
 
 def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> "Command":
-    """A command that sets a mask."""
-
     async def command(connection: Connection, unit: Unit) -> None:
         what(connection.status, scpi.integer(scpi.count(unit, 1)[0], maximum))
 
@@ -381,8 +378,6 @@ def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> "Co
 
 
 def _bare(what: Callable[[InstrumentStatus], None]) -> "Command":
-    """A command without parameters."""
-
     async def command(connection: Connection, unit: Unit) -> None:
         what(connection.status)
 

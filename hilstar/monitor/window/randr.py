@@ -227,7 +227,6 @@ class Randr:
         return current if any(current) else IDENTITY
 
     def _properties(self, output: int) -> Iterator[tuple[str, Value | bytes]]:
-        """Each property with its value, the EDID as bytes."""
         count = ctypes.c_int()
         atoms = self._xrandr.XRRListOutputProperties(self._display, output, ctypes.byref(count))
         for atom in atoms[: count.value] if atoms else ():

@@ -245,7 +245,6 @@ class Window:
         self._changed = True
 
     def _follow_display(self) -> None:
-        """Notice that the display was unplugged, and fill it again once it is back."""
         self._changed = False
         display = self.display
         if display is None:

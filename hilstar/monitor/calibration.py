@@ -19,9 +19,9 @@ from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import write_whole
 from hilstar.monitor import response as responses
-from hilstar.monitor.identity import MonitorIdentity
+from hilstar.monitor.identity import TABLE, MonitorIdentity
 from hilstar.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes, read_text
-from hilstar.toml_tables import Kind, Table, explained
+from hilstar.toml_tables import Kind, Table, explained, toml_text
 
 FORMULAS = ("srgb", "gamma2.2")
 BUILT_IN = (*FORMULAS, "lcd-example")
@@ -429,19 +429,11 @@ def write_calibration(
     table = path.parent / head.response
     codes = np.arange(len(next(iter(columns.values()))))
     rows = "".join(",".join([str(code), *(f"{float(light[code])!r}" for light in columns.values())]) + "\n" for code in codes)
-    comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included\n".encode(
-        "ascii", "replace"
-    ).decode()
-    lines = ["[calibration]", *_keys(msgspec.structs.asdict(head)), ""]
-    if weights is not None:
-        lines += ["[weights]", *(f"{name} = {share!r}" for name, share in msgspec.structs.asdict(weights).items()), ""]
-    lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
-    if errors is not None:
-        lines += ["", "[errors]", *(f"{key} = {json.dumps(value)}" for key, value in msgspec.structs.asdict(errors).items())]
-    if identity is not None:
-        lines += ["", identity.toml()]
-    write_whole(table, comment + ",".join(["code", *columns]) + "\n" + rows)
-    write_whole(path, "\n".join(lines) + "\n")
+    comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included\n"
+    tables: dict[str, Any] = {"calibration": head, "weights": weights, "noise": {"relative": float(f"{noise:.6g}")}}
+    tables |= {"notes": notes, "errors": errors, TABLE: None if identity is None else identity.known()}
+    write_whole(table, comment.encode("ascii", "replace").decode() + ",".join(["code", *columns]) + "\n" + rows)
+    write_whole(path, toml_text(msgspec.to_builtins(tables)))
     return table
 
 
@@ -456,7 +448,3 @@ def add_uniformity(path: Path, grid: FloatArray, relative: float | None = None) 
     known = "" if relative is None else f"relative = {relative:.4g}\n"
     write_whole(path, f"{text}\n[uniformity]\nfile = {json.dumps(table.name)}\n{known}")
     return table
-
-
-def _keys(table: dict[str, Any]) -> list[str]:
-    return [f"{key} = {json.dumps(value if isinstance(value, int) else str(value))}" for key, value in table.items()]

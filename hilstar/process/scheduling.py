@@ -54,9 +54,7 @@ class Timex(ctypes.Structure):
 
     _fields_ = (
         ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
+        *((name, ctypes.c_long) for name in ("offset", "freq", "maxerror")),
         ("others", ctypes.c_byte * 256),
     )
 

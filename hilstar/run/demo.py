@@ -8,7 +8,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from hilstar.bench.frame_files import write_codes_png, write_preview_png
 from hilstar.errors import MachineError
 from hilstar.files import make_directory
 from hilstar.monitor.response import Codes
+from hilstar.process.closing import Closing
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
 from hilstar.run.loop import Limit
 from hilstar.run.pacer import FrameSink, Shown
@@ -136,7 +136,7 @@ def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watchin
     return Demo(summary, kept, bench.config.monitor.bits)
 
 
-class _DemoSender:
+class _DemoSender(Closing):
     def __init__(self, arguments: list[str]) -> None:
         self._command = [sys.executable, "-m", "hilstar", *arguments]
         self._process: subprocess.Popen[bytes] | None = None
@@ -148,10 +148,7 @@ class _DemoSender:
             command = shlex.join(["hilstar", *self._command[3:]])
             raise MachineError(f"the demo's sender ended before an attitude came; to see why, run: {command}")
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
+    def close(self) -> None:
         if self._process is not None:
             self._process.terminate()
             self._process.wait()

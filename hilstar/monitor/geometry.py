@@ -185,8 +185,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
     if lens.field is not None:
         field = FieldTable(x_px=lens.field.x.tolist(), y_px=lens.field.y.tolist())
     w, x, y, z = q_cam_to_mon.tolist()
-    k1, k2, k3 = lens.radial
-    p1, p2 = lens.tangential
+    coefficients: dict[str, Any] = dict(zip(LensTable.__struct_fields__, (*lens.radial, *lens.tangential), strict=True))
     found = GeometryFile(
         kind=KIND,
         resolution_px=camera.resolution_px,
@@ -194,11 +193,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         principal_point_px=camera.principal_point_px,
         q_cam_to_mon=(w, x, y, z),
         tilt_deg=(float(np.degrees(lens.tilt_rad[0])), float(np.degrees(lens.tilt_rad[1]))),
-        k1=k1,
-        k2=k2,
-        k3=k3,
-        p1=p1,
-        p2=p2,
+        **coefficients,
         max_field_deg=math.degrees(math.atan(lens.max_tangent)) if math.isfinite(lens.max_tangent) else None,
         field=field,
         sigma=notes.sigma,

@@ -15,7 +15,7 @@ import contextlib
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, Unpack
 
 import numpy as np
 import zmq
@@ -23,12 +23,11 @@ import zmq
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.endpoint import parse_endpoint
-from hilstar.attitude.wire.keys import NO_KEYS
 from hilstar.attitude.wire.links import Arrival, LockstepLink, Pictures, RawMessage, TrackerCamera
 from hilstar.attitude.wire.source import Conventions, Mounting
 from hilstar.attitude.wire.vizard_message import Components, SimUpdate, VizBody, VizCamera, WireFormatError, decode_update
 from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqReceiver
-from hilstar.attitude.wire.zmq_socket import ZmqSocket
+from hilstar.attitude.wire.zmq_socket import SocketOptions, ZmqSocket
 from hilstar.errors import InputError, printable, shortened
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
@@ -251,18 +250,11 @@ class VizardLive(ZmqSocket, LockstepLink):
 
     asks_for_pictures = True
 
-    def __init__(
-        self,
-        endpoint: str,
-        follower: Follower,
-        *,
-        bind: bool = True,
-        notices: Notices | None = None,
-        clock: HostClock = HOST_CLOCK,
-    ) -> None:
+    def __init__(self, endpoint: str, follower: Follower, **options: Unpack[SocketOptions]) -> None:
         check_loopback(endpoint)
-        size = MAX_UPDATE_BYTES
-        super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices, max_part_bytes=size, clock=clock)
+        options.setdefault("bind", True)
+        options["max_part_bytes"] = MAX_UPDATE_BYTES
+        super().__init__(zmq.REP, endpoint, **options)
         self._follower, self.conventions = follower, follower.conventions
         self._tracker: TrackerCamera | None = None
         self._pictures: Pictures | None = None

@@ -5,7 +5,7 @@ import math
 import struct
 from collections.abc import Iterable
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import msgspec
 import zmq
@@ -15,7 +15,7 @@ from hilstar.attitude.wire.apart import OpenStream, ReaderProcess
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.source import PACKETS, Conventions, Mounting
-from hilstar.attitude.wire.zmq_socket import MAX_PART_BYTES, QUEUE_MESSAGES, ZmqSocket
+from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, SocketOptions, ZmqSocket
 from hilstar.notices import Notices
 from hilstar.process.closing import Closing
 from hilstar.process.interrupts import caught
@@ -51,24 +51,15 @@ class ZmqReceiver(ZmqSocket, StreamLink):
     """A SUB socket that takes every message that begins with `topic`; it connects, or binds with `bind`."""
 
     def __init__(
-        self,
-        endpoint: str,
-        *,
-        bind: bool = False,
-        keys: CurveKeys = NO_KEYS,
-        notices: Notices | None = None,
-        topic: bytes = b"",
-        max_part_bytes: int = MAX_PART_BYTES,
-        decoder: PacketDecoder = PACKET_DECODER,
-        clock: HostClock = HOST_CLOCK,
+        self, endpoint: str, *, topic: bytes = b"", decoder: PacketDecoder = PACKET_DECODER, **options: Unpack[SocketOptions]
     ) -> None:
-        self.topic, self.decoder, self.bound = topic, decoder, bind
+        self.topic, self.decoder, self.bound = topic, decoder, options.get("bind", False)
         self.conventions, self.stamped = decoder.conventions, decoder.stamped
-        super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices, max_part_bytes=max_part_bytes, clock=clock)
-        if not bind:  # a connecting socket hears nothing until a sender binds there
+        super().__init__(zmq.SUB, endpoint, **options)
+        if not self.bound:  # a connecting socket hears nothing until a sender binds there
             self.verb = "waiting for a sender at"
         self._shut()
-        self._lost_until = clock.within(0.0)
+        self._lost_until = self._clock.within(0.0)
 
     def opener(self) -> OpenStream:
         """What another process opens the same socket by."""
@@ -173,7 +164,7 @@ class ZmqSender(ZmqSocket):
 
     def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, clock: HostClock = HOST_CLOCK) -> None:
         self._tended_until = clock.within(0.0)
-        super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys, notices=None, clock=clock)
+        super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys, clock=clock)
         self._ready()
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
@@ -205,17 +196,11 @@ class ZmqSender(ZmqSocket):
 class ZmqLockstep(ZmqSocket, LockstepLink):
     """A REP socket: one request is one attitude and gets one reply; it binds, or connects with `bind=False`."""
 
-    def __init__(
-        self,
-        endpoint: str,
-        *,
-        bind: bool = True,
-        keys: CurveKeys = NO_KEYS,
-        notices: Notices | None = None,
-        clock: HostClock = HOST_CLOCK,
-    ) -> None:
-        super().__init__(zmq.REP, endpoint, bind=bind, keys=keys, notices=notices, clock=clock)
-        self._json = False
+    _json = False  # whether the last request was
+
+    def __init__(self, endpoint: str, **options: Unpack[SocketOptions]) -> None:
+        options.setdefault("bind", True)
+        super().__init__(zmq.REP, endpoint, **options)
 
     def receive(self, timeout_ms: int) -> Arrival[wire.Event] | None:
         """The next request for a frame, or None; it must be answered before the next can arrive.

@@ -144,10 +144,6 @@ class PacketCounts:
 Watch = Callable[[int, bytes, wire.AttitudeSample | None, wire.Refusal | None], None]
 
 
-def nobody_watches(host_ns: int, raw: bytes, sample: wire.AttitudeSample | None, refusal: wire.Refusal | None) -> None:
-    """The watch of a run without a ledger."""
-
-
 class Receiver:
     """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it. `back` leads back.
 
@@ -159,7 +155,7 @@ class Receiver:
         link: StreamLink,
         timeline: Timeline,
         traffic: Traffic = QUIET,
-        watch: Watch = nobody_watches,
+        watch: Watch = lambda host_ns, raw, sample, refusal: None,
         notices: Notices | None = None,
         *,
         wrong_rates: WrongRates = "use-quaternions",
@@ -185,7 +181,7 @@ class Receiver:
         self._watch = watch
         self._repeats = Repeats(self._notices)
         self._rates = RateCheck(wrong_rates, self._notices)
-        self._senders = Senders(timeline.stale_after_ns, self._notices)
+        self._senders = Senders(timeline.policy.stale_after_ns, self._notices)
         self._begun_ns: int | None = None
         self._learn_from_ns: int | None = None
         self._empty_ns = 0
@@ -225,10 +221,6 @@ class Receiver:
         """Stop listening; the caller closes the link."""
         self._stop.set()
         self._thread.join()
-
-    def sender_ns(self, continuous_ns: int) -> int:
-        """A time of the timeline on the sender's own clock."""
-        return continuous_ns - self.jumps.correction_ns
 
     def clock_summary(self) -> ClockSummary:
         """The clock's summary, its offset that of the sender's clock as it is now, after all jumps."""

@@ -1,7 +1,7 @@
 """hilstar certify: how sure a bench is, stated and dated; and whether it has moved since."""
 
 import datetime
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +9,7 @@ import msgspec
 import typer
 from typer import Option
 
+from hilstar.cli.first_light import image_source
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
 from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError
@@ -153,29 +154,19 @@ def _reader(
     check: bool,
     again: bool,
 ) -> "Reader | None":
-    from contextlib import closing
-
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.image_sources import GrabCommand, ImageSource, SerialDiode, VirtualBench
     from hilstar.certify.check import checks_in
     from hilstar.certify.readings import ImageReader, VirtualReader
-    from hilstar.cli.options import parse_diode
     from hilstar.files import temporary_folder
 
-    source: ImageSource
-    if virtual is not None:
-        truth = read_bench_file(virtual)
-        if not whole:
-            return VirtualReader(file, truth, seed, checks_in(output) + 1 if check else 0)
-        source = ended.enter_context(closing(VirtualBench(file, truth, seed)))
-    elif grab is not None:
-        recorder = None if diode is None else SerialDiode(*parse_diode(diode))
-        source = shown = ended.enter_context(closing(GrabCommand(grab, dark, recorder)))
-        truth = None
-        shown.find_monitor(file, datetime.datetime.now(datetime.UTC).date(), force=again)
-        source.gate(file)
-    else:
+    truth = None if virtual is None else read_bench_file(virtual)
+    if truth is None and grab is None:
         return None
+    if truth is not None and not whole:
+        return VirtualReader(file, truth, seed, checks_in(output) + 1 if check else 0)
+    source = ended.enter_context(closing(image_source(file, grab, virtual, dark, diode, seed)))
+    source.find_monitor(file, datetime.datetime.now(datetime.UTC).date(), force=again)
+    source.gate(file)
     folder = ended.enter_context(temporary_folder("certify"))
     say(f"images by {source.identity}")
     return ImageReader(file, source, folder, truth=truth)

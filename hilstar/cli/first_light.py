@@ -101,7 +101,7 @@ def first_light(
     watched_s = SECONDS * ((0.0 if virtual is None else WARM_UP_MIN) if warm_up is None else warm_up)
     with (
         page_listener(console, control, token, console_name) as listener,
-        closing(_image_source(file, grab, virtual, dark, diode, seed)) as source,
+        closing(image_source(file, grab, virtual, dark, diode, seed)) as source,
         alone_in(make_directory(output)),
         _shown(listener, control, file) as (tell, watch),
     ):
@@ -140,7 +140,7 @@ def _shown(
         yield tell, feed.show
 
 
-def _image_source(
+def image_source(
     file: "files.BenchFile", grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
 ) -> "ImageSource":
     """The source of images. Raises InputError for options that exclude each other."""

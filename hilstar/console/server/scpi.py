@@ -225,7 +225,7 @@ class Connection:
         self.status.questionable.see(questionable)
         if self.status.completes and not self._server.pending():
             self.status.completes = False
-            self.status.event |= OPERATION_COMPLETE
+            self.status.standard.event |= OPERATION_COMPLETE
 
     async def answer(self, line: str | None) -> str:
         """Do what a line says; its answers, "" for none. None is a line that was too long."""
@@ -388,8 +388,8 @@ Command = Callable[[Connection, Unit], Awaitable[str | None]]
 # Queries that answer at once. None of any kind has parameters.
 QUERIES: dict[str, Callable[[Connection], str]] = {
     "*IDN?": lambda at: f"hilstar,star display,0,{__version__}",
-    "*ESE?": lambda at: str(at.status.event_enable),
-    "*ESR?": lambda at: str(at.status.read_event()),
+    "*ESE?": lambda at: str(at.status.standard.enable),
+    "*ESR?": lambda at: str(at.status.standard.read()),
     "*SRE?": lambda at: str(at.status.service_enable),
     "*STB?": Connection.status_byte,
     "*TST?": Connection.self_test,
@@ -414,7 +414,7 @@ COMMANDS: dict[str, Command] = {
     "*OPC": Connection.complete_later,
     "*OPC?": Connection.complete,
     "*WAI": Connection.wait,
-    "*ESE": _setting(lambda status, mask: setattr(status, "event_enable", mask), 255),
+    "*ESE": _setting(lambda status, mask: setattr(status.standard, "enable", mask), 255),
     "*SRE": _setting(lambda status, mask: setattr(status, "service_enable", mask & ~scpi.MASTER), 255),
     "SYSTem:AUTHenticate": Connection.authenticate,
     "STATus:PRESet": _bare(InstrumentStatus.preset),

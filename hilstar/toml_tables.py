@@ -3,7 +3,9 @@
 The line says table, key, value, and what is wanted, in the place of msgspec's own message.
 """
 
+import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -83,6 +85,27 @@ def _such_as(field: msgspec.structs.FieldInfo, value: Any) -> str:
         return f", such as {field.name} = [{_toml(value)}, {_toml(value)}]"
     example = field.default if isinstance(field.default, tuple) else EXAMPLES[len(kinds)]
     return f", such as {field.name} = {_toml(list(example)).replace(',', ', ')}"
+
+
+def toml_text(tables: Mapping[str, Any]) -> str:
+    """A file of plain keys, then a table for each dictionary; None and empty tables are left unsaid.
+
+    TOML writes numbers, truth values, plain text and lists as JSON does; a list of lists stands row by row.
+    """
+    plain_keys = {key: value for key, value in tables.items() if not isinstance(value, dict)}
+    parts = {"": plain_keys} | {f"[{key}]\n": value for key, value in tables.items() if isinstance(value, dict)}
+    texts = []
+    for head, part in parts.items():
+        rows = "".join(f"{key} = {_written(value)}\n" for key, value in part.items() if value is not None)
+        texts += [head + rows] if rows else []
+    return "\n".join(texts)
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        rows = ",\n    ".join(map(json.dumps, value))
+        return f"[\n    {rows},\n]"
+    return json.dumps(value)
 
 
 def _toml(value: Any) -> str:

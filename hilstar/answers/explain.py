@@ -63,7 +63,6 @@ def under_conventions(answer: Answer, decoder: AnswerDecoder, shown: FloatArray 
 
 
 def _as_sent(q_icrs_to_cam: FloatArray, conventions: Conventions) -> FloatArray:
-    """The quaternion in the order and sense in which the tracker sent it."""
     q, convention = q_icrs_to_cam, conventions.convention
     if convention.frame == "body" and conventions.q_body_to_cam is not None:
         q = multiply(conjugate(normalise(np.array(conventions.q_body_to_cam))), q)

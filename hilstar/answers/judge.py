@@ -183,7 +183,6 @@ class AnswerJudge:
         return found
 
     def _lately(self, now_ns: int) -> FloatArray:
-        """The rows of the last minute, in their order."""
         at = self._count % MAX_IN_WINDOW
         rows = self._rows[: self._count] if self._count < MAX_IN_WINDOW else np.roll(self._rows, -at, axis=0)
         return rows[rows[:, HOST_S] >= now_ns / NS_PER_S - WINDOW_S]

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from hilstar.answers.answer import Answer, ReportedStar
+from hilstar.answers.answer import Answer
 from hilstar.answers.formats import AnswerDecoder, RefusedAnswer
 from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.byte_links import ByteLink, FileBytes, SerialBytes, TcpBytes, UdpBytes, ZmqBytes
@@ -43,18 +43,15 @@ MAX_DETAILS = 20  # reasons whose newest example is kept
 
 
 class HandedOver(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What the other process decoded: an answer's numbers, or counts of refusals with an example."""
+    """What the other process decoded: an answer, or counts of refusals with an example of each."""
 
-    t_ns: int | None = None
-    q: list[float] | None = None
-    rate: list[float] | None = None
-    valid: bool = True
-    mode: str = ""
-    stars: int | None = None
-    rms_arcsec: float | None = None
-    centroids: tuple[ReportedStar, ...] = ()
+    answer: Answer | None = None
     refused: dict[str, int] = {}
     details: dict[str, str] = {}
+
+
+hand_over = msgspec.msgpack.Encoder(enc_hook=np.ndarray.tolist).encode
+handed_over = msgspec.msgpack.Decoder(HandedOver, dec_hook=lambda kind, numbers: np.array(numbers)).decode
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,7 @@ class ReadPlan:
 
 
 class DecodingLink:
-    """In the other process: the road, its bounds, its questions, and what the bytes say, as messages of [raw, HandedOver]."""
+    """In the other process: the road, its bounds, its questions, and what the bytes say, each message a `HandedOver`."""
 
     def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self._link, self._clock = plan.open(notices), clock
@@ -144,15 +141,13 @@ class DecodingLink:
                     details[FLOOD] = f"over {MAX_ANSWERS_PER_S} answers a second"
                 else:
                     self._answers_left -= 1
-                    given.append(chunk._replace(parts=[found.raw, msgspec.msgpack.encode(handed_over(found))], sender=None))
+                    given.append(chunk._replace(parts=[hand_over(HandedOver(found))], sender=None))
             self._work_left_s -= (self._clock.now_ns() - begun_ns) / NS_PER_S
         if refused:
-            counted = HandedOver(refused=dict(refused), details=details)
-            given.append(RawMessage(now_ns, [b"", msgspec.msgpack.encode(counted)]))
+            given.append(RawMessage(now_ns, [hand_over(HandedOver(refused=dict(refused), details=details))]))
         return given
 
     def _pieces(self, chunks: list[RawMessage]) -> Iterator[tuple[RawMessage, bytes]]:
-        """What came, a message or some bytes of a stream at a time."""
         for chunk in chunks:
             data = chunk.parts[-1]
             size = max(len(data), 1) if self._link.messages else PIECE_BYTES
@@ -162,21 +157,6 @@ class DecodingLink:
     def close(self) -> None:
         """Close the road."""
         self._link.close()
-
-
-def handed_over(answer: Answer) -> HandedOver:
-    """An answer's numbers."""
-    q, rate = answer.q_icrs_to_cam, answer.rate_cam_rad_s
-    return HandedOver(
-        t_ns=answer.t_ns,
-        q=None if q is None else q.tolist(),
-        rate=None if rate is None else rate.tolist(),
-        valid=answer.valid,
-        mode=answer.mode,
-        stars=answer.star_count,
-        rms_arcsec=answer.rms_arcsec,
-        centroids=answer.centroids,
-    )
 
 
 class AnswersApart(Closing):
@@ -191,8 +171,6 @@ class AnswersApart(Closing):
         plan.decoder(messages)
         self._refused: Counter[str] = Counter()
         self.details: dict[str, str] = {}
-        self._notices = notices
-        self._decode = msgspec.msgpack.Decoder(HandedOver).decode
         self._process = ReaderProcess(notices, clock=clock, name="the reader of the tracker's answers")
         self._process.read(stream=partial(DecodingLink, plan))
 
@@ -204,23 +182,13 @@ class AnswersApart(Closing):
         """The answers since the last call, oldest first; waits at most `timeout_ms` for the first."""
         found: list[Answer] = []
         for record in self._process.take() if self._process.wait(timeout_ms) else ():
-            if record.notice is not None:
-                kind, detail, who = record.notice
-                if record.lasting:
-                    self._notices.tell(kind, detail, who)
-                else:
-                    self._notices.mention(kind, detail)
             if record.message is None:
                 continue
-            raw, packed = record.message.parts
-            said = self._decode(packed)
-            if said.refused:
-                self._refused.update(said.refused)
-                self.details = dict(list({**self.details, **said.details}.items())[-MAX_DETAILS:])
-                continue
-            q, rate = (None if numbers is None else np.array(numbers) for numbers in (said.q, said.rate))
-            more = (said.valid, said.mode, said.stars, said.rms_arcsec, said.centroids)
-            found.append(Answer(record.message.host_ns, raw, said.t_ns, q, rate, *more))
+            said = handed_over(record.message.parts[0])
+            if said.answer is not None:
+                found.append(said.answer)
+            self._refused.update(said.refused)
+            self.details = dict(list({**self.details, **said.details}.items())[-MAX_DETAILS:])
         return found
 
     def refusals(self) -> dict[str, int]:

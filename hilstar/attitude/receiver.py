@@ -14,19 +14,8 @@ from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
 from hilstar.attitude.clock.senders import Repeats, Senders
 from hilstar.attitude.clock.timeline import Timeline
+from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
-from hilstar.attitude.wire.packet import (
-    REASONS,
-    AnswerPacket,
-    AttitudeSample,
-    Event,
-    Packet,
-    Reason,
-    Refusal,
-    Status,
-    TimeReply,
-    TimeRequest,
-)
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
@@ -73,25 +62,25 @@ class BackChannel:
 
     def __init__(self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = HOST_CLOCK.now_ns) -> None:
         self._link, self._now_ns = link, now_ns
-        self._send: Callable[[Packet], None] = link.send
+        self._send: Callable[[wire.Packet], None] = link.send
         self._traffic = traffic
         self._posting = threading.Lock()
-        self._status: Status | None = None
-        self._answers: deque[AnswerPacket] = deque(maxlen=MAX_PASSED_ON)
+        self._status: wire.Status | None = None
+        self._answers: deque[wire.AnswerPacket] = deque(maxlen=MAX_PASSED_ON)
         self._next_status_ns = 0
-        self._asked: dict[int, TimeRequest] = {}
+        self._asked: dict[int, wire.TimeRequest] = {}
         self._asks = 0
         self._quick_asks = FIRST_ASKS
         self._next_ask_ns = 0
 
-    def post(self, status: Status) -> None:
+    def post(self, status: wire.Status) -> None:
         """Take the newest status; it leaves when it is due, with the one-time health bits of those that never left."""
         with self._posting:
             if self._status is not None:
                 status = replace(status, health=status.health | self._status.health & TOLD_ONCE)
             self._status = status
 
-    def pass_on(self, answer: AnswerPacket) -> None:
+    def pass_on(self, answer: wire.AnswerPacket) -> None:
         """Take an answer of the tracker; it leaves at once. The oldest of more than MAX_PASSED_ON is dropped."""
         self._answers.append(answer)
 
@@ -99,7 +88,7 @@ class BackChannel:
         """Send what is due; time requests only where `ask`."""
         if ask and self._traffic.time_requests and now_ns >= self._next_ask_ns:
             self._asks += 1
-            request = TimeRequest(self._asks, self._now_ns())
+            request = wire.TimeRequest(self._asks, self._now_ns())
             self._asked = {sequence: asked for sequence, asked in self._asked.items() if self._asks - sequence < FIRST_ASKS}
             self._asked[self._asks] = request
             self._quick_asks -= 1
@@ -124,12 +113,12 @@ class BackChannel:
         if arrival.back is not None:
             self._send = arrival.back
 
-    def answer(self, request: TimeRequest, arrival: Arrival[Event]) -> None:
+    def answer(self, request: wire.TimeRequest, arrival: Arrival[wire.Event]) -> None:
         """Answer a sender's own time request."""
         send = self._link.send if arrival.back is None else arrival.back
-        send(TimeReply(request.sequence, request.t1_ns, arrival.host_ns, self._now_ns()))
+        send(wire.TimeReply(request.sequence, request.t1_ns, arrival.host_ns, self._now_ns()))
 
-    def exchange(self, reply: TimeReply, t4_ns: int, correction_ns: int) -> Exchange | None:
+    def exchange(self, reply: wire.TimeReply, t4_ns: int, correction_ns: int) -> Exchange | None:
         """The exchange that a reply completes, its sender times made continuous; None for a reply to nothing."""
         request = self._asked.pop(reply.sequence, None)
         if request is None or request.t1_ns != reply.t1_ns:
@@ -143,7 +132,7 @@ class PacketCounts:
     """How many attitude messages arrived, and how many of those were refused, by reason."""
 
     received: int = 0
-    refused_by: dict[Reason, int] = field(default_factory=lambda: dict.fromkeys(REASONS, 0))
+    refused_by: dict[wire.Reason, int] = field(default_factory=lambda: dict.fromkeys(wire.REASONS, 0))
 
     @property
     def refused(self) -> int:
@@ -152,15 +141,11 @@ class PacketCounts:
 
 
 # Called for every attitude message with its arrival, its bytes, what it says, and why it was refused, if it was.
-Watch = Callable[[int, bytes, AttitudeSample | None, Refusal | None], None]
-
-
-def nobody_watches(host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
-    """The watch of a run without a ledger."""
+Watch = Callable[[int, bytes, wire.AttitudeSample | None, wire.Refusal | None], None]
 
 
 class Receiver:
-    """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it.
+    """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it. `back` leads back.
 
     What arrives before `learn` is called fills the timeline, and teaches the clock little. `now_ns` is the host's clock.
     """
@@ -170,7 +155,7 @@ class Receiver:
         link: StreamLink,
         timeline: Timeline,
         traffic: Traffic = QUIET,
-        watch: Watch = nobody_watches,
+        watch: Watch = lambda host_ns, raw, sample, refusal: None,
         notices: Notices | None = None,
         *,
         wrong_rates: WrongRates = "use-quaternions",
@@ -192,11 +177,11 @@ class Receiver:
         self.latency_ms = RunningStatistics()
         self._link = link
         self._timeline = timeline
-        self._back = BackChannel(link, traffic, now_ns)
+        self.back = BackChannel(link, traffic, now_ns)
         self._watch = watch
         self._repeats = Repeats(self._notices)
         self._rates = RateCheck(wrong_rates, self._notices)
-        self._senders = Senders(timeline.stale_after_ns, self._notices)
+        self._senders = Senders(timeline.policy.stale_after_ns, self._notices)
         self._begun_ns: int | None = None
         self._learn_from_ns: int | None = None
         self._empty_ns = 0
@@ -236,18 +221,6 @@ class Receiver:
         """Stop listening; the caller closes the link."""
         self._stop.set()
         self._thread.join()
-
-    def post(self, status: Status) -> None:
-        """Hand in the newest status; it leaves when it is due."""
-        self._back.post(status)
-
-    def pass_on(self, answer: AnswerPacket) -> None:
-        """Hand in an answer of the tracker, for the sender."""
-        self._back.pass_on(answer)
-
-    def sender_ns(self, continuous_ns: int) -> int:
-        """A time of the timeline on the sender's own clock."""
-        return continuous_ns - self.jumps.correction_ns
 
     def clock_summary(self) -> ClockSummary:
         """The clock's summary, its offset that of the sender's clock as it is now, after all jumps."""
@@ -296,7 +269,7 @@ class Receiver:
             self._take_decided(self._senders.expire(now_ns))
         self._settle(self.jumps.expire(now_ns))
         if self._link.two_way:
-            self._back.talk(now_ns, ask=self._learn_from_ns is not None)
+            self.back.talk(now_ns, ask=self._learn_from_ns is not None)
 
     def _doubt(self, known: UnixOffset) -> None:
         """Say while nothing keeps this machine's clock of Unix time."""
@@ -305,15 +278,15 @@ class Receiver:
         else:
             self._notices.begin(UNDISCIPLINED, UNDISCIPLINED_LINE)
 
-    def _take(self, arrival: Arrival[Event], waited_ns: int) -> None:
+    def _take(self, arrival: Arrival[wire.Event], waited_ns: int) -> None:
         match arrival.event:
-            case TimeRequest() as request if self._link.two_way:
-                self._back.answer(request, arrival)
-            case TimeReply() as reply if self._link.two_way:
-                exchange = self._back.exchange(reply, arrival.host_ns, self.jumps.correction_ns)
+            case wire.TimeRequest() as request if self._link.two_way:
+                self.back.answer(request, arrival)
+            case wire.TimeReply() as reply if self._link.two_way:
+                exchange = self.back.exchange(reply, arrival.host_ns, self.jumps.correction_ns)
                 if exchange is not None:
                     self.clock.exchange(exchange)
-            case AttitudeSample() as sample:
+            case wire.AttitudeSample() as sample:
                 self.counts.received += 1
                 refusal = self._repeats.judge(sample, arrival.host_ns, arrival.raw)
                 if refusal is not None:
@@ -326,8 +299,8 @@ class Receiver:
                 self._take_decided(self._senders.take(own))
             case other:
                 self.counts.received += 1
-                refusal = Refusal("format", f"a {type(other).__name__} packet is not an attitude")
-                self._refuse(arrival, other if isinstance(other, Refusal) else refusal)
+                refusal = wire.Refusal("format", f"a {type(other).__name__} packet is not an attitude")
+                self._refuse(arrival, other if isinstance(other, wire.Refusal) else refusal)
 
     def _take_decided(self, arrivals: list[SampleArrival]) -> None:
         """Take samples whose sender is decided: the one shown, or another, whose samples are refused."""
@@ -338,7 +311,7 @@ class Receiver:
             if self._learn_from_ns is None or arrival.host_ns < self._learn_from_ns:
                 arrival = replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
             elif self.clock.unheard:
-                self._back.ask_quickly(arrival.host_ns)
+                self.back.ask_quickly(arrival.host_ns)
             self._settle(self.jumps.take(arrival))
             slowness = self.jumps.slowness
             if slowness and not self.clock.synchronised:
@@ -354,7 +327,7 @@ class Receiver:
             if refusal is not None:
                 self._refuse(arrival, refusal)
                 continue
-            self._back.follow(arrival)
+            self.back.follow(arrival)
             if arrival.waited_ns != WAITED_UNKNOWN_NS:
                 latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
                 self.latency_ms.add((latency_ns or 0.0) / NS_PER_MS)
@@ -364,10 +337,10 @@ class Receiver:
             total_s = self.jumps.correction_ns / NS_PER_S
             self._notices.tell("jump", f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream continues")
 
-    def _refuse(self, arrival: Arrival[Event], refusal: Refusal) -> None:
+    def _refuse(self, arrival: Arrival[wire.Event], refusal: wire.Refusal) -> None:
         self.counts.refused_by[refusal.reason] += 1
         if self.counts.refused_by[refusal.reason] == 1:
             line = f"packet refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
             self._notices.mention("refused", line)
-        sample = arrival.event if isinstance(arrival.event, AttitudeSample) else None
+        sample = arrival.event if isinstance(arrival.event, wire.AttitudeSample) else None
         self._watch(arrival.host_ns, arrival.raw, sample, refusal)

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from hilstar.cli import options
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 
 if TYPE_CHECKING:
-    from collections import Counter
     from collections.abc import Iterator
 
     from hilstar.answers.answer import Answer
@@ -28,17 +28,15 @@ MAX_ROWS = 100_000  # of the JSON object: the newest
 def answers(
     bench: options.BenchFile,
     recorded: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="FILE", help="Bytes recorded from the tracker's line; by default the live link."),
+        Path | None, Option("--from", metavar="FILE", help="Bytes recorded from the tracker's line; by default the live link.")
     ] = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Show which bytes became which field, and each answer under every convention.")
+        bool, Option("--explain", help="Show which bytes became which field, and each answer under every convention.")
     ] = False,
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,
     seconds: Annotated[
-        float | None,
-        typer.Option("--seconds", metavar="S", help="End after so long; by default with Ctrl-C.", min=0.1, max=1e7),
+        float | None, Option("--seconds", metavar="S", help="End after so long; by default with Ctrl-C.", min=0.1, max=1e7)
     ] = None,
     as_json: options.Json = False,
 ) -> None:
@@ -49,6 +47,8 @@ def answers(
     """
     from collections import Counter, deque
 
+    from hilstar.answers.explain import lines_of
+    from hilstar.answers.formats import RefusedAnswer
     from hilstar.answers.reader import ReadPlan, recorded_answers
     from hilstar.bench.bench_file import read_bench_file
 
@@ -67,24 +67,24 @@ def answers(
         found = recorded_answers(plan, decoder, recorded)
     rows: deque[dict[str, Any]] = deque(maxlen=MAX_ROWS)
     for each in found:
-        _count(each, counts)
+        if isinstance(each, RefusedAnswer):
+            counts[each.reason] += 1
+            row, line = {"refused": each.reason, "detail": each.detail}, f"refused ({each.reason}): {each.detail}"
+        else:
+            counts["answers"] += 1
+            counts["valid"] += each.valid
+            row, line = _row(each), _line(each)
         if as_json:
-            rows.append(_row(each))
+            rows.append(row | {"raw": each.raw.hex()})
             continue
-        for line in [_line(each), *(_explained(each, decoder, shown) if explain else ())]:
-            if line:
-                typer.echo(line)
+        for text in [line, *(lines_of(each, decoder, shown) if explain else ())]:
+            if text:
+                typer.echo(text)
     if as_json:
         print_json({"answers": list(rows), "counts": dict(counts)})
     else:
         refused = ", ".join(f"{count} {reason}" for reason, count in counts.items() if reason not in {"answers", "valid"})
         say(f"{counts['answers']} answers, {counts['valid']} valid" + (f"; refused: {refused}" if refused else ""))
-
-
-def _explained(found: "Answer | RefusedAnswer", decoder: "AnswerDecoder", shown: "FloatArray | None") -> list[str]:
-    from hilstar.answers.explain import lines_of
-
-    return lines_of(found, decoder, shown)
 
 
 def _shown_now(file: "BenchFile") -> "FloatArray | None":
@@ -131,7 +131,6 @@ def _shown_by_page() -> "FloatArray | None":
 
 
 def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iterator[Answer | RefusedAnswer]]":
-    """The answers of the live link, read here."""
     import threading
 
     from hilstar.answers.reader import live_answers
@@ -149,42 +148,14 @@ def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iter
     return decoder, found()
 
 
-def _count(found: "Answer | RefusedAnswer", counts: "Counter[str]") -> None:
-    from hilstar.answers.formats import RefusedAnswer
-
-    if isinstance(found, RefusedAnswer):
-        counts[found.reason] += 1
-        return
-    counts["answers"] += 1
-    counts["valid"] += found.valid
+def _row(found: "Answer") -> dict[str, Any]:
+    names = ("t_ns", "q_icrs_to_cam", "rate_cam_rad_s", "valid", "mode", "rms_arcsec", "centroids")
+    return {name: getattr(found, name) for name in names} | {"stars": found.star_count}
 
 
-def _row(found: "Answer | RefusedAnswer") -> dict[str, Any]:
-    """For a program."""
-    from hilstar.answers.formats import RefusedAnswer
-
-    if isinstance(found, RefusedAnswer):
-        return {"refused": found.reason, "detail": found.detail, "raw": found.raw.hex()}
-    return {
-        "t_ns": found.t_ns,
-        "q_icrs_to_cam": None if found.q_icrs_to_cam is None else found.q_icrs_to_cam.tolist(),
-        "rate_cam_rad_s": None if found.rate_cam_rad_s is None else found.rate_cam_rad_s.tolist(),
-        "valid": found.valid,
-        "mode": found.mode,
-        "stars": found.star_count,
-        "rms_arcsec": found.rms_arcsec,
-        "centroids": [list(star) for star in found.centroids],
-        "raw": found.raw.hex(),
-    }
-
-
-def _line(found: "Answer | RefusedAnswer") -> str:
-    """For a person."""
-    from hilstar.answers.formats import RefusedAnswer
+def _line(found: "Answer") -> str:
     from hilstar.rotation import to_radec_roll_deg
 
-    if isinstance(found, RefusedAnswer):
-        return f"refused ({found.reason}): {found.detail}"
     words = [f"t {'-' if found.t_ns is None else f'{found.t_ns / 1e9:.6f}'} s"]
     if found.q_icrs_to_cam is not None:
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(found.q_icrs_to_cam)

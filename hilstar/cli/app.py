@@ -2,53 +2,36 @@
 
 import copy
 import sys
-from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperGroup
 
-from hilstar.cli.answers import answers
-from hilstar.cli.assess import assess
-from hilstar.cli.attitude import attitude
-from hilstar.cli.benchmark import benchmark
-from hilstar.cli.budget import budget
-from hilstar.cli.calibrate import alignment, dots, geometric, photometric, plan, psf, scale
-from hilstar.cli.campaign import campaign
-from hilstar.cli.catalogue import catalogue
-from hilstar.cli.certify import certify
-from hilstar.cli.compare import compare
-from hilstar.cli.confront import confront
-from hilstar.cli.convert import convert
-from hilstar.cli.demo import demo
-from hilstar.cli.doctor import doctor
-from hilstar.cli.first_light import first_light
-from hilstar.cli.fmu import fmu
-from hilstar.cli.frame import frame
-from hilstar.cli.keys import keys
-from hilstar.cli.latency import latency
-from hilstar.cli.optics import lens, map_, zernike
-from hilstar.cli.replay import replay
-from hilstar.cli.report import report
-from hilstar.cli.send import send
-from hilstar.cli.sensor import import_, measure
-from hilstar.cli.serve import serve
-from hilstar.cli.service import install, uninstall
-from hilstar.cli.simulate import simulate
-from hilstar.cli.study import study
-from hilstar.cli.tracker import tracker
-from hilstar.cli.verify import verify
 from hilstar.version import __version__
 
-COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Show stars": (demo, frame, serve, replay),
-    "Attitude streams": (send, attitude, convert, answers, fmu, keys),
-    "Check what is shown": (simulate, verify, compare, budget, catalogue, report),
-    "Test the tracker": (assess, campaign, tracker, confront),
-    "Calibrate": (first_light, latency, certify),
-    "Study": (study, benchmark),
-    "This machine": (doctor,),
+# By their panels, each a file of this folder and its function.
+COMMANDS = {
+    "Show stars": ("demo", "frame", "serve", "replay"),
+    "Attitude streams": ("send", "attitude", "convert", "answers", "fmu", "keys"),
+    "Check what is shown": ("simulate", "verify", "compare", "budget", "catalogue", "report"),
+    "Test the tracker": ("assess", "campaign", "tracker", "confront"),
+    "Calibrate": ("first_light", "latency", "certify"),
+    "Study": ("study", "benchmark"),
+    "This machine": ("doctor",),
+}
+CALIBRATE = "Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by stars."
+SENSOR = "A tracker's sensor for the bench file, from its EMVA 1288 data sheet or its own frames."
+OPTICS = "A tracker's glass for `[tracker.optics] psf`: point spread functions by place, colour and focus."
+SERVICE = "A run that this machine starts, watches, and starts again."
+# The same of files with several commands.
+GROUPS = {
+    "calibrate": ("Calibrate", CALIBRATE, ("dots", "geometric", "psf", "alignment", "plan", "photometric", "scale")),
+    "sensor": ("Calibrate", SENSOR, ("import_", "measure")),
+    "optics": ("Calibrate", OPTICS, ("map_", "lens", "zernike")),
+    "service": ("This machine", SERVICE, ("install", "uninstall")),
 }
 
 
@@ -109,12 +92,6 @@ app = Application(
     rich_markup_mode="markdown",  # "rich" would swallow a table's name, as in [answers]
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-calibrate = typer.Typer(
-    help="Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by stars."
-)
-sensor = typer.Typer(help="A tracker's sensor for the bench file, from its EMVA 1288 data sheet or its own frames.")
-optics = typer.Typer(help="A tracker's glass for `[tracker.optics] psf`: point spread functions by place, colour and focus.")
-service = typer.Typer()
 
 
 def print_version(wanted: bool) -> None:
@@ -126,31 +103,22 @@ def print_version(wanted: bool) -> None:
 
 @app.callback()
 def hilstar(
-    _: Annotated[
-        bool, typer.Option("--version", callback=print_version, is_eager=True, help="Print the version and quit.")
-    ] = False,
+    _: Annotated[bool, Option("--version", callback=print_version, is_eager=True, help="Print the version and quit.")] = False,
 ) -> None:
     """Show a star tracker on a bench the stars it would see: attitudes in, frames of code values out."""
 
 
-@service.callback()
-def of_this_machine() -> None:
-    """A run that this machine starts, watches, and starts again."""
+def add(to: typer.Typer, file: str, name: str, panel: str | None = None) -> None:
+    """Add the command of a function `name` in a file of this folder."""
+    function = getattr(import_module(f"hilstar.cli.{file}"), name)
+    to.command(name.strip("_").replace("_", "-"), rich_help_panel=panel)(function)
 
 
-for panel, commands in COMMANDS.items():
-    for command in commands:
-        app.command(command.__name__.replace("_", "-"), rich_help_panel=panel)(command)
-for command in (dots, geometric, psf, alignment, plan, photometric, scale):
-    calibrate.command()(command)
-app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")
-sensor.command("import")(import_)
-sensor.command()(measure)
-app.add_typer(sensor, name="sensor", rich_help_panel="Calibrate")
-optics.command("map")(map_)
-optics.command()(lens)
-optics.command()(zernike)
-app.add_typer(optics, name="optics", rich_help_panel="Calibrate")
-service.command()(install)
-service.command()(uninstall)
-app.add_typer(service, name="service", rich_help_panel="This machine")
+for panel, names in COMMANDS.items():
+    for name in names:
+        add(app, name, name, panel)
+for group, (panel, words, names) in GROUPS.items():
+    members = typer.Typer(help=words)
+    for name in names:
+        add(members, group, name)
+    app.add_typer(members, name=group, rich_help_panel=panel)

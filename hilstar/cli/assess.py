@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import Json, RunFile, check_files
-from hilstar.console.terminal import print_json, say
+from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
 
@@ -15,10 +15,10 @@ MAX_LATENCY_MS = 1e7
 
 def assess(
     ledger: RunFile,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for budget.html and its tables.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for budget.html and its tables.")],
     telemetry: Annotated[
         Path | None,
-        typer.Argument(
+        Argument(
             metavar="[TELEMETRY]",
             help="Its answers on its own clock: CSV t_s,qw,qx,qy,qz[,valid] (q_icrs_to_cam, scalar first), AEM, MCAP;"
             " by default the answers in the ledger.",
@@ -27,17 +27,17 @@ def assess(
     ] = None,
     stamp: Annotated[
         Literal["start", "middle", "end"] | None,
-        typer.Option(
+        Option(
             help="Where in an exposure of tracker.exposure_s t_s stands; by default the middle, for the ledger's own answers"
             " as its bench file says.",
             show_default=False,
         ),
     ] = None,
     latency_ms: Annotated[
-        float, typer.Option("--latency-ms", metavar="MS", help="How much later than that t_s is, where it is known.")
+        float, Option("--latency-ms", metavar="MS", help="How much later than that t_s is, where it is known.")
     ] = 0.0,
     display_attitudes: Annotated[
-        int, typer.Option(metavar="N", min=0, max=1000, help="Attitudes at which the twin measures the display; 0 for none.")
+        int, Option(metavar="N", min=0, max=1000, help="Attitudes at which the twin measures the display; 0 for none.")
     ] = 12,
     as_json: Json = False,
 ) -> None:
@@ -54,13 +54,7 @@ def assess(
     make_directory(output)
     write_tables(output, found)
     write_page(output / "budget.html", found)
-    if as_json:
-        print_json(budget_of(found))
-        for note in found.notes:
-            say(note)
-        return
-    for what, text in lines_of(found):
-        typer.echo(f"{what:24}{text}")
-    for note in found.notes:
-        typer.echo(f"{'note':24}{note}")
-    typer.echo(f"{'page':24}{output / 'budget.html'}")
+    rows = [*lines_of(found), *(("note", note) for note in found.notes), ("page", output / "budget.html")]
+    print_found(as_json, budget_of(found), (f"{what:24}{text}" for what, text in rows))
+    for note in found.notes if as_json else ():
+        say(note)

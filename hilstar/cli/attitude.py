@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
+from typer import Argument, Option
 
 from hilstar.cli import options
-from hilstar.console.terminal import print_json, say
+from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError
 from hilstar.resources import resource_path
 
@@ -21,21 +21,20 @@ SHOWN_STARS = 3
 
 def attitude(
     source: Annotated[
-        Path, typer.Argument(metavar="INPUT", help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
+        Path, Argument(metavar="INPUT", help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
     ],
     at: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--at",
             metavar="T",
             help="Seconds after the log's first sample, or a date and time as the log has them; by default its first sample.",
         ),
     ] = None,
     bench: Annotated[
-        Path | None,
-        typer.Option(metavar="BENCH.toml", help="Whose tracker, mounting and sky to use; by default the demo's tracker."),
+        Path | None, Option(metavar="BENCH.toml", help="Whose tracker, mounting and sky to use; by default the demo's tracker.")
     ] = None,
-    wait: Annotated[float, typer.Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)] = 10.0,
+    wait: Annotated[float, Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)] = 10.0,
     kernel: options.KernelFiles = None,
     topic: options.TopicName = None,
     body: options.BodyName = None,
@@ -44,7 +43,7 @@ def attitude(
     place: options.PlaceText = None,
     mounting: options.MountingText = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
+        bool, Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
     ] = False,
     as_json: options.Json = False,
 ) -> None:
@@ -69,23 +68,16 @@ def attitude(
     file = dated(file, conventions.scale, sample.t_ns)
     told = {"source": conventions.source, "held": held, **_pointing(sample, file)}
     meaning = conventions.lines(mounted)
-    if as_json:
-        print_json({**told, "conventions": meaning})
-        return
-    for line in [*(meaning if explain else ()), *_lines(told)]:
-        typer.echo(line)
+    print_found(as_json, told | {"conventions": meaning}, [*(meaning if explain else ()), *_lines(told)])
 
 
 class _Found(NamedTuple):
-    """An attitude, its source's conventions, and whether it is held over a gap of the log."""
-
     sample: "AttitudeSample"
     conventions: "Conventions"
     held: bool = False
 
 
 def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
-    """The first attitude of the stream that a bench file names."""
     from hilstar.run.open_link import first_attitude, open_link
 
     if at is not None:
@@ -97,7 +89,6 @@ def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
 
 
 def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
-    """The attitude of a log at a time."""
     from hilstar.attitude.clock.timeline import Policy
     from hilstar.attitude.logs.entries import log_joins
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
@@ -117,7 +108,6 @@ def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
 
 
 def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
-    """Where the camera looks, and what it sees."""
     import numpy as np
 
     from hilstar.bench.build import brightest_seen
@@ -140,7 +130,6 @@ def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
 
 
 def _lines(told: dict[str, Any]) -> list[str]:
-    """The same as lines of text."""
     q = ", ".join(f"{c:.7f}" for c in told["q_icrs_to_cam"])
     width, height = told["tracker"]["resolution_px"]
     lines = [
@@ -160,5 +149,4 @@ def _lines(told: dict[str, Any]) -> list[str]:
 
 
 def _turn(angle_deg: float) -> str:
-    """An angle in [0, 360) degrees, also after rounding."""
     return f"{round(angle_deg, 4) % 360:.4f}"

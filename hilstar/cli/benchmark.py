@@ -4,29 +4,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import MAX_SEED, Json, parse_counts, parse_sizes
-from hilstar.console.terminal import print_json, progress
+from hilstar.console.terminal import print_found, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
 
-OwnBench = Annotated[Path | None, typer.Argument(metavar="[BENCH.toml]", help="Your bench file, at its own image size.")]
+OwnBench = Annotated[Path | None, Argument(metavar="[BENCH.toml]", help="Your bench file, at its own image size.")]
 
 
 def benchmark(
     bench_file: OwnBench = None,
-    quick: Annotated[bool, typer.Option("--quick", help="1920x1080 only, up to 10000 stars: at most half a minute.")] = False,
-    stars: Annotated[str | None, typer.Option(metavar="N,N,...", help="Stars in view.")] = None,
-    sizes: Annotated[str | None, typer.Option(metavar="WxH,WxH,...", help="Image sizes.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the random stars beyond the catalogue.", min=0, max=MAX_SEED)] = 1,
+    quick: Annotated[bool, Option("--quick", help="1920x1080 only, up to 10000 stars: at most half a minute.")] = False,
+    stars: Annotated[str | None, Option(metavar="N,N,...", help="Stars in view.")] = None,
+    sizes: Annotated[str | None, Option(metavar="WxH,WxH,...", help="Image sizes.")] = None,
+    seed: Annotated[int, Option(help="Seed of the random stars beyond the catalogue.", min=0, max=MAX_SEED)] = 1,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for bench.csv, tracker.csv and bench.png.")
+        Path | None, Option("-o", "--output", metavar="DIR", help="Directory for bench.csv, tracker.csv and bench.png.")
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Time a whole frame and its stages, and the virtual tracker, beside NumPy, numba, GalSim, photutils and sep."""
-    import msgspec
     import numpy as np
 
     from hilstar.bench.bench_file import read_bench_file
@@ -48,7 +47,4 @@ def benchmark(
         result = speed.run(plan, np.random.default_rng(seed), advance)
     if output is not None:
         speed_report.write(result, make_directory(output))
-    if as_json:
-        print_json(msgspec.to_builtins(result))
-    else:
-        typer.echo("\n".join(speed_report.lines(result)))
+    print_found(as_json, result, speed_report.lines(result))

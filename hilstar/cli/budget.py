@@ -1,31 +1,28 @@
 """hilstar budget: which magnitudes a bench can show and how well, or the noise of its tracker's stars."""
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from hilstar.cli.options import BenchFile, Json, RadecText, parse_attitude
-from hilstar.console.terminal import print_json, say
+from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import check_directory, make_directory
 
 
 def budget(
     bench_file: BenchFile,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")
-    ] = None,
+    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")] = None,
     centroider: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or box5 (centres of mass), or "
             "all of them; what the bench has under verify, or fit, unless given."
         ),
     ] = None,
     noise: Annotated[
-        bool, typer.Option("--noise", help="The noise of the tracker's own stars by source, and the limits that it sets.")
+        bool, Option("--noise", help="The noise of the tracker's own stars by source, and the limits that it sets.")
     ] = False,
     radec: RadecText = None,
     as_json: Json = False,
@@ -54,10 +51,7 @@ def budget(
         found, assumed = find_budget(bench, by), shares_line(bench) or colour_line(bench)
     if output is not None:
         write_report(make_directory(output), found)
-    if as_json:
-        print_json(asdict(found))
-    else:
-        typer.echo("\n".join(budget_lines(found)))
+    print_found(as_json, found, budget_lines(found))
     if assumed is not None:
         say(assumed)
 
@@ -74,7 +68,4 @@ def star_noise(bench_file: Path, output: Path | None, radec: str | None, as_json
     found = noise_budget(read_bench_file(bench_file), attitude, CentroidSettings(), np.random.default_rng(0))
     if output is not None:
         write_noise(make_directory(output), found)
-    if as_json:
-        print_json(asdict(found))
-    else:
-        typer.echo("\n".join(noise_lines(found)))
+    print_found(as_json, found, noise_lines(found))

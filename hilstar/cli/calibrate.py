@@ -1,35 +1,32 @@
 """hilstar calibrate: a bench's geometry by dots or attitudes, its monitor by patches, its scale by stars."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, Overwrite, check_files, parse_numbers, parse_reading
 from hilstar.cli.running import Windowed
-from hilstar.console.terminal import print_json, say
+from hilstar.console.terminal import print_found, print_json, say
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
+NAMED = "in the bench file, under [collimator]: geometry = {!r}"
 RESOLUTION_FORM = "--resolution W,H in pixels, such as 1920,1080"
 
 
 def dots(
     bench_file: BenchFile,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")],
-    frames: Annotated[int, typer.Option(help="Number of frames.", min=1, max=1000)] = 20,
-    dots_per_frame: Annotated[int, typer.Option("--dots", help="About how many dots are lit in each.", min=1, max=5000)] = 60,
-    show: Annotated[
-        bool, typer.Option("--show", help="Show the frames on the display: space for the next, q to quit.")
-    ] = False,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="With --show: time for each frame, without keys.", min=0)
-    ] = None,
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")],
+    frames: Annotated[int, Option(help="Number of frames.", min=1, max=1000)] = 20,
+    dots_per_frame: Annotated[int, Option("--dots", help="About how many dots are lit in each.", min=1, max=5000)] = 60,
+    show: Annotated[bool, Option("--show", help="Show the frames on the display: space for the next, q to quit.")] = False,
+    seconds: Annotated[float | None, Option(metavar="S", help="With --show: time for each frame, without keys.", min=0)] = None,
     windowed: Windowed = False,
-    seed: Annotated[int, typer.Option(help="Seed of the dots' codes.", min=0, max=MAX_SEED)] = 0,
+    seed: Annotated[int, Option(help="Seed of the dots' codes.", min=0, max=MAX_SEED)] = 0,
     as_json: Json = False,
 ) -> None:
     """Make frames of dots for `calibrate geometric`: each dot blinks its own code."""
@@ -53,24 +50,23 @@ def dots(
     if show:
         shown = show_dots(plan, monitor, seconds, windowed=windowed)
         say(f"{shown} of {plan.frames} frames shown")
-    if as_json:
-        print_json({"frames": plan.frames, "dots": len(plan), "lit": int(plan.lit.sum()), "seed": seed, "written": str(output)})
-    else:
-        typer.echo(f"{len(plan)} dots in {plan.frames} frames, {plan.lit.sum() / plan.frames:.0f} lit in each, in {output}")
+    told = {"frames": plan.frames, "dots": len(plan), "lit": int(plan.lit.sum()), "seed": seed, "written": str(output)}
+    each = f"{plan.lit.sum() / plan.frames:.0f} lit in each"
+    print_found(as_json, told, [f"{len(plan)} dots in {plan.frames} frames, {each}, in {output}"])
 
 
 def geometric(
     bench_file: BenchFile,
     observed: Annotated[
-        list[Path], typer.Argument(metavar="OBSERVED...", help="A CSV of centroids (frame,x_px,y_px), or the tracker's images.")
+        list[Path], Argument(metavar="OBSERVED...", help="A CSV of centroids (frame,x_px,y_px), or the tracker's images.")
     ],
-    plan: Annotated[Path, typer.Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")],
+    plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")],
     tracker_is_ideal: Annotated[
-        bool, typer.Option("--tracker-is-ideal", help="Take the tracker's lens as ideal; the file then holds both lenses.")
+        bool, Option("--tracker-is-ideal", help="Take the tracker's lens as ideal; the file then holds both lenses.")
     ] = False,
-    dark: Annotated[Path | None, typer.Option(metavar="FILE", help="A dark frame, taken from each image.")] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The error over the screen, and the residuals.")] = None,
+    dark: Annotated[Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")] = None,
+    plot: Annotated[Path | None, Option(metavar="OUT.png", help="The error over the screen, and the residuals.")] = None,
     as_json: Json = False,
 ) -> None:
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker saw."""
@@ -84,17 +80,17 @@ def geometric(
     found = calibrate_files(file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal)
     monitor = file.config.monitor
     written = write_calibrated(output, found, plot, _monitor_of(monitor.display, monitor.resolution_px))
-    _report(output, as_json, lambda: summary_of(found, written), lambda: lines_of(found))
+    print_found(as_json, summary_of(found, written), [*lines_of(found), NAMED.format(output.name)])
 
 
 def psf(
     bench_file: BenchFile,
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGES...", help="The tracker's images of the dots.")],
-    plan: Annotated[Path, typer.Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")],
-    dark: Annotated[Path | None, typer.Option(metavar="FILE", help="A dark frame, taken from each image.")] = None,
-    oversampling: Annotated[int, typer.Option(help="Samples a tracker pixel along each axis.", min=2, max=16)] = 4,
-    plot: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The PSFs over the field.")] = None,
+    images: Annotated[list[Path], Argument(metavar="IMAGES...", help="The tracker's images of the dots.")],
+    plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")],
+    dark: Annotated[Path | None, Option(metavar="FILE", help="A dark frame, taken from each image.")] = None,
+    oversampling: Annotated[int, Option(help="Samples a tracker pixel along each axis.", min=2, max=16)] = 4,
+    plot: Annotated[Path | None, Option(metavar="OUT.png", help="The PSFs over the field.")] = None,
     as_json: Json = False,
 ) -> None:
     """Find the effective PSF of tracker and collimator over the field by the dots of `calibrate geometric`."""
@@ -110,11 +106,8 @@ def psf(
     write_glass(output, found.glass)
     if plot is not None:
         draw_effective(plot, found)
-    if as_json:
-        print_json(summary_of(found) | {"written": [str(each) for each in (output, plot) if each is not None]})
-        return
-    typer.echo("\n".join(lines_of(found)))
-    typer.echo(f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}")
+    told = summary_of(found) | {"written": [str(each) for each in (output, plot) if each is not None]}
+    print_found(as_json, told, [*lines_of(found), f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}"])
 
 
 def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> Any:
@@ -129,36 +122,27 @@ def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> 
     return identity
 
 
-def _report(output: Path, as_json: bool, figures: Callable[[], dict[str, Any]], lines: Callable[[], list[str]]) -> None:
-    """Print what was found, as JSON or as lines, and where the geometry file is named."""
-    if as_json:
-        print_json(figures())
-        return
-    typer.echo("\n".join(lines()))
-    typer.echo(f"in the bench file, under [collimator]: geometry = {str(output.name)!r}")
-
-
 def alignment(
     bench_file: BenchFile,
     pairs: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="PAIRS.csv",
             help="Commanded and reported q_icrs_to_cam, scalar first: qw,qx,qy,qz,tw,tx,ty,tz[,valid]. With --ledger, the"
             " tracker's telemetry: t_s,qw,qx,qy,qz[,valid].",
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")],
     ledger: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="RUN.mcap",
             help="The ledger of the run that the telemetry is of: t_s is the middle of an exposure in seconds of the ledger's"
             " light_ns, the sender's clock.",
         ),
     ] = None,
     offset_s: Annotated[
-        float | None, typer.Option("--offset-s", help="With --ledger: seconds to add to the telemetry's t_s; 0 by default.")
+        float | None, Option("--offset-s", help="With --ledger: seconds to add to the telemetry's t_s; 0 by default.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -176,23 +160,21 @@ def alignment(
     found = align_files(file, pairs, ledger, offset_s or 0.0)
     monitor = file.config.monitor
     write_alignment(output, found, file, _monitor_of(monitor.display, monitor.resolution_px))
-    _report(output, as_json, lambda: summary_of(found) | {"written": [str(output)]}, lambda: lines_of(found))
+    print_found(as_json, summary_of(found) | {"written": [str(output)]}, [*lines_of(found), NAMED.format(output.name)])
 
 
 def plan(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="PLAN.csv", help="The plan, to be filled in.")],
-    bits: Annotated[int, typer.Option(help="Bits per code.", min=1, max=16)] = 8,
-    levels: Annotated[int, typer.Option(help="Levels from black to white; half of white is added.", min=2)] = 32,
-    repeats: Annotated[int, typer.Option(help="Repeats of each level; 3 are enough for a plain power law.", min=1)] = 6,
-    channels: Annotated[str, typer.Option(help="Channels to measure, of w, r, g, b.")] = "w",
-    seed: Annotated[int, typer.Option(help="Seed of the order.", min=0, max=MAX_SEED)] = 0,
-    headless: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the patches to this directory as PNG.")] = None,
-    resolution: Annotated[str, typer.Option(metavar="W,H", help="Size of the pictures.")] = "1920,1080",
-    show: Annotated[bool, typer.Option("--show", help="Show the patches on a display: space for the next, q to quit.")] = False,
-    display: Annotated[str, typer.Option(metavar="INDEX|NAME", help="With --show: the display.")] = "0",
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="With --show: time for each patch, without keys.", min=0)
-    ] = None,
+    output: Annotated[Path, Option("-o", "--output", metavar="PLAN.csv", help="The plan, to be filled in.")],
+    bits: Annotated[int, Option(help="Bits per code.", min=1, max=16)] = 8,
+    levels: Annotated[int, Option(help="Levels from black to white; half of white is added.", min=2)] = 32,
+    repeats: Annotated[int, Option(help="Repeats of each level; 3 are enough for a plain power law.", min=1)] = 6,
+    channels: Annotated[str, Option(help="Channels to measure, of w, r, g, b.")] = "w",
+    seed: Annotated[int, Option(help="Seed of the order.", min=0, max=MAX_SEED)] = 0,
+    headless: Annotated[Path | None, Option(metavar="DIR", help="Write the patches to this directory as PNG.")] = None,
+    resolution: Annotated[str, Option(metavar="W,H", help="Size of the pictures.")] = "1920,1080",
+    show: Annotated[bool, Option("--show", help="Show the patches on a display: space for the next, q to quit.")] = False,
+    display: Annotated[str, Option(metavar="INDEX|NAME", help="With --show: the display.")] = "0",
+    seconds: Annotated[float | None, Option(metavar="S", help="With --show: time for each patch, without keys.", min=0)] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
@@ -215,11 +197,10 @@ def plan(
         write_patches(headless, planned, (width, height), bits)
         written.append(str(headless))
     codes = len({patch.code for patch in planned})
-    if as_json:
-        print_json({"bits": bits, "patches": len(planned), "codes": codes, "seed": seed, "written": written})
-    else:
-        typer.echo(f"{len(planned)} patches of {codes} codes in {', '.join(written)}")
-        typer.echo("fill in the column value, and give the file to hilstar calibrate photometric")
+    line = f"{len(planned)} patches of {codes} codes in {', '.join(written)}"
+    advice = "fill in the column value, and give the file to hilstar calibrate photometric"
+    told = {"bits": bits, "patches": len(planned), "codes": codes, "seed": seed, "written": written}
+    print_found(as_json, told, [line, advice])
     if show:
         shown = show_patches(planned, bits, int(display) if display.isdecimal() else display, seconds)
         say(f"{shown} of {len(planned)} patches shown")
@@ -228,16 +209,16 @@ def plan(
 
 
 def photometric(
-    measured: Annotated[Path, typer.Argument(metavar="MEASURED.csv", help="code,channel,value; see configs/CALIBRATION.md.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="MONITOR.toml", help="The calibration file.")],
-    bits: Annotated[int | None, typer.Option(help="Bits per code; by default from the codes measured.", min=1, max=16)] = None,
-    who: Annotated[str, typer.Option(help="Who made the measurements.")] = "",
-    when: Annotated[str, typer.Option(help="Date of the measurements; today by default.")] = "",
-    instrument: Annotated[str, typer.Option(help="Instrument used.")] = "",
-    unit: Annotated[str, typer.Option(help="Unit of the values, such as cd/m2 or DN.")] = "",
-    plot: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The response and its residuals.")] = None,
+    measured: Annotated[Path, Argument(metavar="MEASURED.csv", help="code,channel,value; see configs/CALIBRATION.md.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="MONITOR.toml", help="The calibration file.")],
+    bits: Annotated[int | None, Option(help="Bits per code; by default from the codes measured.", min=1, max=16)] = None,
+    who: Annotated[str, Option(help="Who made the measurements.")] = "",
+    when: Annotated[str, Option(help="Date of the measurements; today by default.")] = "",
+    instrument: Annotated[str, Option(help="Instrument used.")] = "",
+    unit: Annotated[str, Option(help="Unit of the values, such as cd/m2 or DN.")] = "",
+    plot: Annotated[Path | None, Option(metavar="OUT.png", help="The response and its residuals.")] = None,
     display: Annotated[
-        str, typer.Option(metavar="INDEX|NAME", help="The display that was measured, where this machine has one.")
+        str, Option(metavar="INDEX|NAME", help="The display that was measured, where this machine has one.")
     ] = "0",
     as_json: Json = False,
 ) -> None:
@@ -277,12 +258,10 @@ def photometric(
 
 def scale(
     bench_file: BenchFile,
-    reading: Annotated[list[str], typer.Option(metavar="HIP,DN", help="A star, and the sum of its DN above the background.")],
-    exposure: Annotated[
-        float | None, typer.Option(metavar="S", help="The tracker's exposure; by default the bench file's.")
-    ] = None,
+    reading: Annotated[list[str], Option(metavar="HIP,DN", help="A star, and the sum of its DN above the background.")],
+    exposure: Annotated[float | None, Option(metavar="S", help="The tracker's exposure; by default the bench file's.")] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="OUT.toml", help="A copy of the bench file with the key set.")
+        Path | None, Option("-o", "--output", metavar="OUT.toml", help="A copy of the bench file with the key set.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -301,20 +280,12 @@ def scale(
         say(f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation, and the response")
     if output is not None:
         with_flux_at_white(file, found, output)
-    summary: dict[str, Any] = {
-        "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
-        "assumed_e_per_s": found.assumed_e_per_s,
-        "readings": len(reading),
-        "scatter_mag": found.scatter_mag,
-        "relative_error": found.relative_error,
-        "exposure_s": exposure_s,
-        "written": None if output is None else str(output),
-    }
-    if as_json:
-        print_json(summary)
-        return
-    typer.echo(f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag; under [render]:")
-    typer.echo(f"flux_at_white_e_per_s = {found.flux_at_white_e_per_s!r}")
+    keys = ("flux_at_white_e_per_s", "assumed_e_per_s", "scatter_mag", "relative_error")
+    summary: dict[str, Any] = {key: getattr(found, key) for key in keys}
+    summary |= {"readings": len(reading), "exposure_s": exposure_s, "written": None if output is None else str(output)}
+    lines = [f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag; under [render]:"]
+    lines.append(f"flux_at_white_e_per_s = {found.flux_at_white_e_per_s!r}")
     if found.relative_error is not None:
-        stated = f"flux_at_white_relative = {found.relative_error:.3g}\nflux_at_white_dof = {len(found.ratios) - 1}"
-        typer.echo(f"# and how well it is known, under [certify]:\n{stated}")
+        lines.append("# and how well it is known, under [certify]:")
+        lines += [f"flux_at_white_relative = {found.relative_error:.3g}", f"flux_at_white_dof = {len(found.ratios) - 1}"]
+    print_found(as_json, summary, lines)

@@ -5,16 +5,17 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
 from hilstar.cli import running
 from hilstar.cli.options import Headless, Json, parse_memory
-from hilstar.console.terminal import print_json, progress, say
+from hilstar.console.terminal import print_found, progress, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory
 
@@ -23,53 +24,48 @@ if TYPE_CHECKING:
     from hilstar.campaign.cluster import Scheduler
     from hilstar.campaign.run import Campaign
     from hilstar.campaign.store import Directory
+    from hilstar.console.listener import PageListener
 
 CENTROIDS = "centroids"  # the solver without another one
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
 
 
 def campaign(
-    plan: Annotated[Path, typer.Argument(metavar="PLAN.toml", help="What varies, and how (docs: Campaigns).")],
+    plan: Annotated[Path, Argument(metavar="PLAN.toml", help="What varies, and how (docs: Campaigns).")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Directory of the campaign; it goes on where it was.")
+        Path, Option("-o", "--output", metavar="DIR", help="Directory of the campaign; it goes on where it was.")
     ],
-    workers: Annotated[
-        int | None, typer.Option(help="Processes on this machine; by default one a core.", min=1, max=1024)
-    ] = None,
+    workers: Annotated[int | None, Option(help="Processes on this machine; by default one a core.", min=1, max=1024)] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, whose workers run the cases; off loopback with TLS."),
+        Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, whose workers run the cases; off loopback with TLS."),
     ] = None,
     tls_ca_file: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="With --scheduler tls://HOST:PORT: the CA's certificates, PEM, as Dask's."),
+        Path | None, Option(metavar="FILE", help="With --scheduler tls://HOST:PORT: the CA's certificates, PEM, as Dask's.")
     ] = None,
-    tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="This side's certificate, PEM.")] = None,
-    tls_key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Its key, where the certificate's file has none.")
-    ] = None,
+    tls_cert: Annotated[Path | None, Option(metavar="FILE", help="This side's certificate, PEM.")] = None,
+    tls_key: Annotated[Path | None, Option(metavar="FILE", help="Its key, where the certificate's file has none.")] = None,
     solver: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="SOLVER",
             help='What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image} that prints a quaternion.',
         ),
     ] = CENTROIDS,
-    solver_timeout: Annotated[float, typer.Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)] = 10.0,
-    images: Annotated[Literal["fits"] | None, typer.Option(help="Keep the images, with their truth.")] = None,
+    solver_timeout: Annotated[float, Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)] = 10.0,
+    images: Annotated[Literal["fits"] | None, Option(help="Keep the images, with their truth.")] = None,
     memory: Annotated[
-        str | None,
-        typer.Option(metavar="SIZE", help="For this process and its workers together, such as 4GB: as many run as fit."),
+        str | None, Option(metavar="SIZE", help="For this process and its workers together, such as 4GB: as many run as fit.")
     ] = None,
     headless: Headless = False,
     windowed: running.Windowed = False,
     force: running.Force = False,
-    frames: Annotated[str | None, typer.Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")] = None,
+    frames: Annotated[str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")] = None,
     console: running.Console = None,
     token: running.Token = None,
     console_name: running.ConsoleName = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Exit with code 1 where one of the plan's requirements is not met.")
+        bool, Option("--strict", help="Exit with code 1 where one of the plan's requirements is not met.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -97,7 +93,9 @@ def campaign(
     try:
         directory.claim(this.about())
         if not directory.table.exists() and this.on_bench:
-            show_cases(this, directory, Showing(headless, windowed, force, frames, console, token, console_name))
+            shown_bench = partial(running.shown_bench, headless=headless, windowed=windowed, force=force, timed=True)
+            with running.page_listener(console, False, token, console_name) as listener:
+                show_cases(this, directory, shown_bench, frames, listener)
         elif not directory.table.exists():
             run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
         from hilstar.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
@@ -119,10 +117,7 @@ def campaign(
             lines += [each.words for each in verdicts]
     finally:
         directory.close()
-    if as_json:
-        print_json(summary)
-    else:
-        typer.echo("\n".join(lines))
+    print_found(as_json, summary, lines)
     if strict and not_met:
         raise typer.Exit(1)
 
@@ -135,35 +130,25 @@ def _check_options(on_bench: bool, of_bench: dict[str, bool], pooled: dict[str, 
             raise InputError(f"campaign {name}: is for through = {through}; leave it out")
 
 
-@dataclass(frozen=True, slots=True)
-class Showing:
-    """How the cases are shown to a real tracker: the options of `serve`."""
-
-    headless: bool
-    windowed: bool
-    force: bool
-    frames: str | None
-    console: str | None
-    token: str | None
-    console_name: list[str] | None
-
-
-def show_cases(this: "Campaign", directory: "Directory", asked: Showing) -> None:
+def show_cases(
+    this: "Campaign",
+    directory: "Directory",
+    shown_bench: Callable[["BenchFile"], AbstractContextManager[tuple[Any, Any]]],
+    frames: str | None,
+    listener: "PageListener | None",
+) -> None:
     """Show the missing cases to the real tracker, with progress on the terminal and on the page."""
     from hilstar.campaign.bench_run import OpenDisplay
-    from hilstar.console.publisher import PageParts, RunDescription
+    from hilstar.console.publisher import RunDescription
     from hilstar.console.run_status import RunSource, RunStatus
     from hilstar.notices import Notices
-    from hilstar.run.record.ledger import Ledger, LedgerSwitch
+    from hilstar.run.record.ledger import LedgerSwitch
 
     count, begun = 0, 0
     notices, started_s, said_s = Notices(), time.monotonic(), time.monotonic()
     where = str(this.path)
 
-    with (
-        telling(this.cases) as advance,
-        running.page_listener(asked.console, False, asked.token, asked.console_name) as listener,
-    ):
+    with telling(this.cases) as advance:
 
         def on_done(done: int) -> None:
             nonlocal count, begun, said_s
@@ -177,14 +162,11 @@ def show_cases(this: "Campaign", directory: "Directory", asked: Showing) -> None
 
         @contextmanager
         def display(file: "BenchFile") -> Iterator[OpenDisplay]:
-            with (
-                running.shown_bench(file, asked.headless, asked.windowed, asked.force, timed=True) as (bench, screen),
-                running.optional_frames(asked.frames, bench, screen) as feed,
-            ):
+            with shown_bench(file) as (bench, screen), running.optional_frames(frames, bench, screen) as feed:
                 ledger = LedgerSwitch()
                 renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
                 told = RunSource(where, renderer, refresh_hz, math.inf, running.forced_on(screen))
-                parts = PageParts(bench, notices, ledger, lambda path: Ledger(path, bench, notices), screen)
+                parts = running.page_parts(bench, notices, ledger, screen)
                 page, status = RunDescription("campaign", "campaign", where), RunStatus(told, ledger)
                 with running.followed(listener, False, page, parts, status, frames=feed) as (sink, follower, _):
                     yield OpenDisplay(bench, screen, sink, follower)

@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from hilstar.cli.options import BenchFile, Json
-from hilstar.console.terminal import print_json
+from hilstar.console.terminal import print_found
 from hilstar.errors import InputError, shortened
 from hilstar.files import check_outputs
 
@@ -14,17 +14,14 @@ from hilstar.files import check_outputs
 def catalogue(
     bench_file: BenchFile,
     output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="STARS.csv|fits|parquet|vot", help="The table; its ending says what it is."),
+        Path, Option("-o", "--output", metavar="STARS.csv|fits|parquet|vot", help="The table; its ending says what it is.")
     ],
     to: Annotated[
-        float | None, typer.Option("--to", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40)
+        float | None, Option("--to", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40)
     ] = None,
     epoch: Annotated[
         float | None,
-        typer.Option(
-            "--epoch", metavar="JYEAR", help="Julian year of the places; the bench's by default.", min=-10_000, max=10_000
-        ),
+        Option("--epoch", metavar="JYEAR", help="Julian year of the places; the bench's by default.", min=-10_000, max=10_000),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -39,11 +36,6 @@ def catalogue(
     found = bench_catalogue(file, to, epoch)
     write_catalogue(output, found)
     told = {"file": str(output), "stars": len(found), "epoch_jyear": found.epoch_jyear, "zero_points_mag": found.zero_points}
-    if as_json:
-        print_json(told)
-        return
     vega, ab = found.zero_points["vega"], found.zero_points["ab"]
-    typer.echo(
-        f"{len(found)} stars at J{found.epoch_jyear:g}; an electron per second is {vega:.4f} mag (Vega), {ab:.4f} mag (AB);"
-        f" wrote {output}"
-    )
+    worth = f"an electron per second is {vega:.4f} mag (Vega), {ab:.4f} mag (AB)"
+    print_found(as_json, told, [f"{len(found)} stars at J{found.epoch_jyear:g}; {worth}; wrote {output}"])

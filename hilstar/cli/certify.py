@@ -1,15 +1,17 @@
 """hilstar certify: how sure a bench is, stated and dated; and whether it has moved since."""
 
 import datetime
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
+from typer import Option
 
+from hilstar.cli.first_light import image_source
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
-from hilstar.console.terminal import print_json, say
+from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory, write_whole
 from hilstar.reading import exists
@@ -23,38 +25,30 @@ CERTIFICATE, REFERENCE, PAGE = "certificate.json", "reference.json", "index.html
 
 def certify(
     bench_file: BenchFile,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory of the certificate and its checks.")],
-    check: Annotated[
-        bool, typer.Option("--check", help="Has the bench moved since its certificate? A minute's readings.")
-    ] = False,
-    again: Annotated[bool, typer.Option("--again", help="Certify anew, in place of the certificate in DIR.")] = False,
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory of the certificate and its checks.")],
+    check: Annotated[bool, Option("--check", help="Has the bench moved since its certificate? A minute's readings.")] = False,
+    again: Annotated[bool, Option("--again", help="Certify anew, in place of the certificate in DIR.")] = False,
     grab: Annotated[
         str | None,
-        typer.Option(
-            metavar="CMD", help="Command that takes the tracker's image, as that of first-light ({output}, {pattern})."
-        ),
+        Option(metavar="CMD", help="Command that takes the tracker's image, as that of first-light ({output}, {pattern})."),
     ] = None,
     virtual: Annotated[
-        Path | None,
-        typer.Option(metavar="TRUTH.toml", help="Without hardware: a bench file that says how the bench really is."),
+        Path | None, Option(metavar="TRUTH.toml", help="Without hardware: a bench file that says how the bench really is.")
     ] = None,
     whole: Annotated[
-        bool, typer.Option("--whole", help="With --virtual: draw every image of the tracker; else only figures are drawn.")
+        bool, Option("--whole", help="With --virtual: draw every image of the tracker; else only figures are drawn.")
     ] = False,
     dark: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="With --grab: the tracker's image with the monitor switched off.")
+        Path | None, Option(metavar="FILE", help="With --grab: the tracker's image with the monitor switched off.")
     ] = None,
     diode: Annotated[
-        str | None, typer.Option(metavar="serial:/dev/ttyX@BAUD", help="With --grab: photodiode before the display's square.")
+        str | None, Option(metavar="serial:/dev/ttyX@BAUD", help="With --grab: photodiode before the display's square.")
     ] = None,
     warm_up: Annotated[
-        float,
-        typer.Option("--warm-up", metavar="MIN", min=0, max=240, help="Watch white for up to so long, until it is stable."),
+        float, Option("--warm-up", metavar="MIN", min=0, max=240, help="Watch white for up to so long, until it is stable.")
     ] = 0.0,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Few trials: first order is enough where the model is linear.")
-    ] = False,
-    seed: Annotated[int, typer.Option(help="With --virtual: seed of the readings' noise.", min=0, max=MAX_SEED)] = 0,
+    quick: Annotated[bool, Option("--quick", help="Few trials: first order is enough where the model is linear.")] = False,
+    seed: Annotated[int, Option(help="With --virtual: seed of the readings' noise.", min=0, max=MAX_SEED)] = 0,
     as_json: Json = False,
 ) -> None:
     """State how sure a bench is: the light, places, attitude and latency of stars, with the uncertainty of each.
@@ -116,18 +110,13 @@ def _certify(
         write_whole(output / REFERENCE, reference)
     write_whole(path, raw)
     write_certificate_page(output / PAGE, found, digest)
-    if as_json:
-        print_json({**msgspec.to_builtins(found), "sha256": digest, "page": str(output / PAGE)})
-        return
-    for name, text in text_lines(found, digest, output):
-        typer.echo(f"{name:24}{text}")
+    told = {**msgspec.to_builtins(found), "sha256": digest, "page": str(output / PAGE)}
+    print_found(as_json, told, (f"{name:24}{text}" for name, text in text_lines(found, digest, output)))
 
 
 def _check(
     file: "files.BenchFile", reader: "Reader", output: Path, now: datetime.datetime, warm_up: float, as_json: bool
 ) -> None:
-    from dataclasses import asdict
-
     from hilstar.bench.certificate import read_certificate
     from hilstar.certify.check import by_bench_file, compare, read_reference, record, take_check, watch
 
@@ -140,20 +129,14 @@ def _check(
     figures = compare(file, reference or by_bench_file(file), take_check(file, reader))
     rows = record(output, now, since, figures)
     good = all(each.in_tolerance for each in figures)
-    if as_json:
-        found = {"certificate": since, "in_tolerance": good, "checks": len({row["made"] for row in rows})}
-        print_json(
-            {**found, "figures": [asdict(each) for each in figures], "warm_up": None if warmed is None else asdict(warmed)}
-        )
-    else:
-        for each in figures:
-            verdict = "in" if each.in_tolerance else "OUT OF"
-            u = f"{each.value:+.4g} +- {(each.upper - each.lower) / 2:.2g} {each.unit}"
-            typer.echo(f"{each.quantity:16}{u:28}{verdict} tolerance ({each.threshold:.2g})")
-        typer.echo(f"{'since':16}{since}")
-        if warmed is not None:
-            typer.echo(f"{'warm-up':16}{warmed.line}")
-        typer.echo(f"{'verdict':16}{'the bench is as certified' if good else 'the bench has moved: certify it --again'}")
+    lines = []
+    for each in figures:
+        u = f"{each.value:+.4g} +- {(each.upper - each.lower) / 2:.2g} {each.unit}"
+        lines.append(f"{each.quantity:16}{u:28}{'in' if each.in_tolerance else 'OUT OF'} tolerance ({each.threshold:.2g})")
+    lines += [f"{'since':16}{since}", *([] if warmed is None else [f"{'warm-up':16}{warmed.line}"])]
+    lines.append(f"{'verdict':16}{'the bench is as certified' if good else 'the bench has moved: certify it --again'}")
+    found = {"certificate": since, "in_tolerance": good, "checks": len({row["made"] for row in rows})}
+    print_found(as_json, found | {"figures": figures, "warm_up": warmed}, lines)
     if not good:
         raise typer.Exit(1)
 
@@ -171,29 +154,19 @@ def _reader(
     check: bool,
     again: bool,
 ) -> "Reader | None":
-    from contextlib import closing
-
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.image_sources import GrabCommand, ImageSource, SerialDiode, VirtualBench
     from hilstar.certify.check import checks_in
     from hilstar.certify.readings import ImageReader, VirtualReader
-    from hilstar.cli.options import parse_diode
     from hilstar.files import temporary_folder
 
-    source: ImageSource
-    if virtual is not None:
-        truth = read_bench_file(virtual)
-        if not whole:
-            return VirtualReader(file, truth, seed, checks_in(output) + 1 if check else 0)
-        source = ended.enter_context(closing(VirtualBench(file, truth, seed)))
-    elif grab is not None:
-        recorder = None if diode is None else SerialDiode(*parse_diode(diode))
-        source = shown = ended.enter_context(closing(GrabCommand(grab, dark, recorder)))
-        truth = None
-        shown.find_monitor(file, datetime.datetime.now(datetime.UTC).date(), force=again)
-        source.gate(file)
-    else:
+    truth = None if virtual is None else read_bench_file(virtual)
+    if truth is None and grab is None:
         return None
+    if truth is not None and not whole:
+        return VirtualReader(file, truth, seed, checks_in(output) + 1 if check else 0)
+    source = ended.enter_context(closing(image_source(file, grab, virtual, dark, diode, seed)))
+    source.find_monitor(file, datetime.datetime.now(datetime.UTC).date(), force=again)
+    source.gate(file)
     folder = ended.enter_context(temporary_folder("certify"))
     say(f"images by {source.identity}")
     return ImageReader(file, source, folder, truth=truth)

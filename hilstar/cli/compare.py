@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import Json
 from hilstar.console.terminal import print_json
@@ -14,14 +15,12 @@ MAX_LINES = 10  # stars listed: if the whole sky differs, more of them say nothi
 
 
 def compare(
-    frame: Annotated[Path, typer.Argument(metavar="A.fits", help="The linear image from `hilstar frame -o`.")],
-    golden: Annotated[Path, typer.Argument(metavar="B.fits", help="The golden frame that it is compared with.")],
-    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="B's stars, from `hilstar frame --truth`.")] = None,
-    flux_mag: Annotated[float | None, typer.Option(help="Largest flux error of a star; 0.001 by default.")] = None,
-    centroid_px: Annotated[float | None, typer.Option(help="Largest centroid error of a star; 0.001 by default.")] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")
-    ] = None,
+    frame: Annotated[Path, Argument(metavar="A.fits", help="The linear image from `hilstar frame -o`.")],
+    golden: Annotated[Path, Argument(metavar="B.fits", help="The golden frame that it is compared with.")],
+    truth: Annotated[Path | None, Option(metavar="TRUTH.csv", help="B's stars, from `hilstar frame --truth`.")] = None,
+    flux_mag: Annotated[float | None, Option(help="Largest flux error of a star; 0.001 by default.")] = None,
+    centroid_px: Annotated[float | None, Option(help="Largest centroid error of a star; 0.001 by default.")] = None,
+    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")] = None,
     as_json: Json = False,
 ) -> None:
     """Compare two frames star by star; exit code 0 if they show the same sky, 1 if not."""

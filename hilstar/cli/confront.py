@@ -4,28 +4,27 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import BenchFile, Json, QuaternionText, RadecText, check_files, parse_attitude
-from hilstar.console.terminal import print_json, say
+from hilstar.console.terminal import print_found, say
 from hilstar.files import check_directory
 
 
 def confront(
     bench_file: BenchFile,
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Raw frames: FITS, TIFF or PNG, 8 to 16 bits.")],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for the page, tracker.toml, tables.")
-    ],
+    images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Raw frames: FITS, TIFF or PNG, 8 to 16 bits.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for the page, tracker.toml, tables.")],
     fixed: Annotated[
-        bool, typer.Option("--fixed", help="Fit attitudes and background alone: does the bench file's camera predict these?")
+        bool, Option("--fixed", help="Fit attitudes and background alone: does the bench file's camera predict these?")
     ] = False,
     radec: RadecText = None,
     quaternion: QuaternionText = None,
     at: Annotated[
-        str | None, typer.Option("--at", metavar="UTC", help="When the images were taken, where they do not say it.")
+        str | None, Option("--at", metavar="UTC", help="When the images were taken, where they do not say it.")
     ] = None,
     as_json: Json = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where an image is beyond the limits.")] = False,
+    strict: Annotated[bool, Option("--strict", help="Exit with 1 where an image is beyond the limits.")] = False,
 ) -> None:
     """Fit a tracker's camera to photographs of the sky, and hold what `simulate` predicts against them."""
     from hilstar.bench.bench_file import BenchFile as ReadFile
@@ -41,15 +40,8 @@ def confront(
     check_files(images, [output / name for name in OUTPUTS], file)
     tell = (lambda line: None) if as_json else typer.echo
     found = confront_files(bench_file, images, output, start=start, at_ns=at_ns, fixed=fixed, tell=tell)
-    if as_json:
-        print_json(found.figures)
-    else:
-        for line in found.lines:
-            typer.echo(line)
-        typer.echo(f"page: {output / 'index.html'}")
-    for note in found.notes:
+    print_found(as_json, found.figures, [*found.lines, f"page: {output / 'index.html'}"])
+    for note in (*found.notes, *found.failures):
         say(note)
-    for failure in found.failures:
-        say(failure)
     if strict and found.failures:
         raise typer.Exit(1)

@@ -4,14 +4,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument
 
 from hilstar.cli import options
 from hilstar.console.terminal import say
 
 
 def convert(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help=options.LOG_HELP)],
-    output: Annotated[Path, typer.Argument(metavar="OUT", help=".csv, .jsonl, .aem, .xml or .mcap.")],
+    log: Annotated[Path, Argument(metavar="LOG", help=options.LOG_HELP)],
+    output: Annotated[Path, Argument(metavar="OUT", help=".csv, .jsonl, .aem, .xml or .mcap.")],
     kernel: options.KernelFiles = None,
     topic: options.TopicName = None,
     body: options.BodyName = None,

@@ -9,20 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Option
 
+from hilstar.cli import running
 from hilstar.cli.options import MAX_SEED, Json
-from hilstar.cli.running import (
-    Console,
-    ConsoleName,
-    Control,
-    Token,
-    followed,
-    optional_answers,
-    optional_frames,
-    optional_ledger,
-    page_listener,
-    refuse_lost_gpu,
-)
 from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.terminal import progress, report, say
 from hilstar.errors import MachineError
@@ -47,18 +37,18 @@ PLANTED += ["--wrong", str(WRONG)]
 
 
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Directory for the pictures.")] = Path("hilstar-demo"),
+    output: Annotated[Path, Option("-o", "--output", help="Directory for the pictures.")] = Path("hilstar-demo"),
     duration: Annotated[
-        float | None, typer.Option(help="Seconds to run; by default 10, and 60 with --loop.", min=0.5, max=600)
+        float | None, Option(help="Seconds to run; by default 10, and 60 with --loop.", min=0.5, max=600)
     ] = None,
     loop: Annotated[
-        bool, typer.Option("--loop", help="A slow scan with a virtual tracker before the display, and its error budget.")
+        bool, Option("--loop", help="A slow scan with a virtual tracker before the display, and its error budget.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the jitter, and of the tracker's errors.", min=0, max=MAX_SEED)] = 1,
-    console: Console = None,
-    control: Control = False,
-    token: Token = None,
-    console_name: ConsoleName = None,
+    seed: Annotated[int, Option(help="Seed of the jitter, and of the tracker's errors.", min=0, max=MAX_SEED)] = 1,
+    console: running.Console = None,
+    control: running.Control = False,
+    token: running.Token = None,
+    console_name: running.ConsoleName = None,
     as_json: Json = False,
 ) -> None:
     """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out.
@@ -75,7 +65,7 @@ def demo(
     samples = (scan_samples if loop else slew_samples)(seconds + 1.0, np.random.default_rng(seed))
     demo_file = resource_path("configs", "demo.toml")
     with (
-        page_listener(console, control, token, console_name) as listener,
+        running.page_listener(console, control, token, console_name) as listener,
         tracker_beside(output, demo_file, seconds, seed) if loop else nullcontext() as tracker,
         progress("serving", seconds * HZ) as advance,
     ):
@@ -120,24 +110,23 @@ def _watching(
     advance: "FrameSink",
     tracker: "TrackerBeside | None",
 ) -> "Iterator[tuple[FrameSink, Outlet]]":
-    """Follow the demo with a progress bar, its page and, if there is one, its tracker."""
-    from hilstar.console.publisher import PageParts, RunDescription
-    from hilstar.run.record.ledger import NO_SPLIT, Ledger
+    from hilstar.console.publisher import RunDescription
+    from hilstar.run.record.ledger import NO_SPLIT
     from hilstar.run.serve import Outlet
 
     notices = Notices()
     status = RunStatus(RunSource(f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz))
     with (
-        optional_ledger(None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT) as kept,
-        optional_answers(bench, notices, kept, None) as answers,
-        optional_frames(None if tracker is None else FREE_PORT, bench, None) as frames,
+        running.optional_ledger(None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT) as kept,
+        running.optional_answers(bench, notices, kept, None) as answers,
+        running.optional_frames(None if tracker is None else FREE_PORT, bench, None) as frames,
         nullcontext() if tracker is None or frames is None else tracker.before(frames),
     ):
-        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices), answers=answers)
+        parts = running.page_parts(bench, notices, kept, answers=answers)
         page = RunDescription("demo", bench.config.attitude.source, endpoint)
-        with followed(listener, control, page, parts, status, advance, frames) as (sink, follower, requests):
+        with running.followed(listener, control, page, parts, status, advance, frames) as (sink, follower, requests):
             yield sink, Outlet(None, kept, notices, follower=follower, requests=requests, answers=answers)
-    refuse_lost_gpu(notices)
+    running.refuse_lost_gpu(notices)
 
 
 @contextmanager

@@ -6,18 +6,19 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import Json
 from hilstar.cli.running import say_units
-from hilstar.console.terminal import print_json
+from hilstar.console.terminal import print_found
 
 OwnBench = Annotated[
     Path | None,
-    typer.Argument(metavar="[BENCH.toml]", help="A bench file, or one with heads, to be checked too.", show_default=False),
+    Argument(metavar="[BENCH.toml]", help="A bench file, or one with heads, to be checked too.", show_default=False),
 ]
 Report = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--report", help="Print this machine as a row of the table of docs/where-it-fails.md, without names or serial numbers."
     ),
 ]
@@ -29,26 +30,17 @@ def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = 
 
     if report:
         cells = row()
-        if as_json:
-            print_json(cells)
-        else:
-            typer.echo(table(cells))
+        print_found(as_json, cells, [table(cells)])
         return
     benches = examine_bench(bench_file, datetime.now(UTC).date())
     result = examine()
     for bench in benches.values():
         say_units(bench.fields)
-    if as_json:
-        named = {"benches": {name: bench.keys() for name, bench in benches.items()}} if benches else {}
-        print_json(asdict(result) | named)
-    else:
-        for check in result.checks:
-            mark = "ok" if check.ok else "MISSING" if check.required else "none"
-            typer.echo(f"{mark:8}{check.name:12}{check.detail}")
-        for output in result.outputs:
-            typer.echo("\n".join(output.lines()))
-        for name, bench in benches.items():
-            typer.echo("\n".join(bench.lines(name)))
+    named = {"benches": {name: bench.keys() for name, bench in benches.items()}} if benches else {}
+    lines = [check.line() for check in result.checks]
+    lines += [line for output in result.outputs for line in output.lines()]
+    lines += [line for name, bench in benches.items() for line in bench.lines(name)]
+    print_found(as_json, asdict(result) | named, lines)
     if not result.ok:
         raise typer.Exit(3)
     for bench in benches.values():

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
+from typer import Option
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files, parse_diode
 from hilstar.cli.running import Console, ConsoleName, Control, Force, Token, page_listener
-from hilstar.console.terminal import print_json, say
+from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError, did_you_mean
 from hilstar.files import check_directory, make_directory
 from hilstar.reading import exists
@@ -29,11 +30,11 @@ EXAMPLE_TRUTH = "truth-example.toml"  # in configs
 def first_light(
     bench_file: BenchFile,
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="SESSION", help="Directory of the session; an older one is gone on with.")
+        Path, Option("-o", "--output", metavar="SESSION", help="Directory of the session; an older one is gone on with.")
     ],
     grab: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="CMD",
             help="Command that takes the tracker's image: {output} is the file to write; {pattern}, where the command shows"
             " the pattern itself, a picture of it; {exposure_s}, where it can be set, the exposure.",
@@ -41,7 +42,7 @@ def first_light(
     ] = None,
     virtual: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="TRUTH.toml",
             help="Without hardware: a bench file that says how the bench really is. truth-example.toml comes with hilstar"
             " (in configs), for the bench of configs/demo.toml.",
@@ -49,28 +50,26 @@ def first_light(
     ] = None,
     dark: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="The tracker's image with the monitor switched off, for the monitor's black level."),
+        Option(metavar="FILE", help="The tracker's image with the monitor switched off, for the monitor's black level."),
     ] = None,
     diode: Annotated[
-        str | None, typer.Option(metavar="serial:/dev/ttyX@BAUD", help="Photodiode before the display's square, for its delay.")
+        str | None, Option(metavar="serial:/dev/ttyX@BAUD", help="Photodiode before the display's square, for its delay.")
     ] = None,
     patches: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", help="At most so many readings of the monitor's response, 0 for none. [96; by hand 0]", min=0
-        ),
+        Option(metavar="N", help="At most so many readings of the monitor's response, 0 for none. [96; by hand 0]", min=0),
     ] = None,
     warm_up: Annotated[
         float | None,
-        typer.Option(
+        Option(
             metavar="MINUTES",
             help="At most so long is white watched until it is stable to 0.2 %, 0 for not at all. [with --virtual 30, else 0]",
             min=0,
             max=1440,
         ),
     ] = None,
-    again: Annotated[list[str] | None, typer.Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
-    seed: Annotated[int, typer.Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
+    again: Annotated[list[str] | None, Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
+    seed: Annotated[int, Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
     force: Force = False,
     console: Console = None,
     control: Control = False,
@@ -102,7 +101,7 @@ def first_light(
     watched_s = SECONDS * ((0.0 if virtual is None else WARM_UP_MIN) if warm_up is None else warm_up)
     with (
         page_listener(console, control, token, console_name) as listener,
-        closing(_image_source(file, grab, virtual, dark, diode, seed)) as source,
+        closing(image_source(file, grab, virtual, dark, diode, seed)) as source,
         alone_in(make_directory(output)),
         _shown(listener, control, file) as (tell, watch),
     ):
@@ -115,12 +114,9 @@ def first_light(
         if beats is not None:
             tell(beats)
         page = write_page(output, session.as_file(), output / BEFORE_FILE)
-    if as_json:
-        print_json({**msgspec.to_builtins(session.as_file()), "page": str(page)})
-    else:
-        for record in session.as_file().steps:
-            typer.echo(f"{record.name:12} {record.verdict:8} {record.line}")
-        typer.echo(f"{'page':12} {page}")
+    found = session.as_file()
+    lines = [f"{record.name:12} {record.verdict:8} {record.line}" for record in found.steps]
+    print_found(as_json, msgspec.to_builtins(found) | {"page": str(page)}, [*lines, f"{'page':12} {page}"])
     if code:
         raise typer.Exit(code)
 
@@ -144,7 +140,7 @@ def _shown(
         yield tell, feed.show
 
 
-def _image_source(
+def image_source(
     file: "files.BenchFile", grab: str | None, virtual: Path | None, dark: Path | None, diode: str | None, seed: int
 ) -> "ImageSource":
     """The source of images. Raises InputError for options that exclude each other."""

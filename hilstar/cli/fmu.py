@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from hilstar import run
 from hilstar.cli.options import BenchFile, check_files
@@ -21,7 +22,7 @@ EXTRA = "pythonfmu cannot be imported; install it: pip install 'hilstar[fmi]'"
 
 
 def fmu(
-    bench_file: BenchFile, output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")]
+    bench_file: BenchFile, output: Annotated[Path, Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")]
 ) -> None:
     """Make an FMU of a bench: a simulation tool's block with attitude in; frame, health and answered attitude out."""
     from hilstar.bench.bench_file import read_bench_file
@@ -37,7 +38,6 @@ def fmu(
 
 
 def _address(path: Path, settings: object) -> str:
-    """Where the FMU is to send, HOST:PORT. Raises InputError for a bench that no FMU can drive."""
     from hilstar.bench.config.attitude import AttitudeSettings, udp_road
 
     assert isinstance(settings, AttitudeSettings)

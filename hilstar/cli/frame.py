@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Option
 
 from hilstar.cli import options
 from hilstar.cli.running import explain_bench, optional_scenario, say_units
-from hilstar.console.terminal import print_json
+from hilstar.console.terminal import print_found
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, check_ending
 
@@ -17,13 +17,11 @@ def frame(
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="The linear image, electrons per second.")
+        Path | None, Option("-o", "--output", metavar="OUT.fits", help="The linear image, electrons per second.")
     ] = None,
-    truth: Annotated[
-        Path | None, typer.Option(metavar="OUT.csv", help="The truth table: one row for each star in view.")
-    ] = None,
-    codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
-    preview: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
+    truth: Annotated[Path | None, Option(metavar="OUT.csv", help="The truth table: one row for each star in view.")] = None,
+    codes: Annotated[Path | None, Option(metavar="OUT.png", help="The code values.")] = None,
+    preview: Annotated[Path | None, Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
     at: options.AtSeconds = None,
     scenario: options.ScenarioFile = None,
     explain: options.Explain = False,
@@ -79,17 +77,13 @@ def frame(
             "fields_of_view": fields.keys(),
             "gl_renderer": bench.renderer.gl_renderer,
         }
-    if as_json:
-        print_json(summary)
-    else:
-        names = f", clipped: {clipped_text(summary['clipped_mag'])}" if clipped else ""
-        missing = summary["left_out"]
-        if missing["stars"]:
-            names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
-        if summary["faults"]:
-            names += f", faults: {', '.join(summary['faults'])}"
-        typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
-        typer.echo(fields.line())
+    names = f", clipped: {clipped_text(summary['clipped_mag'])}" if clipped else ""
+    missing = summary["left_out"]
+    if missing["stars"]:
+        names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
+    if summary["faults"]:
+        names += f", faults: {', '.join(summary['faults'])}"
+    print_found(as_json, summary, [f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}", fields.line()])
     say_units(fields)  # after the refusals: a failing command prints one line
 
 

@@ -4,15 +4,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from hilstar.console.terminal import say
 from hilstar.files import check_directory
 
 
 def keys(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for the keys.")] = Path(
-        "hilstar-keys"
-    ),
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for the keys.")] = Path("hilstar-keys"),
 ) -> None:
     """Make CURVE keys for ZeroMQ: non-loopback endpoints require them."""
     from hilstar.attitude.wire.keys import make_keys

@@ -4,10 +4,10 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from hilstar.cli.options import Json, Overwrite, RunFile, check_files, parse_diode
-from hilstar.console.terminal import print_json
+from hilstar.console.terminal import print_found
 from hilstar.errors import InputError
 from hilstar.files import CSV, check_directory, check_ending
 
@@ -16,26 +16,19 @@ LEDGER_BEHIND_S = 0.5  # the newest part of a running ledger may not be on the d
 
 def latency(
     ledger: RunFile,
-    edges: Annotated[Path | None, typer.Option(metavar="EDGES.csv", help="Edges from a file: host_ns,level.")] = None,
+    edges: Annotated[Path | None, Option(metavar="EDGES.csv", help="Edges from a file: host_ns,level.")] = None,
     diode: Annotated[
-        str | None, typer.Option(metavar="serial:/dev/ttyX@BAUD", help="Read edges from this device while serve runs.")
+        str | None, Option(metavar="serial:/dev/ttyX@BAUD", help="Read edges from this device while serve runs.")
     ] = None,
-    duration: Annotated[float, typer.Option(help="How long to read edges, in seconds.", min=0.5, max=3600)] = 10.0,
-    save: Annotated[Path | None, typer.Option(metavar="EDGES.csv", help="Save the edges that were read.")] = None,
-    write: Annotated[Path | None, typer.Option(metavar="BENCH.toml", help="Set panel_delay_ms in this bench file.")] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for the chart.")] = None,
+    duration: Annotated[float, Option(help="How long to read edges, in seconds.", min=0.5, max=3600)] = 10.0,
+    save: Annotated[Path | None, Option(metavar="EDGES.csv", help="Save the edges that were read.")] = None,
+    write: Annotated[Path | None, Option(metavar="BENCH.toml", help="Set panel_delay_ms in this bench file.")] = None,
+    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Directory for the chart.")] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Measure the latency from swap to light, by a photodiode over the screen's square and the run's ledger."""
-    from hilstar.calibrate.latency import (
-        capture_edges,
-        latency_lines,
-        measure_latency,
-        read_edges,
-        save_edges,
-        write_panel_delay,
-    )
+    from hilstar.calibrate import latency as by_diode
 
     check_directory("-o", output)
     check_ending("--save", save, CSV)
@@ -43,16 +36,13 @@ def latency(
     if (edges is None) == (diode is None):
         raise InputError("latency: give the edges with either --edges EDGES.csv or --diode serial:/dev/ttyX@115200")
     if diode is None:
-        found = read_edges(edges or Path())
+        found = by_diode.read_edges(edges or Path())
     else:
-        found = capture_edges(*parse_diode(diode), duration)
+        found = by_diode.capture_edges(*parse_diode(diode), duration)
         time.sleep(LEDGER_BEHIND_S)
     if save is not None:
-        save_edges(save, found)
-    summary = measure_latency(ledger, found, output)
-    if as_json:
-        print_json(summary)
-    else:
-        typer.echo("\n".join(latency_lines(summary)))
+        by_diode.save_edges(save, found)
+    summary = by_diode.measure_latency(ledger, found, output)
+    print_found(as_json, summary, by_diode.latency_lines(summary))
     if write is not None:
-        write_panel_delay(write, summary["panel_delay_ms"], summary["panel_delay_u_ms"])
+        by_diode.write_panel_delay(write, summary["panel_delay_ms"], summary["panel_delay_u_ms"])

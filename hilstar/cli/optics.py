@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import Json, check_files, parse_numbers
-from hilstar.console.terminal import print_json
+from hilstar.console.terminal import print_found
 from hilstar.errors import InputError
 from hilstar.files import FITS, check_ending
 
@@ -14,22 +15,18 @@ if TYPE_CHECKING:
     from hilstar.optics.psf_file import Glass
 
 RESOLUTION_FORM = "--resolution W,H in pixels, such as 1024,1024"
-Output = Annotated[Path, typer.Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")]
-Oversampling = Annotated[int, typer.Option(help="Samples a tracker pixel along each axis.", min=1, max=64)]
-Tolerance = Annotated[
-    float, typer.Option(help="Share of a PSF's light that the file's basis may put elsewhere.", min=0, max=0.1)
-]
+Output = Annotated[Path, Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf.")]
+Oversampling = Annotated[int, Option(help="Samples a tracker pixel along each axis.", min=1, max=64)]
+Tolerance = Annotated[float, Option(help="Share of a PSF's light that the file's basis may put elsewhere.", min=0, max=0.1)]
 
 
 def map_(
-    stack: Annotated[
-        Path, typer.Argument(metavar="STACK.fits", help="Images (n, height, width), the chief ray in the middle.")
-    ],
-    points: Annotated[Path, typer.Argument(metavar="POINTS.csv", help="x_px,y_px[,wavelength_nm,...] of each image.")],
+    stack: Annotated[Path, Argument(metavar="STACK.fits", help="Images (n, height, width), the chief ray in the middle.")],
+    points: Annotated[Path, Argument(metavar="POINTS.csv", help="x_px,y_px[,wavelength_nm,...] of each image.")],
     output: Output,
     oversampling: Oversampling = 1,
     pixel_integrated: Annotated[
-        bool, typer.Option("--pixel-integrated", help="The pixel is integrated in the images, as in measured ones.")
+        bool, Option("--pixel-integrated", help="The pixel is integrated in the images, as in measured ones.")
     ] = False,
     tolerance: Tolerance = 1e-3,
     as_json: Json = False,
@@ -43,13 +40,10 @@ def map_(
 
 
 def zernike(
-    pupil: Annotated[
-        Path, typer.Argument(metavar="FILE.toml", help="Aperture, aberrations, field points, wavelengths, focus.")
-    ],
+    pupil: Annotated[Path, Argument(metavar="FILE.toml", help="Aperture, aberrations, field points, wavelengths, focus.")],
     output: Output,
     oversampling: Annotated[
-        int | None,
-        typer.Option(help="Samples a tracker pixel along each axis; by default as diffraction needs.", min=1, max=64),
+        int | None, Option(help="Samples a tracker pixel along each axis; by default as diffraction needs.", min=1, max=64)
     ] = None,
     tolerance: Tolerance = 1e-3,
     as_json: Json = False,
@@ -64,25 +58,24 @@ def zernike(
 
 def lens(
     prescription: Annotated[
-        Path, typer.Argument(metavar="PRESCRIPTION", help="A lens: .zmx of Zemax, .seq of CODE V, .json of optiland.")
+        Path, Argument(metavar="PRESCRIPTION", help="A lens: .zmx of Zemax, .seq of CODE V, .json of optiland.")
     ],
     output: Output,
     bench: Annotated[
-        Path | None, typer.Option(metavar="BENCH.toml", help="A bench whose tracker has the pixel pitch and resolution.")
+        Path | None, Option(metavar="BENCH.toml", help="A bench whose tracker has the pixel pitch and resolution.")
     ] = None,
     pitch_um: Annotated[
-        float | None, typer.Option("--pitch-um", help="The tracker's pixel pitch, in place of the bench's.", min=0.1, max=1000)
+        float | None, Option("--pitch-um", help="The tracker's pixel pitch, in place of the bench's.", min=0.1, max=1000)
     ] = None,
     resolution: Annotated[
-        str | None, typer.Option(metavar="W,H", help="The tracker's resolution, px, in place of the bench's.")
+        str | None, Option(metavar="W,H", help="The tracker's resolution, px, in place of the bench's.")
     ] = None,
     focuses_um: Annotated[
-        str, typer.Option("--focuses-um", metavar="UM[,...]", help="Focus positions; positive: farther from the lens.")
+        str, Option("--focuses-um", metavar="UM[,...]", help="Focus positions; positive: farther from the lens.")
     ] = "0",
-    half_px: Annotated[int, typer.Option("--half-px", help="Half of a stamp's side, px.", min=1, max=100)] = 8,
+    half_px: Annotated[int, Option("--half-px", help="Half of a stamp's side, px.", min=1, max=100)] = 8,
     oversampling: Annotated[
-        int | None,
-        typer.Option(help="Samples a tracker pixel along each axis; by default as diffraction needs.", min=1, max=64),
+        int | None, Option(help="Samples a tracker pixel along each axis; by default as diffraction needs.", min=1, max=64)
     ] = None,
     tolerance: Tolerance = 1e-3,
     as_json: Json = False,
@@ -117,7 +110,6 @@ def lens(
 
 
 def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, float] | None = None) -> None:
-    """Write a glass and say what it holds."""
     import numpy as np
 
     from hilstar.optics.psf_file import write_glass
@@ -135,11 +127,7 @@ def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, float] | 
         **(more or {}),
         "written": [str(output)],
     }
-    if as_json:
-        print_json(facts)
-        return
     colours = f"{len(glass.wavelengths_nm)} wavelengths" if known else "one PSF for all light"
-    typer.echo(
-        f"{len(glass.places_px)} field points, {colours}, {len(glass.focuses_um)} focus positions: {len(glass.basis)} "
-        f"components, which put up to {glass.residual:.1e} of a PSF's light elsewhere; wrote {output}"
-    )
+    line = f"{len(glass.places_px)} field points, {colours}, {len(glass.focuses_um)} focus positions: {len(glass.basis)}"
+    off = f"components, which put up to {glass.residual:.1e} of a PSF's light elsewhere"
+    print_found(as_json, facts, [f"{line} {off}; wrote {output}"])

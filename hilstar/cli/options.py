@@ -6,10 +6,11 @@ A parser takes a text and returns a value. Each refusal shows the form to write.
 import math
 import re
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from hilstar.errors import InputError, did_you_mean
 from hilstar.files import check_outputs, files_named_in, refuse_existing, refuse_writer
@@ -23,57 +24,33 @@ if TYPE_CHECKING:
     from hilstar.calibrate.scale import StarReading
     from hilstar.run.record.ledger import SplitLimits
 
-BenchFile = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and nothing else there.")]
-Headless = Annotated[bool, typer.Option("--headless", help="Draw without a window.")]
-RadecText = Annotated[str | None, typer.Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS.")]
-QuaternionText = Annotated[str | None, typer.Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file that could not be made again.")]
+BenchFile = Annotated[Path, Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")]
+Json = Annotated[bool, Option("--json", help="Print one JSON object on stdout, and nothing else there.")]
+Headless = Annotated[bool, Option("--headless", help="Draw without a window.")]
+RadecText = Annotated[str | None, Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS.")]
+QuaternionText = Annotated[str | None, Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace an existing file that could not be made again.")]
 Explain = Annotated[
-    bool, typer.Option("--explain", help="Explain on stderr what was chosen for this scene, with its error and its saving.")
+    bool, Option("--explain", help="Explain on stderr what was chosen for this scene, with its error and its saving.")
 ]
 AtSeconds = Annotated[
-    float | None, typer.Option("--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default.")
+    float | None, Option("--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default.")
 ]
-RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
+RunFile = Annotated[Path, Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
 ScenarioFile = Annotated[
-    Path | None, typer.Option("--scenario", metavar="FILE.toml", help="Faults on request: what is wrong in the sky, and when.")
+    Path | None, Option("--scenario", metavar="FILE.toml", help="Faults on request: what is wrong in the sky, and when.")
 ]
-UNSAID = "What the log itself does not say"
-KernelFiles = Annotated[
-    list[Path] | None, typer.Option("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.", rich_help_panel=UNSAID)
-]
-TopicName = Annotated[
-    str | None, typer.Option("--topic", metavar="NAME", help="The topic, where a bag has several.", rich_help_panel=UNSAID)
-]
-BodyName = Annotated[
-    str | None,
-    typer.Option("--body", metavar="NAME", help="The body or frame, where a log has several.", rich_help_panel=UNSAID),
-]
-ReferenceName = Annotated[
-    str | None,
-    typer.Option(
-        "--reference",
-        metavar="FRAME",
-        help="The frame that attitudes refer to, or what its axes are: icrs, enu, ned.",
-        rich_help_panel=UNSAID,
-    ),
-]
-EpochUtc = Annotated[
-    str | None, typer.Option("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.", rich_help_panel=UNSAID)
-]
-PlaceText = Annotated[
-    str | None,
-    typer.Option(
-        "--place", metavar="LAT,LON,HEIGHT", help="Where the vehicle is: degrees and metres, WGS84.", rich_help_panel=UNSAID
-    ),
-]
-MountingText = Annotated[
-    str | None,
-    typer.Option(
-        "--mounting", metavar="W,X,Y,Z", help="q_body_to_cam, for a log of the body's attitude.", rich_help_panel=UNSAID
-    ),
-]
+unsaid = partial(Option, rich_help_panel="What the log itself does not say")
+KernelFiles = Annotated[list[Path] | None, unsaid("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.")]
+TopicName = Annotated[str | None, unsaid("--topic", metavar="NAME", help="The topic, where a bag has several.")]
+BodyName = Annotated[str | None, unsaid("--body", metavar="NAME", help="The body or frame, where a log has several.")]
+REFERENCE_HELP = "The frame that attitudes refer to, or what its axes are: icrs, enu, ned."
+ReferenceName = Annotated[str | None, unsaid("--reference", metavar="FRAME", help=REFERENCE_HELP)]
+EpochUtc = Annotated[str | None, unsaid("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.")]
+PLACE_HELP = "Where the vehicle is: degrees and metres, WGS84."
+PlaceText = Annotated[str | None, unsaid("--place", metavar="LAT,LON,HEIGHT", help=PLACE_HELP)]
+MOUNTING_HELP = "q_body_to_cam, for a log of the body's attitude."
+MountingText = Annotated[str | None, unsaid("--mounting", metavar="W,X,Y,Z", help=MOUNTING_HELP)]
 MAX_SEED = 2**63 - 1  # largest number in a FITS header
 LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, MCAP (a ledger), a SPICE CK, a ROS bag or a PX4 ULog."
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

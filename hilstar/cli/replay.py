@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from hilstar.cli import options, running
 from hilstar.console.run_status import RunSource, RunStatus, on_terminal
@@ -13,13 +13,13 @@ from hilstar.notices import Notices
 
 def replay(
     bench_file: options.BenchFile,
-    log: Annotated[Path, typer.Argument(metavar="LOG", help=options.LOG_HELP)],
+    log: Annotated[Path, Argument(metavar="LOG", help=options.LOG_HELP)],
     speed: Annotated[
-        str, typer.Option(metavar="realtime|max|N", help="Real time, as fast as possible, or N times real time.")
+        str, Option(metavar="realtime|max|N", help="Real time, as fast as possible, or N times real time.")
     ] = "realtime",
-    start: Annotated[float | None, typer.Option(metavar="S", help="Start this many seconds after the first sample.")] = None,
-    stop: Annotated[float | None, typer.Option(metavar="S", help="Stop this many seconds after the first sample.")] = None,
-    step: Annotated[float | None, typer.Option(metavar="S", help="Time step of the log between frames, in seconds.")] = None,
+    start: Annotated[float | None, Option(metavar="S", help="Start this many seconds after the first sample.")] = None,
+    stop: Annotated[float | None, Option(metavar="S", help="Stop this many seconds after the first sample.")] = None,
+    step: Annotated[float | None, Option(metavar="S", help="Time step of the log between frames, in seconds.")] = None,
     kernel: options.KernelFiles = None,
     topic: options.TopicName = None,
     body: options.BodyName = None,
@@ -28,9 +28,9 @@ def replay(
     place: options.PlaceText = None,
     headless: options.Headless = False,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a PNG of each frame, and frames.csv.")
+        Path | None, Option("-o", "--output", metavar="DIR", help="Directory for a PNG of each frame, and frames.csv.")
     ] = None,
-    frames: Annotated[str | None, typer.Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")] = None,
+    frames: Annotated[str | None, Option(metavar="ENDPOINT", help=f"{running.FRAMES_HELP}.")] = None,
     ledger: running.LedgerFile = None,
     ledger_split: running.LedgerSplit = None,
     scenario: options.ScenarioFile = None,
@@ -48,8 +48,7 @@ def replay(
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file, with_codes_ms
-    from hilstar.console.publisher import PageParts, RunDescription
-    from hilstar.run.record.ledger import Ledger
+    from hilstar.console.publisher import RunDescription
     from hilstar.run.replay import FrameImages, Wanted, plan_play
     from hilstar.run.replay import replay as replay_log
     from hilstar.run.serve import Outlet
@@ -84,10 +83,7 @@ def replay(
         told = RunSource(f"replaying {log}", renderer, refresh_hz, play.frame_count, running.forced_on(screen))
         status = RunStatus(told, kept)
         page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
-        schedule = getattr(wrong, "schedule", None)  # nobody starts a fault in a run that is replayed
-        parts = PageParts(
-            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, schedule, answers
-        )
+        parts = running.page_parts(bench, notices, kept, screen, wrong, answers, split=split)
         with (
             on_terminal(status),
             running.followed(listener, control, page, parts, status, record, watched) as (sink, follower, requests),

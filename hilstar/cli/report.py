@@ -3,16 +3,16 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from hilstar.cli.options import Json, RunFile
-from hilstar.console.terminal import print_json
+from hilstar.console.terminal import print_found
 from hilstar.files import check_directory
 
 
 def report(
     ledger: RunFile,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for report.html and report.json.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for report.html and report.json.")],
     as_json: Json = False,
 ) -> None:
     """Report a run on one page: pictures, timing, attitude age, missed frames, packets, events and memory."""
@@ -21,9 +21,5 @@ def report(
 
     check_directory("-o", output)
     found = write_report(ledger, output)
-    if as_json:
-        print_json(found)
-        return
-    for what, how_much in table_rows(found):
-        typer.echo(f"{what:32}{how_much}")
-    typer.echo(f"{'page':32}{output / 'report.html'}")
+    rows = [*table_rows(found), ("page", output / "report.html")]
+    print_found(as_json, found, (f"{what:32}{how_much}" for what, how_much in rows))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import typer
+from typer import Option
 
 from hilstar.console.run_status import RunStatus
 from hilstar.console.terminal import report, say
@@ -34,10 +35,10 @@ if TYPE_CHECKING:
     from hilstar.run.sync import BeatSummary
 
 UTC_MARK = "{utc}"  # stands for the time in a ledger's name
-Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
+Windowed = Annotated[bool, Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--force",
         help="Show on a display that the start-up checks refuse, or on a monitor that the bench's files were not measured on;"
         " status, page and ledger go on saying so.",
@@ -45,7 +46,7 @@ Force = Annotated[
 ]
 LedgerFile = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         "--ledger",
         metavar="RUN.mcap",
         help="Record every packet and every frame in this file; {utc} in it is the start's time.",
@@ -53,12 +54,11 @@ LedgerFile = Annotated[
 ]
 
 LedgerSplit = Annotated[
-    str | None,
-    typer.Option("--ledger-split", metavar="1GB|1h", help="Continue in RUN.0001.mcap and so on after this size or time."),
+    str | None, Option("--ledger-split", metavar="1GB|1h", help="Continue in RUN.0001.mcap and so on after this size or time.")
 ]
 Console = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--console",
         metavar="[HOST:PORT]",
         help="Serve the operator's page there, by default on 127.0.0.1:8765; port 0 is any free one.",
@@ -67,17 +67,17 @@ Console = Annotated[
 ]
 Scpi = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--scpi",
         metavar="[HOST:PORT]",
         help="Answer a test stand's SCPI there, by default on 127.0.0.1:5025; port 0 is any free one.",
         show_default=False,
     ),
 ]
-Control = Annotated[bool, typer.Option("--control", help="Let the page act: without it, it only shows.")]
+Control = Annotated[bool, Option("--control", help="Let the page act: without it, it only shows.")]
 Token = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--token",
         metavar="TEXT",
         envvar="HILSTAR_TOKEN",
@@ -86,7 +86,7 @@ Token = Annotated[
 ]
 ConsoleName = Annotated[
     list[str] | None,
-    typer.Option("--console-name", metavar="NAME", help="A further name of the page, as a proxy shows it; may be given often."),
+    Option("--console-name", metavar="NAME", help="A further name of the page, as a proxy shows it; may be given often."),
 ]
 FRAMES_HELP = "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570 (hilstar tracker)"
 
@@ -314,6 +314,23 @@ def scpi_listener(
         secret = f', SYST:AUTH "{listener.token}" first' if listener.made else ", SYST:AUTH first" if listener.token else ""
         say(f"SCPI is at {listener.host}:{listener.port}{secret}")
         yield listener
+
+
+def page_parts(
+    bench: Any,
+    notices: Notices,
+    ledger: "LedgerSwitch",
+    screen: Any = None,
+    faults: Any = None,
+    answers: Any = None,
+    **split: Any,
+) -> "PageParts":
+    """The parts of a run for its page; a ledger that is begun there is split as `split` says."""
+    from hilstar.console.publisher import PageParts
+    from hilstar.run.record.ledger import Ledger
+
+    schedule = getattr(faults, "schedule", None)  # nobody starts a fault in a run that is replayed
+    return PageParts(bench, notices, ledger, lambda path: Ledger(path, bench, notices, **split), screen, schedule, answers)
 
 
 @contextmanager

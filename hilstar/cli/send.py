@@ -8,7 +8,7 @@ from itertools import islice, takewhile
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from hilstar.cli import options
 from hilstar.console.terminal import print_json, progress, say
@@ -18,39 +18,35 @@ from hilstar.process.scheduling import PromptWhileLight
 from hilstar.units import NS_PER_S
 
 LISTEN_SLICE_S = 0.1  # between checks for a signal
-Share = Annotated[
-    str, typer.Option(metavar="[SHARE]", help="Fraction of the packets, such as 5% or 0.05; 5% if no value follows.")
-]
-KeyFile = Annotated[Path | None, typer.Option(metavar="FILE", help="From `hilstar keys`.")]
+Share = Annotated[str, Option(metavar="[SHARE]", help="Fraction of the packets, such as 5% or 0.05; 5% if no value follows.")]
+KeyFile = Annotated[Path | None, Option(metavar="FILE", help="From `hilstar keys`.")]
 
 
 def send(
-    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help=options.LOG_HELP)] = None,
-    spin: Annotated[str | None, typer.Option(metavar="AXIS,DEG_PER_S", help="A constant rotation instead of a log.")] = None,
+    log: Annotated[Path | None, Argument(metavar="[LOG]", help=options.LOG_HELP)] = None,
+    spin: Annotated[str | None, Option(metavar="AXIS,DEG_PER_S", help="A constant rotation instead of a log.")] = None,
     to: Annotated[
-        str, typer.Option(metavar="TARGET", help="tcp://HOST:PORT, udp://HOST:PORT or serial:/dev/ttyX@BAUD.")
+        str, Option(metavar="TARGET", help="tcp://HOST:PORT, udp://HOST:PORT or serial:/dev/ttyX@BAUD.")
     ] = "tcp://127.0.0.1:5560",
-    rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Packets per second; by default at the log's own times.")
-    ] = None,
+    rate: Annotated[float | None, Option(metavar="HZ", help="Packets per second; by default at the log's own times.")] = None,
     connect: Annotated[
-        bool, typer.Option("--connect", help="Connect instead of binding, for a bench file with bind = true.")
+        bool, Option("--connect", help="Connect instead of binding, for a bench file with bind = true.")
     ] = False,
     radec: options.RadecText = None,
-    count: Annotated[int | None, typer.Option(help="Stop after this many packets.", min=1)] = None,
-    duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this many seconds.", min=0)] = None,
-    wait: Annotated[float, typer.Option(help="Seconds to wait for a listener.", min=0, max=1e6)] = 30.0,
+    count: Annotated[int | None, Option(help="Stop after this many packets.", min=1)] = None,
+    duration: Annotated[float | None, Option(metavar="S", help="Stop after this many seconds.", min=0)] = None,
+    wait: Annotated[float, Option(help="Seconds to wait for a listener.", min=0, max=1e6)] = 30.0,
     lose: Share = "0",
     corrupt: Share = "0",
     reorder: Share = "0",
     jitter: Annotated[
-        float, typer.Option(metavar="MS", help="Delay each packet at random by up to this much.", min=0, max=1e6)
+        float, Option(metavar="MS", help="Delay each packet at random by up to this much.", min=0, max=1e6)
     ] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of the faults.", min=0, max=options.MAX_SEED)] = 0,
+    seed: Annotated[int, Option(help="Seed of the faults.", min=0, max=options.MAX_SEED)] = 0,
     secret_key: KeyFile = None,
     server_key: KeyFile = None,
     allowed_clients: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Directory of the public keys that may connect.")
+        Path | None, Option(metavar="DIR", help="Directory of the public keys that may connect.")
     ] = None,
     mounting: options.MountingText = None,
     as_json: options.Json = False,

@@ -3,20 +3,20 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import Json, check_files
-from hilstar.console.terminal import print_json
+from hilstar.console.terminal import print_found
 from hilstar.files import TOML, check_ending
 
 if TYPE_CHECKING:
     from hilstar.calibrate.sensor import SensorFile
 
-Output = Annotated[Path, typer.Option("-o", "--output", metavar="SENSOR.toml", help="The tables for a bench file.")]
+Output = Annotated[Path, Option("-o", "--output", metavar="SENSOR.toml", help="The tables for a bench file.")]
 
 
 def import_(
-    data: Annotated[Path, typer.Argument(metavar="EMVA.csv|json", help="Rows of quantity, value and unit.")],
+    data: Annotated[Path, Argument(metavar="EMVA.csv|json", help="Rows of quantity, value and unit.")],
     output: Output,
     as_json: Json = False,
 ) -> None:
@@ -29,9 +29,9 @@ def import_(
 
 
 def measure(
-    flats: Annotated[list[Path], typer.Argument(metavar="FLATS...", help="FITS or PNG, two of each light after each other.")],
+    flats: Annotated[list[Path], Argument(metavar="FLATS...", help="FITS or PNG, two of each light after each other.")],
     darks: Annotated[
-        list[Path], typer.Option("--darks", metavar="DARKS...", help="Frames without light, two of each exposure (EXPTIME).")
+        list[Path], Option("--darks", metavar="DARKS...", help="Frames without light, two of each exposure (EXPTIME).")
     ],
     output: Output,
     as_json: Json = False,
@@ -48,9 +48,6 @@ def _tell(output: Path, sensor: "SensorFile", source: str, as_json: bool) -> Non
     from hilstar.calibrate.sensor import write_sensor
 
     files = write_sensor(output, sensor, source)
-    if as_json:
-        print_json(
-            {"keys": sensor.keys, "sigmas": sensor.sigmas, "notes": sensor.notes, "written": [str(file) for file in files]}
-        )
-        return
-    typer.echo("\n".join([*sensor.lines, *sensor.notes, f"wrote {', '.join(str(file) for file in files)}"]))
+    written = [str(file) for file in files]
+    told = {"keys": sensor.keys, "sigmas": sensor.sigmas, "notes": sensor.notes, "written": written}
+    print_found(as_json, told, [*sensor.lines, *sensor.notes, f"wrote {', '.join(written)}"])

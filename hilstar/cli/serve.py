@@ -6,15 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import msgspec
 import typer
 from msgspec import UNSET
 from msgspec.structs import replace as replaced
+from typer import Option
 
 from hilstar.cli import running
 from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files, parse_split
 from hilstar.console.run_status import RunSource, RunStatus, on_terminal
-from hilstar.console.terminal import say, without_attitude
+from hilstar.console.terminal import print_found, say, without_attitude
 from hilstar.errors import InputError
 from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 NO_ATTITUDE = 4
 # Options of a head's process: the file with `heads`, and the endpoint of the source's attitudes.
-HeadOf = Annotated[Path | None, typer.Option("--head-of", hidden=True)]
-FedBy = Annotated[str | None, typer.Option("--fed-by", hidden=True)]
+HeadOf = Annotated[Path | None, Option("--head-of", hidden=True)]
+FedBy = Annotated[str | None, Option("--fed-by", hidden=True)]
 
 
 def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json: bool) -> None:
@@ -55,15 +55,14 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
         assert not link.steps  # read_heads refuses lockstep
         told = run_heads(asked, link, say)
-    if as_json:
-        typer.echo(msgspec.json.encode({"heads": told}).decode())
-    else:
-        for name, head in told.items():
-            summary = head["summary"]
-            frames = summary.get("frames") if isinstance(summary, dict) else None
-            counted = "no summary" if frames is None else f"{frames} frames"
-            again = f", started again {head['restarts']} times" if head["restarts"] else ""
-            typer.echo(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
+    lines = []
+    for name, head in told.items():
+        summary = head["summary"]
+        frames = summary.get("frames") if isinstance(summary, dict) else None
+        counted = "no summary" if frames is None else f"{frames} frames"
+        again = f", started again {head['restarts']} times" if head["restarts"] else ""
+        lines.append(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
+    print_found(as_json, {"heads": told}, lines)
     codes = [head["exit_code"] for head in told.values()]
     if all(code == NO_ATTITUDE for code in codes):
         raise typer.Exit(NO_ATTITUDE)
@@ -73,7 +72,6 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
 
 
 def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, ...]:
-    """The address of each head's page. Raises InputError where one is taken, before a head is started."""
     from hilstar.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
 
     if console is None:
@@ -104,9 +102,9 @@ def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
 def serve(
     bench_file: BenchFile,
     headless: Headless = False,
-    duration: Annotated[float | None, typer.Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)] = None,
+    duration: Annotated[float | None, Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)] = None,
     frames: Annotated[
-        list[str] | None, typer.Option(metavar="N|ENDPOINT", help=f"Number of frames to draw. {running.FRAMES_HELP}.")
+        list[str] | None, Option(metavar="N|ENDPOINT", help=f"Number of frames to draw. {running.FRAMES_HELP}.")
     ] = None,
     ledger: running.LedgerFile = None,
     ledger_split: running.LedgerSplit = None,
@@ -144,9 +142,7 @@ def serve(
         return
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.cameras import fields_of_view
-    from hilstar.console.publisher import PageParts
     from hilstar.run.loop import Limit
-    from hilstar.run.record.ledger import Ledger
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import serve as serve_stream
 
@@ -181,15 +177,7 @@ def serve(
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
         told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest, running.forced_on(screen))
         status = RunStatus(told, kept)
-        parts = PageParts(
-            bench,
-            notices,
-            kept,
-            lambda path: Ledger(path, bench, notices, split=split),
-            screen,
-            getattr(wrong, "schedule", None),
-            answers,
-        )
+        parts = running.page_parts(bench, notices, kept, screen, wrong, answers, split=split)
         with (
             on_terminal(status),
             running.followed(listener, control, _described(file, link), parts, status, frames=watched, scpi=instrument) as fed,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import BenchFile, Overwrite, with_values
 from hilstar.cli.running import UTC_MARK
@@ -78,11 +79,10 @@ SYSTEMD_S = 30.0  # more than TimeoutStopSec, in which a run ends
 def install(
     bench_file: BenchFile,
     options: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[-- OPTIONS]", help="Options of `hilstar serve`, such as `-- --console --control`."),
+        list[str] | None, Argument(metavar="[-- OPTIONS]", help="Options of `hilstar serve`, such as `-- --console --control`.")
     ] = None,
-    name: Annotated[str | None, typer.Option(metavar="NAME", help="The service's name; by default the bench file's.")] = None,
-    to_stdout: Annotated[bool, typer.Option("--print", help="Print the unit, and write nothing.")] = False,
+    name: Annotated[str | None, Option(metavar="NAME", help="The service's name; by default the bench file's.")] = None,
+    to_stdout: Annotated[bool, Option("--print", help="Print the unit, and write nothing.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a systemd unit of this user that serves a bench: watched, and back within seconds whenever it ends."""
@@ -120,7 +120,7 @@ def install(
 
 def uninstall(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="The service's name, as install printed it; by default the bench file's.")
+        str, Argument(metavar="NAME", help="The service's name, as install printed it; by default the bench file's.")
     ],
 ) -> None:
     """Stop a service, and delete its unit and its token."""
@@ -143,7 +143,6 @@ def uninstall(
 
 
 def _systemctl(*words: str) -> bool:
-    """Run systemctl. Returns whether it succeeded; False without systemd."""
     try:
         done = subprocess.run(["systemctl", "--user", *words], capture_output=True, timeout=SYSTEMD_S, check=False)
     except (OSError, subprocess.TimeoutExpired):
@@ -152,7 +151,6 @@ def _systemctl(*words: str) -> bool:
 
 
 def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAddress | None]":
-    """The options, checked by `hilstar serve`, and the address of its page. Raises InputError."""
     from hilstar.console.listener import parse_address
 
     words = with_values(options)
@@ -228,6 +226,5 @@ def _literal(text: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A word of a unit's command line."""
     text = _literal(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
     return text if re.fullmatch(r"[A-Za-z0-9_@%+=:,./{}-]+", text) else f'"{text}"'

@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Option
 
 from hilstar.cli import options
 from hilstar.cli.running import optional_scenario
-from hilstar.console.terminal import print_json, progress, say
+from hilstar.console.terminal import print_found, progress, say
 from hilstar.errors import InputError
 from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 
@@ -20,22 +21,20 @@ def simulate(
     bench_file: options.BenchFile,
     radec: options.RadecText = None,
     quaternion: options.QuaternionText = None,
-    rate: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s.")
-    ] = None,
+    rate: Annotated[str | None, Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s.")] = None,
     at: options.AtSeconds = None,
     scenario: options.ScenarioFile = None,
     log: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="Simulate frames along a log, into the directory given by -o.")
+        Path | None, Option(metavar="LOG", help="Simulate frames along a log, into the directory given by -o.")
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1)
+        int | None, Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1)
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the frame's noise.", min=0, max=options.MAX_SEED)] = 0,
-    noise: Annotated[Literal["full", "none"], typer.Option(help="The detector's full noise, or none.")] = "full",
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="The image in DN, uint16.")] = None,
-    png: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
-    dn_png: Annotated[Path | None, typer.Option(metavar="OUT.png|.tif", help="The DN themselves, as 16-bit greyscale.")] = None,
+    seed: Annotated[int, Option(help="Seed of the frame's noise.", min=0, max=options.MAX_SEED)] = 0,
+    noise: Annotated[Literal["full", "none"], Option(help="The detector's full noise, or none.")] = "full",
+    output: Annotated[Path | None, Option("-o", "--output", metavar="OUT.fits", help="The image in DN, uint16.")] = None,
+    png: Annotated[Path | None, Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
+    dn_png: Annotated[Path | None, Option(metavar="OUT.png|.tif", help="The DN themselves, as 16-bit greyscale.")] = None,
     as_json: options.Json = False,
 ) -> None:
     """Simulate the virtual tracker's image of the sky, with noise."""
@@ -86,12 +85,9 @@ def simulate(
             "written": [str(path) for path in targets],
             "gl_renderer": simulator.renderer.gl_renderer,
         }
-    if as_json:
-        print_json(summary)
-    else:
-        dn = summary["dn"]
-        named = f", faults: {', '.join(exposure.faults)}" if exposure.faults else ""
-        typer.echo(f"{summary['stars']} stars{named}, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}")
+    dn, named = summary["dn"], f", faults: {', '.join(exposure.faults)}" if exposure.faults else ""
+    line = f"{summary['stars']} stars{named}, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}"
+    print_found(as_json, summary, [line])
 
 
 def simulate_log(

@@ -6,10 +6,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from hilstar.cli.options import Json, check_files
-from hilstar.console.terminal import print_json, progress
+from hilstar.console.terminal import print_found, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
 
@@ -35,15 +35,14 @@ CHAIN_SCENES = 5
 
 
 def study(
-    what: Annotated[Study, typer.Argument(help="The study.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for charts and tables.")],
+    what: Annotated[Study, Argument(help="The study.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for charts and tables.")],
     bench: Annotated[
-        Path | None, typer.Argument(metavar="[BENCH.toml]", help="The bench file of `chain`.", show_default=False)
+        Path | None, Argument(metavar="[BENCH.toml]", help="The bench file of `chain`.", show_default=False)
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer rounds, where a full study takes minutes.")] = False,
+    quick: Annotated[bool, Option("--quick", help="Fewer rounds, where a full study takes minutes.")] = False,
     images: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Photographs for `confront`: a folder for each camera, with its guess.toml."),
+        Path | None, Option(metavar="DIR", help="Photographs for `confront`: a folder for each camera, with its guess.toml.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -69,10 +68,8 @@ def study(
             lines, right = study_lines(what, output, quick)
         else:
             lines, right = chain_lines(bench, output, quick, advance)
-    if as_json:
-        print_json({"study": what, "right": right, "findings": lines, "directory": str(output)})
-    else:
-        typer.echo("\n".join([*lines, f"figures and tables in {output}"]))
+    told = {"study": what, "right": right, "findings": lines, "directory": str(output)}
+    print_found(as_json, told, [*lines, f"figures and tables in {output}"])
 
 
 def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:

@@ -5,10 +5,12 @@ import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from hilstar.cli import options
 from hilstar.console.terminal import print_json, say
@@ -24,73 +26,57 @@ NICE = 5
 MAX_RATE_HZ, USUAL_RATE_HZ = 1000.0, 10.0
 MAX_ARCSEC, MAX_S, MAX_PPM = 1e5, 1e5, 1e4
 SILENT = re.compile(r"(\d+(?:\.\d*)?)s?(?:@(\d+(?:\.\d*)?)s?)?")
-PLANTED = "Errors to plant"
+planted = partial(Option, rich_help_panel="Errors to plant")
 
 
 def tracker(
     bench_file: options.BenchFile,
-    watch: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where serve or replay --frames sends its frames from.")],
+    watch: Annotated[str, Option(metavar="ENDPOINT", help="Where serve or replay --frames sends its frames from.")],
     answer: Annotated[
-        str,
-        typer.Option(metavar="TARGET", help="tcp://HOST:PORT (ZeroMQ), udp://HOST:PORT or serial:/dev/ttyX@BAUD."),
+        str, Option(metavar="TARGET", help="tcp://HOST:PORT (ZeroMQ), udp://HOST:PORT or serial:/dev/ttyX@BAUD.")
     ],
     rate: Annotated[
-        float | None,
-        typer.Option(metavar="HZ", help="Answers per second; by default 10, or one an exposure where that is less."),
+        float | None, Option(metavar="HZ", help="Answers per second; by default 10, or one an exposure where that is less.")
     ] = None,
     solver: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="truth|tetra3|CMD",
             help="Who finds the attitude when none is expected: tetra3 (the extra hilstar[solve], the default where it is"
             ' installed), a command such as "solve {image}", python:MODULE:FUNCTION, or the true one each time.',
         ),
     ] = None,
-    form: Annotated[str, typer.Option("--format", metavar="packet|json", help="The format of the answers.")] = "packet",
+    form: Annotated[str, Option("--format", metavar="packet|json", help="The format of the answers.")] = "packet",
     connect: Annotated[
-        bool, typer.Option("--connect", help="Connect the ZeroMQ answers instead of binding: [answers] bind = true.")
+        bool, Option("--connect", help="Connect the ZeroMQ answers instead of binding: [answers] bind = true.")
     ] = False,
-    bias: Annotated[str, typer.Option(metavar="X,Y,Z", help="Arcsec about cam x, y and z.", rich_help_panel=PLANTED)] = "0,0,0",
+    bias: Annotated[str, planted(metavar="X,Y,Z", help="Arcsec about cam x, y and z.")] = "0,0,0",
     fov_error: Annotated[
         float,
-        typer.Option(
+        planted(
             metavar="ARCSEC",
             min=0,
             max=MAX_ARCSEC,
             help="One sigma about x and y of waves of 400 px, and 4 times that about z.",
-            rich_help_panel=PLANTED,
         ),
     ] = 0.0,
     pixel_error: Annotated[
-        float,
-        typer.Option(metavar="ARCSEC", min=0, max=MAX_ARCSEC, help="The same, of waves of one pixel.", rich_help_panel=PLANTED),
+        float, planted(metavar="ARCSEC", min=0, max=MAX_ARCSEC, help="The same, of waves of one pixel.")
     ] = 0.0,
-    wrong: Annotated[
-        str, typer.Option(metavar="SHARE", help="Of the answers that are any attitude, such as 1%.", rich_help_panel=PLANTED)
-    ] = "0",
+    wrong: Annotated[str, planted(metavar="SHARE", help="Of the answers that are any attitude, such as 1%.")] = "0",
     silent: Annotated[
-        str | None,
-        typer.Option(
-            metavar="S[@T]", help="Say nothing for S seconds, from T (5) after the first exposure.", rich_help_panel=PLANTED
-        ),
+        str | None, planted(metavar="S[@T]", help="Say nothing for S seconds, from T (5) after the first exposure.")
     ] = None,
-    babble: Annotated[bool, typer.Option("--babble", help="Send garbage between answers.", rich_help_panel=PLANTED)] = False,
-    latency: Annotated[
-        float,
-        typer.Option(metavar="S", help="From mid-exposure to the answer, at least.", min=0, max=MAX_S, rich_help_panel=PLANTED),
-    ] = 0.0,
-    clock_drift: Annotated[
-        float, typer.Option(metavar="PPM", help="Of its own clock.", min=-MAX_PPM, max=MAX_PPM, rich_help_panel=PLANTED)
-    ] = 0.0,
-    clock_offset: Annotated[
-        float, typer.Option(metavar="S", help="Of its own clock.", min=-MAX_S, max=MAX_S, rich_help_panel=PLANTED)
-    ] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of noise and errors.", min=0, max=options.MAX_SEED)] = 0,
+    babble: Annotated[bool, planted("--babble", help="Send garbage between answers.")] = False,
+    latency: Annotated[float, planted(metavar="S", help="From mid-exposure to the answer, at least.", min=0, max=MAX_S)] = 0.0,
+    clock_drift: Annotated[float, planted(metavar="PPM", help="Of its own clock.", min=-MAX_PPM, max=MAX_PPM)] = 0.0,
+    clock_offset: Annotated[float, planted(metavar="S", help="Of its own clock.", min=-MAX_S, max=MAX_S)] = 0.0,
+    seed: Annotated[int, Option(help="Seed of noise and errors.", min=0, max=options.MAX_SEED)] = 0,
     duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Seconds from the first frame; by default until Ctrl-C.", min=0, max=1e8)
+        float | None, Option(metavar="S", help="Seconds from the first frame; by default until Ctrl-C.", min=0, max=1e8)
     ] = None,
     record: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="Write its answers as telemetry, too, as assess reads it.")
+        Path | None, Option(metavar="FILE.csv", help="Write its answers as telemetry, too, as assess reads it.")
     ] = None,
     as_json: options.Json = False,
 ) -> None:
@@ -114,9 +100,9 @@ def tracker(
         raise InputError(f"--bias {bias}: write at most {MAX_ARCSEC:g} arcsec")
     repeating, silence = (fov_error, pixel_error), parse_silent(silent)
     share = options.parse_share(wrong, "--wrong")
-    planted = Planted(tuple(bias_arcsec), *repeating, share, *silence, latency, clock_drift, clock_offset)
+    errors = Planted(tuple(bias_arcsec), *repeating, share, *silence, latency, clock_drift, clock_offset)
     rate_hz, stop = checked_rate(rate, file.config.tracker.exposure_s), threading.Event()
-    noise, errors, garbage = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3))
+    noise, chance, garbage = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3))
     with (
         FrameWatch(watch) as frames,
         LiveTracker(file, noise) as live,
@@ -126,7 +112,7 @@ def tracker(
     ):
         live.lost_in_space = solver_of(solver, live)
         say(f"{frames.verb.replace('a sender', 'frames')} {watch}; answers {rate_hz:g} Hz, {form}, to {link.endpoint}")
-        process = TrackerProcess(live, frames, planted, rate_hz, errors)
+        process = TrackerProcess(live, frames, errors, rate_hz, chance)
 
         def send(said: "Answer") -> None:
             link.send(said)

@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, ScenarioFile
 from hilstar.cli.running import optional_scenario
-from hilstar.console.terminal import print_json, progress
+from hilstar.console.terminal import print_found, print_json, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
 
@@ -20,16 +21,14 @@ if TYPE_CHECKING:
 
 def verify(
     bench_file: BenchFile,
-    fields: Annotated[int, typer.Option(help="Number of random attitudes.", min=1, max=100_000)] = 10,
-    seed: Annotated[int, typer.Option(help="Seed of the attitudes and the noise.", min=0, max=MAX_SEED)] = 0,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for charts and a table.")
-    ] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with code 1 if the bench does not pass.")] = False,
+    fields: Annotated[int, Option(help="Number of random attitudes.", min=1, max=100_000)] = 10,
+    seed: Annotated[int, Option(help="Seed of the attitudes and the noise.", min=0, max=MAX_SEED)] = 0,
+    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Directory for charts and a table.")] = None,
+    strict: Annotated[bool, Option("--strict", help="Exit with code 1 if the bench does not pass.")] = False,
     propose: Annotated[
-        bool, typer.Option("--propose", help="Find the smallest change of the bench file with which a failing bench passes.")
+        bool, Option("--propose", help="Find the smallest change of the bench file with which a failing bench passes.")
     ] = False,
-    write: Annotated[bool, typer.Option("--write", help="Find it, and make it in the bench file.")] = False,
+    write: Annotated[bool, Option("--write", help="Find it, and make it in the bench file.")] = False,
     scenario: ScenarioFile = None,
     as_json: Json = False,
 ) -> None:
@@ -68,16 +67,13 @@ def verify(
 
 
 def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> None:
-    """Print the angles between the heads of a file with `heads`, solved from what their trackers would see."""
     import numpy as np
 
     from hilstar.twin.heads import verify_heads
 
     with progress("verifying", fields) as advance:
         pairs = [pair.summary() for pair in verify_heads(heads, fields, np.random.default_rng(seed), advance)]
-    if as_json:
-        print_json({"angles": pairs})
-        return
+    lines = []
     for pair in pairs:
         first, second = pair["heads"]
         linear, codes = pair["linear_arcsec"], pair["codes_arcsec"]
@@ -87,7 +83,8 @@ def _verify_heads(heads: "HeadsFile", fields: int, seed: int, as_json: bool) -> 
                 f"{linear['rms']:.4f} / {linear['max']:.4f} arcsec from linear light, {codes['rms']:.4f} / {codes['max']:.4f}"
                 f" from codes (rms / max, {pair['fields']} fields)"
             )
-        typer.echo(f"{f'{first} to {second}':20}{told}")
+        lines.append(f"{f'{first} to {second}':20}{told}")
+    print_found(as_json, {"angles": pairs}, lines)
 
 
 def _proposed(file: "Bench", verdict: "Verdict", seed: int, write: bool, as_json: bool) -> dict[str, Any]:

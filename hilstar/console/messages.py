@@ -18,16 +18,7 @@ import msgspec
 import numpy as np
 
 from hilstar.answers.judge import TrackerFigures
-from hilstar.console.protocol import (
-    PATCH_SHARE,
-    AttitudeSource,
-    Hello,
-    LedgerState,
-    NewestFrame,
-    RunCounts,
-    ShownAttitude,
-    ShownClock,
-)
+from hilstar.console import protocol
 
 FRAME = struct.Struct("<12qI")
 PICTURE = struct.Struct("<3q4I4d")
@@ -71,16 +62,11 @@ class PictureHead(NamedTuple):
     q_z: float = math.nan
 
 
-class RunState(msgspec.Struct, frozen=True, kw_only=True):
+class RunState(protocol.SkyState, frozen=True, kw_only=True):
     """The run at a host time, ns; `alive_ns` is when the frame loop last moved, 0 before it began."""
 
     host_ns: int
     alive_ns: int = 0
-    frame: NewestFrame = NewestFrame()
-    attitude: ShownAttitude | None = None
-    clock: ShownClock | None = None
-    counts: RunCounts = RunCounts()
-    operator: dict[str, bool] = {}
     operator_text: str = ""
     overlay: int = 0
     patch_share: float = 0.0
@@ -88,12 +74,9 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     display_lost: str = ""
     gamma: str = ""
     forced: str = ""
-    ledger: LedgerState | None = None
     note: str = ""
-    faults: list[str] = []
     rates: str = ""
-    failed: list[str] = []
-    tracker: TrackerFigures | None = None
+    failed: list[str] = msgspec.field(default_factory=list)
 
 
 class NewAnswer(msgspec.Struct, frozen=True):
@@ -119,7 +102,7 @@ class Order(msgspec.Struct, kw_only=True):
     name: str
     who: str
     on: bool = True
-    level: float = PATCH_SHARE
+    level: float = protocol.PATCH_SHARE
     text: str = ""
     fault: str = ""
 
@@ -151,8 +134,8 @@ class Setup(msgspec.Struct, kw_only=True):
     at all, in a first-light session ("session"). Without a `token` anybody who reaches the page may see it.
     """
 
-    hello: Hello
-    source: AttitudeSource
+    hello: protocol.Hello
+    source: protocol.AttitudeSource
     hosts: list[str]
     names: list[str]
     any_address: bool

@@ -91,7 +91,6 @@ class CameraMarks:
             return np.asarray(inside & (np.abs(y_px - (height - 1) / 2) <= height * (0.5 + beyond)))
 
     def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[GridLine]:
-        """Lines of RA and of Dec that cross the image."""
         ra_deg, dec_deg, _ = to_radec_roll_deg(q_icrs_to_cam)
         radius_deg = math.degrees(self.monitor.field_radius_rad(0.0))
         step_deg = _step(STEPS_DEG, radius_deg / LINES_ACROSS)
@@ -110,7 +109,6 @@ class CameraMarks:
             yield from self._line(f"RA {ra % 360:.{_digits(ra_step_deg)}f}\N{DEGREE SIGN}", np.full_like(up, ra), up, turn)
 
     def _line(self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray) -> Iterator[GridLine]:
-        """A line over the sky, in pieces where it leaves the image."""
         x_px, y_px = self.monitor.project(direction_of(ra_deg, dec_deg) @ turn.T)
         inside = self.on_screen(x_px, y_px, BEYOND)
         # A piece extends one point beyond the image's edge on each side; a single point is no line.

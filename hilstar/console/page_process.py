@@ -15,14 +15,16 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple
 
 import msgspec
 
 from hilstar.console.listener import PageListener
 from hilstar.console.messages import Order, OrderAnswer, RunEvent, RunState, Setup, SharedMemory
 from hilstar.errors import one_line
-from hilstar.notices import Listener, Notice
+from hilstar.notices import Notice, Notices
+from hilstar.process.closing import Closing
+from hilstar.process.scheduling import HOST_CLOCK, BackOff
 
 TICK_S = 0.1
 FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # before the page's process is started again
@@ -44,50 +46,35 @@ class Listeners(NamedTuple):
 Do = Callable[[Order], OrderAnswer]  # on a thread of its own
 
 
-class PageSubject(Protocol):
-    """The run or session that the page shows: its state, its events, and its record of events."""
-
-    def now(self) -> RunState:
-        """The current state."""
-
-    def listen(self, listener: Listener) -> None:
-        """Pass every further event to `listener`."""
-
-    def tell(self, kind: str, line: str) -> None:
-        """Record an event."""
-
-
 @dataclass(slots=True)
 class _Page:
-    """A page's process, and the channel to it."""
-
     process: "subprocess.Popen[bytes]"
     channel: socket.socket
     begun_s: float
 
 
-class PageProcess:
-    """The page of a run while this is open."""
+class PageProcess(Closing):
+    """The page of a run or session while this is open: `now` is its state, and `notices` are its events."""
 
-    def __init__(self, setup: Setup, memory: SharedMemory, listeners: Listeners, watched: PageSubject, do: Do) -> None:
-        self._memory, self._watched, self._do = memory, watched, do
+    def __init__(
+        self, setup: Setup, memory: SharedMemory, listeners: Listeners, now: Callable[[], RunState], notices: Notices, do: Do
+    ) -> None:
+        self._memory, self._now, self._notices, self._do = memory, now, notices, do
         self._listener_fds = [-1 if each is None else each.socket.fileno() for each in listeners]
         self._setup_fd = os.memfd_create("hilstar-console-setup")
         with os.fdopen(os.dup(self._setup_fd), "wb") as file:
             file.write(msgspec.msgpack.encode(setup))
         self._events: deque[Notice] = deque(maxlen=1000)
-        watched.listen(self._events.append)
+        notices.listen(self._events.append)
         self._stop = threading.Event()
         self._page: _Page | None = None
-        self._start_s, self._wait_s = 0.0, FIRST_WAIT_S
+        self._again = BackOff(FIRST_WAIT_S, MAX_WAIT_S, HOST_CLOCK)
         self._workers = ThreadPoolExecutor(MAX_ORDERS, thread_name_prefix="hilstar-order")
         self._thread = threading.Thread(target=self._run, name="hilstar-console", daemon=True)
-
-    def __enter__(self) -> Self:
         self._thread.start()
-        return self
 
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the page's process."""
         self._stop.set()
         self._thread.join()
         self._workers.shutdown(wait=False, cancel_futures=True)
@@ -118,7 +105,7 @@ class PageProcess:
 
     def _tick(self, now_s: float) -> None:
         try:
-            self._memory.states.put(msgspec.json.encode(self._watched.now()))
+            self._memory.states.put(msgspec.json.encode(self._now()))
             ahead_s = time.time() - time.monotonic_ns() * 1e-9
             while self._events:
                 notice = self._events.popleft()
@@ -128,14 +115,13 @@ class PageProcess:
             self._memory.states.put(msgspec.json.encode(RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
         page = self._page
         if page is None:
-            if now_s >= self._start_s:
+            if self._again.over:
                 self._start_page(now_s)
         elif (code := page.process.poll()) is not None:
             page.channel.close()
             self._page = None
-            if now_s - page.begun_s > STEADY_S:
-                self._wait_s = FIRST_WAIT_S
-            self._put_off(now_s, f"the operator's page ended ({f'signal {-code}' if code < 0 else f'exit code {code}'})")
+            how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            self._lose(f"the operator's page ended ({how})", anew=now_s - page.begun_s > STEADY_S)
 
     def _start_page(self, now_s: float) -> None:
         channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -151,16 +137,16 @@ class PageProcess:
             )
         except OSError as error:
             channel.close()
-            self._put_off(now_s, f"the operator's page cannot be started ({error.strerror})")
+            self._lose(f"the operator's page cannot be started ({error.strerror})")
             return
         finally:
             its_end.close()
         channel.setblocking(False)
         self._page = _Page(process, channel, now_s)
 
-    def _put_off(self, now_s: float, what: str) -> None:
-        self._watched.tell("console-lost", f"{what}; it is started again")
-        self._start_s, self._wait_s = now_s + self._wait_s, min(2 * self._wait_s, MAX_WAIT_S)
+    def _lose(self, what: str, *, anew: bool = False) -> None:
+        self._notices.tell("console-lost", f"{what}; it is started again")
+        self._again.put_off(anew=anew)
 
     def _listen(self, seconds: float) -> None:
         page = self._page

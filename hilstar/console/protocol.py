@@ -116,21 +116,26 @@ class LedgerState(msgspec.Struct, frozen=True):
     failing: str = ""
 
 
-class PageState(msgspec.Struct, frozen=True, kw_only=True):
+class SkyState(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run tells of itself and the page shows as it is; `operator` has the switches, `faults` those that are on."""
+
+    attitude: ShownAttitude | None = None
+    clock: ShownClock | None = None
+    counts: RunCounts = RunCounts()
+    frame: NewestFrame = NewestFrame()
+    operator: dict[str, bool] = {}
+    faults: list[str] = []
+    ledger: LedgerState | None = None
+    tracker: TrackerFigures | None = None
+
+
+class PageState(SkyState, frozen=True, kw_only=True):
     """The run as the page shows it, ten times a second."""
 
     utc: str
     health: SkyHealth
-    attitude: ShownAttitude | None
     source: AttitudeSource
-    clock: ShownClock | None
-    counts: RunCounts
     pacing: Pacing | None
-    frame: NewestFrame
-    operator: dict[str, bool]
-    faults: list[str]
-    ledger: LedgerState | None
-    tracker: TrackerFigures | None = None
 
 
 class ChartPoint(msgspec.Struct, kw_only=True):

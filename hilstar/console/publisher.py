@@ -18,39 +18,12 @@ from hilstar.attitude.clock.rate_check import WRONG
 from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 from hilstar.bench.certificate import certificate_number
 from hilstar.bench.frame import Bench
+from hilstar.console import messages, protocol
 from hilstar.console.listener import PageListener
-from hilstar.console.messages import (
-    BLANK,
-    FRAME,
-    HAS_AGE,
-    MAX_SPRITES,
-    MISSING,
-    PICTURE_HEAD_BYTES,
-    STALE,
-    NewAnswer,
-    Order,
-    OrderAnswer,
-    Pace,
-    PictureHead,
-    RunState,
-    ScpiSetup,
-    Setup,
-    SharedMemory,
-)
 from hilstar.console.overlay import OverlayScene, colour_notes, overlay_of
 from hilstar.console.page_process import Listeners, PageProcess
-from hilstar.console.protocol import (
-    SWITCHES,
-    AttitudeSource,
-    Hello,
-    LedgerState,
-    NewestFrame,
-    RunCounts,
-    ShownAttitude,
-    ShownClock,
-)
 from hilstar.errors import HilstarError, did_you_mean, one_line, printable
-from hilstar.notices import Listener, Notice
+from hilstar.notices import Notice, Notices
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.run.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests, aid_levels_of
 from hilstar.run.record.ledger_records import MAX_CENTROIDS
@@ -62,7 +35,6 @@ if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.scenario import FaultSchedule
     from hilstar.calibrate.first_light.image_sources import Pattern
-    from hilstar.notices import Notices
     from hilstar.run.live_answers import LiveAnswers
     from hilstar.run.pacer import Shown
     from hilstar.run.record.ledger import Ledger, LedgerSwitch
@@ -79,7 +51,7 @@ class FramePublisher:
     at most ten times a second, and only while somebody looks at one.
     """
 
-    def __init__(self, memory: SharedMemory) -> None:
+    def __init__(self, memory: messages.SharedMemory) -> None:
         self.shown: Shown | None = None
         self.count = 0  # frames so far
         self.running: Running | None = None
@@ -98,7 +70,7 @@ class FramePublisher:
         lit = None if newest is None or newest.lit is None else tuple(newest.lit.q.tolist())
         stars = () if newest is None else newest.answer.centroids[:MAX_CENTROIDS]
         places = [(round(star.x_px, 2), round(star.y_px, 2)) for star in stars]
-        self._memory.answers.put(msgspec.json.encode(NewAnswer(answers.figures, lit, places)))
+        self._memory.answers.put(msgspec.json.encode(messages.NewAnswer(answers.figures, lit, places)))
 
     def see(self, shown: "Shown") -> None:
         """Publish a frame. Called by the frame loop."""
@@ -108,9 +80,14 @@ class FramePublisher:
         if running is None:
             return
         tally, packets = running.loop.tally, running.packets
-        flags = STALE * shown.stale | MISSING * shown.missing | BLANK * (attitude is None) | HAS_AGE * (attitude is not None)
+        flags = (
+            messages.STALE * shown.stale
+            | messages.MISSING * shown.missing
+            | messages.BLANK * (attitude is None)
+            | messages.HAS_AGE * (attitude is not None)
+        )
         self._memory.frames.put(
-            FRAME.pack(
+            messages.FRAME.pack(
                 shown.number,
                 shown.draw_ns,
                 shown.swap_ns,
@@ -133,17 +110,16 @@ class FramePublisher:
                 self._copy(shown)
 
     def _copy(self, shown: "Shown") -> None:
-        """Copy a picture: levels, attitude, and the places of its stars."""
         drawn, sprites = shown.drawn.levels, shown.drawn.sprites
         levels = drawn if drawn.ndim == 2 else drawn.max(axis=2)  # the page's picture is grey
         height, width = levels.shape
         places: list[np.ndarray] = []
         if sprites is not None:
-            kept = brightest(sprites.data["electrons_per_s"], MAX_SPRITES)
+            kept = brightest(sprites.data["electrons_per_s"], messages.MAX_SPRITES)
             places = [part if kept is None else part[kept] for part in (sprites.star, sprites.x_px, sprites.y_px)]
         count = len(places[0]) if places else 0
         q = () if shown.attitude is None else shown.attitude.q_icrs_to_cam.tolist()
-        head = PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q)
+        head = messages.PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q)
         self._memory.put_picture(head, levels, places)
 
 
@@ -162,7 +138,7 @@ class PageParts:
     """The parts of a run; `make_ledger` begins a ledger at a path, `answers` are the tracker's."""
 
     bench: Bench
-    notices: "Notices"
+    notices: Notices
     ledger: "LedgerSwitch"
     make_ledger: "Callable[[Path], Ledger]"
     screen: "Screen | None" = None
@@ -176,23 +152,15 @@ class WatchedRun:
     def __init__(self, feed: FramePublisher, parts: PageParts) -> None:
         self._feed, self._parts, self._notices = feed, parts, parts.notices
 
-    def listen(self, listener: Listener) -> None:
-        """Pass every further event of the run to `listener`."""
-        self._notices.listen(listener)
-
-    def tell(self, kind: str, line: str) -> None:
-        """Record an event of the run."""
-        self._notices.tell(kind, line)
-
-    def now(self) -> RunState:
+    def now(self) -> messages.RunState:
         """The run's current state, read beside the frame loop."""
         running, shown = self._feed.running, self._feed.shown
         if running is None:
-            return RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
+            return messages.RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
         tally, aids, packets = running.loop.tally, running.loop.pacer.operator.aids, running.packets
-        screen, faults, newest = self._parts.screen, self._parts.faults, NewestFrame()
+        screen, faults, newest = self._parts.screen, self._parts.faults, protocol.NewestFrame()
         if shown is not None:
-            newest = NewestFrame(
+            newest = protocol.NewestFrame(
                 number=shown.number,
                 missing=shown.missing,
                 stale=shown.stale,
@@ -200,13 +168,13 @@ class WatchedRun:
                 stars=shown.drawn.star_count,
                 clipped=list(shown.drawn.clipped_hip[:MAX_CLIPPED]),
             )
-        return RunState(
+        return messages.RunState(
             host_ns=time.monotonic_ns(),
             alive_ns=running.loop.watch.alive_ns,
             frame=newest,
             attitude=_attitude(shown),
             clock=_clock(running),
-            counts=RunCounts(
+            counts=protocol.RunCounts(
                 frames=tally.frames,
                 missed=tally.missed_frames,
                 stale=tally.stale_frames,
@@ -229,22 +197,22 @@ class WatchedRun:
             tracker=None if running.answers is None else running.answers.figures,
         )
 
-    def _ledger(self) -> LedgerState | None:
+    def _ledger(self) -> protocol.LedgerState | None:
         ledger = self._parts.ledger.current
         if ledger is None:
             return None
         troubles = [words for kind, words in LEDGER_TROUBLES.items() if kind in self._notices.active]
-        return LedgerState(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
+        return protocol.LedgerState(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
 
 
-def _attitude(shown: "Shown | None") -> ShownAttitude | None:
+def _attitude(shown: "Shown | None") -> protocol.ShownAttitude | None:
     attitude = None if shown is None else shown.attitude
     if attitude is None:
         return None
     w, x, y, z = attitude.q_icrs_to_cam.tolist()
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
     rate = attitude.rate_cam_rad_s
-    return ShownAttitude(
+    return protocol.ShownAttitude(
         q=(w, x, y, z),
         ra_deg=ra_deg,
         dec_deg=dec_deg,
@@ -254,11 +222,11 @@ def _attitude(shown: "Shown | None") -> ShownAttitude | None:
     )
 
 
-def _clock(running: "Running") -> ShownClock | None:
+def _clock(running: "Running") -> protocol.ShownClock | None:
     clock = None if running.clock is None else running.clock()
     if clock is None or clock.mode == "none":
         return None
-    return ShownClock(
+    return protocol.ShownClock(
         offset_ms=clock.offset_ms,
         sigma_ms=clock.uncertainty_ms,
         drift_ppm=clock.drift_ppm,
@@ -287,19 +255,19 @@ class OrderHandler:
         self._ledger, self._notices, self._make_ledger = parts.ledger, parts.notices, parts.make_ledger
         self._ledger_lock = threading.Lock()
 
-    def do(self, order: Order) -> OrderAnswer:
+    def do(self, order: messages.Order) -> messages.OrderAnswer:
         """Carry out an order; the answer says what went wrong."""
         who = one_line(order.who)[:MAX_WHO_CHARACTERS]
         doers = {"ledger": self._switch_ledger, "mark": self._mark, "fault": self._fault} | dict.fromkeys(
-            SWITCHES, self._switch
+            protocol.SWITCHES, self._switch
         )
         try:
             status, line = doers[order.name](order, who)
         except HilstarError as error:
             status, line = 409, one_line(str(error))
-        return OrderAnswer(id=order.id, status=status, line=printable(line))  # a ledger may be called anything
+        return messages.OrderAnswer(id=order.id, status=status, line=printable(line))  # a ledger may be called anything
 
-    def _switch(self, order: Order, who: str) -> Done:
+    def _switch(self, order: messages.Order, who: str) -> Done:
         if order.name == "patch" and order.on and order.level not in PATCHES:
             return 400, f"no such patch; write a level of {', '.join(map(str, PATCHES))}"
         request = SwitchRequest(order.name, order.on, who, order.level)
@@ -310,7 +278,6 @@ class OrderHandler:
         return 504, f"the frame loop did not take it within {LOOP_WAITS_S:g} s; nothing changed"
 
     def _waits_for(self, holds: Callable[[], bool]) -> bool:
-        """Wait for a condition for at most LOOP_WAITS_S; whether it came to hold."""
         end_s = time.monotonic() + LOOP_WAITS_S
         while not holds():
             if time.monotonic() > end_s:
@@ -318,7 +285,7 @@ class OrderHandler:
             time.sleep(POLL_S)
         return True
 
-    def _switch_ledger(self, order: Order, who: str) -> Done:
+    def _switch_ledger(self, order: messages.Order, who: str) -> Done:
         with self._ledger_lock:
             if order.on:
                 path = self._free_path()
@@ -337,7 +304,6 @@ class OrderHandler:
             return 200, f"ledger off: {ledger_now.path} is whole"
 
     def _free_path(self) -> Path:
-        """A new file name, beside the newest ledger if there was one."""
         folder = Path.cwd() if self._ledger.last is None else self._ledger.last.path.parent
         now = datetime.now(UTC)
         for k in range(100):
@@ -346,14 +312,14 @@ class OrderHandler:
                 return path
         return folder / f"hilstar-{now:%Y%m%dT%H%M%S.%fZ}.mcap"
 
-    def _mark(self, order: Order, who: str) -> Done:
+    def _mark(self, order: messages.Order, who: str) -> Done:
         text = printable(" ".join(order.text.split()))[:MAX_MARK_CHARACTERS]
         if not text:
             return 400, 'a mark needs its text: {"text": "..."}'
         self._notices.tell("mark", f"mark, by {who}: {text}", who)
         return 200, "mark written" if self._ledger.on else "mark told; no ledger is being written"
 
-    def _fault(self, order: Order, who: str) -> Done:
+    def _fault(self, order: messages.Order, who: str) -> Done:
         faults = self._faults
         if faults is None or not faults.names():
             return 409, "this run has no faults to start: give it some with --scenario"
@@ -375,14 +341,16 @@ class RunDescription:
     command: str
     kind: str
     endpoint: str
-    pace: Pace = "clock"
+    pace: messages.Pace = "clock"
     steer_port: int = 0
 
 
-def setup_for(listeners: Listeners, control: bool, description: RunDescription, file: "BenchFile", picture_bytes: int) -> Setup:
+def setup_for(
+    listeners: Listeners, control: bool, description: RunDescription, file: "BenchFile", picture_bytes: int
+) -> messages.Setup:
     """The setup of a page and of SCPI for a bench file; a run adds to `hello`."""
     monitor, page, scpi = file.config.monitor, listeners.page, listeners.scpi
-    hello = Hello(
+    hello = protocol.Hello(
         version=__version__,
         command=f"hilstar {description.command}",
         bench=printable(file.path.name),
@@ -393,9 +361,9 @@ def setup_for(listeners: Listeners, control: bool, description: RunDescription, 
         refresh_hz=monitor.refresh_hz,
         control=control,
     )
-    return Setup(
+    return messages.Setup(
         hello=hello,
-        source=AttitudeSource(description.kind, printable(description.endpoint)),
+        source=protocol.AttitudeSource(description.kind, printable(description.endpoint)),
         hosts=[] if page is None else page.hosts,
         names=[] if page is None else [name.lower() for name in page.names],
         any_address=page is not None and page.any_address,
@@ -405,7 +373,7 @@ def setup_for(listeners: Listeners, control: bool, description: RunDescription, 
         pace=description.pace,
         scpi=None
         if scpi is None
-        else ScpiSetup(scpi.token, description.kind, description.steer_port, file.config.attitude.max_rate_deg_s),
+        else messages.ScpiSetup(scpi.token, description.kind, description.steer_port, file.config.attitude.max_rate_deg_s),
     )
 
 
@@ -436,7 +404,7 @@ def opened_page(
     """The page and the SCPI of a run while this is open: the publisher of its frames, and the queue of its requests."""
     width, height = parts.bench.config.monitor.resolution_px
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
-    memory = SharedMemory.make(picture_bytes)
+    memory = messages.SharedMemory.make(picture_bytes)
     feed, requests = FramePublisher(memory), SwitchRequests()
     bench, orders = parts.bench, OrderHandler(requests, feed, parts)
     setup = setup_for(listeners, control, description, bench.file, picture_bytes)
@@ -446,7 +414,7 @@ def opened_page(
     setup.hello.faults = [] if parts.faults is None else parts.faults.names()
     if listeners.page is not None:
         setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
-    with PageProcess(setup, memory, listeners, WatchedRun(feed, parts), orders.do):
+    with PageProcess(setup, memory, listeners, WatchedRun(feed, parts).now, parts.notices, orders.do):
         yield feed, requests
 
 
@@ -454,12 +422,18 @@ CODE_BYTES = 2
 FAILED, FORCED = "failed:", "forced"  # as `first-light` says of a step, and of a monitor
 
 
+class _SessionNotices(Notices):
+    """Events of a session: the terminal has its lines already."""
+
+    def tell(self, kind: str, detail: str, who: str = "") -> None:
+        self._hand_on(Notice.now(kind, " ".join(detail.split()), who))
+
+
 class SessionPublisher:
     """Publishes a first-light session: the session's thread writes pictures, the page's keeper reads the state."""
 
-    def __init__(self, memory: SharedMemory) -> None:
-        self._memory = memory
-        self._listeners: list[Listener] = []
+    def __init__(self, memory: messages.SharedMemory) -> None:
+        self._memory, self.notices = memory, _SessionNotices()
         self._failed: dict[str, str] = {}
         self._patterns = 0
 
@@ -468,12 +442,12 @@ class SessionPublisher:
         codes = pattern.codes if pattern.codes.ndim == 2 else pattern.codes.max(axis=2)
         height, width = codes.shape
         # A step may have found that the monitor is larger than the bench file said.
-        if PICTURE_HEAD_BYTES + codes.nbytes > self._memory.pictures.slot_bytes:
+        if messages.PICTURE_HEAD_BYTES + codes.nbytes > self._memory.pictures.slot_bytes:
             return
         self._patterns += 1
-        head = PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, codes.itemsize, 0)
+        head = messages.PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, codes.itemsize, 0)
         self._memory.put_picture(head, codes)
-        self.tell("pattern", f"shows {pattern.name}")
+        self.notices.tell("pattern", f"shows {pattern.name}")
 
     def say(self, line: str) -> None:
         """Publish a line of the session: a step begins or ends."""
@@ -482,30 +456,21 @@ class SessionPublisher:
             self._failed[step] = f"{step} {words.strip()}"
         else:
             self._failed.pop(step, None)
-        self.tell("step", line)
+        self.notices.tell("step", line)
 
-    def listen(self, listener: Listener) -> None:
-        """Hand every further event to `listener`."""
-        self._listeners.append(listener)
-
-    def tell(self, kind: str, line: str) -> None:
-        """Record an event."""
-        for listener in self._listeners:
-            listener(Notice.now(kind, " ".join(line.split())))
-
-    def now(self) -> RunState:
+    def now(self) -> messages.RunState:
         """The session's current state."""
         now_ns = time.monotonic_ns()
-        failed, shown = list(self._failed.values()), NewestFrame(number=self._patterns, missing=False, blank=False)
-        return RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
+        failed, shown = list(self._failed.values()), protocol.NewestFrame(number=self._patterns, missing=False, blank=False)
+        return messages.RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
 
-    def do(self, order: Order) -> OrderAnswer:
+    def do(self, order: messages.Order) -> messages.OrderAnswer:
         """Record a mark; a session takes no other order."""
         if order.name != "mark" or not order.text.strip():
             line = "a session of first light takes marks with a text, and no other order"
-            return OrderAnswer(id=order.id, status=409, line=line)
-        self.tell("mark", f"mark, by {one_line(order.who)}: {one_line(order.text)}")
-        return OrderAnswer(id=order.id, status=200, line="mark told; a session has no ledger")
+            return messages.OrderAnswer(id=order.id, status=409, line=line)
+        self.notices.tell("mark", f"mark, by {one_line(order.who)}: {one_line(order.text)}")
+        return messages.OrderAnswer(id=order.id, status=200, line="mark told; a session has no ledger")
 
 
 @contextmanager
@@ -514,10 +479,10 @@ def session_page(listener: PageListener, control: bool, file: "BenchFile") -> It
     monitor = file.config.monitor
     width, height = monitor.resolution_px
     picture_bytes = width * height * CODE_BYTES
-    memory = SharedMemory.make(picture_bytes)
+    memory = messages.SharedMemory.make(picture_bytes)
     feed = SessionPublisher(memory)
     listeners = Listeners(listener)
     setup = setup_for(listeners, control, RunDescription("first-light", "session", "", "session"), file, picture_bytes)
     setup.hello.session = True
-    with PageProcess(setup, memory, listeners, feed, feed.do):
+    with PageProcess(setup, memory, listeners, feed.now, feed.notices, feed.do):
         yield feed

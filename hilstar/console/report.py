@@ -132,7 +132,6 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
 
 
 def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> list[dict[str, Any]]:
-    """Pictures of the chosen frames, replayed with the faults that they had."""
     recording = read_recording(ledger)
     frames = run.keyframes.chosen(run.last)
     # Where a fault froze the sky, the picture is an earlier frame's.
@@ -157,7 +156,6 @@ def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> 
 
 
 def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
-    """One frame: its packed levels and its truth."""
     shown_levels = shown.drawn.levels
     levels = shown_levels if shown_levels.ndim == 2 else shown_levels.max(axis=2)
     attitude = shown.attitude
@@ -248,7 +246,6 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
 
 
 def _utc(run: RunFigures, host_ns: int) -> str | None:
-    """A host time of the run as UTC; None where the ledger's head lacks it."""
     try:
         unix_ns = int(run.head["unix_ns"]) + host_ns - int(run.head["monotonic_ns"])
         return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=unix_ns // 1000)).isoformat(timespec="milliseconds")
@@ -330,7 +327,6 @@ def _event(record: EventRecord, run: RunFigures) -> dict[str, Any]:
 
 
 def _path(rows: FloatArray) -> dict[str, Any]:
-    """The attitude along the run, and its rate in cam components, deg/s."""
     turned_deg = np.degrees(rows[:, 6:9])
     rate = np.diff(turned_deg, axis=0, append=np.nan) / np.diff(rows[:, 1], append=np.nan)[:, None]
     return {

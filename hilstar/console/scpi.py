@@ -136,7 +136,6 @@ class Headers:
 
 
 def _forms(pattern: str) -> Iterator[str]:
-    """Every spelling of a pattern, upper case."""
     if pattern.startswith("*"):
         yield pattern
         return
@@ -282,8 +281,7 @@ class InstrumentStatus:
     """What IEEE 488.2 and SCPI keep for a connection: the queue of errors, the registers, what `*OPC` waits for."""
 
     errors: deque[str] = field(default_factory=deque)
-    event: int = 0
-    event_enable: int = 0
+    standard: Register = field(default_factory=Register)
     service_enable: int = 0
     operation: Register = field(default_factory=Register)
     questionable: Register = field(default_factory=Register)
@@ -291,26 +289,21 @@ class InstrumentStatus:
 
     def add(self, error: ScpiError) -> None:
         """Queue an error, and set its bit of the standard event register."""
-        self.event |= EVENT_BITS[-error.number // 100]
+        self.standard.event |= EVENT_BITS[-error.number // 100]
         if len(self.errors) < MAX_ERRORS:
             self.errors.append(error.text)
         else:
             self.errors[-1] = ScpiError(-350).text
-            self.event |= EVENT_BITS[3]
+            self.standard.event |= EVENT_BITS[3]
 
     def next_error(self) -> str:
         """The oldest error, which leaves the queue."""
         return self.errors.popleft() if self.errors else ScpiError(0).text
 
-    def read_event(self) -> int:
-        """The standard event register, which reading clears."""
-        event, self.event = self.event, 0
-        return event
-
     def clear(self) -> None:
         """`*CLS`: events and errors are gone, enables stay."""
         self.errors.clear()
-        self.event = self.operation.event = self.questionable.event = 0
+        self.standard.event = self.operation.event = self.questionable.event = 0
         self.completes = False
 
     def preset(self) -> None:
@@ -320,7 +313,7 @@ class InstrumentStatus:
     def byte(self, message_waits: bool) -> int:
         """The status byte, as `*STB?` has it."""
         found = ERRORS_WAIT * bool(self.errors) | MESSAGE_WAITS * message_waits
-        found |= STANDARD_EVENT * bool(self.event & self.event_enable)
+        found |= STANDARD_EVENT * bool(self.standard.event & self.standard.enable)
         found |= QUESTIONABLE * bool(self.questionable.event & self.questionable.enable)
         found |= OPERATION * bool(self.operation.event & self.operation.enable)
         return found | MASTER * bool(found & self.service_enable & ~MASTER)

@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -35,12 +35,21 @@ def say(line: str) -> None:
     typer.echo(line, err=True)
 
 
-def print_json(value: dict[str, Any] | msgspec.Struct) -> None:
+def print_json(value: Any) -> None:
     """The one JSON object of --json; NumPy's numbers come out as plain ones."""
     try:
         typer.echo(msgspec.json.encode(value, enc_hook=_plain).decode())
     except UnicodeEncodeError:  # a file's name that is not UTF-8; Python's own writes its bytes as escapes
         typer.echo(json.dumps(msgspec.to_builtins(value, enc_hook=_plain)))
+
+
+def print_found(as_json: bool, found: Any, lines: Iterable[str]) -> None:
+    """What a command found: an object (a dictionary, dataclass or struct) for a program, or lines for a person."""
+    if as_json:
+        print_json(found)
+    else:
+        for line in lines:
+            typer.echo(line)
 
 
 def _plain(value: Any) -> Any:

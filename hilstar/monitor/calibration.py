@@ -18,20 +18,10 @@ from msgspec import Meta
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import write_whole
-from hilstar.monitor.identity import MonitorIdentity
-from hilstar.monitor.response import (
-    MAX_LEVELS,
-    TRIPLES,
-    Response,
-    Weights,
-    bit_stealing_response,
-    gamma_response,
-    mixed_response,
-    srgb_response,
-    table_response,
-)
+from hilstar.monitor import response as responses
+from hilstar.monitor.identity import TABLE, MonitorIdentity
 from hilstar.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes, read_text
-from hilstar.toml_tables import Kind, Table, explained
+from hilstar.toml_tables import Kind, Table, explained, toml_text
 
 FORMULAS = ("srgb", "gamma2.2")
 BUILT_IN = (*FORMULAS, "lcd-example")
@@ -42,7 +32,7 @@ ADVICE = "see configs/CALIBRATION.md"
 GREY, PRIMARIES = ("w",), ("r", "g", "b")
 TYPE_WORDS = {"float": "a number", "int": "a whole number", "str": "text", "object": "a table"}
 Share = Annotated[float, Meta(ge=0, le=1e12)]
-REC709_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)  # a photometer's, of the sRGB primaries (IEC 61966-2-1)
+REC709_WEIGHTS: responses.Weights = (0.2126, 0.7152, 0.0722)  # a photometer's, of the sRGB primaries (IEC 61966-2-1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +46,12 @@ class Calibration:
     """
 
     name: str
-    response: Response
+    response: responses.Response
     sha256: str
     uniformity: FloatArray | None = None
     uniformity_relative: float | None = None  # standard error of a field
     noise: float = 0.0
-    weights: Weights | None = None
+    weights: responses.Weights | None = None
     who: str = ""
     when: str = ""
     instrument: str = ""
@@ -71,8 +61,8 @@ class Calibration:
     @property
     def can_steal_bits(self) -> bool:
         """Whether `load_calibration` would take it with `bit_stealing`."""
-        levels = (2**self.response.bits - 1) * TRIPLES + 1
-        return self.weights is not None and levels <= MAX_LEVELS
+        levels = (2**self.response.bits - 1) * responses.TRIPLES + 1
+        return self.weights is not None and levels <= responses.MAX_LEVELS
 
     @property
     def is_formula(self) -> bool:
@@ -116,7 +106,7 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     name = str(source)
     if name in FORMULAS:
         grey = _formula(name, bits)
-        response = bit_stealing_response((grey, grey, grey), REC709_WEIGHTS) if bit_stealing else grey
+        response = responses.bit_stealing_response((grey, grey, grey), REC709_WEIGHTS) if bit_stealing else grey
         digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()
         return Calibration(name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula")
     path = _path_of(source)
@@ -153,8 +143,8 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     )
 
 
-def _formula(name: str, bits: int) -> Response:
-    return srgb_response(bits) if name == "srgb" else gamma_response(bits)
+def _formula(name: str, bits: int) -> responses.Response:
+    return responses.srgb_response(bits) if name == "srgb" else responses.gamma_response(bits)
 
 
 def _path_of(source: str | Path) -> Path:
@@ -183,7 +173,7 @@ def primary_lights(source: str | Path, bits: int) -> FloatArray:
     return np.asarray(light * (shares / shares.sum())[:, None])
 
 
-def primary_responses(source: str | Path, bits: int) -> tuple[Response, ...]:
+def primary_responses(source: str | Path, bits: int) -> tuple[responses.Response, ...]:
     """The response of each primary, relative to its own white: a calibration's columns r, g and b, or its grey one for all.
 
     Raises InputError as `load_calibration` does.
@@ -192,7 +182,9 @@ def primary_responses(source: str | Path, bits: int) -> tuple[Response, ...]:
         return (_formula(str(source), bits),) * 3
     path = _path_of(source)
     columns = read_response(beside(path, read_toml(path).calibration.response, "[calibration] response"), bits)
-    tables = {name: table_response(bits, (light - light[0]) / (light[-1] - light[0])) for name, light in columns.items()}
+    tables = {
+        name: responses.table_response(bits, (light - light[0]) / (light[-1] - light[0])) for name, light in columns.items()
+    }
     return tuple(tables[name] for name in ("rgb" if "r" in tables else "www"))
 
 
@@ -227,9 +219,8 @@ def with_uniformity(
 
 
 def _response(
-    path: Path, bits: int, columns: dict[str, FloatArray], weights: Weights | None, bit_stealing: bool
-) -> tuple[Response, Weights | None]:
-    """The grey (or bit-stealing) response of measured light, and the primaries' shares of white."""
+    path: Path, bits: int, columns: dict[str, FloatArray], weights: responses.Weights | None, bit_stealing: bool
+) -> tuple[responses.Response, responses.Weights | None]:
     whites = {name: float(light[-1] - light[0]) for name, light in columns.items()}
     if weights is None and "r" in columns:
         weights = whites["r"], whites["g"], whites["b"]
@@ -240,11 +231,11 @@ def _response(
     elif bit_stealing:
         raise InputError(f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r, g, b")
     black = float(np.mean([light[0] for light in columns.values()])) / sum(whites.values())
-    tables = {name: table_response(bits, (light - light[0]) / whites[name]) for name, light in columns.items()}
+    tables = {name: responses.table_response(bits, (light - light[0]) / whites[name]) for name, light in columns.items()}
     if weights is None or ("w" in tables and not bit_stealing):
-        return table_response(bits, tables["w"].light, black), weights
+        return responses.table_response(bits, tables["w"].light, black), weights
     r, g, b = (tables["w"],) * 3 if "w" in tables else (tables["r"], tables["g"], tables["b"])
-    return (bit_stealing_response if bit_stealing else mixed_response)((r, g, b), weights, black), weights
+    return (responses.bit_stealing_response if bit_stealing else responses.mixed_response)((r, g, b), weights, black), weights
 
 
 class CalibrationHead(Table, frozen=True):
@@ -345,7 +336,6 @@ def read_toml(path: Path, read: list[bytes] | None = None) -> CalibrationFile:
 
 
 def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> FloatArray:
-    """Rows of finite, non-negative numbers, all of the same length."""
     rows = []
     for number, line in lines:
         try:
@@ -439,19 +429,11 @@ def write_calibration(
     table = path.parent / head.response
     codes = np.arange(len(next(iter(columns.values()))))
     rows = "".join(",".join([str(code), *(f"{float(light[code])!r}" for light in columns.values())]) + "\n" for code in codes)
-    comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included\n".encode(
-        "ascii", "replace"
-    ).decode()
-    lines = ["[calibration]", *_keys(msgspec.structs.asdict(head)), ""]
-    if weights is not None:
-        lines += ["[weights]", *(f"{name} = {share!r}" for name, share in msgspec.structs.asdict(weights).items()), ""]
-    lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
-    if errors is not None:
-        lines += ["", "[errors]", *(f"{key} = {json.dumps(value)}" for key, value in msgspec.structs.asdict(errors).items())]
-    if identity is not None:
-        lines += ["", identity.toml()]
-    write_whole(table, comment + ",".join(["code", *columns]) + "\n" + rows)
-    write_whole(path, "\n".join(lines) + "\n")
+    comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included\n"
+    tables: dict[str, Any] = {"calibration": head, "weights": weights, "noise": {"relative": float(f"{noise:.6g}")}}
+    tables |= {"notes": notes, "errors": errors, TABLE: None if identity is None else identity.known()}
+    write_whole(table, comment.encode("ascii", "replace").decode() + ",".join(["code", *columns]) + "\n" + rows)
+    write_whole(path, toml_text(msgspec.to_builtins(tables)))
     return table
 
 
@@ -466,7 +448,3 @@ def add_uniformity(path: Path, grid: FloatArray, relative: float | None = None) 
     known = "" if relative is None else f"relative = {relative:.4g}\n"
     write_whole(path, f"{text}\n[uniformity]\nfile = {json.dumps(table.name)}\n{known}")
     return table
-
-
-def _keys(table: dict[str, Any]) -> list[str]:
-    return [f"{key} = {json.dumps(value if isinstance(value, int) else str(value))}" for key, value in table.items()]

@@ -17,19 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, IntArray
+from hilstar.monitor import quantise
 from hilstar.monitor.balance import AS_USUAL, IN_A_FRAME, SUMS, Balance, Seen, Weights
 from hilstar.monitor.footprints import FEWEST, FootprintMap, Footprints, PixelOrder, PlaceArray
-from hilstar.monitor.quantise import (
-    FrameLight,
-    LevelCost,
-    Panel,
-    PixelQuantiser,
-    Quantiser,
-    RoundQuantiser,
-    ThresholdCounter,
-    dither_levels,
-    level_dtype,
-)
 from hilstar.monitor.response import Levels
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
@@ -84,7 +74,7 @@ def _fits(psf: Psf) -> bool:
     return psf.separable and order.near <= MAX_NEAR and order.size <= MAX_SIZE
 
 
-class ExactQuantiser(Quantiser):
+class ExactQuantiser(quantise.Quantiser):
     """Looks at stars: `shader`, a compute shader, chooses the levels of each one together, over the nearest ones.
 
     An instance chooses those of sprites of `psf` on a panel, image after image, for a tracker that sees it as `seen`. `weights`
@@ -99,40 +89,40 @@ class ExactQuantiser(Quantiser):
     remembers: ClassVar[bool] = False
     left: Left | None = None
     # For so much of what these quantisers of other primaries left in the same frame each star makes up, in steps of both.
-    given: Sequence[tuple[float, Quantiser]] = ()
+    given: Sequence[tuple[float, quantise.Quantiser]] = ()
     kept = KEPT
     over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
 
-    def __init__(self, panel: Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
+    def __init__(self, panel: quantise.Panel, resolution_px: tuple[int, int], psf: Psf, seen: Seen = AS_USUAL) -> None:
         super().__init__(panel, resolution_px, psf, seen)
         self._map = FootprintMap(resolution_px, psf)
         self._balance = Balance(psf, seen, self.weights)
         response = panel.response
         self._light = np.append(response.light, response.light[-1])  # there is no step above white
         self._step_e_per_s = float(response.light[1]) * panel.flux_at_white_e_per_s
-        self._lower = ThresholdCounter(response.light[1:].astype(np.float32))
-        self._nearest = ThresholdCounter(response.threshold.astype(np.float32))
+        self._lower = quantise.ThresholdCounter(response.light[1:].astype(np.float32))
+        self._nearest = quantise.ThresholdCounter(response.threshold.astype(np.float32))
         self._first_threshold = np.float32(response.threshold[0])
-        self._flat = np.zeros(self._map.pixels + 1, dtype=level_dtype(response))  # one more, for pixels off the image
+        self._flat = np.zeros(self._map.pixels + 1, dtype=quantise.level_dtype(response))  # one more, for pixels off the image
         self._lit: PlaceArray = np.empty(0, dtype=np.int32)
         self._on_floor = False
         uniformity = panel.uniformity
         self._output = None if uniformity is None else np.append(uniformity.ravel(), np.float32(1))
 
-    def draw(self, light: FrameLight) -> Levels:
+    def draw(self, light: quantise.FrameLight) -> Levels:
         """The levels of the next frame: its stars are added to its dithered extended light."""
         if light.sprites is None or not light.sprites.extended:
             return self.levels(light.sprites)
-        return self.levels(light.sprites, dither_levels(light.extended(), self._panel, self.floor_turn(light.number)))
+        return self.levels(light.sprites, quantise.dither_levels(light.extended(), self._panel, self.floor_turn(light.number)))
 
     def begin_anew(self) -> None:
         """The next frame is the first of a sequence."""
         self.left = None
 
     @classmethod
-    def by_pixel(cls) -> type[PixelQuantiser]:
+    def by_pixel(cls) -> type[quantise.PixelQuantiser]:
         """The nearest levels, which its pass changes."""
-        return RoundQuantiser
+        return quantise.RoundQuantiser
 
     @classmethod
     def takes(cls, psf: Psf, gl_version: int) -> bool:
@@ -140,12 +130,12 @@ class ExactQuantiser(Quantiser):
         return gl_version >= COMPUTE_VERSION and _fits(psf)
 
     @classmethod
-    def cost(cls, psf: Psf, gl_version: int) -> LevelCost:
+    def cost(cls, psf: Psf, gl_version: int) -> quantise.LevelCost:
         """The cost of the shader, or of NumPy where the shader cannot draw."""
         has_compute = gl_version >= COMPUTE_VERSION
         by_numpy_ms = NUMPY_EXACT_MS_A_STAR if _fits(psf) else WIDE_EXACT_MS_A_STAR
         why = "" if has_compute else "in NumPy: its compute shaders need OpenGL 4.3"
-        return LevelCost(EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why)
+        return quantise.LevelCost(EXACT_MS_A_STAR if cls.takes(psf, gl_version) else by_numpy_ms, why)
 
     @classmethod
     def fewest(cls, order: PixelOrder) -> int:
@@ -158,7 +148,7 @@ class ExactQuantiser(Quantiser):
         return 0.0
 
     @classmethod
-    def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
+    def faintest_e_per_s(cls, panel: quantise.Panel, psf: Psf) -> float:
         """The rate of half a step: any pixel of the star may show it."""
         return panel.response.half_step * panel.flux_at_white_e_per_s
 

@@ -191,7 +191,6 @@ def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, le
 
 
 def _shown(place: PlaceArray, panel: Panel, levels: Levels) -> FloatArray:
-    """Light of `levels` at places in the flat image, electrons per second; 0 at the place past its end."""
     if levels.ndim == 3:
         return np.asarray(sum(_shown(place, one, Levels(levels[..., k])) for k, one in enumerate(panel.primaries)))
     level = np.append(levels.ravel(), levels.dtype.type(0))[place]

@@ -1,6 +1,5 @@
 """The monitor behind its collimator as the camera that the tracker looks into, and the file of a geometric calibration."""
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from hilstar.monitor.identity import TABLE, MonitorIdentity
 from hilstar.reading import parse_toml, read_text
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera, Lens, ResidualField
+from hilstar.toml_tables import toml_text
 
 MAX_FILE_BYTES = 1_000_000
 MAX_TERMS = 21
@@ -185,8 +185,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
     if lens.field is not None:
         field = FieldTable(x_px=lens.field.x.tolist(), y_px=lens.field.y.tolist())
     w, x, y, z = q_cam_to_mon.tolist()
-    k1, k2, k3 = lens.radial
-    p1, p2 = lens.tangential
+    coefficients: dict[str, Any] = dict(zip(LensTable.__struct_fields__, (*lens.radial, *lens.tangential), strict=True))
     found = GeometryFile(
         kind=KIND,
         resolution_px=camera.resolution_px,
@@ -194,34 +193,15 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         principal_point_px=camera.principal_point_px,
         q_cam_to_mon=(w, x, y, z),
         tilt_deg=(float(np.degrees(lens.tilt_rad[0])), float(np.degrees(lens.tilt_rad[1]))),
-        k1=k1,
-        k2=k2,
-        k3=k3,
-        p1=p1,
-        p2=p2,
+        **coefficients,
         max_field_deg=math.degrees(math.atan(lens.max_tangent)) if math.isfinite(lens.max_tangent) else None,
         field=field,
         sigma=notes.sigma,
         error=notes.error,
         made=notes.made,
     )
-    # Plain values and lists, tables after them; what is None or an empty table is left unsaid.
     table = msgspec.to_builtins(found) | {TABLE: None if notes.identity is None else notes.identity.known()}
-    plain = [f"{key} = {_value(value)}" for key, value in table.items() if not isinstance(value, dict) and value is not None]
-    parts = ["\n".join(plain)]
-    for key, value in table.items():
-        if isinstance(value, dict) and value:
-            rows = "\n".join(f"{name} = {_value(inner)}" for name, inner in value.items() if inner is not None)
-            parts.append(f"[{key}]\n{rows}")
-    write_whole(path, "\n\n".join(parts) + "\n")
-
-
-def _value(value: Any) -> str:
-    """A value as TOML, which writes numbers, truth values, plain text and lists as JSON does; a list of lists row by row."""
-    if isinstance(value, list) and value and isinstance(value[0], list):
-        rows = ",\n    ".join(map(json.dumps, value))
-        return f"[\n    {rows},\n]"
-    return json.dumps(value)
+    write_whole(path, toml_text(table))
 
 
 def monitor_camera(

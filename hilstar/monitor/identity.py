@@ -1,7 +1,6 @@
 """Which monitor, in which mode and with which settings: what calibration files carry, and how two of them differ."""
 
 import hashlib
-import json
 import struct
 from collections.abc import Iterator
 from typing import Any
@@ -62,10 +61,6 @@ class MonitorIdentity(Table, frozen=True):
     def known(self) -> dict[str, Any]:
         """What is known, by its keys."""
         return {key: value for key, value in msgspec.to_builtins(self).items() if value not in ("", None, ())}
-
-    def toml(self) -> str:
-        """The table of a calibration file."""
-        return f"[{TABLE}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in self.known().items())
 
 
 def edid_identity(edid: bytes) -> MonitorIdentity:

@@ -74,7 +74,6 @@ def read_primaries(path: Path) -> tuple[Curve, ...]:
 
 
 def _curves(nm: FloatArray, power: FloatArray) -> tuple[Curve, ...]:
-    """Curves of powers (3, n) at wavelengths (n,), with no light beyond their ends, where a tracker may see."""
     first, last = np.nextafter(nm[[0, -1]], [0.0, np.inf])  # knots beside both ends and far off
     knots = np.concatenate([[RANGE_NM[0], first], nm, [last, RANGE_NM[1]]])
     return tuple(Curve(knots, np.pad(one, 2)) for one in power)
@@ -120,7 +119,6 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
 
 
 def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths (bands,) and spectra (samples, bands) of a CGATS text."""
     text = read_text(path, CCSS_ADVICE, MAX_CURVE_BYTES)
     if not text.lstrip().startswith("CCSS"):
         raise InputError(f"{path}: its first word is not CCSS; {CCSS_ADVICE}")

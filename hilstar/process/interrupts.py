@@ -222,7 +222,6 @@ def _whereabouts() -> str:
 
 
 def _say_if_read(line: str) -> None:
-    """Write a line to stderr if that does not block."""
     with contextlib.suppress(OSError, ValueError):
         if select.select([], [2], [], 0)[1]:
             os.write(2, line.encode())
@@ -284,8 +283,6 @@ def end_with_parent(parent: int | None = None) -> None:
 
 
 class _QueuedStderr(io.RawIOBase):
-    """Writes go to stderr from a thread, in order; beyond MAX_WAITING_BYTES they are dropped and counted."""
-
     def __init__(self) -> None:
         super().__init__()
         self._waiting: deque[bytes] = deque()

@@ -54,9 +54,7 @@ class Timex(ctypes.Structure):
 
     _fields_ = (
         ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
+        *((name, ctypes.c_long) for name in ("offset", "freq", "maxerror")),
         ("others", ctypes.c_byte * 256),
     )
 
@@ -135,6 +133,20 @@ class Deadline:
     def over(self) -> bool:
         """Whether it has come."""
         return self._clock.now_ns() >= self._due_ns
+
+
+class BackOff(Deadline):
+    """The moment of the next try: at once, then `min_s` after a failure, and twice as long after each further one."""
+
+    def __init__(self, min_s: float, max_s: float, clock: HostClock) -> None:
+        super().__init__(clock, clock.now_ns())
+        self._min_s, self._max_s, self._wait_s = min_s, max_s, min_s
+
+    def put_off(self, *, anew: bool = False) -> None:
+        """The try failed; `anew` for the first failure after all was well."""
+        wait_s = self._min_s if anew else self._wait_s
+        self._due_ns = self._clock.now_ns() + round(wait_s * 1e9)
+        self._wait_s = min(2 * wait_s, self._max_s)
 
 
 HOST_CLOCK = HostClock()
@@ -240,7 +252,6 @@ def drawing_threads_apart() -> Iterator[None]:
 
 
 def _threads() -> dict[int, str]:
-    """The names of this process's threads; none where there is no /proc."""
     names: dict[int, str] = {}
     with contextlib.suppress(OSError):
         for task in TASKS.iterdir():
@@ -250,12 +261,10 @@ def _threads() -> dict[int, str]:
 
 
 def _cores() -> list[int]:
-    """The cores that this process may run on; none where the system does not say."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 def _spread(threads: list[int]) -> None:
-    """A core for each thread, if there are as many cores as threads."""
     cores = _cores()
     if len(threads) < 2 or len(threads) != len(cores):
         return

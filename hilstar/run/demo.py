@@ -8,7 +8,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from hilstar.bench.frame_files import write_codes_png, write_preview_png
 from hilstar.errors import MachineError
 from hilstar.files import make_directory
 from hilstar.monitor.response import Codes
+from hilstar.process.closing import Closing
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
 from hilstar.run.loop import Limit
 from hilstar.run.pacer import FrameSink, Shown
@@ -76,7 +76,6 @@ def scan_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
 
 
 def _jittered(path: Callable[[float], FloatArray], duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
-    """Attitudes along a path at SEND_HZ, with jitter and rates, until REST_S after a duration."""
     count = round((duration_s + REST_S) * SEND_HZ) + 1
     times_s = np.arange(count) / SEND_HZ
     # Jitter about cam axes: first-order Gauss-Markov noise.
@@ -137,25 +136,19 @@ def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watchin
     return Demo(summary, kept, bench.config.monitor.bits)
 
 
-class _DemoSender:
-    """A process of hilstar's that begins when it is first tended, and ends with this."""
-
+class _DemoSender(Closing):
     def __init__(self, arguments: list[str]) -> None:
         self._command = [sys.executable, "-m", "hilstar", *arguments]
         self._process: subprocess.Popen[bytes] | None = None
 
     def tend(self) -> None:
-        """Begin it. Raises MachineError where it has ended."""
         if self._process is None:
             self._process = subprocess.Popen(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         elif self._process.poll() is not None:
             command = shlex.join(["hilstar", *self._command[3:]])
             raise MachineError(f"the demo's sender ended before an attitude came; to see why, run: {command}")
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
+    def close(self) -> None:
         if self._process is not None:
             self._process.terminate()
             self._process.wait()

@@ -53,6 +53,10 @@ class Check:
     detail: str
     required: bool = True
 
+    def line(self) -> str:
+        """For a person."""
+        return f"{'ok' if self.ok else 'MISSING' if self.required else 'none':8}{self.name:12}{self.detail}"
+
 
 @dataclass(frozen=True, slots=True)
 class OutputReport:
@@ -150,8 +154,6 @@ def _gl() -> str:
 
 
 class _Unsaid(Notices):
-    """Events of a connection that nobody asked after."""
-
     def mention(self, kind: str, detail: str) -> None:
         """Say nothing."""
 
@@ -176,7 +178,6 @@ def _catalogue() -> str:
 
 
 def _gpus() -> Check:
-    """Which GPUs draw headless and in a window."""
     found = gpus()
     leave_contexts()
     try:
@@ -241,7 +242,6 @@ def _opengl() -> str:
 
 
 def _cards() -> Iterator[str]:
-    """Kernel driver and PCI identity of each graphics card."""
     for card in sorted((SYS / "class/drm").glob("card[0-9]")):
         with contextlib.suppress(OSError):
             driver = (card / "device/driver").resolve(strict=True).name

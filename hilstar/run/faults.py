@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import msgspec
 
-from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.attitude.wire.zmq_socket import SocketOptions
 from hilstar.bench.config.attitude import FaultSettings
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
@@ -62,19 +62,12 @@ def act(schedule: FaultSchedule, raw: bytes) -> None:
 class FaultStream:
     """Listens on a thread of its own while it is open. Raises InputError where the endpoint cannot be used."""
 
-    def __init__(
-        self,
-        schedule: FaultSchedule,
-        endpoint: str,
-        *,
-        bind: bool = False,
-        keys: CurveKeys = NO_KEYS,
-        notices: Notices | None = None,
-    ) -> None:
+    def __init__(self, schedule: FaultSchedule, endpoint: str, **options: Unpack[SocketOptions]) -> None:
         self.messages = 0
         self.refused: Counter[str] = Counter()
-        self._schedule, self._notices = schedule, Notices() if notices is None else notices
-        self._link = ZmqReceiver(endpoint, bind=bind, keys=keys, notices=self._notices, max_part_bytes=MAX_MESSAGE_BYTES)
+        self._schedule, self._notices = schedule, options.get("notices") or Notices()
+        options |= {"notices": self._notices, "max_part_bytes": MAX_MESSAGE_BYTES}
+        self._link = ZmqReceiver(endpoint, **options)
         self._allowance = Allowance(MAX_BURST, MAX_PER_S)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-faults", daemon=True)

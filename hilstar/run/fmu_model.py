@@ -74,7 +74,6 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
         self._begun: tuple[float, float] | None = None  # a communication point, s, and when it was there
 
     def _register(self) -> None:
-        """Declare the variables of the block."""
         parameter = {"causality": Fmi2Causality.parameter, "variability": Fmi2Variability.fixed}
         self.register_variable(String("address", description="HOST:PORT of hilstar's [attitude] bind", **parameter))
         pace = "a step takes as long as it simulates; false: the tool itself is in real time"
@@ -147,14 +146,12 @@ class StarDisplay(Fmi2Slave):  # type: ignore[misc]
             opened.close()
 
     def _now_ns(self) -> int:
-        """The model's time now, on which time requests are answered."""
         if self._zero is None:
             return 0
         model_ns, host_ns = self._zero
         return model_ns + time.monotonic_ns() - host_ns
 
     def _listen(self, opened: socket.socket) -> None:
-        """Take what comes back until the socket is closed."""
         while self._socket is opened:
             try:
                 numbers = unpacked(opened.recv(256))

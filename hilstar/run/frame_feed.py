@@ -28,8 +28,6 @@ WORD_BYTES = 8
 
 @dataclass(slots=True)
 class _Copied:
-    """A frame's levels, and what is said of it."""
-
     levels: npt.NDArray[np.unsignedinteger[Any]]
     head: FrameHead | None = None
 
@@ -82,7 +80,6 @@ class FrameFeed(Closing):
         self._full.put(copied)
 
     def _attitude(self, shown: Shown) -> tuple[float, float, float, float] | None:
-        """The mean attitude while the frame is lit."""
         if shown.attitude is None:
             return None
         q, rate = shown.attitude.q_icrs_to_cam, shown.drawn.rate_cam_rad_s

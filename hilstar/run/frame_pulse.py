@@ -11,7 +11,7 @@ from hilstar.bench.config import SyncSettings
 from hilstar.errors import one_line
 from hilstar.notices import Notices
 from hilstar.process.closing import Closing
-from hilstar.process.scheduling import raise_priority
+from hilstar.process.scheduling import HOST_CLOCK, BackOff, raise_priority
 from hilstar.run.sync import SyncSummary
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -42,7 +42,7 @@ class FramePulse(Closing):
         self._delay_ms, self._line_ms = RunningStatistics(), RunningStatistics()
         self._counts: Counter[str] = Counter()
         self.counted: Callable[[str], None] = lambda what: None
-        self._retry_s, self._back_off_s = 0.0, MIN_BACK_OFF_S
+        self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, HOST_CLOCK)
         self._thread = threading.Thread(target=self._run, name="hilstar-pulse", daemon=True)
         self._thread.start()
 
@@ -94,8 +94,7 @@ class FramePulse(Closing):
             why = one_line(str(error))
             self._notices.tell("sync-lost", f"[sync] port {self._line.port} is gone ({why}): frames go on without their pulse")
             self._line.close()
-            self._back_off_s = MIN_BACK_OFF_S
-            self._retry_s = time.monotonic() + self._back_off_s
+            self._retry.put_off(anew=True)
             return
         self._count("sent")
         self._delay_ms.add((begin_ns - self._frame_ns) / NS_PER_MS)
@@ -106,14 +105,13 @@ class FramePulse(Closing):
         self.counted(what)
 
     def _reopen(self) -> None:
-        if time.monotonic() < self._retry_s:
+        if not self._retry.over:
             return
         try:
             self._line.open()
         except LOST:
             self._line.close()
-            self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
-            self._retry_s = time.monotonic() + self._back_off_s
+            self._retry.put_off()
             return
         self._notices.tell("sync-back", f"[sync] port {self._line.port} is back")
 

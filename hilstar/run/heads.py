@@ -101,7 +101,6 @@ class HeadProcess:
             pass
 
     def _drain(self) -> bool:
-        """Take the signs of life that wait; whether there were any."""
         heard = False
         with contextlib.suppress(BlockingIOError):
             while True:

@@ -86,7 +86,6 @@ class LiveAnswers:
         self._look()
 
     def _look(self) -> None:
-        """Take what has come, and bring the figures up to date."""
         for answer in self._source.take():
             if not self._allowance.take(answer.host_ns):
                 self._too_many += 1

@@ -147,7 +147,6 @@ def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSa
 
 
 def _rate_between(samples: list[AttitudeSample], after: int, t_ns: int) -> FloatArray | None:
-    """The log's rate at a time: between those of the samples before and after, where both have one."""
     before = samples[after - 1]
     if before.rate_cam_rad_s is None or before.t_ns == t_ns or after == len(samples):
         return before.rate_cam_rad_s

@@ -144,10 +144,10 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
         shown = loop.draw(moment.slot, t_ns, timeline.at(t_ns), moment)
         if shown is None:
             return None
-        light_ns = receiver.sender_ns(t_ns)
+        light_ns = t_ns - receiver.jumps.correction_ns  # of the sender's own clock
         outlet.record(bench, loop, shown, light_ns)
         if link.two_way:
-            receiver.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
+            receiver.back.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
         return shown
 
     receiver.start()
@@ -178,7 +178,7 @@ def _pass_on(receiver: Receiver, numbers: Iterator[int], answer: Answer, middle_
     t_ns, rate = middle_ns - round(offset_ms * NS_PER_MS), answer.rate_cam_rad_s
     flags = protocol.ANSWER_VALID | (0 if rate is None else protocol.ANSWER_RATE_VALID)
     q, rates = tuple(answer.q_icrs_to_cam.tolist()), (0.0, 0.0, 0.0) if rate is None else tuple(rate.tolist())
-    receiver.pass_on(AnswerPacket(next(numbers), flags, t_ns, q, rates, answer.star_count or 0))
+    receiver.back.pass_on(AnswerPacket(next(numbers), flags, t_ns, q, rates, answer.star_count or 0))
 
 
 class LockstepRun:

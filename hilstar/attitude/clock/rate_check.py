@@ -56,7 +56,6 @@ class _Stretch(NamedTuple):
 
     @property
     def turns(self) -> bool:
-        """Whether the attitude turns by more than its noise."""
         return float(np.linalg.norm(self.turn)) > max(MIN_TURN_RAD_S, TURN_SIGMA * self.turn_sigma)
 
 
@@ -73,7 +72,6 @@ class _Cause:
     in_icrs: bool = False
 
     def mended(self, stretch: _Stretch) -> FloatArray:
-        """The mean rate (3,) of a stretch without it."""
         return np.asarray(self.mends @ (stretch.rate_as_icrs if self.in_icrs else stretch.rate))
 
 
@@ -95,7 +93,6 @@ GROSS = "no unit, sign or order of axes explains them"
 
 
 def _causes() -> Iterator[_Cause]:
-    """Those without a choice of axes, the simplest first."""
     for unit, size in UNITS.items():
         yield _Cause(f"they are in {unit}; send rad/s", SAME / size, 1 / size)
     for unit, size in DEGREES:
@@ -226,8 +223,6 @@ def _limit(stretch: _Stretch, share: float, sigma: float, scale: float = 1.0) ->
 
 
 class _Length:
-    """The newest stretches of one length."""
-
     def __init__(self, length_s: float) -> None:
         self._length_ns = round(length_s * NS_PER_S)
         self.samples: list[AttitudeSample] = []
@@ -247,7 +242,6 @@ class _Length:
         return True
 
     def newest(self, count: int) -> list[_Stretch]:
-        """So many of the newest stretches; [] while there are fewer."""
         return list(self.stretches)[-count:] if len(self.stretches) >= count else []
 
 

@@ -265,7 +265,7 @@ class ClockSummary:
 
 
 class SenderClock:
-    """The sender's time at any host time. One thread may observe while another asks.
+    """The sender's time at any host time; `mode` says where the offset comes from. One thread may observe, another ask.
 
     `known` is the offset of a clock that is not estimated: of the host's own one ("shared"), or of Unix time.
     """
@@ -276,7 +276,7 @@ class SenderClock:
         self._known = known is not None
         self._base_ns: int | None = None  # the first offset: the rest fits a float64 to below 1 ns
         self._line: _OffsetLine | None = None  # one attribute: read whole by other threads
-        self._mode: ClockMode = mode
+        self.mode: ClockMode = mode
         if known is not None:
             self.know(known)
         self._first_ns: int | None = None
@@ -320,7 +320,7 @@ class SenderClock:
 
     def _choose(self, host_ns: int) -> None:
         exchanged = self._exchanges.current_line(host_ns)
-        self._mode = "one-way" if exchanged is None else "exchange"
+        self.mode = "one-way" if exchanged is None else "exchange"
         self._line = exchanged or self._one_way.line
 
     def to_sender_ns(self, host_ns: int) -> int:
@@ -352,11 +352,6 @@ class SenderClock:
         return 0.0 if line is None or base_ns is None else host_ns - t_ns - base_ns - line.at(host_ns)
 
     @property
-    def mode(self) -> ClockMode:
-        """Where the offset comes from."""
-        return self._mode
-
-    @property
     def unheard(self) -> bool:
         """True before the first message that did not wait."""
         return self._one_way.guessed
@@ -364,19 +359,19 @@ class SenderClock:
     @property
     def synchronised(self) -> bool:
         """True while four-timestamp exchanges carry the offset."""
-        return self._mode == "exchange"
+        return self.mode == "exchange"
 
     def summary(self) -> ClockSummary:
         """What is known of the clock now."""
         line = self._line
         if line is None or self._base_ns is None:
-            return ClockSummary(self._mode)
+            return ClockSummary(self.mode)
         behind_ns = 0.0 if self._used is None else abs(line.at(self._used[0]) - self._used[1])
         uncertainty_ns = line.uncertainty_ns
-        if self._mode == "one-way":
+        if self.mode == "one-way":
             uncertainty_ns = max(uncertainty_ns, self._one_way.all_above_ns) + LOCAL_DELAY_NS
         return ClockSummary(
-            self._mode,
+            self.mode,
             offset_ms=(self._base_ns + line.offset_ns) / NS_PER_MS,
             drift_ppm=0.0 - line.drift * 1e6,
             uncertainty_ms=(uncertainty_ns + behind_ns) / NS_PER_MS if math.isfinite(uncertainty_ns) else None,

@@ -115,7 +115,6 @@ class _CourseAgreement:
 
     @property
     def score(self) -> int:
-        """How many of clock, count and sky agree."""
         return self.clock + self.count + self.sky
 
 
@@ -205,7 +204,6 @@ class _KnownSender:
         self.sample, self.q, self.host_ns, self.waited_ns = sample, q, arrival.host_ns, arrival.waited_ns
 
     def patience_ns(self, silent_after_ns: int) -> float:
-        """How long it may be silent before a stranger is taken for it."""
         if self.heard < MIN_KNOWN or self.host_ns - self.since_ns < MIN_KNOWN_NS:
             return silent_after_ns
         return min(silent_after_ns, USUAL_SILENCES * self.silence_ns + SLACK_NS)
@@ -219,8 +217,6 @@ def _rate_of(sample: AttitudeSample) -> Turn | None:
 
 
 class _Waiting(NamedTuple):
-    """A stranger's message that nothing has decided yet."""
-
     arrival: SampleArrival
     sender: _KnownSender
 

@@ -49,7 +49,6 @@ class _Damped(NamedTuple):
     ahead_s: float
 
     def by(self, seconds: float) -> Vector:
-        """The part of the rate, rad/s, to leave out of a prediction over `seconds`."""
         share = 1.0 if seconds >= self.ahead_s else (seconds / self.ahead_s) ** 2  # 1 - sin(x) / x goes with the square
         x, y, z = self.excess
         return share * x, share * y, share * z
@@ -73,7 +72,6 @@ class _Damping:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the samples so far: what follows does not continue them."""
         self._seen: deque[_SeenSample] = deque(maxlen=MAX_KEPT)
         self._trend = [0.0, 0.0, 0.0]
         self._weight = 0.0
@@ -167,7 +165,7 @@ class Timeline:
     """
 
     def __init__(self, policy: Policy, capacity: int = LIVE_CAPACITY, joins: Joins | None = None) -> None:
-        self._policy = policy
+        self.policy = policy
         self._joins = joins
         self._capacity = capacity
         self._t_ns: list[int] = []
@@ -180,14 +178,9 @@ class Timeline:
     def __len__(self) -> int:
         return len(self._samples)
 
-    @property
-    def stale_after_ns(self) -> int:
-        """The age at which an attitude counts as stale."""
-        return self._policy.stale_after_ns
-
     def add(self, sample: AttitudeSample, received_ns: int | None = None) -> Refusal | None:
         """Append a sample, or say why it is refused: its time does not increase, or its rate is too high."""
-        too_fast = rate_refusal(sample, self._policy.max_rate_rad_s)
+        too_fast = rate_refusal(sample, self.policy.max_rate_rad_s)
         if too_fast is not None:
             return too_fast
         damped = self._damp(sample)
@@ -229,7 +222,7 @@ class Timeline:
         age_ns = max(t_ns - before.t_ns, 0)
         after = near[place + 1] if place + 1 < len(near) else before
         if after is before or after.place_km is None or after.velocity_km_s is None or self._jumped(before, after):
-            return before.place_km + before.velocity_km_s * (min(age_ns, self._policy.max_extrapolation_ns) / NS_PER_S)
+            return before.place_km + before.velocity_km_s * (min(age_ns, self.policy.max_extrapolation_ns) / NS_PER_S)
         gap_s = (after.t_ns - before.t_ns) / NS_PER_S
         u = age_ns / (after.t_ns - before.t_ns)
         straight = after.place_km - before.place_km
@@ -242,7 +235,7 @@ class Timeline:
         if place + 1 < len(near):
             join = self._joined(newest, near[place + 1])
             if join == "hold":
-                gap = age_ns > self._policy.stale_after_ns and not self._jumped(newest, near[place + 1])
+                gap = age_ns > self.policy.stale_after_ns and not self._jumped(newest, near[place + 1])
                 return _held(newest, age_ns, gap)
             q, rate = self._between(near, place, age_ns, join)
             return Attitude(q, age_ns, False, newest.sequence, rate_cam_rad_s=rate)
@@ -282,21 +275,21 @@ class Timeline:
             return self._joins(before, after)
         # Rates say little about a long silence: propagated across it from both sides they overshoot; SLERP cannot.
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
-        return "blend" if known and after.t_ns - before.t_ns <= self._policy.stale_after_ns else "slerp"
+        return "blend" if known and after.t_ns - before.t_ns <= self.policy.stale_after_ns else "slerp"
 
     def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
         """True where the attitude jumps: the sample says so, or the turn would exceed the maximum rate."""
         if after.discontinuity:
             return True
         seconds = (after.t_ns - before.t_ns) / NS_PER_S
-        return angle_between_rad(before.q_icrs_to_cam, after.q_icrs_to_cam) > self._policy.max_rate_rad_s * seconds
+        return angle_between_rad(before.q_icrs_to_cam, after.q_icrs_to_cam) > self.policy.max_rate_rad_s * seconds
 
     def _rate_of(self, previous: AttitudeSample | None, newest: AttitudeSample) -> FloatArray | None:
         """The rate for predicting past a sample: its own, else that of the turn to it; None where neither is known."""
         if newest.rate_cam_rad_s is not None or previous is None or self._jumped(previous, newest):
             return newest.rate_cam_rad_s
         gap_ns = newest.t_ns - previous.t_ns
-        if gap_ns > self._policy.stale_after_ns:
+        if gap_ns > self.policy.stale_after_ns:
             return None
         return rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
 
@@ -309,17 +302,17 @@ class Timeline:
         if rate is None or sample.acceleration_cam_rad_s2 is not None:
             damping.restart()
             return UNDAMPED
-        if previous is None or sample.t_ns - previous.t_ns > self._policy.stale_after_ns or self._jumped(previous, sample):
+        if previous is None or sample.t_ns - previous.t_ns > self.policy.stale_after_ns or self._jumped(previous, sample):
             return damping.add(sample.t_ns, tuple(rate.tolist()), None)
         turn = rate_between_rad_s(previous.q_icrs_to_cam, sample.q_icrs_to_cam, 1.0)
         return damping.add(sample.t_ns, tuple(rate.tolist()), tuple(turn.tolist()))
 
     def _predict(self, newest: AttitudeSample, rate: FloatArray | None, age_ns: int, damped: _Damped) -> Attitude:
-        stale = age_ns > self._policy.stale_after_ns
+        stale = age_ns > self.policy.stale_after_ns
         if rate is None:
             return _held(newest, age_ns, stale)
         # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17, holding 144.
-        prediction_ns = min(age_ns, self._policy.max_extrapolation_ns)
+        prediction_ns = min(age_ns, self.policy.max_extrapolation_ns)
         seconds, bend = prediction_ns / NS_PER_S, newest.acceleration_cam_rad_s2
         if self._damping is not None:
             self._damping.asked(seconds)

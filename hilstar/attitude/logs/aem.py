@@ -35,27 +35,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.logs.aem_blocks import (
-    DERIVATIVE,
-    EULER_ANGVEL,
-    EULER_DERIVATIVE,
-    EULER_RATE,
-    QUATERNION,
-    QUATERNIONS,
-    RATE,
-    SPIN,
-    SPIN_NUTATION,
-    SPIN_NUTATION_MOM,
-    SPINS,
-    VERSION_KEY,
-    AemFaultError,
-    Block,
-    epoch_ns,
-    epoch_text,
-    kvn_blocks,
-    sequence,
-    xml_blocks,
-)
+from hilstar.attitude.logs import aem_blocks as ccsds
 from hilstar.attitude.logs.entries import LogEntry, LogReading, log_joins
 from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
 from hilstar.attitude.wire.source import Conventions, components
@@ -74,7 +54,8 @@ BODY_FRAME = re.compile(
 OF_DATE_FRAME = re.compile("MOD|TOD|TEME|ITRF-?([0-9]{2}|[0-9]{4})?")
 OfDate = Callable[[str, str, npt.NDArray[np.int64]], tuple[FloatArray, FloatArray, str | None]]
 AMBIGUOUS = (
-    f"{EULER_RATE} of AEM 1.0 does not say whether its rates are those of the angles or an angular velocity; they are not used"
+    f"{ccsds.EULER_RATE} of AEM 1.0 does not say whether its rates are those of the angles or an angular velocity; they are"
+    " not used"
 )
 QUARTER_TURN_DEG = 90.0
 ADVICE = "sort its lines; leap seconds are not counted, so write TAI across one"
@@ -97,9 +78,9 @@ def _euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatA
 
     `values` (n, 3 or 6) are degrees and degrees per second.
     """
-    axes, values = sequence(meta), np.radians(values)
+    axes, values = ccsds.sequence(meta), np.radians(values)
     q = _turned(values[:, :3], axes)
-    if meta["ATTITUDE_TYPE"] != EULER_DERIVATIVE:
+    if meta["ATTITUDE_TYPE"] != ccsds.EULER_DERIVATIVE:
         return q, None
     rate = np.zeros((len(values), 3))
     for k, axis in enumerate(axes):  # each turn's rate, then carried through the turns after it
@@ -119,11 +100,11 @@ def _spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
     q = _turned(np.column_stack((np.pi / 2 + alpha, np.pi / 2 - delta, angle)), (2, 0, 2))
     rate = np.zeros((len(values), 3))
     rate[:, 2] = spin_rate
-    if kind == SPIN_NUTATION:
+    if kind == ccsds.SPIN_NUTATION:
         nutation, phase = np.radians(values[:, 4]), np.radians(values[:, 6])
         momentum = np.stack((np.sin(nutation) * np.cos(phase), -np.sin(nutation) * np.sin(phase), np.cos(nutation)), axis=1)
         rate += (2 * np.pi / values[:, 5])[:, None] * momentum
-    elif kind == SPIN_NUTATION_MOM:
+    elif kind == ccsds.SPIN_NUTATION_MOM:
         momentum = direction_of(values[:, 4], values[:, 5])
         rate += np.radians(values[:, 6])[:, None] * rotate(q, momentum)
     return q, rate
@@ -133,7 +114,7 @@ def _spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
 class _DatedBlock:
     """One segment: its keywords, and its entries in the order of the file."""
 
-    block: Block
+    block: ccsds.Block
     times: list[int]
     entries: list[LogEntry]
 
@@ -165,10 +146,10 @@ class _DatedBlock:
         """Where it is meant to be used; without keywords, all of it. Raises AemFaultError."""
         where, meta = self.block.where[0], self.block.meta
         first, last = self.times[0], self.times[-1]
-        start = epoch_ns(where, meta["USEABLE_START_TIME"]) if "USEABLE_START_TIME" in meta else first
-        stop = epoch_ns(where, meta["USEABLE_STOP_TIME"]) if "USEABLE_STOP_TIME" in meta else last
+        start = ccsds.epoch_ns(where, meta["USEABLE_START_TIME"]) if "USEABLE_START_TIME" in meta else first
+        stop = ccsds.epoch_ns(where, meta["USEABLE_STOP_TIME"]) if "USEABLE_STOP_TIME" in meta else last
         if stop < start:
-            raise AemFaultError(where, "USEABLE_STOP_TIME is before USEABLE_START_TIME")
+            raise ccsds.AemFaultError(where, "USEABLE_STOP_TIME is before USEABLE_START_TIME")
         return min(max(start, first), last), max(min(stop, last), first)
 
 
@@ -186,8 +167,8 @@ def _resolved(segments: list[_DatedBlock], told: dict[str, str]) -> list[list[Lo
     several = [group for group in groups if len(group) > 1]
     if several:
         told["aem-overlap"] = (
-            f"{sum(map(len, several))} segments overlap, first at {epoch_text(several[0][1].times[0])}: where they do, the one"
-            " that its USEABLE times give is taken, and of several the one that begins later"
+            f"{sum(map(len, several))} segments overlap, first at {ccsds.epoch_text(several[0][1].times[0])}: where they do,"
+            " the one that its USEABLE times give is taken, and of several the one that begins later"
         )
     return [group[0].entries if len(group) == 1 else _one_run(group) for group in groups]
 
@@ -195,7 +176,7 @@ def _resolved(segments: list[_DatedBlock], told: dict[str, str]) -> list[list[Lo
 def _one_run(group: list[_DatedBlock]) -> list[LogEntry]:
     if len(group) > MAX_OVERLAPPING:
         where = group[0].block.where[0]
-        raise AemFaultError(where, f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each")
+        raise ccsds.AemFaultError(where, f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each")
     useable = [segment.useable_ns() for segment in group]
     edges = sorted({edge for k, segment in enumerate(group) for edge in (segment.times[0], segment.times[-1], *useable[k])})
     pieces: list[tuple[int, int, int]] = []  # block number, from, to
@@ -235,13 +216,13 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
 
     Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame and one of those above.
     """
-    blocks = xml_blocks(text) if text.lstrip().startswith("<") else kvn_blocks(text)
+    blocks = ccsds.xml_blocks(text) if text.lstrip().startswith("<") else ccsds.kvn_blocks(text)
     if len({block.meta["TIME_SYSTEM"] for block in blocks}) > 1:
-        raise AemFaultError("", "TIME_SYSTEM changes from block to block; write one file for each time system")
+        raise ccsds.AemFaultError("", "TIME_SYSTEM changes from block to block; write one file for each time system")
     frames = [_frames(block.meta) for block in blocks]
     if len({body for _, body in frames}) > 1:
-        raise AemFaultError("", "the spacecraft's frame changes from block to block; write one file for each")
-    timed = [([epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b) for b in blocks]
+        raise ccsds.AemFaultError("", "the spacecraft's frame changes from block to block; write one file for each")
+    timed = [([ccsds.epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b) for b in blocks]
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[LogEntry] = []
     told: dict[str, str] = {}
@@ -253,13 +234,13 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
                 entries[-1] = LogEntry(end.where, replace(end.event, t_ns=end.event.t_ns - 1))
             following[0] = LogEntry(first.where, replace(first.event, discontinuity=True))
         entries += following
-    if any(block.meta["ATTITUDE_TYPE"] == EULER_RATE for block in blocks):
+    if any(block.meta["ATTITUDE_TYPE"] == ccsds.EULER_RATE for block in blocks):
         told["aem-rates"] = AMBIGUOUS
     (first_ns, *_), block = timed[0]
     return LogReading(entries, _conventions(block, first_ns, of_date), ADVICE, list(told.items()))
 
 
-def _conventions(block: Block, first_ns: int, of_date: OfDate) -> Conventions:
+def _conventions(block: ccsds.Block, first_ns: int, of_date: OfDate) -> Conventions:
     """What the numbers of a file mean, in the words of its first block; an attitude as that block has it at its first epoch."""
     meta = block.meta
     (reference, body), scale, to_body = _frames(meta), meta["TIME_SYSTEM"], _second_frame_is_cam(meta)
@@ -289,9 +270,9 @@ def _conventions(block: Block, first_ns: int, of_date: OfDate) -> Conventions:
     )
 
 
-def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[LogEntry]:
+def _entries(block: ccsds.Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[LogEntry]:
     q, rate = _attitudes(block)
-    if block.meta["ATTITUDE_TYPE"] == SPIN:
+    if block.meta["ATTITUDE_TYPE"] == ccsds.SPIN:
         # Only the rate says how often a body spins between attitudes that are more than a quarter turn apart. Below that the
         # attitudes are better: in the standard's own example (ST5) SPIN_ANGLE_VEL is a fifth more than the spin angle turns.
         steps_s = np.diff(np.array(times, dtype=object)).astype(np.float64) / NS_PER_S
@@ -300,7 +281,7 @@ def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, st
     reference, _ = _frames(block.meta)
     if reference not in INERTIAL_FRAMES:
         if any(t_ns not in INT64 for t_ns in times):
-            raise AemFaultError(
+            raise ccsds.AemFaultError(
                 block.where[-1], f"the times of the block do not fit 64 bits, so {reference} has no place there"
             )
         q_icrs_to_frame, frame_rate, notice = of_date(reference, block.meta["TIME_SYSTEM"], np.array(times, dtype=np.int64))
@@ -316,23 +297,23 @@ def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, st
         yield LogEntry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
 
 
-def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
+def _attitudes(block: ccsds.Block) -> tuple[FloatArray, FloatArray | None]:
     """`q_icrs_to_cam` (n, 4) and, where the type has it, the rate (n, 3) in cam components, rad/s."""
     meta, kind = block.meta, block.meta["ATTITUDE_TYPE"]
     to_cam = _second_frame_is_cam(meta)
     with np.errstate(all="ignore"):  # an overflow is refused as not finite
-        if kind not in QUATERNIONS:
-            q, rate = _spin(block.values, kind) if kind in SPINS else _euler(block.values, meta)
-            if kind == EULER_ANGVEL:
+        if kind not in ccsds.QUATERNIONS:
+            q, rate = _spin(block.values, kind) if kind in ccsds.SPINS else _euler(block.values, meta)
+            if kind == ccsds.EULER_ANGVEL:
                 q = q if to_cam else conjugate(q)
                 return q, _rate_in_cam(meta, q, np.radians(block.values[:, 3:]))
             return (q, rate) if to_cam else (conjugate(q), None if rate is None else -rotate(conjugate(q), rate))
         q, more = block.values[:, :4], block.values[:, 4:]
         if to_cam:
             q = conjugate(q)
-        if kind == QUATERNION:
+        if kind == ccsds.QUATERNION:
             return q, None
-        if kind == DERIVATIVE:
+        if kind == ccsds.DERIVATIVE:
             q_dot = conjugate(more) if to_cam else more
             return q, -2.0 * multiply(q_dot, conjugate(q))[:, 1:] / (q * q).sum(axis=1, keepdims=True)
         return q, _rate_in_cam(meta, q, np.radians(more))
@@ -340,13 +321,15 @@ def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
 
 def _rate_in_cam(meta: dict[str, str], q: FloatArray, rate: FloatArray) -> FloatArray:
     """The rate (n, 3) of cam in its components, from that of the second frame with respect to the first in either's."""
-    key = "RATE_FRAME" if meta["ATTITUDE_TYPE"] == RATE else "ANGVEL_FRAME"
-    if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == RATE:
-        raise AemFaultError("", f"{RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {DERIVATIVE}")
+    key = "RATE_FRAME" if meta["ATTITUDE_TYPE"] == ccsds.RATE else "ANGVEL_FRAME"
+    if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == ccsds.RATE:
+        raise ccsds.AemFaultError(
+            "", f"{ccsds.RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {ccsds.DERIVATIVE}"
+        )
     a, b, given = meta["REF_FRAME_A"], meta["REF_FRAME_B"], meta.get(key, "missing")
     frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)
     if frame not in {a, b}:
-        raise AemFaultError("", f"{key} is {given}; write {a} or {b}")
+        raise ccsds.AemFaultError("", f"{key} is {given}; write {a} or {b}")
     rate = rate if _second_frame_is_cam(meta) else -rate
     return rotate(q, rate) / (q * q).sum(axis=1, keepdims=True) if _is_reference(frame) else rate
 
@@ -358,7 +341,7 @@ def _frames(meta: dict[str, str]) -> tuple[str, str]:
     if not _is_reference(reference) or not BODY_FRAME.fullmatch(body):
         wanted = "one must be ICRF, EME2000, MOD, TOD, TEME or ITRF"
         body_wanted = "the other a spacecraft frame (SC_BODY_1, STARTRACKER_1, INSTRUMENT_A, CAM, ...)"
-        raise AemFaultError("", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}, {body_wanted}")
+        raise ccsds.AemFaultError("", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}, {body_wanted}")
     return reference, body
 
 
@@ -367,9 +350,9 @@ def _is_reference(frame: str) -> bool:
 
 
 def _second_frame_is_cam(meta: dict[str, str]) -> bool:
-    direction = meta.get("ATTITUDE_DIR", "A2B" if meta[VERSION_KEY] == "2.0" else "missing")
+    direction = meta.get("ATTITUDE_DIR", "A2B" if meta[ccsds.VERSION_KEY] == "2.0" else "missing")
     if direction not in {"A2B", "B2A"}:
-        raise AemFaultError("", f"ATTITUDE_DIR is {direction}; write A2B or B2A")
+        raise ccsds.AemFaultError("", f"ATTITUDE_DIR is {direction}; write A2B or B2A")
     return _is_reference(meta["REF_FRAME_A"]) == (direction == "A2B")
 
 
@@ -386,14 +369,14 @@ def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = N
     return "\n".join(lines) + "\n"
 
 
-def _written_block(samples: Sequence[AttitudeSample], scale: str | None) -> Block:
+def _written_block(samples: Sequence[AttitudeSample], scale: str | None) -> ccsds.Block:
     rates = [sample.rate_cam_rad_s for sample in samples if sample.rate_cam_rad_s is not None]
     q = np.array([sample.q_icrs_to_cam for sample in samples])
     values = conjugate(q)
     if len(rates) == len(samples):
         q_dot = multiply(np.concatenate((np.zeros((len(q), 1)), np.array(rates)), axis=1), q) / -2.0
         values = np.concatenate((values, conjugate(q_dot)), axis=1)
-    epochs = [epoch_text(sample.t_ns) for sample in samples]
+    epochs = [ccsds.epoch_text(sample.t_ns) for sample in samples]
     meta = {
         "OBJECT_NAME": "UNKNOWN",
         "OBJECT_ID": "UNKNOWN",
@@ -403,14 +386,14 @@ def _written_block(samples: Sequence[AttitudeSample], scale: str | None) -> Bloc
         "TIME_SYSTEM": scale if scale in SCALES else "UTC",
         "START_TIME": epochs[0],
         "STOP_TIME": epochs[-1],
-        "ATTITUDE_TYPE": QUATERNION if values.shape[1] == 4 else DERIVATIVE,
+        "ATTITUDE_TYPE": ccsds.QUATERNION if values.shape[1] == 4 else ccsds.DERIVATIVE,
         "QUATERNION_TYPE": "LAST",
     }
-    return Block(meta, [], epochs, values + 0.0)  # + 0.0: CCSDS has no -0
+    return ccsds.Block(meta, [], epochs, values + 0.0)  # + 0.0: CCSDS has no -0
 
 
-def _kvn(header: dict[str, str], segments: list[Block]) -> Iterator[str]:
-    yield from (f"{VERSION_KEY:25}= 1.0", "", *(f"{key:25}= {value}" for key, value in header.items()))
+def _kvn(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
+    yield from (f"{ccsds.VERSION_KEY:25}= 1.0", "", *(f"{key:25}= {value}" for key, value in header.items()))
     for segment in segments:
         yield from ("", "META_START", *(f"COMMENT {line}" for line in COMMENTS))
         yield from (f"{key:25}= {value}" for key, value in segment.meta.items())
@@ -421,14 +404,13 @@ def _kvn(header: dict[str, str], segments: list[Block]) -> Iterator[str]:
         yield "DATA_STOP"
 
 
-def _xml(header: dict[str, str], segments: list[Block]) -> Iterator[str]:
-    """The lines; nothing in them needs an entity."""
-    yield from ('<?xml version="1.0" encoding="UTF-8"?>', f'<aem id="{VERSION_KEY}" version="1.0">')
+def _xml(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
+    yield from ('<?xml version="1.0" encoding="UTF-8"?>', f'<aem id="{ccsds.VERSION_KEY}" version="1.0">')
     yield from ("  <header>", *_elements(4, header), "  </header>", "  <body>")
     for segment in segments:
         yield from ("    <segment>", "      <metadata>", *(f"        <COMMENT>{line}</COMMENT>" for line in COMMENTS))
         yield from (*_elements(8, segment.meta), "      </metadata>", "      <data>")
-        name = "quaternionState" if segment.meta["ATTITUDE_TYPE"] == QUATERNION else "quaternionDerivative"
+        name = "quaternionState" if segment.meta["ATTITUDE_TYPE"] == ccsds.QUATERNION else "quaternionDerivative"
         for epoch, values in zip(segment.epochs, segment.values.tolist(), strict=True):
             yield from ("        <attitudeState>", f"          <{name}>", f"            <EPOCH>{epoch}</EPOCH>")
             for kind, ending, q in (("quaternion", "", values[:4]), ("quaternionRate", "_DOT", values[4:])):

@@ -266,8 +266,6 @@ def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: s
 
 @dataclass(slots=True)
 class _Element:
-    """An XML element, while it is read or afterwards."""
-
     name: str
     line: int
     attributes: dict[str, str]
@@ -377,7 +375,6 @@ class _XmlReading:
             self._check_message(element)
 
     def _let_go(self, element: _Element) -> None:
-        """Forget an element that has been read."""
         self._open[-1].children.pop()
         self._kept = sum(1 + len(each.children) for each in self._open)
 
@@ -443,7 +440,6 @@ def _state(holder: _Element, meta: dict[str, str]) -> tuple[str, list[float]]:
 
 
 def _leaves(element: _Element, path: str) -> Iterator[tuple[str, _Element]]:
-    """The elements without children below one, and their paths from it."""
     for child in element.children:
         if child.children:
             child.parts(*(each.name for each in child.children))
@@ -481,7 +477,6 @@ def _number(leaf: _Element, key: str) -> float:
 
 @cache
 def _unit(key: str) -> str:
-    """The unit of a number; "" for one that has none."""
     container, _, name = key.rpartition("/")
     if container == "quaternion":
         return ""

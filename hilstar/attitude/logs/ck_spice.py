@@ -84,7 +84,6 @@ class _Daf:
     summaries: list[_Summary]
 
     def words(self, summary: _Summary) -> FloatArray:
-        """The doubles (n,) of an array. Raises InputError where the file cannot be read."""
         first, last = summary.integers[-2:]
         with open_regular(self.path, "give a SPICE kernel") as file:
             file.seek((first - 1) * WORD_BYTES)
@@ -329,7 +328,6 @@ class _Structure:
         return int(self.spice.ckmeta(self.body, "SCLK"))
 
     def t_s(self, tick: float) -> float:
-        """Ephemeris time (TDB seconds past J2000)."""
         return float(self.spice.sct2e(self.clock, tick))
 
     def t_ns(self, tick: float) -> int:

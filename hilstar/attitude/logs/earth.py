@@ -153,7 +153,6 @@ def _tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
 
 
 def _chain(*turns: FloatArray) -> FloatArray:
-    """The rotation of all turns, the first one first."""
     q = turns[0]
     for turn in turns[1:]:
         q = multiply(turn, q)

@@ -103,7 +103,6 @@ def ns_of_seconds(seconds: str) -> int:
 
 
 def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    """Write samples with every column; a rate that is not known is an empty cell. Raises OSError."""
     file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
     for sample in samples:
         rate = sample.rate_cam_rad_s
@@ -114,7 +113,6 @@ def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
 
 
 def _read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
-    """The entries of a log's lines; blank ones are ignored."""
     for number, line in enumerate(lines, start=1):
         if line.strip():
             event = decode(line.strip().encode())
@@ -124,7 +122,6 @@ def _read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
 
 
 def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    """Write one object for each sample; a rate that is not known has no key. Raises OSError."""
     encoder = msgspec.json.Encoder()
     for sample in samples:
         form: dict[str, object] = {"t_ns": sample.t_ns, "q": sample.q_icrs_to_cam.tolist()}
@@ -227,8 +224,21 @@ def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
 
         with open_bag(path) as bag:
             yield read_ros(bag, stated)
-    elif head.startswith((MCAP_MAGIC, ULOG_MAGIC, CK_MAGIC)):
-        yield _read_binary(path, head, stated)
+    elif head.startswith(ULOG_MAGIC):
+        _require("pyulog", "px4", f"{path}: a ULog of PX4")
+        from hilstar.attitude.logs.px4 import read_ulog
+
+        yield read_ulog(path, stated)
+    elif head.startswith(CK_MAGIC):
+        _require("spiceypy", "spice", f"{path}: a SPICE CK")
+        from hilstar.attitude.logs.ck import read_ck
+
+        yield read_ck(path, stated)
+    elif head.startswith(MCAP_MAGIC):
+        from hilstar.attitude.logs.mcap_log import read_attitudes
+
+        entries = (LogEntry(f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
+        yield LogReading(entries, replace(PACKETS, source="MCAP"), "the sender restarted here; give a log of one run")
     else:
         with _open_text(path) as reading:
             yield reading
@@ -249,23 +259,6 @@ def _is_bag(path: Path, head: bytes) -> bool:
 def _require(library: str, extra: str, what: str) -> None:
     if importlib.util.find_spec(library) is None:
         raise MachineError(f"{what}; reading it needs {library}: pip install 'hilstar[{extra}]'")
-
-
-def _read_binary(path: Path, head: bytes, stated: Stated) -> LogReading:
-    if head.startswith(ULOG_MAGIC):
-        _require("pyulog", "px4", f"{path}: a ULog of PX4")
-        from hilstar.attitude.logs.px4 import read_ulog
-
-        return read_ulog(path, stated)
-    if head.startswith(CK_MAGIC):
-        _require("spiceypy", "spice", f"{path}: a SPICE CK")
-        from hilstar.attitude.logs.ck import read_ck
-
-        return read_ck(path, stated)
-    from hilstar.attitude.logs.mcap_log import read_attitudes
-
-    entries = (LogEntry(f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
-    return LogReading(entries, replace(PACKETS, source="MCAP"), "the sender restarted here; give a log of one run")
 
 
 @contextlib.contextmanager

@@ -27,25 +27,10 @@ from typing import IO, NamedTuple, Self
 import lz4.frame
 import msgspec
 import zstandard
+from mcap import records as kinds
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import RecordLengthLimitExceeded
 from mcap.opcode import Opcode
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Message,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
@@ -124,9 +109,9 @@ def read_topics(path: Path, *, tell: bool = True) -> Iterator[tuple[str, bytes]]
     for part in parts_of(path):
         channels: dict[int, str] = {}
         for record in records_of(part):
-            if isinstance(record, Channel):
+            if isinstance(record, kinds.Channel):
                 channels[record.id] = record.topic
-            elif isinstance(record, Message) and record.channel_id in channels:
+            elif isinstance(record, kinds.Message) and record.channel_id in channels:
                 yield channels[record.channel_id], record.data
     unfinished = unfinished_part(path) if tell else None
     if unfinished is not None:
@@ -149,12 +134,12 @@ def read_messages(path: Path, topic: str, *, tell: bool = True) -> Iterator[byte
 
 def topics_of(path: Path) -> list[str]:
     """The topics that a file has channels for. Raises InputError for damage."""
-    return sorted({record.topic for record in records_of(path) if isinstance(record, Channel)})
+    return sorted({record.topic for record in records_of(path) if isinstance(record, kinds.Channel)})
 
 
 def read_metadata(path: Path, name: str) -> dict[str, str]:
     """The first metadata of that name, {} where there is none. Raises InputError for damage."""
-    return next((dict(r.metadata) for r in records_of(path) if isinstance(r, Metadata) and r.name == name), {})
+    return next((dict(r.metadata) for r in records_of(path) if isinstance(r, kinds.Metadata) and r.name == name), {})
 
 
 def is_mcap(path: Path) -> bool:
@@ -169,7 +154,7 @@ def is_mcap(path: Path) -> bool:
 def holds_ros(path: Path) -> bool:
     """Whether the first channel that is hilstar's or ROS's is ROS's. Raises InputError for damage before it."""
     for record in records_of(path):
-        if isinstance(record, Channel):
+        if isinstance(record, kinds.Channel):
             if record.message_encoding in ROS_ENCODINGS:
                 return True
             if record.message_encoding == "json" and record.topic in OWN_TOPICS:
@@ -177,7 +162,7 @@ def holds_ros(path: Path) -> bool:
     return False
 
 
-def records_of(path: Path) -> Iterator[McapRecord]:
+def records_of(path: Path) -> Iterator[kinds.McapRecord]:
     """Every record of one file, chunks unpacked into their schemas, channels and messages. Raises InputError for damage."""
     with open_regular(path, ADVICE) as file:
         finished = _is_finished(file)
@@ -193,7 +178,7 @@ def records_of(path: Path) -> Iterator[McapRecord]:
         while True:
             try:
                 record = next(records, None)
-                data = _unpacked(record, room) if isinstance(record, Chunk) else None
+                data = _unpacked(record, room) if isinstance(record, kinds.Chunk) else None
             except Exception as error:  # the reader passes on what struct, zstd, lz4 and UTF-8 raise
                 cut_off = isinstance(error, RecordLengthLimitExceeded) or not capped.left
                 if cut_off and not finished and not isinstance(error, TooLargeError):
@@ -214,7 +199,7 @@ def records_of(path: Path) -> Iterator[McapRecord]:
 class _Reader(StreamReader):
     """Skips the indexes of messages, which nothing here uses and the library takes apart entry by entry."""
 
-    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+    def _read_record(self, opcode: int, length: int) -> kinds.McapRecord | None:
         return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
 
 
@@ -262,7 +247,7 @@ def unpacked(data: bytes, compression: str, limit: int, exact: bool = True) -> b
     return whole
 
 
-def _unpacked(chunk: Chunk, room: int) -> bytes:
+def _unpacked(chunk: kinds.Chunk, room: int) -> bytes:
     """A chunk's content, once its size and CRC are those that it states."""
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
@@ -277,8 +262,7 @@ def _unpacked(chunk: Chunk, room: int) -> bytes:
     return data
 
 
-def _inside(data: bytes) -> Iterator[McapRecord]:
-    """The schemas, channels and messages of a chunk."""
+def _inside(data: bytes) -> Iterator[kinds.McapRecord]:
     place = 0
     while place < len(data):
         opcode, length = _record_head.unpack_from(data, place)
@@ -289,9 +273,9 @@ def _inside(data: bytes) -> Iterator[McapRecord]:
             if length < _message_head.size:
                 raise DamageError("a message is shorter than its head")
             channel, sequence, log_ns, publish_ns = _message_head.unpack_from(data, place)
-            yield Message(channel, log_ns, data[place + _message_head.size : place + length], publish_ns, sequence)
+            yield kinds.Message(channel, log_ns, data[place + _message_head.size : place + length], publish_ns, sequence)
         elif opcode in {Opcode.CHANNEL, Opcode.SCHEMA}:
-            kind = Channel if opcode == Opcode.CHANNEL else Schema
+            kind = kinds.Channel if opcode == Opcode.CHANNEL else kinds.Schema
             yield kind.read(ReadDataStream(io.BytesIO(data[place : place + length])))
         place += length
 
@@ -306,8 +290,6 @@ class JsonTopic:
 
 
 class _Pending(NamedTuple):
-    """A message that is not written yet."""
-
     channel: int
     time_ns: int
     record: bytes
@@ -320,8 +302,10 @@ class McapWriter:
         self.size_bytes = 0
         self._fd = fd
         self._ids = {key: number for number, key in enumerate(topics, start=1)}
-        self._schemas = [Schema(i, topic.schema, "jsonschema", topic.schema_name) for i, topic in enumerate(topics.values(), 1)]
-        self._channels = [Channel(i, topic.name, "json", {}, i) for i, topic in enumerate(topics.values(), 1)]
+        self._schemas = [
+            kinds.Schema(i, topic.schema, "jsonschema", topic.schema_name) for i, topic in enumerate(topics.values(), 1)
+        ]
+        self._channels = [kinds.Channel(i, topic.name, "json", {}, i) for i, topic in enumerate(topics.values(), 1)]
         self._pending: list[_Pending] = []
         self.pending_bytes = 0
         self.crc = 0  # CRC-32 of all that is written
@@ -331,10 +315,10 @@ class McapWriter:
         self._chunks = 0
         self._times_ns: list[int] = []  # the first and the last of all messages
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
-        head = Metadata(metadata_name, dict(metadata))
-        before = MCAP_MAGIC + _bytes_of(Header("", "hilstar"))
+        head = kinds.Metadata(metadata_name, dict(metadata))
+        before = MCAP_MAGIC + _bytes_of(kinds.Header("", "hilstar"))
         whole = _bytes_of(head)
-        self._metadata_index = MetadataIndex(len(before), len(whole), metadata_name)
+        self._metadata_index = kinds.MetadataIndex(len(before), len(whole), metadata_name)
         # Outside the first chunk: most readers also look for channels there, and these are never lost with a chunk.
         self._append(before + whole + _bytes_of(*self._schemas, *self._channels))
 
@@ -369,7 +353,7 @@ class McapWriter:
         times_ns = [entry.time_ns for entry in self._pending]
         first_ns, last_ns = min(times_ns), max(times_ns)
         packed = self._compressor.compress(data)
-        chunk = _bytes_of(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data)))
+        chunk = _bytes_of(kinds.Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data)))
         entries: dict[int, list[tuple[int, int]]] = {}  # by channel: the times of its messages and where they begin
         offset = 0
         for channel, time_ns, record in self._pending:
@@ -378,7 +362,7 @@ class McapWriter:
         indexes, offsets, place = b"", {}, self.size_bytes
         for channel, records in entries.items():
             offsets[channel] = place + len(chunk) + len(indexes)
-            indexes += _bytes_of(MessageIndex(channel, records))
+            indexes += _bytes_of(kinds.MessageIndex(channel, records))
         self._append(chunk + indexes)
         self._counts.update(entry.channel for entry in self._pending)
         self._pending, self.pending_bytes = [], 0
@@ -386,7 +370,9 @@ class McapWriter:
         self._times_ns += [first_ns, last_ns]
         self._times_ns = [min(self._times_ns), max(self._times_ns)]
         if self._indexed:
-            entry = ChunkIndex(len(chunk), place, "zstd", len(packed), last_ns, len(indexes), offsets, first_ns, len(data))
+            entry = kinds.ChunkIndex(
+                len(chunk), place, "zstd", len(packed), last_ns, len(indexes), offsets, first_ns, len(data)
+            )
             self._index += _bytes_of(entry)
         if len(self._index) > MAX_INDEX_BYTES:
             self._indexed, self._index = False, bytearray()
@@ -394,11 +380,11 @@ class McapWriter:
     def finish(self) -> None:
         """Write what was added, the index and the end. Raises OSError; the file is then as if its writer had been killed."""
         self.flush()
-        end = _bytes_of(DataEnd(self.crc))
+        end = _bytes_of(kinds.DataEnd(self.crc))
         start = self.size_bytes + len(end)
         first_ns, last_ns = self._times_ns or (0, 0)
         totals = (self.written, last_ns, first_ns)
-        statistics = Statistics(0, len(self._channels), dict(self._counts), self._chunks, *totals, 1, len(self._schemas))
+        statistics = kinds.Statistics(0, len(self._channels), dict(self._counts), self._chunks, *totals, 1, len(self._schemas))
         groups = {
             Opcode.SCHEMA: _bytes_of(*self._schemas),
             Opcode.CHANNEL: _bytes_of(*self._channels),
@@ -409,15 +395,14 @@ class McapWriter:
         summary, offsets = b"", b""
         for opcode, group in groups.items():
             if group:
-                offsets += _bytes_of(SummaryOffset(opcode, start + len(summary), len(group)))
+                offsets += _bytes_of(kinds.SummaryOffset(opcode, start + len(summary), len(group)))
             summary += group
         offset_start = start + len(summary)
         summary += offsets
         crc = zlib.crc32(_footer_head.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
-        self._append(end + summary + _bytes_of(Footer(start, offset_start, crc)) + MCAP_MAGIC)
+        self._append(end + summary + _bytes_of(kinds.Footer(start, offset_start, crc)) + MCAP_MAGIC)
 
     def _append(self, data: bytes) -> None:
-        """Write at the end, all or nothing."""
         try:
             rest = memoryview(data)
             while rest:
@@ -431,7 +416,7 @@ class McapWriter:
         self.crc = zlib.crc32(data, self.crc)
 
 
-def _bytes_of(*records: McapRecord) -> bytes:
+def _bytes_of(*records: kinds.McapRecord) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)

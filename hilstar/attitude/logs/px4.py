@@ -67,8 +67,6 @@ ORDER_ADVICE = "the log has two attitudes of one time, or is damaged there"
 
 
 class _ULogTopic(NamedTuple):
-    """A topic of the log, and which of its instances."""
-
     name: str
     instance: int
 
@@ -86,7 +84,6 @@ class _Sieved:
 
     @property
     def told(self) -> list[tuple[str, str]]:
-        """A notice of everything that is missing."""
         lines = []
         if self.cut_at is not None:
             lines.append(("log-cut", f"the log ends within a message at byte {self.cut_at}; all before it is read"))
@@ -339,7 +336,6 @@ def _degrees(series: _Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
 
 
 def _of(topics: dict[_ULogTopic, _Series], names: tuple[str, ...]) -> list[_Series]:
-    """The series of topics by name, the first instance first."""
     return [topics[topic] for name in names for topic in sorted(topics) if topic.name == name]
 
 

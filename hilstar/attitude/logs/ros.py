@@ -87,7 +87,6 @@ def typestore(encoding: Encoding) -> "Typestore":
 
 
 def _decoded(topic: BagTopic, data: bytes) -> Any:
-    """The message in some bytes. Raises rosbags.serde.SerdeError."""
     store = typestore(topic.encoding)
     read = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
     return read(data, OWN_NAMES.get(topic.type, topic.type))
@@ -238,8 +237,6 @@ class _FrameChain(NamedTuple):
 
 
 class _Tree:
-    """The transforms of a bag."""
-
     def __init__(self, path: Path, transforms: "Iterable[_Heard]") -> None:
         self._path = path
         self._up: dict[str, dict[str, _Edge]] = {}
@@ -347,14 +344,11 @@ def _kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told
 
 
 class _Heard(NamedTuple):
-    """An orientation, where it stands in the bag, and when it was recorded."""
-
     where: str
     receive_ns: int
     turn: _RosTurn
 
     def t_ns(self, stamped: bool) -> int:
-        """Its time, where the messages of its topic have times of their own or not."""
         return (self.turn.stamp_ns or 0) if stamped else self.receive_ns
 
 

@@ -144,8 +144,6 @@ class _Db3File:
 
 
 class _McapBag:
-    """An .mcap file, as `_Db3File`."""
-
     def __init__(self, path: Path) -> None:
         self._path = path
 
@@ -190,8 +188,6 @@ class _CutError(Exception):
 
 
 class _BagFile:
-    """A .bag file, as `_Db3File`."""
-
     def __init__(self, path: Path) -> None:
         self._path = path
         self._cut_at: int | None = None

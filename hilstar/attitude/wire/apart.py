@@ -25,7 +25,7 @@ import msgspec
 
 from hilstar.attitude.wire.links import LinkCounts, RawMessage
 from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
 from hilstar.units import NS_PER_S
 
 CHILD = "hilstar.attitude.wire.apart_child"
@@ -83,6 +83,14 @@ class Record(msgspec.Struct, frozen=True, omit_defaults=True):
     lasting: bool = True
     end: str | None = None
 
+    def told_to(self, notices: Notices) -> bool:
+        """Whether it is a notice, which is then passed on."""
+        if self.notice is not None and self.lasting:
+            notices.tell(*self.notice)
+        elif self.notice is not None:
+            notices.mention(*self.notice[:2])
+        return self.notice is not None
+
 
 _encoder, _decoder = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(Record)
 
@@ -134,8 +142,8 @@ class ReaderProcess:
         self._wire: socket.socket | None = None
         self._stream = RecordStream()
         self._why, self._ready = "", False
-        self._silent_s, self._back_off_s = 0.0, MIN_BACK_OFF_S
-        self._again = clock.within(0.0)
+        self._silent_s = 0.0
+        self._again = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
         self._begin()
 
     def _begin(self) -> None:
@@ -208,7 +216,7 @@ class ReaderProcess:
                 self.take()
 
     def take(self) -> list[Record]:
-        """What has come of the order, without waiting."""
+        """What has come of the order, without waiting; notices are passed on here."""
         if self._wire is None:
             return []
         try:
@@ -226,7 +234,7 @@ class ReaderProcess:
                 self._ready = True
                 if record.end is not None:
                     self._why = record.end
-                elif record.order == self._order.number != 0:
+                elif record.order == self._order.number != 0 and not record.told_to(self._notices):
                     taken.append(record)
         except ValueError as error:
             self._ended(str(error))
@@ -234,15 +242,11 @@ class ReaderProcess:
 
     def _ended(self, why: str) -> None:
         code = self._stop(0.0)
-        if self._steady.over:
-            self._back_off_s = MIN_BACK_OFF_S
-        self._again = self._clock.within(self._back_off_s)
-        self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
+        self._again.put_off(anew=self._steady.over)
         why = self._why or why or (f"signal {-code}" if code < 0 else f"exit code {code}")
         self._notices.tell("receiver-failed", f"{self._name} stopped ({why}); restarting it")
 
     def _stop(self, patience_s: float) -> int:
-        """Let the process end, within `patience_s` in order; its exit code."""
         wire, self._wire = self._wire, None
         if wire is not None:
             wire.close()

@@ -68,8 +68,6 @@ class Wire:
 
 
 class _OpenDevice:
-    """A serial device, which the process that shows stars has opened and set up."""
-
     def __init__(self, file: int, clock: HostClock = HOST_CLOCK) -> None:
         self.link_counts = LinkCounts()
         self._file, self._clock = file, clock
@@ -94,8 +92,6 @@ class _OpenDevice:
 
 
 class _ForwardedNotices(Notices):
-    """Forwards a link's notices, each after the counts so far; drops them once the other side is gone."""
-
     def __init__(self, wire: Wire, order: int) -> None:
         super().__init__()
         self.link_counts = LinkCounts()  # the link's own, as soon as there is one

@@ -15,13 +15,13 @@ import serial
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.links import LinkCounts, RawMessage
-from hilstar.attitude.wire.serial_link import LOST, opening_fault
+from hilstar.attitude.wire.serial_link import LOST, open_port, opening_fault
 from hilstar.attitude.wire.udp import Datagrams
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
 from hilstar.process.closing import Closing
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
 
 MAX_READ_BYTES = 65_536
 MAX_DATAGRAMS = 200
@@ -39,7 +39,7 @@ class ByteLink(Closing):
     def __init__(self, endpoint: str, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self.endpoint, self.link_counts = endpoint, LinkCounts()
         self._notices, self._clock = notices, clock
-        self._back_off_s, self._retry = MIN_BACK_OFF_S, clock.within(0.0)
+        self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
 
     @abstractmethod
     def taken(self, timeout_ms: int) -> list[RawMessage]:
@@ -51,12 +51,7 @@ class ByteLink(Closing):
     def _lose(self, why: str) -> None:
         self.link_counts.lost += 1
         self._notices.tell("answers-lost", f"{self.endpoint}: the tracker's line is lost ({one_line(why)}); waiting for it")
-        self._back_off_s = MIN_BACK_OFF_S
-        self._retry = self._clock.within(self._back_off_s)
-
-    def _failed(self) -> None:
-        self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
-        self._retry = self._clock.within(self._back_off_s)
+        self._retry.put_off(anew=True)
 
     def _opened(self) -> None:
         self.link_counts.connections += 1
@@ -86,9 +81,7 @@ class SerialBytes(ByteLink):
             raise InputError(f"[answers] {self.endpoint}: {opening_fault(error, port)}") from error
 
     def _open(self) -> serial.Serial:
-        device = serial.Serial(self._port, self._baud, timeout=0, exclusive=True)
-        with contextlib.suppress(OSError, ValueError):  # else a USB adapter buffers for 16 ms; a pty has no such mode
-            device.set_low_latency_mode(True)
+        device = open_port(self._port, self._baud)
         self._opened()
         return device
 
@@ -109,7 +102,7 @@ class SerialBytes(ByteLink):
             return []
         except LOST as error:
             if self._device is None:
-                self._failed()
+                self._retry.put_off()
             else:
                 self._lose(str(getattr(error, "strerror", None) or error))
                 self.close()
@@ -222,7 +215,7 @@ class TcpBytes(ByteLink):
         try:
             self._take(socket.create_connection(self._place, CONNECT_S))
         except OSError:
-            self._failed()
+            self._retry.put_off()
 
     def _accept(self) -> None:
         if self._listener is None:
@@ -310,7 +303,6 @@ class FileBytes(ByteLink):
             self._clock.sleep(min(FILE_LOOK_S, end.left_s))
 
     def _follow(self) -> None:
-        """Look whether the file was made anew or cut."""
         named = self._path.stat()
         if self._file < 0:
             self._open()

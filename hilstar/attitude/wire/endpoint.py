@@ -202,7 +202,6 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
 
 
 def _parts(text: str, word: str) -> tuple[str, int | None]:
-    """Address and port of ADDRESS[:PORT] or [IPv6][:PORT]. Raises InputError."""
     text = f"[{text}]" if text.count(":") > 1 and not text.startswith("[") else text
     match = PLACE.fullmatch(text)
     if match is None:

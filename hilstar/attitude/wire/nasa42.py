@@ -257,7 +257,6 @@ class _Connection(Link):
             self._notices.tell("back", "42 is connected again")
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once unread bytes or a new connection wait."""
         waited = [each for each in (self._listener, self._connection) if each is not None]
         if not waited:
             return False
@@ -276,7 +275,6 @@ class _Connection(Link):
             connection.close()
 
     def close(self) -> None:
-        """Close the connection; 42 ends at its next message."""
         self._shut()
         if self._listener is not None:
             self._listener.close()

@@ -11,21 +11,12 @@ from collections.abc import Iterator
 import serial
 from serial.tools import list_ports
 
+from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.links import Arrival, RawMessage, StreamLink
-from hilstar.attitude.wire.packet import (
-    DELIMITER,
-    Event,
-    Packet,
-    StreamDecoder,
-    decode_frame,
-    encode,
-    frame,
-    frame_declares_discontinuity,
-)
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
-from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
 from hilstar.units import NS_PER_S
 
 DEFAULT_BAUD = 115_200
@@ -63,6 +54,14 @@ def adapters() -> list[str]:
     return [f"{words.count(word)} x {word}" if words.count(word) > 1 else word for word in dict.fromkeys(words)]
 
 
+def open_port(port: str, baud: int) -> serial.Serial:
+    """A port of its own, whose bytes come at once. Raises OSError, ValueError or OverflowError."""
+    device = serial.Serial(port, baud, timeout=0, exclusive=True)
+    with contextlib.suppress(OSError, ValueError):  # else a USB adapter buffers for 16 ms; a pty has no such mode
+        device.set_low_latency_mode(True)
+    return device
+
+
 class SerialLink(StreamLink):
     """A serial port that is reopened, with back-off, whenever it disappears.
 
@@ -77,9 +76,8 @@ class SerialLink(StreamLink):
         self.endpoint = f"serial:{port}@{baud}"
         self._port, self._baud = port, baud
         self._reopened = 0
-        self._decoder = StreamDecoder()
-        self._back_off_s = MIN_BACK_OFF_S
-        self._retry = clock.within(0.0)
+        self._decoder = wire.StreamDecoder()
+        self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
@@ -91,13 +89,10 @@ class SerialLink(StreamLink):
         return self._reopened
 
     def _open(self) -> serial.Serial:
-        device = serial.Serial(self._port, self._baud, timeout=0, exclusive=True)
-        with contextlib.suppress(OSError, ValueError):  # else a USB adapter buffers for 16 ms; a pty has no such mode
-            device.set_low_latency_mode(True)
-        self._decoder = StreamDecoder()
-        return device
+        self._decoder = wire.StreamDecoder()
+        return open_port(self._port, self._baud)
 
-    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+    def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
         """The frames that have arrived, and only the newest of a flood; waits at most `timeout_ms` for the first byte."""
         device = self._device
         if device is None:
@@ -113,11 +108,10 @@ class SerialLink(StreamLink):
             bodies = self._decoder.frames(chunk.parts[0])
             for k, body in enumerate(bodies, 1):  # frames before the chunk's last were there earlier, and waited for it
                 waiting.append(chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies)))
-        taken = self._gate.newest(waiting, frame_declares_discontinuity)
-        return [Arrival(each.host_ns, decode_frame(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
+        taken = self._gate.newest(waiting, wire.frame_declares_discontinuity)
+        return [Arrival(each.host_ns, wire.decode_frame(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
-        """What has come, read now."""
         if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
             device.timeout = timeout_ms / 1000
         data = device.read(1)
@@ -133,9 +127,9 @@ class SerialLink(StreamLink):
         except (OSError, ValueError, TypeError):  # gone: `receive` notices, and reports it
             return False
 
-    def send(self, packet: Packet) -> None:
+    def send(self, packet: wire.Packet) -> None:
         """Send to the other side without waiting: what the line does not take at once is lost."""
-        self.send_bytes(frame(packet))
+        self.send_bytes(wire.frame(packet))
 
     def send_bytes(self, data: bytes, patience_s: float = 0.0) -> bool:
         """Send bytes as they are, waiting at most `patience_s` while the line is full; False where some were lost."""
@@ -166,16 +160,15 @@ class SerialLink(StreamLink):
                     return
                 self._clock.sleep(DRAIN_LOOK_S)
 
-    def wire_ns(self, packet: Packet) -> int:
+    def wire_ns(self, packet: wire.Packet) -> int:
         """How long a packet's frame takes at this baud rate."""
-        return (len(encode(packet)) + FRAMING_BYTES) * BITS_PER_BYTE * NS_PER_S // self._baud
+        return (len(wire.encode(packet)) + FRAMING_BYTES) * BITS_PER_BYTE * NS_PER_S // self._baud
 
     def _lose(self, why: str) -> None:
         self.link_counts.lost += 1
         self._notices.tell("lost", f"{self.endpoint} disconnected ({one_line(why)}); waiting for it to come back")
         self._shut()
-        self._back_off_s = MIN_BACK_OFF_S
-        self._retry = self._clock.within(self._back_off_s)
+        self._retry.put_off(anew=True)
 
     def _reopen(self, timeout_ms: int) -> None:
         if not self._retry.over:
@@ -184,12 +177,11 @@ class SerialLink(StreamLink):
         try:
             self._device = self._open()
         except (OSError, ValueError):
-            self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
-            self._retry = self._clock.within(self._back_off_s)
+            self._retry.put_off()
             return
         self._reopened += 1
         self._notices.tell("back", f"{self.endpoint} is back")
-        self.send_bytes(DELIMITER)
+        self.send_bytes(wire.DELIMITER)
 
     def _shut(self) -> None:
         device, self._device = self._device, None

@@ -77,7 +77,6 @@ def read_frame(parts: list[bytes]) -> ShownFrame | str:
 
 
 def _checked(first: bytes, indices: bytes, values: bytes) -> ShownFrame:
-    """The frame of three parts. Raises ValueError or msgspec's errors for what is none."""
     head = _heads.decode(first)
     sizes = 0 < head.width <= MAX_SIDE_PX and 0 < head.height <= MAX_SIDE_PX
     if not (sizes and 1 <= head.bits <= 16 and head.channels in {1, 3}):

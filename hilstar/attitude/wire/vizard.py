@@ -15,30 +15,19 @@ import contextlib
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, Unpack
 
 import numpy as np
 import zmq
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.endpoint import parse_endpoint
-from hilstar.attitude.wire.keys import NO_KEYS
 from hilstar.attitude.wire.links import Arrival, LockstepLink, Pictures, RawMessage, TrackerCamera
-from hilstar.attitude.wire.packet import (
-    MAX_PLACE_KM,
-    MAX_SPEED_KM_S,
-    MIN_PLACE_KM,
-    U32,
-    AttitudeSample,
-    Event,
-    Refusal,
-    Status,
-    checked_sample,
-)
 from hilstar.attitude.wire.source import Conventions, Mounting
 from hilstar.attitude.wire.vizard_message import Components, SimUpdate, VizBody, VizCamera, WireFormatError, decode_update
 from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqReceiver
-from hilstar.attitude.wire.zmq_socket import ZmqSocket
+from hilstar.attitude.wire.zmq_socket import SocketOptions, ZmqSocket
 from hilstar.errors import InputError, printable, shortened
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
@@ -123,10 +112,10 @@ class DifferenceRates:
 
     def __init__(self, max_step_ns: int, max_rate_rad_s: float) -> None:
         self._max_step_ns, self._max_rate_rad_s = max_step_ns, max_rate_rad_s
-        self._last: AttitudeSample | None = None
+        self._last: wire.AttitudeSample | None = None
         self._mean: tuple[FloatArray, float] | None = None
 
-    def moving(self, sample: AttitudeSample) -> AttitudeSample:
+    def moving(self, sample: wire.AttitudeSample) -> wire.AttitudeSample:
         """The sample with its rate (3,), rad/s, and acceleration (3,), rad/s^2, in the components of its own frame."""
         before, self._last = self._last, sample
         earlier, self._mean = self._mean, None
@@ -159,28 +148,28 @@ class Follower:
         self._taken = taken
         self.conventions = replace(CONVENTIONS, turns="; ".join((TURNS, *TOLD[taken])))
 
-    def take(self, message: bytes) -> tuple[AttitudeSample | Refusal, SimUpdate | None]:
+    def take(self, message: bytes) -> tuple[wire.AttitudeSample | wire.Refusal, SimUpdate | None]:
         """The camera's attitude in a VizMessage, or why there is none; and the message itself where it is one."""
         try:
             update = decode_update(message)
         except WireFormatError as error:
-            return Refusal("format", f"not Basilisk's VizMessage: {error}"), None
+            return wire.Refusal("format", f"not Basilisk's VizMessage: {error}"), None
         chosen = self._chosen(update.spacecraft)
-        if isinstance(chosen, Refusal):
+        if isinstance(chosen, wire.Refusal):
             return chosen, update
         if len(chosen.sigma_bn) != 3:
             what = f"spacecraft {named(chosen)}: {len(chosen.sigma_bn)} components of its rotation (sigma_BN), not 3"
-            return Refusal("format", what), update
-        sample = checked_sample(update.t_ns, quaternion_of_mrp(chosen.sigma_bn), None, update.frame % U32)
+            return wire.Refusal("format", what), update
+        sample = wire.checked_sample(update.t_ns, quaternion_of_mrp(chosen.sigma_bn), None, update.frame % wire.U32)
         state = self._state(update, chosen)
-        if isinstance(state, Refusal):
+        if isinstance(state, wire.Refusal):
             return state, update
-        if isinstance(sample, AttitudeSample):
+        if isinstance(sample, wire.AttitudeSample):
             sample = replace(sample, place_km=state[0], velocity_km_s=state[1])
             sample = self._mounting.sample(self._rates.moving(sample))
         return sample, update
 
-    def _state(self, update: SimUpdate, craft: VizBody) -> tuple[FloatArray | None, FloatArray | None] | Refusal:
+    def _state(self, update: SimUpdate, craft: VizBody) -> tuple[FloatArray | None, FloatArray | None] | wire.Refusal:
         """Place (3,), km, and velocity (3,), km/s, as far as they are taken, or why they are not.
 
         A "state" is about the Earth's centre: where the message has it, else at N's origin. A "velocity" is against N's origin.
@@ -192,20 +181,20 @@ class Follower:
             earth = next((body for body in update.bodies if body.name.lower() in EARTHS), VizBody())
             place_m, velocity_m_s = _against(place_m, earth.position_m), _against(velocity_m_s, earth.velocity_m_s)
         speed_m_s, far_km = math.hypot(*velocity_m_s), math.hypot(*place_m) / M_PER_KM
-        if len(velocity_m_s) != 3 or not speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
+        if len(velocity_m_s) != 3 or not speed_m_s <= wire.MAX_SPEED_KM_S * M_PER_KM:
             told = f"{speed_m_s:.3g} m/s" if velocity_m_s else "nothing"
-            advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
-            return Refusal("format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}")
+            advice = f"it is {wire.MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
+            return wire.Refusal("format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}")
         velocity = np.array(velocity_m_s) / M_PER_KM
         if self._taken == "velocity":
             return None, velocity
-        if len(place_m) == 3 and MIN_PLACE_KM < far_km < MAX_PLACE_KM:
+        if len(place_m) == 3 and wire.MIN_PLACE_KM < far_km < wire.MAX_PLACE_KM:
             return np.array(place_m) / M_PER_KM, velocity
         told = f"{far_km:.4g} km from the Earth's centre" if place_m else "nowhere"
-        advice = f'[spacecraft] orbit = "source" takes {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km'
-        return Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
+        advice = f'[spacecraft] orbit = "source" takes {wire.MIN_PLACE_KM:g} to {wire.MAX_PLACE_KM:g} km'
+        return wire.Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
 
-    def _chosen(self, spacecraft: tuple[VizBody, ...]) -> VizBody | Refusal:
+    def _chosen(self, spacecraft: tuple[VizBody, ...]) -> VizBody | wire.Refusal:
         """The spacecraft that is followed; parts of others (a parent is named) are taken only by their own name."""
         if self._name is None:
             found = [craft for craft in spacecraft if craft.parent in {"", craft.name}]
@@ -215,9 +204,9 @@ class Follower:
             return found[0]
         names = ", ".join(map(named, (found if self._name is None else spacecraft)[:MAX_NAMES])) or "none"
         if self._name is None:
-            return Refusal("format", f'spacecraft: {names}; write the one that is meant, [attitude] spacecraft = "NAME"')
+            return wire.Refusal("format", f'spacecraft: {names}; write the one that is meant, [attitude] spacecraft = "NAME"')
         wanted = shortened(printable(self._name))
-        return Refusal("format", f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}")
+        return wire.Refusal("format", f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}")
 
 
 def q_body_to_cam(camera: VizCamera) -> FloatArray | None:
@@ -261,22 +250,15 @@ class VizardLive(ZmqSocket, LockstepLink):
 
     asks_for_pictures = True
 
-    def __init__(
-        self,
-        endpoint: str,
-        follower: Follower,
-        *,
-        bind: bool = True,
-        notices: Notices | None = None,
-        clock: HostClock = HOST_CLOCK,
-    ) -> None:
+    def __init__(self, endpoint: str, follower: Follower, **options: Unpack[SocketOptions]) -> None:
         check_loopback(endpoint)
-        size = MAX_UPDATE_BYTES
-        super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices, max_part_bytes=size, clock=clock)
+        options.setdefault("bind", True)
+        options["max_part_bytes"] = MAX_UPDATE_BYTES
+        super().__init__(zmq.REP, endpoint, **options)
         self._follower, self.conventions = follower, follower.conventions
         self._tracker: TrackerCamera | None = None
         self._pictures: Pictures | None = None
-        self._sample: AttitudeSample | None = None  # at the last step
+        self._sample: wire.AttitudeSample | None = None  # at the last step
         self._described: dict[int, VizCamera] = {}
         self._compared: set[int] = set()
 
@@ -284,7 +266,7 @@ class VizardLive(ZmqSocket, LockstepLink):
         """What to answer for the pictures of Basilisk's cameras: those of the tracker at the last step, or none."""
         self._tracker, self._pictures = tracker, pictures
 
-    def receive(self, timeout_ms: int) -> Arrival[Event] | None:
+    def receive(self, timeout_ms: int) -> Arrival[wire.Event] | None:
         """The next step, or None; it must be answered before the next request can arrive."""
         parts = self._take_parts() if self._waits(timeout_ms) else None
         if parts is None:
@@ -301,13 +283,13 @@ class VizardLive(ZmqSocket, LockstepLink):
         self._answer(PLAIN_ANSWERS.get(word, [ERROR]))
         return None
 
-    def _step(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
+    def _step(self, host_ns: int, parts: list[bytes]) -> Arrival[wire.Event]:
         self._sample = None
         message = update_of(parts)
         if message is None:
-            return Arrival(host_ns, Refusal("format", f"SIM_UPDATE of {len(parts)} parts; Basilisk sends four"), parts[-1])
+            return Arrival(host_ns, wire.Refusal("format", f"SIM_UPDATE of {len(parts)} parts; Basilisk sends four"), parts[-1])
         event, update = self._follower.take(message)
-        self._sample = event if isinstance(event, AttitudeSample) else None
+        self._sample = event if isinstance(event, wire.AttitudeSample) else None
         self._described |= {camera.identity: camera for camera in (update.cameras if update is not None else ())}
         return Arrival(host_ns, event, message)
 
@@ -320,7 +302,7 @@ class VizardLive(ZmqSocket, LockstepLink):
                 self._notices.tell("other-camera", trouble)
         return b"" if self._sample is None or self._pictures is None else self._pictures(self._sample)
 
-    def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
+    def answer(self, status: wire.Status, shown_ns: int, refusal: wire.Refusal | None) -> None:
         """Let the simulation go on; or, where its step was refused, end it."""
         self._answer([OK if refusal is None else ERROR])
 
@@ -337,15 +319,15 @@ class Opening:
     """
 
     def __init__(self) -> None:
-        self._held: list[Arrival[Event]] = []
+        self._held: list[Arrival[wire.Event]] = []
         self._opens = True
 
-    def passed(self, arrivals: list[Arrival[Event]], now_ns: int) -> list[Arrival[Event]]:
+    def passed(self, arrivals: list[Arrival[wire.Event]], now_ns: int) -> list[Arrival[wire.Event]]:
         """What goes on now, of what arrived and what was held."""
-        out: list[Arrival[Event]] = []
+        out: list[Arrival[wire.Event]] = []
         for arrival in arrivals:
             sample = arrival.event
-            if not isinstance(sample, AttitudeSample):
+            if not isinstance(sample, wire.AttitudeSample):
                 out.append(arrival)
                 continue
             if self._opens and sample.rate_cam_rad_s is None and len(self._held) < HELD:
@@ -356,7 +338,7 @@ class Opening:
             out += self._released()
         return out
 
-    def _released(self) -> list[Arrival[Event]]:
+    def _released(self) -> list[Arrival[wire.Event]]:
         released, self._held, self._opens = self._held, [], False
         return released
 
@@ -368,15 +350,15 @@ class BroadcastDecoder(PacketDecoder):
         self._follower, self.conventions, self._clock = follower, follower.conventions, clock
         self._opening = Opening()
 
-    def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[Event]]:
+    def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[wire.Event]]:
         """What messages say, and those that were held back."""
         return self._opening.passed(super().arrivals(messages), self._clock.now_ns())
 
-    def _arrival(self, message: RawMessage) -> Arrival[Event]:
+    def _arrival(self, message: RawMessage) -> Arrival[wire.Event]:
         parts = list(message.parts)
         update = update_of(parts)
         if update is None:
-            refusal = Refusal("format", f"a message of {len(parts)} parts; Basilisk sends SIM_UPDATE and a VizMessage")
+            refusal = wire.Refusal("format", f"a message of {len(parts)} parts; Basilisk sends SIM_UPDATE and a VizMessage")
             return Arrival(message.host_ns, refusal, parts[-1], message.waited_ns)
         return Arrival(message.host_ns, self._follower.take(update)[0], update, message.waited_ns)
 

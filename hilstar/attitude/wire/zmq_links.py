@@ -5,28 +5,17 @@ import math
 import struct
 from collections.abc import Iterable
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import msgspec
 import zmq
 
+from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import OpenStream, ReaderProcess
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival, LockstepLink, RawMessage, StreamLink
-from hilstar.attitude.wire.packet import (
-    AnswerPacket,
-    AttitudeSample,
-    Event,
-    Refusal,
-    Status,
-    TimeReply,
-    TimeRequest,
-    declares_discontinuity,
-    decode,
-    encode,
-)
 from hilstar.attitude.wire.source import PACKETS, Conventions, Mounting
-from hilstar.attitude.wire.zmq_socket import MAX_PART_BYTES, QUEUE_MESSAGES, ZmqSocket
+from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, SocketOptions, ZmqSocket
 from hilstar.notices import Notices
 from hilstar.process.closing import Closing
 from hilstar.process.interrupts import caught
@@ -46,13 +35,13 @@ class PacketDecoder:
     conventions = PACKETS
     stamped = False  # whether messages carry their own times of arrival
 
-    def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[Event]]:
+    def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[wire.Event]]:
         """What messages say."""
         return [self._arrival(message) for message in messages]
 
-    def _arrival(self, message: RawMessage) -> Arrival[Event]:
+    def _arrival(self, message: RawMessage) -> Arrival[wire.Event]:
         raw = message.parts[-1]
-        return Arrival(message.host_ns, decode(raw), raw, message.waited_ns)
+        return Arrival(message.host_ns, wire.decode(raw), raw, message.waited_ns)
 
 
 PACKET_DECODER = PacketDecoder()
@@ -62,24 +51,15 @@ class ZmqReceiver(ZmqSocket, StreamLink):
     """A SUB socket that takes every message that begins with `topic`; it connects, or binds with `bind`."""
 
     def __init__(
-        self,
-        endpoint: str,
-        *,
-        bind: bool = False,
-        keys: CurveKeys = NO_KEYS,
-        notices: Notices | None = None,
-        topic: bytes = b"",
-        max_part_bytes: int = MAX_PART_BYTES,
-        decoder: PacketDecoder = PACKET_DECODER,
-        clock: HostClock = HOST_CLOCK,
+        self, endpoint: str, *, topic: bytes = b"", decoder: PacketDecoder = PACKET_DECODER, **options: Unpack[SocketOptions]
     ) -> None:
-        self.topic, self.decoder, self.bound = topic, decoder, bind
+        self.topic, self.decoder, self.bound = topic, decoder, options.get("bind", False)
         self.conventions, self.stamped = decoder.conventions, decoder.stamped
-        super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices, max_part_bytes=max_part_bytes, clock=clock)
-        if not bind:  # a connecting socket hears nothing until a sender binds there
+        super().__init__(zmq.SUB, endpoint, **options)
+        if not self.bound:  # a connecting socket hears nothing until a sender binds there
             self.verb = "waiting for a sender at"
         self._shut()
-        self._lost_until = clock.within(0.0)
+        self._lost_until = self._clock.within(0.0)
 
     def opener(self) -> OpenStream:
         """What another process opens the same socket by."""
@@ -90,7 +70,7 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         super()._configure(made)
         made.setsockopt(zmq.SUBSCRIBE, self.topic)
 
-    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+    def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
         """The waiting messages, oldest first, and only the newest of a flood; waits at most `timeout_ms` for the first."""
         return self.decoder.arrivals(self.taken(timeout_ms))
 
@@ -103,7 +83,7 @@ class ZmqReceiver(ZmqSocket, StreamLink):
         while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (parts := self._take_parts()) is not None:
             waiting.append(RawMessage(self._clock.now_ns(), parts))
             taken_bytes += sum(map(len, parts))
-        return self._gate.newest(waiting, declares_discontinuity)
+        return self._gate.newest(waiting, wire.declares_discontinuity)
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once a message waits."""
@@ -145,7 +125,7 @@ class ZmqApart(StreamLink):
         """Wait until the socket can be opened at once, or for a moment."""
         self._reader.await_ready()
 
-    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+    def receive(self, timeout_ms: int) -> list[Arrival[wire.Event]]:
         """The messages that came, oldest first, with their stamps; waits at most `timeout_ms` for the first."""
         self.wait_for_message(timeout_ms)
         waiting, self._waiting = self._waiting, []
@@ -168,10 +148,6 @@ class ZmqApart(StreamLink):
                     self._waiting.append(record.message)
                 if record.counts is not None:
                     self.link_counts += record.counts
-                if record.notice is not None and record.lasting:
-                    self._notices.tell(*record.notice)
-                elif record.notice is not None:
-                    self._notices.mention(*record.notice[:2])
         return bool(self._waiting)
 
     def close(self) -> None:
@@ -183,12 +159,12 @@ class ZmqSender(ZmqSocket):
     """An XPUB socket, which reports subscribers; it binds, or connects with `bind=False`."""
 
     LINGER_MS, STOPPED_LINGER_MS = 2000, 200  # for a slow subscriber, without and with a signal
-    status: Status | None = None  # no way back
-    answer: AnswerPacket | None = None
+    status: wire.Status | None = None  # no way back
+    answer: wire.AnswerPacket | None = None
 
     def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, clock: HostClock = HOST_CLOCK) -> None:
         self._tended_until = clock.within(0.0)
-        super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys, notices=None, clock=clock)
+        super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys, clock=clock)
         self._ready()
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
@@ -220,19 +196,13 @@ class ZmqSender(ZmqSocket):
 class ZmqLockstep(ZmqSocket, LockstepLink):
     """A REP socket: one request is one attitude and gets one reply; it binds, or connects with `bind=False`."""
 
-    def __init__(
-        self,
-        endpoint: str,
-        *,
-        bind: bool = True,
-        keys: CurveKeys = NO_KEYS,
-        notices: Notices | None = None,
-        clock: HostClock = HOST_CLOCK,
-    ) -> None:
-        super().__init__(zmq.REP, endpoint, bind=bind, keys=keys, notices=notices, clock=clock)
-        self._json = False
+    _json = False  # whether the last request was
 
-    def receive(self, timeout_ms: int) -> Arrival[Event] | None:
+    def __init__(self, endpoint: str, **options: Unpack[SocketOptions]) -> None:
+        options.setdefault("bind", True)
+        super().__init__(zmq.REP, endpoint, **options)
+
+    def receive(self, timeout_ms: int) -> Arrival[wire.Event] | None:
         """The next request for a frame, or None; it must be answered before the next can arrive.
 
         Time requests are answered here. libzmq announces a request without its delimiter, then drops it: none is waited for.
@@ -240,17 +210,17 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
         message = self._take() if self._waits(timeout_ms) else None
         if message is None:
             return None
-        host_ns, event = self._clock.now_ns(), decode(message)
-        if isinstance(event, TimeRequest):
-            self._answer(encode(TimeReply(event.sequence, event.t1_ns, host_ns, self._clock.now_ns())))
+        host_ns, event = self._clock.now_ns(), wire.decode(message)
+        if isinstance(event, wire.TimeRequest):
+            self._answer(wire.encode(wire.TimeReply(event.sequence, event.t1_ns, host_ns, self._clock.now_ns())))
             return None
         self._json = message[:64].lstrip()[:1] == b"{"
         return Arrival(host_ns, event, message)
 
-    def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
+    def answer(self, status: wire.Status, shown_ns: int, refusal: wire.Refusal | None) -> None:
         """Answer the request: with a status packet for a packet, with an object for JSON."""
         if not self._json:
-            self._answer(encode(status))
+            self._answer(wire.encode(status))
             return
         fields = {name: getattr(status, name) for name in status.__dataclass_fields__}
         trouble = None if refusal is None else {"reason": refusal.reason, "detail": refusal.detail}
@@ -272,11 +242,11 @@ class Feed(Closing):
         self._socket.setsockopt(zmq.SNDHWM, QUEUE_MESSAGES)
         self._socket.bind(endpoint)
 
-    def give(self, arrival: Arrival[Event]) -> None:
+    def give(self, arrival: Arrival[wire.Event]) -> None:
         """Hand on a message: its bytes, or where those are the source's own words a packet of the same attitude."""
         raw = arrival.raw
-        if isinstance(arrival.event, AttitudeSample) and not isinstance(decode(raw), AttitudeSample):
-            raw = encode(arrival.event)
+        if isinstance(arrival.event, wire.AttitudeSample) and not isinstance(wire.decode(raw), wire.AttitudeSample):
+            raw = wire.encode(arrival.event)
         with contextlib.suppress(zmq.Again):
             self._socket.send_multipart([STAMP.pack(arrival.host_ns), raw], zmq.NOBLOCK)
 
@@ -295,13 +265,13 @@ class FedDecoder(PacketDecoder):
         self._mounting = mounting
         self.conventions = conventions
 
-    def _arrival(self, message: RawMessage) -> Arrival[Event]:
+    def _arrival(self, message: RawMessage) -> Arrival[wire.Event]:
         if len(message.parts) != 2 or len(message.parts[0]) != STAMP.size:
             return super()._arrival(message)
         (came_ns,) = STAMP.unpack(message.parts[0])
         raw = message.parts[1]
-        event = decode(raw)
-        if not isinstance(event, AttitudeSample):
+        event = wire.decode(raw)
+        if not isinstance(event, wire.AttitudeSample):
             return Arrival(came_ns, event, raw)
         camera = self._mounting.sample(event)
-        return Arrival(came_ns, camera, encode(camera))
+        return Arrival(came_ns, camera, wire.encode(camera))

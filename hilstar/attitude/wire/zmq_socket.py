@@ -15,12 +15,12 @@ import resource
 import socket
 import struct
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict, Unpack
 
 import zmq
 
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
-from hilstar.attitude.wire.keys import AllowList, CurveKeys, check_reach, load_public, load_secret
+from hilstar.attitude.wire.keys import NO_KEYS, AllowList, CurveKeys, check_reach, load_public, load_secret
 from hilstar.attitude.wire.links import PAUSE_S, Link, LinkCounts
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -225,6 +225,16 @@ def zmq_version() -> str:
     return zmq.zmq_version()
 
 
+class SocketOptions(TypedDict, total=False):
+    """How a socket is opened: whether it binds, whose keys it has, who hears of it, its largest part, and the clock."""
+
+    bind: bool
+    keys: CurveKeys
+    notices: Notices | None
+    max_part_bytes: int
+    clock: HostClock
+
+
 class ZmqSocket(Link):
     """A socket and its context, bound or connected; reopened after a flood.
 
@@ -233,19 +243,10 @@ class ZmqSocket(Link):
     request that is lost with the first socket would leave its sender waiting for ever.
     """
 
-    def __init__(
-        self,
-        kind: int,
-        endpoint: str,
-        *,
-        bind: bool,
-        keys: CurveKeys,
-        notices: Notices | None,
-        max_part_bytes: int = MAX_PART_BYTES,
-        clock: HostClock = HOST_CLOCK,
-    ) -> None:
-        super().__init__(notices, clock)
-        self._max_part_bytes = max_part_bytes
+    def __init__(self, kind: int, endpoint: str, **options: Unpack[SocketOptions]) -> None:
+        super().__init__(options.get("notices"), options.get("clock", HOST_CLOCK))
+        self._max_part_bytes = options.get("max_part_bytes", MAX_PART_BYTES)
+        bind, keys = options.get("bind", False), options.get("keys", NO_KEYS)
         self._place = parse_endpoint(endpoint)
         check_reach(self._place, endpoint, bind=bind, keys=keys)
         check_use(self._place, endpoint, bind=bind)
@@ -257,7 +258,7 @@ class ZmqSocket(Link):
         self._server_key = None if bind or keys.server_key is None else load_public(keys.server_key)
         allowed = AllowList(keys.allowed_clients) if bind and keys.allowed_clients is not None else None
         _raise_file_limit()
-        self._memory = _MemoryWatch(clock)
+        self._memory = _MemoryWatch(self._clock)
         self._context = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
         self._socket: zmq.Socket[bytes] | None = None
@@ -278,7 +279,6 @@ class ZmqSocket(Link):
             raise
 
     def _open(self, patience_s: float = REBIND_S) -> zmq.Socket[bytes]:
-        """The socket, opened. Raises InputError where it cannot be bound within `patience_s`."""
         made: zmq.Socket[bytes] = self._context.socket(self._kind)
         self._configure(made)
         self._socket = made
@@ -315,7 +315,6 @@ class ZmqSocket(Link):
             return
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
-        """Set the options that must come before bind or connect."""
         made.setsockopt(zmq.LINGER, 0)
         made.setsockopt(zmq.IPV6, "[" in self._address)
         made.setsockopt(zmq.MAXMSGSIZE, self._max_part_bytes)
@@ -359,7 +358,6 @@ class ZmqSocket(Link):
             self._reset(f"memory grew by more than {MAX_GROWTH_BYTES / 1e6:.0f} MB, as by a message that never ends")
 
     def _take(self) -> bytes | None:
-        """The last part of the next message; None as for `_take_parts`."""
         parts = self._take_parts()
         return None if parts is None else parts[-1]
 

@@ -109,7 +109,6 @@ class Guard:
 
 
 def _split(host: str) -> tuple[str, str]:
-    """Name and port of a Host header; the name of an IPv6 address keeps its brackets."""
     if host.startswith("["):
         name, _, rest = host.partition("]")
         return name + "]", rest[1:] if rest.startswith(":") else ("x" if rest else "")
@@ -308,7 +307,6 @@ class Page:
 
 
 async def _body(request: Request) -> bytes:
-    """Read the body. Raises Refused (413, 408, 400). A body that is too long is read and dropped, up to a bound."""
     if int(request.headers.get("content-length", "0")) > MAX_BODY_BYTES and "expect" in request.headers:
         raise Refused(413, f"a control has at most {MAX_BODY_BYTES} bytes")
     data, seen = b"", 0

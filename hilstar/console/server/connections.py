@@ -150,7 +150,7 @@ class OpenPage:
 
     def __init__(self, socket: WebSocket) -> None:
         self.socket = socket
-        self._line: ReadingWebSocket = socket.scope["extensions"][LINE]
+        self.line: ReadingWebSocket = socket.scope["extensions"][LINE]
         self.address = "" if socket.client is None else socket.client.host
         self.want = PageWants()
         self.asked = False  # has said what it wants, as the page does at once
@@ -182,17 +182,8 @@ class OpenPage:
         """Close the connection with a code, after what is being sent."""
         self.closing = code
         self._wake.set()
-        if code != POLICY and not self.is_read:  # it would not read the code either
-            self.drop()
-
-    def drop(self) -> None:
-        """End the connection now, whatever waits to be sent."""
-        self._line.drop()
-
-    @property
-    def is_read(self) -> bool:
-        """Whether it has lately shown that it reads what it is sent."""
-        return self._line.is_read
+        if code != POLICY and not self.line.is_read:  # it would not read the code either
+            self.line.drop()
 
     async def send_all(self) -> None:
         """Send what is queued until it is to be closed; WebSocketDisconnect, TimeoutError where it cannot."""
@@ -264,7 +255,7 @@ class OpenPages:
         if len(self._clients) < MAX_CLIENTS:
             return
         by_address = Counter(client.address for client in self._clients)
-        worth = {c: (c.is_read, c.asked, c.is_page, -by_address[c.address]) for c in self._clients}
+        worth = {c: (c.line.is_read, c.asked, c.is_page, -by_address[c.address]) for c in self._clients}
         least = min(worth, key=worth.__getitem__)  # the first of equals is the oldest
         self._clients.pop(least)
         least.close(GIVES_WAY)
@@ -280,7 +271,7 @@ class OpenPages:
             for task in tasks:
                 task.cancel()
             results = await asyncio.gather(*tasks, return_exceptions=True)
-            asyncio.get_running_loop().call_later(CLOSING_S, client.drop)
+            asyncio.get_running_loop().call_later(CLOSING_S, client.line.drop)
             if client.closing is not None and not any(isinstance(r, WebSocketDisconnect | TimeoutError) for r in results):
                 await _close(client)
 

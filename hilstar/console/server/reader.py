@@ -9,41 +9,14 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from hilstar.answers.judge import TrackerFigures
-from hilstar.console.messages import (
-    FRAME,
-    HAS_AGE,
-    PICTURE,
-    PICTURE_HEAD_BYTES,
-    SPRITE,
-    FrameNumbers,
-    NewAnswer,
-    Pace,
-    PictureHead,
-    RunEvent,
-    RunState,
-    Setup,
-    SharedMemory,
-)
+from hilstar.console import messages, protocol
 from hilstar.console.overlay import MAX_STARS, OverlayScene
-from hilstar.console.protocol import (
-    HISTORY_S,
-    KEPT_EVENTS,
-    ChartPoint,
-    EventLine,
-    Pacing,
-    PageState,
-    PageText,
-    PictureFormat,
-    RunCounts,
-    SkyHealth,
-    StarMark,
-    Truth,
-)
 from hilstar.monitor.response import Levels
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -68,7 +41,9 @@ class RecentFrames:
     missed_share: float = 0.0
 
 
-def reasons(seen: RunState | None, now_ns: int, lately: RecentFrames, refresh_hz: float, pace: Pace) -> list[str]:
+def reasons(
+    seen: messages.RunState | None, now_ns: int, lately: RecentFrames, refresh_hz: float, pace: messages.Pace
+) -> list[str]:
     """The reasons why the sky is not right, [] where it is. See `Setup.pace`."""
     if seen is None:
         return ["the run has not begun"]
@@ -85,7 +60,7 @@ def reasons(seen: RunState | None, now_ns: int, lately: RecentFrames, refresh_hz
     return [*found, *_of_attitude(seen, now_ns, lately, pace), *_of_rest(seen, lately)]
 
 
-def _of_attitude(seen: RunState, now_ns: int, lately: RecentFrames, pace: Pace) -> Iterator[str]:
+def _of_attitude(seen: messages.RunState, now_ns: int, lately: RecentFrames, pace: messages.Pace) -> Iterator[str]:
     if not seen.alive_ns:
         return
     if seen.frame.missing:
@@ -97,7 +72,7 @@ def _of_attitude(seen: RunState, now_ns: int, lately: RecentFrames, pace: Pace) 
         yield f"the simulator has asked for no frame for {_s(now_ns - lately.swap_ns)}"
 
 
-def _of_rest(seen: RunState, lately: RecentFrames) -> Iterator[str]:
+def _of_rest(seen: messages.RunState, lately: RecentFrames) -> Iterator[str]:
     if seen.ledger is not None and seen.ledger.failing:
         yield f"the ledger fails: {seen.ledger.failing}"
     if seen.hidden:
@@ -119,7 +94,6 @@ def _of_rest(seen: RunState, lately: RecentFrames) -> Iterator[str]:
 
 
 def _s(time_ns: int) -> str:
-    """A duration as the page writes it."""
     s = time_ns / NS_PER_S
     if s < 60:
         return f"{s:.1f} s"
@@ -149,30 +123,30 @@ MIN_INTERVALS = 10
 class RunReader:
     """A run for its page. `look` brings it up to date."""
 
-    def __init__(self, memory: SharedMemory, setup: Setup) -> None:
+    def __init__(self, memory: messages.SharedMemory, setup: messages.Setup) -> None:
         self._memory, self.setup = memory, setup
-        self.seen: RunState | None = None
+        self.seen: messages.RunState | None = None
         self.health = Health(memory.wrong_since_s or time.time())  # an earlier page of this run may have died
-        self.points: deque[ChartPoint] = deque(maxlen=round(HISTORY_S / TICK_S))
-        self.events: deque[EventLine] = deque(maxlen=KEPT_EVENTS)
+        self.points: deque[protocol.ChartPoint] = deque(maxlen=round(protocol.HISTORY_S / TICK_S))
+        self.events: deque[protocol.EventLine] = deque(maxlen=protocol.KEPT_EVENTS)
         self._frame_at = self._event_at = self._answer_at = 0
-        self.answer: NewAnswer | None = None
+        self.answer: messages.NewAnswer | None = None
         self._answered: list[TrackerFigures] = []  # since the last point
         self._wrong = 0
-        self._last: FrameNumbers | None = None
+        self._last: messages.FrameNumbers | None = None
         self._intervals_ms: deque[tuple[int, float]] = deque()
-        self._received: deque[tuple[int, RunCounts]] = deque()  # over the last second
+        self._received: deque[tuple[int, protocol.RunCounts]] = deque()  # over the last second
         self._begun_ns = time.monotonic_ns()
-        self.pacing: Pacing | None = None
+        self.pacing: protocol.Pacing | None = None
         self._pacing_ns = 0
 
-    def look(self) -> list[EventLine]:
+    def look(self) -> list[protocol.EventLine]:
         """Read the shared memory; the new events."""
         now_ns, unix_s = time.monotonic_ns(), time.time()
         found = self._memory.states.last()
         if found is not None:
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):  # cut, being too long: the one before stays
-                self.seen = msgspec.json.decode(found[1], type=RunState)
+                self.seen = msgspec.json.decode(found[1], type=messages.RunState)
         self.points.append(self._point(now_ns))
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
@@ -183,8 +157,8 @@ class RunReader:
         for number, data in self._memory.events.after(self._event_at):
             self._event_at = number
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
-                event = msgspec.json.decode(data, type=RunEvent)
-                new.append(EventLine(utc_text(event.unix_s), event.kind, event.line))
+                event = msgspec.json.decode(data, type=messages.RunEvent)
+                new.append(protocol.EventLine(utc_text(event.unix_s), event.kind, event.line))
         self.events.extend(new)
         return new
 
@@ -194,17 +168,17 @@ class RunReader:
         for number, data in self._memory.answers.after(self._answer_at):
             self._answer_at = number
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
-                self.answer = msgspec.json.decode(data, type=NewAnswer)
+                self.answer = msgspec.json.decode(data, type=messages.NewAnswer)
                 found = self.answer.figures
                 self._answered.append(found)
         return found
 
-    def _point(self, now_ns: int) -> ChartPoint:
+    def _point(self, now_ns: int) -> protocol.ChartPoint:
         """What the frames since the last look add to the charts."""
-        point = ChartPoint(t_s=round((now_ns - self._begun_ns) / NS_PER_S, 3))
+        point = protocol.ChartPoint(t_s=round((now_ns - self._begun_ns) / NS_PER_S, 3))
         for number, data in self._memory.frames.after(self._frame_at):
             self._frame_at = number
-            self._add(point, FrameNumbers._make(FRAME.unpack(data)))
+            self._add(point, messages.FrameNumbers._make(messages.FRAME.unpack(data)))
         for figures in self._answered:
             point.wrong, self._wrong = point.wrong + figures.wrong - self._wrong, figures.wrong
             if figures.verdict == "right" and figures.residual_arcsec is not None:
@@ -219,9 +193,9 @@ class RunReader:
                 point.packets_hz = round((self.seen.counts.received - first.received) / (now_ns - first_ns) * NS_PER_S, 2)
         return point
 
-    def _add(self, point: ChartPoint, frame: FrameNumbers) -> None:
+    def _add(self, point: protocol.ChartPoint, frame: messages.FrameNumbers) -> None:
         last, self._last = self._last, frame
-        if frame.flags & HAS_AGE:
+        if frame.flags & messages.HAS_AGE:
             point.take("age_ms", frame.age_ns / NS_PER_MS)
         point.take("frame_ms", (frame.swap_ns - frame.draw_ns) / NS_PER_MS)
         if last is None or frame.frames != last.frames + 1:
@@ -240,36 +214,25 @@ class RunReader:
         shown, lost = last.frames - first.frames, last.missed - first.missed
         return lost / (shown + lost) if shown + lost else 0.0
 
-    def _pacing_now(self, now_ns: int) -> Pacing | None:
-        while self._intervals_ms and now_ns - self._intervals_ms[0][0] > HISTORY_S * NS_PER_S:
+    def _pacing_now(self, now_ns: int) -> protocol.Pacing | None:
+        while self._intervals_ms and now_ns - self._intervals_ms[0][0] > protocol.HISTORY_S * NS_PER_S:
             self._intervals_ms.popleft()
         if len(self._intervals_ms) < MIN_INTERVALS:
             return None
         intervals_ms = np.array([interval for _, interval in self._intervals_ms])
         p50, p99 = np.percentile(intervals_ms, [50, 99])
-        return Pacing(round(float(p50), 3), round(float(p99), 3), round(float(np.std(intervals_ms, ddof=1)), 4))
+        return protocol.Pacing(round(float(p50), 3), round(float(p99), 3), round(float(np.std(intervals_ms, ddof=1)), 4))
 
-    def health_now(self) -> SkyHealth:
+    def health_now(self) -> protocol.SkyHealth:
         """The answer of `GET /health`."""
-        return SkyHealth(self.health.ok, utc_text(self.health.since_s), self.health.reasons)
+        return protocol.SkyHealth(self.health.ok, utc_text(self.health.since_s), self.health.reasons)
 
-    def state(self) -> PageState:
+    def state(self) -> protocol.PageState:
         """The state of the run, as the page shows it."""
-        seen = RunState(host_ns=0) if self.seen is None else self.seen
-        return PageState(
-            utc=utc_text(time.time()),
-            health=self.health_now(),
-            attitude=seen.attitude,
-            source=self.setup.source,
-            clock=seen.clock,
-            counts=seen.counts,
-            pacing=self.pacing,
-            frame=seen.frame,
-            operator=seen.operator,
-            faults=seen.faults,
-            ledger=seen.ledger,
-            tracker=seen.tracker,
-        )
+        seen = messages.RunState(host_ns=0) if self.seen is None else self.seen
+        same: dict[str, Any] = {name: getattr(seen, name) for name in protocol.SkyState.__struct_fields__}
+        now, health = utc_text(time.time()), self.health_now()
+        return protocol.PageState(utc=now, health=health, source=self.setup.source, pacing=self.pacing, **same)
 
 
 LEVEL = 1  # zlib's fastest: a night sky is nearly all zeros
@@ -288,26 +251,28 @@ class PackedPicture:
 class PicturePacker:
     """Packs the newest picture for pages, which takes 10 to 30 ms; called on another thread."""
 
-    def __init__(self, memory: SharedMemory, scene: OverlayScene | None) -> None:
+    def __init__(self, memory: messages.SharedMemory, scene: OverlayScene | None) -> None:
         self._memory, self._scene = memory, scene
 
-    def newest(self, after: int, seen: RunState | None, answer: NewAnswer | None = None) -> PackedPicture | None:
+    def newest(
+        self, after: int, seen: messages.RunState | None, answer: messages.NewAnswer | None = None
+    ) -> PackedPicture | None:
         """The newest picture, None where there is none after that number."""
         found = self._memory.pictures.last() if self._memory.pictures.newest > after else None
         if found is None or found[0] <= after:
             return None
         number, data = found
-        head = PictureHead._make(PICTURE.unpack_from(data))
+        head = messages.PictureHead._make(messages.PICTURE.unpack_from(data))
         count, dtype = head.width * head.height, np.dtype(f"<u{head.item_bytes}")
-        levels = Levels(np.frombuffer(data, dtype, count, PICTURE_HEAD_BYTES).reshape(head.height, head.width))
-        sprites = np.frombuffer(data, SPRITE, head.sprites, PICTURE_HEAD_BYTES + count * head.item_bytes)
+        levels = Levels(np.frombuffer(data, dtype, count, messages.PICTURE_HEAD_BYTES).reshape(head.height, head.width))
+        sprites = np.frombuffer(data, messages.SPRITE, head.sprites, messages.PICTURE_HEAD_BYTES + count * head.item_bytes)
         if self._scene is not None and seen is not None and seen.overlay and not self._scene.aids_in_levels:
             levels = self._scene.aids.laid_over(levels, seen.overlay, seen.patch_share)
         # The binary message: a length, a JSON head of that many bytes, and the deflated levels.
-        form = PictureFormat(w=head.width, h=head.height, frame=head.frame, dtype=f"u{head.item_bytes}")
+        form = protocol.PictureFormat(w=head.width, h=head.height, frame=head.frame, dtype=f"u{head.item_bytes}")
         text = msgspec.json.encode(form)
         picture = struct.pack("<I", len(text)) + text + zlib.compress(np.ascontiguousarray(levels).tobytes(), LEVEL)
-        truth = Truth(frame=head.frame, stars=[])
+        truth = protocol.Truth(frame=head.frame, stars=[])
         if self._scene is not None:
             q = np.array([head.q_w, head.q_x, head.q_y, head.q_z])
             stars = stars_of(self._scene, sprites, seen)
@@ -318,10 +283,12 @@ class PicturePacker:
                 marks = self._scene.marks.answer(residual, lit, shown, answer.centroids)
                 truth = msgspec.structs.replace(truth, reported_px=marks.field_px, centroids_px=marks.centroids_px)
         without_grid = msgspec.structs.replace(truth, grid=msgspec.UNSET)
-        return PackedPicture(number, picture, PageText(truth=without_grid).json(), PageText(truth=truth).json())
+        return PackedPicture(
+            number, picture, protocol.PageText(truth=without_grid).json(), protocol.PageText(truth=truth).json()
+        )
 
 
-def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) -> list[StarMark]:
+def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: messages.RunState | None) -> list[protocol.StarMark]:
     """Where the stars of a picture were drawn, the brightest first."""
     # A moving star has several sprites along its path: the mean place of each.
     stars, which = np.unique(sprites["star"], return_inverse=True)
@@ -334,5 +301,5 @@ def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) ->
         hip, label = int(scene.hip[star]), scene.label(star)
         known_mag = round(v_mag, 2) if math.isfinite(v_mag) else None
         place, over = (round(float(x_px[k]), 2), round(float(y_px[k]), 2)), int((hip or label) in clipped)
-        marks.append(StarMark(*place, known_mag, hip, label, over, scene.colours.get(star, "")))
+        marks.append(protocol.StarMark(*place, known_mag, hip, label, over, scene.colours.get(star, "")))
     return marks

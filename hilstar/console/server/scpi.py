@@ -130,7 +130,6 @@ class ScpiServer:
                 self._look()
 
     def _look(self) -> None:
-        """Bring every connection's registers up to date."""
         self.pending()  # what is shown while nobody waits counts, too
         for client in self._clients:
             client.look()
@@ -226,7 +225,7 @@ class Connection:
         self.status.questionable.see(questionable)
         if self.status.completes and not self._server.pending():
             self.status.completes = False
-            self.status.event |= OPERATION_COMPLETE
+            self.status.standard.event |= OPERATION_COMPLETE
 
     async def answer(self, line: str | None) -> str:
         """Do what a line says; its answers, "" for none. None is a line that was too long."""
@@ -372,8 +371,6 @@ def _numbers(values: tuple[float, ...] | list[float] | None, places: int) -> str
 
 
 def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> "Command":
-    """A command that sets a mask."""
-
     async def command(connection: Connection, unit: Unit) -> None:
         what(connection.status, scpi.integer(scpi.count(unit, 1)[0], maximum))
 
@@ -381,8 +378,6 @@ def _setting(what: Callable[[InstrumentStatus, int], None], maximum: int) -> "Co
 
 
 def _bare(what: Callable[[InstrumentStatus], None]) -> "Command":
-    """A command without parameters."""
-
     async def command(connection: Connection, unit: Unit) -> None:
         what(connection.status)
 
@@ -393,8 +388,8 @@ Command = Callable[[Connection, Unit], Awaitable[str | None]]
 # Queries that answer at once. None of any kind has parameters.
 QUERIES: dict[str, Callable[[Connection], str]] = {
     "*IDN?": lambda at: f"hilstar,star display,0,{__version__}",
-    "*ESE?": lambda at: str(at.status.event_enable),
-    "*ESR?": lambda at: str(at.status.read_event()),
+    "*ESE?": lambda at: str(at.status.standard.enable),
+    "*ESR?": lambda at: str(at.status.standard.read()),
     "*SRE?": lambda at: str(at.status.service_enable),
     "*STB?": Connection.status_byte,
     "*TST?": Connection.self_test,
@@ -419,7 +414,7 @@ COMMANDS: dict[str, Command] = {
     "*OPC": Connection.complete_later,
     "*OPC?": Connection.complete,
     "*WAI": Connection.wait,
-    "*ESE": _setting(lambda status, mask: setattr(status, "event_enable", mask), 255),
+    "*ESE": _setting(lambda status, mask: setattr(status.standard, "enable", mask), 255),
     "*SRE": _setting(lambda status, mask: setattr(status, "service_enable", mask & ~scpi.MASTER), 255),
     "SYSTem:AUTHenticate": Connection.authenticate,
     "STATus:PRESet": _bare(InstrumentStatus.preset),

@@ -41,7 +41,6 @@ class Awake:
             self._process.stdout.close()
 
     def _wait(self) -> None:
-        """Wait for its word, or its end."""
         if self._process.stdout is not None and select.select([self._process.stdout], [], [], MAX_WAIT_S)[0]:
             os.read(self._process.stdout.fileno(), 1)
         self._process.poll()  # the one that was begun ends at once, and leaves the other behind
@@ -58,13 +57,10 @@ class _Blanking(NamedTuple):
 
     @property
     def happens(self) -> bool:
-        """Whether the screen would ever go dark."""
         return self.timeout_s != 0 or self.dpms
 
 
 class _Server:
-    """An X server, through Xlib."""
-
     def __init__(self) -> None:
         self._x11, self._xext = (ctypes.CDLL(name) for name in ("libX11.so.6", "libXext.so.6"))
         self._x11.XOpenDisplay.restype = ctypes.c_void_p
@@ -77,7 +73,6 @@ class _Server:
         self._has_dpms = bool(query and self._xext.DPMSCapable(self._display))
 
     def blanking(self) -> _Blanking:
-        """The present setting."""
         parts = [ctypes.c_int() for _ in range(4)]
         self._x11.XGetScreenSaver(self._display, *(ctypes.byref(part) for part in parts))
         level, on = ctypes.c_ushort(), ctypes.c_ubyte()
@@ -96,7 +91,6 @@ class _Server:
         self._x11.XSync(self._display, 0)
 
     def restore(self, before: _Blanking) -> None:
-        """Set what was set before."""
         self._x11.XSetScreenSaver(self._display, *before[:4])
         if before.dpms:
             self._xext.DPMSEnable(self._display)

@@ -9,10 +9,21 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any
 
 from hilstar.monitor.window.output_settings import IDENTITY, NVIDIA, NVIDIA_ATTRIBUTES, OutputState, Pair, Value, property_value
-from hilstar.monitor.window.x11 import INT, TEXT, X11_LIBRARY, Survival, has_extension, is_composited, load_library
+from hilstar.monitor.window.x11 import (
+    INT,
+    NUMBER,
+    POINTER,
+    TEXT,
+    X11_LIBRARY,
+    Survival,
+    has_extension,
+    is_composited,
+    load_library,
+)
+from hilstar.process.closing import Closing
 
 XRANDR_LIBRARY = "libXrandr.so.2"
 ROTATE_0 = 1  # randr.h
@@ -20,117 +31,81 @@ FIXED_ONE = 65536.0  # XFixed
 MAX_ITEMS = 4096  # items of four bytes
 NVIDIA_S = 3.0
 BYTE_BITS = 8
-_Pointer, _Id, _Ids = ctypes.c_void_p, ctypes.c_ulong, ctypes.POINTER(ctypes.c_ulong)
+_Id, _Ids, UINT = NUMBER, ctypes.POINTER(NUMBER), ctypes.c_uint
 
 
-class _Mode(ctypes.Structure):  # XRRModeInfo
+class _Mode(ctypes.Structure):  # XRRModeInfo; of `sync` the third are a line's pixels, the last a frame's lines
     _fields_ = (
-        ("id", _Id),
-        ("width", ctypes.c_uint),
-        ("height", ctypes.c_uint),
-        ("dot_clock", ctypes.c_ulong),
-        ("sync", ctypes.c_uint * 7),  # third: a line's pixels; last: a frame's lines
-        ("name", _Pointer),
-        ("name_length", ctypes.c_uint),
-        ("flags", ctypes.c_ulong),
+        *(("id", _Id), ("width", UINT), ("height", UINT), ("dot_clock", NUMBER), ("sync", UINT * 7)),
+        *(("name", POINTER), ("name_length", UINT), ("flags", NUMBER)),
     )
 
 
 class _Resources(ctypes.Structure):  # XRRScreenResources
     _fields_ = (
-        ("times", ctypes.c_ulong * 2),
-        ("ncrtc", ctypes.c_int),
-        ("crtcs", _Ids),
-        ("noutput", ctypes.c_int),
-        ("outputs", _Ids),
-        ("nmode", ctypes.c_int),
-        ("modes", ctypes.POINTER(_Mode)),
+        *(("times", NUMBER * 2), ("ncrtc", INT), ("crtcs", _Ids), ("noutput", INT), ("outputs", _Ids)),
+        *(("nmode", INT), ("modes", ctypes.POINTER(_Mode))),
     )
 
 
 class _Output(ctypes.Structure):  # XRROutputInfo
     _fields_ = (
-        ("time", ctypes.c_ulong),
-        ("crtc", _Id),
-        ("name", ctypes.c_char_p),
-        ("name_length", ctypes.c_int),
-        ("size_mm", ctypes.c_ulong * 2),
-        ("connection", ctypes.c_ushort),
-        ("subpixels", ctypes.c_ushort),
-        ("ncrtc", ctypes.c_int),
-        ("crtcs", _Ids),
-        ("nclone", ctypes.c_int),
-        ("clones", _Ids),
-        ("nmode", ctypes.c_int),
-        ("npreferred", ctypes.c_int),
-        ("modes", _Ids),
+        *(("time", NUMBER), ("crtc", _Id), ("name", TEXT), ("name_length", INT), ("size_mm", NUMBER * 2)),
+        *(("connection", ctypes.c_ushort), ("subpixels", ctypes.c_ushort), ("ncrtc", INT), ("crtcs", _Ids)),
+        *(("nclone", INT), ("clones", _Ids), ("nmode", INT), ("npreferred", INT), ("modes", _Ids)),
     )
 
 
 class _Crtc(ctypes.Structure):  # XRRCrtcInfo, its beginning
-    _fields_ = (
-        ("time", ctypes.c_ulong),
-        ("corner", ctypes.c_int * 2),
-        ("size", ctypes.c_uint * 2),
-        ("mode", _Id),
-        ("rotation", ctypes.c_ushort),
-    )
+    _fields_ = (("time", NUMBER), ("corner", INT * 2), ("size", UINT * 2), ("mode", _Id), ("rotation", ctypes.c_ushort))
 
 
 class _Transform(ctypes.Structure):  # XRRCrtcTransformAttributes
     _fields_ = (
-        ("pending", ctypes.c_int * 9),
-        ("pending_filter", _Pointer),
-        ("pending_count", ctypes.c_int),
-        ("pending_parameters", _Pointer),
-        ("current", ctypes.c_int * 9),
-        ("current_filter", _Pointer),
+        *(("pending", INT * 9), ("pending_filter", POINTER), ("pending_count", INT), ("pending_parameters", POINTER)),
+        *(("current", INT * 9), ("current_filter", POINTER)),
     )
 
 
 class _Gamma(ctypes.Structure):  # XRRCrtcGamma
-    _fields_ = (("size", ctypes.c_int), *((name, _Pointer) for name in ("red", "green", "blue")))
+    _fields_ = (("size", INT), ("red", POINTER), ("green", POINTER), ("blue", POINTER))
 
 
 class _Providers(ctypes.Structure):  # XRRProviderResources
-    _fields_ = (("time", ctypes.c_ulong), ("count", ctypes.c_int), ("ids", _Ids))
+    _fields_ = (("time", NUMBER), ("count", INT), ("ids", _Ids))
 
 
 class _Provider(ctypes.Structure):  # XRRProviderInfo, its beginning
     _fields_ = (
-        ("capabilities", ctypes.c_uint),
-        ("ncrtcs", ctypes.c_int),
-        ("crtcs", _Ids),
-        ("noutputs", ctypes.c_int),
-        ("outputs", _Ids),
-        ("name", ctypes.c_char_p),
+        *(("capabilities", UINT), ("ncrtcs", INT), ("crtcs", _Ids), ("noutputs", INT), ("outputs", _Ids)),
+        ("name", TEXT),
     )
 
 
 X11_FUNCTIONS: dict[str, tuple[Any, ...]] = {
-    "XOpenDisplay": (_Pointer, TEXT),
-    "XCloseDisplay": (INT, _Pointer),
-    "XDefaultRootWindow": (_Id, _Pointer),
-    "XGetAtomName": (_Pointer, _Pointer, _Id),
-    "XFree": (INT, _Pointer),
+    "XOpenDisplay": (POINTER, TEXT),
+    "XCloseDisplay": (INT, POINTER),
+    "XDefaultRootWindow": (_Id, POINTER),
+    "XGetAtomName": (POINTER, POINTER, _Id),
+    "XFree": (INT, POINTER),
 }
 XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
-    "XRRGetScreenResourcesCurrent": (_Pointer, _Pointer, _Id),
-    "XRRGetOutputInfo": (_Pointer, _Pointer, _Pointer, _Id),
-    "XRRGetCrtcInfo": (_Pointer, _Pointer, _Pointer, _Id),
-    "XRRGetCrtcGamma": (_Pointer, _Pointer, _Id),
-    "XRRGetCrtcTransform": (INT, _Pointer, _Id, _Pointer),
-    "XRRListOutputProperties": (_Ids, _Pointer, _Id, _Pointer),
-    "XRRGetOutputProperty": (INT, _Pointer, _Id, _Id, *[ctypes.c_long] * 2, *[INT] * 2, _Id, *[_Pointer] * 5),
-    "XRRGetProviderResources": (_Pointer, _Pointer, _Id),
-    "XRRGetProviderInfo": (_Pointer, _Pointer, _Pointer, _Id),
+    "XRRGetScreenResourcesCurrent": (POINTER, POINTER, _Id),
+    "XRRGetOutputInfo": (POINTER, POINTER, POINTER, _Id),
+    "XRRGetCrtcInfo": (POINTER, POINTER, POINTER, _Id),
+    "XRRGetCrtcGamma": (POINTER, POINTER, _Id),
+    "XRRGetCrtcTransform": (INT, POINTER, _Id, POINTER),
+    "XRRListOutputProperties": (_Ids, POINTER, _Id, POINTER),
+    "XRRGetOutputProperty": (INT, POINTER, _Id, _Id, *[ctypes.c_long] * 2, *[INT] * 2, _Id, *[POINTER] * 5),
+    "XRRGetProviderResources": (POINTER, POINTER, _Id),
+    "XRRGetProviderInfo": (POINTER, POINTER, POINTER, _Id),
 } | {
-    f"XRRFree{what}": (None, _Pointer)
+    f"XRRFree{what}": (None, POINTER)
     for what in ("ScreenResources", "OutputInfo", "CrtcInfo", "Gamma", "ProviderResources", "ProviderInfo")
 }
 
 
-class Randr:
+class Randr(Closing):
     """A connection to the X server of DISPLAY. Free it with `close`. Raises OSError without a server or libXrandr.
 
     Requests for an output that has just gone fail in silence: `survival` is a window's, by default one of its own.
@@ -155,12 +130,6 @@ class Randr:
         self._x11.XCloseDisplay(self._display)
         if self._own is not None:
             self._own.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def outputs(self) -> list[OutputState]:
         """The outputs that are lit."""
@@ -223,11 +192,10 @@ class Randr:
         if not self._xrandr.XRRGetCrtcTransform(self._display, crtc, ctypes.byref(pointer)) or not pointer:
             return IDENTITY
         current = tuple(value / FIXED_ONE for value in pointer.contents.current)
-        self._x11.XFree(ctypes.cast(pointer, _Pointer))
+        self._x11.XFree(ctypes.cast(pointer, POINTER))
         return current if any(current) else IDENTITY
 
     def _properties(self, output: int) -> Iterator[tuple[str, Value | bytes]]:
-        """Each property with its value, the EDID as bytes."""
         count = ctypes.c_int()
         atoms = self._xrandr.XRRListOutputProperties(self._display, output, ctypes.byref(count))
         for atom in atoms[: count.value] if atoms else ():
@@ -236,11 +204,11 @@ class Randr:
             if value is not None:
                 yield name, value
         if atoms:
-            self._x11.XFree(ctypes.cast(atoms, _Pointer))
+            self._x11.XFree(ctypes.cast(atoms, POINTER))
 
     def _property(self, output: int, atom: int, raw: bool) -> Value | bytes | None:
         kind, form = ctypes.c_ulong(), ctypes.c_int()
-        count, rest, data = ctypes.c_ulong(), ctypes.c_ulong(), _Pointer()
+        count, rest, data = ctypes.c_ulong(), ctypes.c_ulong(), POINTER()
         results = (ctypes.byref(part) for part in (kind, form, count, rest, data))
         failed = self._xrandr.XRRGetOutputProperty(self._display, output, atom, 0, MAX_ITEMS, 0, 0, 0, *results)
         if failed or not data.value:

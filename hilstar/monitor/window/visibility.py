@@ -26,12 +26,8 @@ class ScreenArea:
 
 class _VisibilityEvent(ctypes.Structure):  # XVisibilityEvent of Xlib, and the beginning of every other event
     _fields_ = (
-        ("type", ctypes.c_int),
-        ("serial", ctypes.c_ulong),
-        ("send_event", ctypes.c_int),
-        ("display", ctypes.c_void_p),
-        ("window", ctypes.c_ulong),
-        ("state", ctypes.c_int),
+        *(("type", INT), ("serial", NUMBER), ("send_event", INT)),
+        *(("display", POINTER), ("window", NUMBER), ("state", INT)),
     )
 
 

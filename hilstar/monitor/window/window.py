@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from hilstar.monitor.window.randr import output_named
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
 from hilstar.monitor.window.watch import DisplayWatch, is_straight
 from hilstar.monitor.window.x11 import BackBuffer, Survival, SwapStamps, back_buffer, has_extension, is_composited, sync_control
+from hilstar.process.closing import Closing
 from hilstar.process.scheduling import drawing_threads_apart
 from hilstar.units import GL_VERSIONS, NS_PER_S
 
@@ -133,7 +134,7 @@ def _pair(values: Any) -> tuple[int, int]:
     return int(first), int(second)
 
 
-class Window:
+class Window(Closing):
     """A window whose GL context is current in the thread that opened it. Free it with `close`.
 
     `lost` is true while its display is unplugged; `gone` says why the window is no more. Raises MachineError without a
@@ -245,7 +246,6 @@ class Window:
         self._changed = True
 
     def _follow_display(self) -> None:
-        """Notice that the display was unplugged, and fill it again once it is back."""
         self._changed = False
         display = self.display
         if display is None:
@@ -396,12 +396,6 @@ class Window:
                 glfw.set_gamma_ramp(monitor, ramp)
         glfw.terminate()
         self._awake.close()  # after GLFW, which restores what it had found: no blanking
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:

@@ -42,13 +42,8 @@ def load_library(name: str, **functions: tuple[Any, ...]) -> Any:
 
 def server_of() -> str:
     """The X server of `DISPLAY`: its maker and release; "" without one. Raises OSError without libX11."""
-    library = load_library(
-        X11_LIBRARY,
-        XOpenDisplay=(POINTER, TEXT),
-        XServerVendor=(TEXT, POINTER),
-        XVendorRelease=(INT, POINTER),
-        XCloseDisplay=(INT, POINTER),
-    )
+    asked = {"XServerVendor": (TEXT, POINTER), "XVendorRelease": (INT, POINTER)}
+    library = load_library(X11_LIBRARY, XOpenDisplay=(POINTER, TEXT), XCloseDisplay=(INT, POINTER), **asked)
     display = library.XOpenDisplay(None)
     if not display:
         return ""
@@ -61,13 +56,8 @@ def server_of() -> str:
 
 class _ErrorEvent(ctypes.Structure):  # XErrorEvent of Xlib
     _fields_ = (
-        ("type", ctypes.c_int),
-        ("display", ctypes.c_void_p),
-        ("resource", ctypes.c_ulong),
-        ("serial", ctypes.c_ulong),
-        ("error", ctypes.c_ubyte),
-        ("request", ctypes.c_ubyte),
-        ("minor", ctypes.c_ubyte),
+        *(("type", INT), ("display", POINTER), ("resource", NUMBER), ("serial", NUMBER)),
+        *((name, ctypes.c_ubyte) for name in ("error", "request", "minor")),
     )
 
 

@@ -223,7 +223,6 @@ def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:
 
 
 def _desktop_faults(window: Window) -> Iterator[str]:
-    """What other programs do to the display."""
     if window.by_wayland:
         yield "a Wayland compositor draws this display (XWayland), and holds frames back; use an Xorg session"
     if window.ramp_refused:
@@ -238,7 +237,6 @@ def _desktop_faults(window: Window) -> Iterator[str]:
 
 
 def _depth_faults(window: Window, monitor: Monitor) -> Iterator[str]:
-    """What would change codes between the frame and the panel's cable."""
     buffer, wanted = window.back_buffer, monitor.bits
     if buffer.bits != wanted:
         depths = f"{buffer.bits} bits per colour and the bench file says {wanted}"

@@ -265,7 +265,6 @@ class DisplayPacer(Pacer):
         return Presented(swap_ns, self._screen.timestamp_source, marker)
 
     def _look_at_ramp(self, swap_ns: int) -> None:
-        """Count a frame under another program's gamma ramp; tell of its beginning and its end."""
         if self._screen.window.ramp_changed:
             self._gamma_frames += 1
             self._gamma_ns += swap_ns - self._last_swap_ns if self._last_swap_ns else 0

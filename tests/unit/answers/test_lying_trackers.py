@@ -7,7 +7,6 @@ import struct
 import tracemalloc
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,18 +14,17 @@ from scipy.spatial.transform import Rotation
 from hilstar.answers.answer import Answer
 from hilstar.answers.explain import lines_of
 from hilstar.answers.formats import MAX_KEPT_BYTES, MAX_MODE_CHARACTERS, AnswerDecoder, RefusedAnswer
-from hilstar.answers.reader import PIECE_BYTES, HandedOver, handed_over
+from hilstar.answers.reader import PIECE_BYTES, HandedOver, hand_over, handed_over
 from tests.unit.answers.test_formats import CCSDS_FIELDS, FRAMINGS, Q, answers, body_of, decoder_of, settings_of
 
 BODY_TO_CAM = (0.5, 0.5, -0.5, 0.5)
-HANDED = msgspec.msgpack.Decoder(HandedOver)
 
 
-def handed(found: list[Answer | RefusedAnswer], decoder: AnswerDecoder) -> list[HandedOver]:
+def handed(found: list[Answer | RefusedAnswer], decoder: AnswerDecoder) -> list[Answer]:
     """What the owner of the process gets; each is explained, too."""
     for each in found:
         assert all(line.isprintable() for line in lines_of(each, decoder, Q))
-    return [HANDED.decode(msgspec.msgpack.encode(handed_over(each))) for each in answers(found)]
+    return [handed_over(hand_over(HandedOver(each))).answer for each in answers(found)]
 
 
 @pytest.mark.parametrize(
@@ -43,7 +41,7 @@ def test_whatever_json_says_can_be_handed_over(text):
     found = decoder.feed(0, text.encode("latin-1"))
     for each in handed(found, decoder):
         assert len(each.mode) <= MAX_MODE_CHARACTERS and each.mode.isprintable()
-        assert each.stars is None
+        assert each.star_count is None
         assert all(star.hip is None for star in each.centroids)
     for refused in found:
         if isinstance(refused, RefusedAnswer):

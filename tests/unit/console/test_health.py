@@ -6,8 +6,8 @@ import pytest
 from msgspec.structs import replace
 
 from hilstar.answers.judge import TrackerFigures
-from hilstar.console.messages import LedgerState, RunState
-from hilstar.console.protocol import NewestFrame, ShownAttitude
+from hilstar.console.messages import RunState
+from hilstar.console.protocol import LedgerState, NewestFrame, ShownAttitude
 from hilstar.console.server.reader import Health, RecentFrames, reasons
 
 S = 1_000_000_000

@@ -123,11 +123,11 @@ def test_the_queue_of_errors_is_bounded_and_its_last_says_so():
     assert status.next_error() == "-222,\"Data out of range;'0'\""
     told = [status.next_error() for _ in range(MAX_ERRORS)]
     assert told[-2:] == ['-350,"Queue overflow"', '0,"No error"']
-    assert status.read_event() == 16 | 8 and status.read_event() == 0
+    assert status.standard.read() == 16 | 8 and status.standard.read() == 0
 
 
 def test_the_status_byte_sums_up_what_is_enabled():
-    status = InstrumentStatus(event_enable=16, service_enable=32)
+    status = InstrumentStatus(standard=scpi.Register(enable=16), service_enable=32)
     assert status.byte(False) == 0
     status.add(ScpiError(-221))
     assert status.byte(False) == scpi.ERRORS_WAIT | scpi.STANDARD_EVENT | scpi.MASTER
@@ -138,7 +138,7 @@ def test_the_status_byte_sums_up_what_is_enabled():
     assert status.byte(True) & (scpi.QUESTIONABLE | scpi.MESSAGE_WAITS) == scpi.QUESTIONABLE | scpi.MESSAGE_WAITS
     assert (status.questionable.read(), status.questionable.read()) == (1 << 9, 0)
     status.clear()
-    assert status.byte(False) == 0 and status.event_enable == 16
+    assert status.byte(False) == 0 and status.standard.enable == 16
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 10_000])

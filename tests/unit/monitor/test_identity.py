@@ -10,8 +10,9 @@ from typing import NamedTuple
 import msgspec
 import pytest
 
-from hilstar.monitor.identity import MonitorIdentity, differences, edid_identity
+from hilstar.monitor.identity import TABLE, MonitorIdentity, differences, edid_identity
 from hilstar.reading import parse_toml
+from hilstar.toml_tables import toml_text
 
 SEED, MUTATED = 37, 10_000
 THIS = MonitorIdentity(
@@ -37,7 +38,7 @@ def real() -> list[Known]:
 
 
 def read_back(identity: MonitorIdentity) -> MonitorIdentity:
-    return msgspec.convert(parse_toml(Path("a.toml"), identity.toml())["monitor_identity"], MonitorIdentity)
+    return msgspec.convert(parse_toml(Path("a.toml"), toml_text({TABLE: identity.known()})).get(TABLE, {}), MonitorIdentity)
 
 
 def test_30_real_edids_are_read_as_edid_decode_reads_them():

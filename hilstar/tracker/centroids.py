@@ -157,13 +157,21 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
     rows, columns = (max(size // BLOCK_PX, 1) for size in image.shape)
     height, width = image.shape[0] // rows, image.shape[1] // columns
     blocks = image[: rows * height, : columns * width].reshape(rows, height, columns, width).swapaxes(1, 2)
-    values = blocks.reshape(rows * columns, height * width)
-    values = values - np.median(values, axis=1, keepdims=True)
+    whole = image.dtype in COUNTED_TYPES
+    values: npt.NDArray[Any] = blocks.reshape(rows * columns, -1).astype(np.float32 if whole else np.float64)
+    values -= _row_medians(values)
+    off = np.abs(values)
     # The median deviation of whole steps is a whole one: half a step more, so that nothing of the noise is cut off.
-    sigma = MAD_TO_SIGMA * (np.median(np.abs(values), axis=1, keepdims=True) + step / 2)
-    kept = np.abs(values) <= CLIP_SIGMAS * sigma
-    noise = np.sqrt((values**2 * kept).sum(axis=1) / kept.sum(axis=1)) / CLIPPED_SIGMA
-    return LocalBackground(float(np.median(image)), max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12)))
+    kept = off <= CLIP_SIGMAS * (MAD_TO_SIGMA * (_row_medians(off) + step / 2))
+    noise = np.sqrt((values**2 * kept).sum(axis=1, dtype=np.float64) / kept.sum(axis=1)) / CLIPPED_SIGMA
+    level = _median(*_counted(image)) if whole else float(np.median(image))
+    return LocalBackground(level, max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12)))
+
+
+def _row_medians(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The median of each row of values (n, k), (n, 1) of their type: whole rows are sorted in a tenth of `np.median`'s time."""
+    middle = np.sort(values, axis=1)[:, (values.shape[1] - 1) // 2 : values.shape[1] // 2 + 1]
+    return np.asarray(middle.mean(axis=1, keepdims=True))
 
 
 def find_stars(

@@ -33,7 +33,7 @@ MIN_STEP_PX = 1e-7
 # Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10 times the
 # plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
-COUNTED_TYPES = (np.uint8, np.uint16)
+COUNTED_TYPES, COUNTED_AT_ONCE = (np.uint8, np.uint16), 1 << 16
 S_CURVE_PHASES = 201  # where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to 1e-5 px
 
 
@@ -134,7 +134,9 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
 
 def _counted(image: npt.NDArray[Any]) -> tuple[FloatArray, IntArray]:
     """The values in an image of DN, in order, and how many pixels have each: ten times faster than pixel by pixel."""
-    counts = np.bincount(image.ravel())
+    flat, counts = image.ravel(), np.zeros(int(image.max()) + 1, dtype=np.intp)
+    for begin in range(0, len(flat), COUNTED_AT_ONCE):  # whose whole numbers of 64 bits stay in a core's cache
+        counts += np.bincount(flat[begin : begin + COUNTED_AT_ONCE], minlength=len(counts))
     values = np.flatnonzero(counts)
     return values.astype(np.float64), counts[values]
 

@@ -1,10 +1,12 @@
 """The door to the commands: what they import takes a third of a second, and Ctrl-C may come in it."""
 
+import gc
 import sys
 from typing import NoReturn
 
 READER_WAITS_S = 0.1  # for a reader of stderr that sleeps
 WRONG_FILE = 2
+OBJECTS_BETWEEN_LOOKS = 20_000  # for garbage: nearly all that a start makes stays, and looking through it took 20 ms
 
 
 def main() -> NoReturn:
@@ -27,6 +29,7 @@ def import_and_run() -> NoReturn:
     from hilstar.process.interrupts import finish_stderr
 
     try:
+        gc.set_threshold(OBJECTS_BETWEEN_LOOKS)
         interrupts.install()
         from hilstar.cli import main as run
 

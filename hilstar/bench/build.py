@@ -281,7 +281,8 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     """The stars of a bench with their electron rates, which are computed only here, as `moving`'s observer sees them."""
     sky = config.sky
     epoch_utc_ns(config)  # which refuses one that a source was to give
-    chosen = choose_catalog(catalogue_choice(config, folder))
+    faintest = math.inf if sky.variables == "phase" else sky.faintest_v_mag
+    chosen = choose_catalog(dataclasses.replace(catalogue_choice(config, folder), faintest_v_mag=faintest))
     if sky.variables == "phase":
         chosen = chosen.at_phase(sky_jd(config, None))
     catalog = chosen.brighter_than(sky.faintest_v_mag)

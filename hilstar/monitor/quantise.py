@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -289,15 +289,45 @@ def shown_light(levels: Levels, panel: Panel) -> FloatArray:
     """
     if levels.ndim == 3:
         return np.asarray(sum(primary_lights(levels, panel)))
-    light = panel.response.light[levels] * panel.flux_at_white_e_per_s
-    return light if panel.uniformity is None else light * panel.uniformity
+    lit, light = lit_light(levels, panel), np.zeros(levels.shape)
+    light.ravel()[lit.place] = lit.e_per_s
+    return light
+
+
+class LitLight(NamedTuple):
+    """The pixels of an image that have light: their places in the flat image and their electrons per second, (n,) each."""
+
+    place: IntArray
+    e_per_s: FloatArray
+
+    @classmethod
+    def of(cls, image: FloatArray | Float32Array) -> "LitLight":
+        """That of an image (height, width)."""
+        place = np.flatnonzero(image != 0)  # `np.nonzero` takes six times as long
+        return cls(place, image.ravel()[place].astype(np.float64))
+
+    def part(self, begin: int, end: int) -> "LitLight":
+        """Some of them."""
+        return LitLight(self.place[begin:end], self.e_per_s[begin:end])
+
+
+def lit_light(levels: Levels, panel: Panel) -> LitLight:
+    """`shown_light` of levels (height, width) where they are not 0, which has no light above black."""
+    place = np.flatnonzero(levels)
+    light = panel.response.light[levels.ravel()[place]] * panel.flux_at_white_e_per_s
+    return LitLight(place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place])
+
+
+def primary_levels(levels: Levels, panel: Panel) -> list[tuple[Levels, Panel]]:
+    """The levels (height, width) of each primary of levels (height, width, 3) with its panel; others as they are."""
+    if levels.ndim == 2:
+        return [(levels, panel)]
+    return [(Levels(levels[..., k]), one) for k, one in enumerate(panel.primaries)]
 
 
 def primary_lights(levels: Levels, panel: Panel) -> list[FloatArray]:
     """The light (height, width) of each primary of levels (height, width, 3); of levels (height, width) all light together."""
-    if levels.ndim == 2:
-        return [shown_light(levels, panel)]
-    return [shown_light(Levels(levels[..., k]), one) for k, one in enumerate(panel.primaries)]
+    return [shown_light(*each) for each in primary_levels(levels, panel)]
 
 
 @dataclass(frozen=True, slots=True)

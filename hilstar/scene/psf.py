@@ -461,6 +461,8 @@ def pixel_share(offset_px: float, sigma_px: float) -> float:
 
 def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
     """As `pixel_share`, of an array of offsets; same shape."""
+    if np.size(offset_px) <= BOUND_PLACES:  # as a bench that opens asks for
+        return np.array([pixel_share(at, sigma_px) for at in np.ravel(offset_px).tolist()]).reshape(np.shape(offset_px))
     from scipy.special import erfc  # as in `stamps`
 
     near, far = np.abs(offset_px) - 0.5, np.abs(offset_px) + 0.5

@@ -6,7 +6,7 @@ What people call bright stars: Bayer's letters, Flamsteed's numbers and proper n
 import csv
 import math
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -164,23 +164,24 @@ def plain_catalog(designation: str, rows_read: int, columns: dict[str, npt.NDArr
     return Catalog(**(none | columns), designation=designation, rows_read=rows_read)  # type: ignore[arg-type]
 
 
-def load_catalog(source: str | Path = "hipparcos") -> Catalog:
-    """Load the packaged catalogue ("hipparcos") or a user's own `hip_main.dat`.
+def load_catalog(source: str | Path = "hipparcos", faintest_v_mag: float = math.inf) -> Catalog:
+    """Load the packaged catalogue ("hipparcos"), of which fainter stars may be left out, or a user's own `hip_main.dat`.
 
     Raises InputError when the file is missing or is not a Hipparcos main catalogue.
     """
     if str(source) == "hipparcos":
-        return _packaged()
+        return _packaged(faintest_v_mag)
     path = Path(source)
     columns, rows_read = read_hip_main(path)
     return unpack(columns, rows_read)
 
 
-@cache
-def _packaged() -> Catalog:
+@lru_cache(maxsize=4)
+def _packaged(faintest_v_mag: float) -> Catalog:
     """The packaged catalogue in read-only arrays, read once: a verdict, a campaign and a study open several benches."""
     with np.load(PACKAGED_CATALOG) as packed:
-        catalog = unpack({name: packed[name] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"]))
+        kept = np.flatnonzero(packed["v_mag"] / FIELDS["v_mag"][1] <= faintest_v_mag)
+        catalog = unpack({name: packed[name][kept] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"]))
     for name in column_names():
         getattr(catalog, name).setflags(write=False)
     return catalog
@@ -262,7 +263,8 @@ def unpack(columns: dict[str, npt.NDArray[np.int64]], rows_read: int) -> Catalog
     values: dict[str, FloatArray] = {}
     for name, (_, per_unit) in FIELDS.items():
         steps = columns[name]
-        values[name] = np.where(steps == np.iinfo(steps.dtype).min, np.nan, steps / per_unit)
+        values[name] = steps / per_unit
+        values[name][steps == np.iinfo(steps.dtype).min] = np.nan
     letters = {name: columns[name].astype(np.uint8).view("S1") for name in LETTERS}
     varies = np.isin(letters["variable"], [bytes([letter]) for letter in VARIABLE_TYPES])
     hip = columns["hip"].astype(np.int32)

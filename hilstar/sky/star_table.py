@@ -14,6 +14,7 @@ import contextlib
 import hashlib
 import json
 import logging
+import math
 import os
 import zipfile
 from collections.abc import Sequence
@@ -456,11 +457,15 @@ def keep(path: Path, made: Kept) -> None:
 
 @dataclass(frozen=True, slots=True)
 class TableChoice:
-    """A bench's catalogue as its file names it; `epoch_jyear` is that of a table's places, where the file states it."""
+    """A bench's catalogue as its file names it; `epoch_jyear` is that of a table's places, where the file states it.
+
+    Of Hipparcos stars fainter than `faintest_v_mag` may be left out.
+    """
 
     source: str | Path = "hipparcos"
     with_hipparcos: bool = False
     epoch_jyear: float | None = None
+    faintest_v_mag: float = math.inf
 
 
 def choose_catalog(choice: TableChoice) -> Catalog:
@@ -475,7 +480,7 @@ def choose_catalog(choice: TableChoice) -> Catalog:
             raise InputError("[sky] with_hipparcos adds a table's stars to Hipparcos; name a table as [sky] catalogue")
         if choice.epoch_jyear is not None:
             raise InputError("[sky] catalogue_epoch_jyear is for a table; Hipparcos has its own, J1991.25")
-        return load_catalog(choice.source)
+        return load_catalog(choice.source, choice.faintest_v_mag)
     path = Path(choice.source)
     made_of = (
         path.name,

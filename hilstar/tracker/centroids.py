@@ -33,7 +33,7 @@ MIN_STEP_PX = 1e-7
 # Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10 times the
 # plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
-COUNTED_TYPES = (np.uint8, np.uint16)
+COUNTED_TYPES, COUNTED_AT_ONCE = (np.uint8, np.uint16), 1 << 16
 S_CURVE_PHASES = 201  # where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to 1e-5 px
 
 
@@ -134,7 +134,9 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
 
 def _counted(image: npt.NDArray[Any]) -> tuple[FloatArray, IntArray]:
     """The values in an image of DN, in order, and how many pixels have each: ten times faster than pixel by pixel."""
-    counts = np.bincount(image.ravel())
+    flat, counts = image.ravel(), np.zeros(int(image.max()) + 1, dtype=np.intp)
+    for begin in range(0, len(flat), COUNTED_AT_ONCE):  # whose whole numbers of 64 bits stay in a core's cache
+        counts += np.bincount(flat[begin : begin + COUNTED_AT_ONCE], minlength=len(counts))
     values = np.flatnonzero(counts)
     return values.astype(np.float64), counts[values]
 
@@ -157,13 +159,21 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
     rows, columns = (max(size // BLOCK_PX, 1) for size in image.shape)
     height, width = image.shape[0] // rows, image.shape[1] // columns
     blocks = image[: rows * height, : columns * width].reshape(rows, height, columns, width).swapaxes(1, 2)
-    values = blocks.reshape(rows * columns, height * width)
-    values = values - np.median(values, axis=1, keepdims=True)
+    whole = image.dtype in COUNTED_TYPES
+    values: npt.NDArray[Any] = blocks.reshape(rows * columns, -1).astype(np.float32 if whole else np.float64)
+    values -= _row_medians(values)
+    off = np.abs(values)
     # The median deviation of whole steps is a whole one: half a step more, so that nothing of the noise is cut off.
-    sigma = MAD_TO_SIGMA * (np.median(np.abs(values), axis=1, keepdims=True) + step / 2)
-    kept = np.abs(values) <= CLIP_SIGMAS * sigma
-    noise = np.sqrt((values**2 * kept).sum(axis=1) / kept.sum(axis=1)) / CLIPPED_SIGMA
-    return LocalBackground(float(np.median(image)), max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12)))
+    kept = off <= CLIP_SIGMAS * (MAD_TO_SIGMA * (_row_medians(off) + step / 2))
+    noise = np.sqrt((values**2 * kept).sum(axis=1, dtype=np.float64) / kept.sum(axis=1)) / CLIPPED_SIGMA
+    level = _median(*_counted(image)) if whole else float(np.median(image))
+    return LocalBackground(level, max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12)))
+
+
+def _row_medians(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The median of each row of values (n, k), (n, 1) of their type: whole rows are sorted in a tenth of `np.median`'s time."""
+    middle = np.sort(values, axis=1)[:, (values.shape[1] - 1) // 2 : values.shape[1] // 2 + 1]
+    return np.asarray(middle.mean(axis=1, keepdims=True))
 
 
 def find_stars(

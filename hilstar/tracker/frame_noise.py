@@ -70,8 +70,9 @@ def poisson(mean_e: Float32Array, normal: Float32Array, smallest_e: float | None
 
     `smallest_e` is the smallest mean beside which these stand (None: of these alone).
     """
-    if np.count_nonzero(mean_e) < mean_e.size / 2:
-        lit, counts = np.flatnonzero(mean_e), np.zeros_like(mean_e)
+    bright = mean_e != 0
+    if np.count_nonzero(bright) < mean_e.size / 2:
+        lit, counts = np.flatnonzero(bright), np.zeros_like(mean_e)
         counts.ravel()[lit] = poisson(mean_e.ravel()[lit], normal.ravel()[lit], 0.0)
         return counts
     is_large = mean_e >= TABLE_BELOW_E

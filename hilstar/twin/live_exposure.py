@@ -16,6 +16,7 @@ from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.errors import InputError
 from hilstar.frame.view import View
+from hilstar.monitor.quantise import LitLight
 from hilstar.process.closing import Closing
 from hilstar.rotation import (
     conjugate,
@@ -199,9 +200,8 @@ class LiveTracker(Closing):
 
     def expose(self, exposed: Exposed) -> npt.NDArray[np.uint16]:
         """The DN of an exposure."""
-        rows, columns = np.divmod(exposed.lit, self._size_px[0])
-        lights = zip(exposed.light_e_per_s.T, self._primaries, strict=True)
-        images = np.array([self._optics.lit_image_e_per_s(rows, columns, *each) for each in lights])
+        lights = (LitLight(exposed.lit, light) for light in exposed.light_e_per_s.T)
+        images = self._optics.images_e_per_s(lights, self._primaries)
         light = self._colours.shown(images) * self.exposure_s
         light += self._under_e
         return self._detector.expose(light, self.exposure_s, self._rng)

@@ -1,7 +1,7 @@
 """The monitor as the tracker sees it: its pixels on the tracker's detector and back, and their light through the optics.
 
-A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: SUB x SUB squares, each a
-Gaussian of the square's own variance, spread by the tracker's PSF. The black level is a glow over the whole monitor, by its own
+A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: four or nine Gaussians that
+have the square's variance together, spread by the tracker's PSF. The black level is a glow over the whole monitor, by its own
 density on the image.
 """
 
@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import Float32Array, FloatArray
 from hilstar.bench.build import bench_primaries, named_channels
 from hilstar.bench.frame import Bench
 from hilstar.monitor.primaries import channel_matrix
-from hilstar.monitor.quantise import Panel
+from hilstar.monitor.quantise import LitLight, Panel
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
 from hilstar.process.closing import Closing
 from hilstar.render.backend import Target
@@ -27,10 +27,12 @@ from hilstar.scene.sprites import mean_share, pack_sprites
 from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
-# Squares along a pixel's side. Against twelve, a star's centroid is off by 1e-5 px and its flux by 2e-6 mag on the demo's
-# bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by 4e-5 px with a PSF of 0.3, and by 2e-4 px and 1e-5 mag
-# with monitor pixels of 2.7 tracker pixels. Points instead of Gaussians of the same variance: 1.5e-3, 3e-3 and 9e-3 px.
-SUB = 3
+# Gaussians along a pixel's side, in sides. Three for thirds of it: against squares a star's centroid is off by 3e-6 px and
+# its flux by 1e-9 mag on the demo's bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by 1e-5 px with a PSF
+# of 0.3, by 1e-4 px with monitor pixels of 2.7 tracker pixels. Two are off by 3e-6 px on the demo's bench too, for their fourth
+# moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF.
+TWO, TWO_UP_TO_SIGMAS = np.array([-0.2525, 0.2525]), 1.7
+THREE = np.array([-1.0, 0.0, 1.0]) / 3
 POINTS_AT_ONCE = 400_000
 
 
@@ -123,7 +125,7 @@ class DisplayColours:
     def shown(self, images: FloatArray) -> FloatArray:
         """Light of each primary (primaries, h, w) in the detector's pixels (h, w)."""
         if self.bayer is None:
-            return np.asarray(images.sum(axis=0))
+            return np.asarray(images.sum(axis=0)) if len(images) > 1 else images[0]
         return in_pixels(np.tensordot(self.by_primary, images, 1), self.bayer)
 
     def grey(self, image: FloatArray) -> FloatArray:
@@ -136,39 +138,30 @@ class TwinOptics(Closing):
 
     def __init__(self, geometry: BenchGeometry, psf: Psf) -> None:
         self.geometry = geometry
-        side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px / SUB
-        self._psf = psf.blurred(side_px / math.sqrt(12))
+        side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+        self._steps = TWO if side_px <= TWO_UP_TO_SIGMAS * min(psf.width_px) else THREE
+        self._psf = psf.blurred(side_px * math.sqrt(1 / 12 - float(np.mean(self._steps**2))))
         self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 
-    def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray], primaries: Sequence[Primary]) -> FloatArray:
-        """Electrons per second of each tracker pixel by each primary's light (H, W): (primaries, h, w), float64."""
-        return np.array([self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)])
+    def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray | LitLight], primaries: Sequence[Primary]) -> FloatArray:
+        """Electrons per second of each tracker pixel by each primary's light: (primaries, h, w), float64."""
+        images = [self.image_e_per_s(light, one) for light, one in zip(lights_e_per_s, primaries, strict=True)]
+        return np.array(images) if len(images) > 1 else images[0][None]
 
-    def image_e_per_s(self, light_e_per_s: FloatArray | Float32Array, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
-        """Electrons per second of each tracker pixel (h, w) from those of each monitor pixel (H, W), float64."""
-        rows, columns = np.divmod(
-            np.flatnonzero(light_e_per_s != 0), light_e_per_s.shape[1]
-        )  # `np.nonzero` takes six times as long
-        return self.lit_image_e_per_s(rows, columns, light_e_per_s[rows, columns].astype(np.float64), primary)
-
-    def lit_image_e_per_s(
-        self, rows: IntArray, columns: IntArray, light_e_per_s: FloatArray, primary: Primary = ALL_ALIKE[0]
-    ) -> FloatArray:
-        """The same from monitor pixels (n,) that are lit."""
-        width, height = self.geometry.tracker.resolution_px
-        total = np.zeros((height, width))
-        at_once = max(1, POINTS_AT_ONCE // SUB**2)
-        for begin in range(0, len(rows), at_once):
-            part = slice(begin, begin + at_once)
-            total += self._points(columns[part], rows[part], light_e_per_s[part], primary)
+    def image_e_per_s(self, light_e_per_s: FloatArray | Float32Array | LitLight, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
+        """Electrons per second of each tracker pixel (h, w) from those of monitor pixels, lit ones or all (H, W), float64."""
+        lit = light_e_per_s if isinstance(light_e_per_s, LitLight) else LitLight.of(light_e_per_s)
+        at_once = POINTS_AT_ONCE // len(self._steps) ** 2
+        total = self._points(lit.part(0, at_once), primary)
+        for begin in range(at_once, len(lit.place), at_once):
+            total += self._points(lit.part(begin, begin + at_once), primary)
         return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total  # a measured PSF may be negative somewhere
 
-    def _points(self, columns: IntArray, rows: IntArray, light_e_per_s: FloatArray, primary: Primary) -> FloatArray:
-        steps = (np.arange(SUB) - (SUB - 1) / 2) / SUB
-        dx, dy = (step.ravel() for step in np.meshgrid(steps, steps))
-        places = (columns[:, None] + dx).ravel(), (rows[:, None] + dy).ravel()
-        x_px, y_px = self.geometry.to_tracker(*places, primary.place_px)
-        light = np.repeat(light_e_per_s / SUB**2, SUB**2)
+    def _points(self, lit: LitLight, primary: Primary) -> FloatArray:
+        dx, dy = (step.ravel() for step in np.meshgrid(self._steps, self._steps))
+        rows, columns = np.divmod(lit.place[:, None], self.geometry.monitor.resolution_px[0])
+        x_px, y_px = self.geometry.to_tracker((columns + dx).ravel(), (rows + dy).ravel(), primary.place_px)
+        light = np.repeat(lit.e_per_s / len(dx), len(dx))
         star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
         sprites = pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px)
         if isinstance(self._psf, GlassPsf):  # grey light has no spectrum here
@@ -183,6 +176,8 @@ class TwinOptics(Closing):
         The density of monitor pixels is that at a tracker pixel's centre; its edge is cut at the pixel, not within it.
         """
         width, height = self.geometry.tracker.resolution_px
+        if not panel.response.black:
+            return np.zeros((height, width))
         y, x = np.mgrid[0:height, 0:width].astype(np.float64)
         seen_x, seen_y = (part.reshape(height, width) for part in self.geometry.to_monitor(x.ravel(), y.ravel()))
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)

@@ -7,11 +7,12 @@ their size; the screen's tilt (a, b) adds d' (a y' - b x') to first order. Stars
 (blends) count as one, at the centroid of their light.
 """
 
+import itertools
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,7 @@ from hilstar.twin.verify.star_finder import (
     crowded,
     faintest_e_per_s,
     nearest,
+    neighbours,
     shared,
     star_finder,
 )
@@ -306,16 +308,10 @@ def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
 
 def _owners(places: FloatArray, light: FloatArray) -> IntArray:
     """For each star (n,) at places (n, 2), in sigmas, the one that it is added to: itself, or a brighter one."""
-    from scipy.spatial import cKDTree
-
-    owner = np.arange(len(light))
-    known = np.flatnonzero(np.isfinite(places).all(axis=1))
-    if not len(known):
-        return owner
-    near: dict[int, list[int]] = {}
-    for a, b in known[cKDTree(places[known]).query_pairs(BLEND_SIGMAS, output_type="ndarray")].tolist():
-        near.setdefault(a, []).append(b)
-        near.setdefault(b, []).append(a)
+    owner, near = np.arange(len(light)), defaultdict[int, list[int]](list)
+    a, b, _ = neighbours(places, places, BLEND_SIGMAS)
+    for star, other in np.stack([a, b], axis=1)[a != b].tolist():
+        near[star].append(other)
     for star in sorted(near, key=lambda star: (-light[star], star)):
         if owner[star] == star:
             for other in near[star]:
@@ -355,19 +351,18 @@ class Comparison:
         tally.blended += int((whole & blended).sum())
         wanted = whole & ~blended
         found = wanted & (sky.index >= 0) & (shown.index >= 0)
-        for k in np.flatnonzero(wanted):
-            (tally.stars if found[k] else tally.lost).append(self._star(seen, int(k), sky, shown, assumed))
+        listed, both = np.flatnonzero(wanted), np.flatnonzero(found)
+        for k, star in zip(listed, self._stars(seen, listed, (sky, shown, assumed)), strict=True):
+            (tally.stars if found[k] else tally.lost).append(star)
         for kind, (there, here) in each.items():
-            tally.off_px.setdefault(kind, []).extend(
-                math.hypot(*here.against(there, int(k))[1:]) for k in np.flatnonzero(found)
-            )
+            tally.off_px.setdefault(kind, []).extend(np.hypot(*here.against(there, both)[1:]).tolist())
         if seen.by_channel:
             tally.out_of_gamut += int((found & ~seen.truth["in_gamut"]).sum())
             self._compare_channels(seen, np.flatnonzero(found & seen.truth["in_gamut"]))
         tally.vanished += len(sky.found) - len(shown.found)
         self._follow(seen, shown.found, wanted)
         self._count_mirrored(seen, shown.found, wanted)
-        self._measure_noisy(seen, self.twin.detected_e(seen, rng), wanted)
+        self._measure_noisy(seen, self.twin.detected_dn(seen, rng), wanted)
 
     def _compare_channels(self, seen: TwinField, stars: IntArray) -> None:
         """The light of each channel in squares about stars, shown against sky."""
@@ -404,25 +399,15 @@ class Comparison:
             limit_e_per_s_px=BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px if given is None else given,
         )
 
-    def _star(self, seen: TwinField, k: int, sky: Matched, shown: Matched, assumed: Matched) -> Star:
-        row, truth = seen.truth[k], self._catalogue(seen)
-        flux_mag, dx_px, dy_px = shown.against(sky, k)
+    def _stars(self, seen: TwinField, k: IntArray, images: tuple[Matched, Matched, Matched]) -> list[Star]:
+        """Rows of the stars `k` (n,), from the images of the sky, of the display, and of one that is as assumed."""
+        sky, shown, assumed = images
+        rows, places = seen.truth[k], (seen.x_px[k], seen.y_px[k])
         codes_mag, *codes_px = assumed.against(sky, k)
-        floor_mag, *floor_px = sky.against(truth, k)
-        return Star(
-            hip=int(row["hip"]),
-            v_mag=float(row["v_mag"]),
-            x_px=float(seen.x_px[k]),
-            y_px=float(seen.y_px[k]),
-            flux_mag=flux_mag,
-            dx_px=dx_px,
-            dy_px=dy_px,
-            codes_mag=codes_mag,
-            codes_px=math.hypot(*codes_px),
-            floor_mag=floor_mag,
-            floor_px=math.hypot(*floor_px),
-            name=str(row["name"]),
-        )
+        floor_mag, *floor_px = sky.against(self._catalogue(seen), k)
+        off = *shown.against(sky, k), codes_mag, np.hypot(*codes_px), floor_mag, np.hypot(*floor_px)
+        columns = rows["hip"], rows["v_mag"], *places, *off, rows["name"]
+        return list(itertools.starmap(Star, zip(*(column.tolist() for column in columns), strict=True)))
 
     def _catalogue(self, seen: TwinField) -> Matched:
         """The catalogue as if it had been found in an image."""
@@ -451,21 +436,21 @@ class Comparison:
             places = geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
             self.tally.mirrored[mirror] += int((wanted & (nearest(shown, *places) >= 0)).sum())
 
-    def _measure_noisy(self, seen: TwinField, detected_e: FloatArray, wanted: npt.NDArray[np.bool_]) -> None:
-        """The same stars in a noisy exposure (h, w), electrons: what the tracker itself adds."""
-        step_e = self.twin.config.tracker.detector.gain_e_per_dn
-        under = estimate_background(detected_e, step_e)
-        if under.noise <= step_e / math.sqrt(12):  # rounding's: most of the image may be clipped at 0 DN, beside a glow
-            under = noisiest_background(detected_e, step_e)
-        windowed = find_stars(detected_e, self.finder.settings, under)
+    def _measure_noisy(self, seen: TwinField, dn: npt.NDArray[Any], wanted: npt.NDArray[np.bool_]) -> None:
+        """The same stars in a noisy exposure (h, w), DN: what the tracker itself adds."""
+        under = estimate_background(dn, 1.0)
+        if under.noise <= 1 / math.sqrt(12):  # rounding's: most of the image may be clipped at 0 DN, beside a glow
+            under = noisiest_background(dn)
+        windowed = find_stars(dn, self.finder.settings, under)
         match, true_px = nearest(windowed, seen.x_px, seen.y_px), (seen.x_px, seen.y_px)
         matched = Matched(windowed, match)
-        found = self.finder.placed(matched, detected_e - under.level, true_px, self.finder.centroider).found
-        expected_e = seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s
+        found = self.finder.placed(matched, dn, true_px, self.finder.centroider, under.level).found
+        tracker = self.twin.config.tracker
+        expected_dn = seen.truth["electrons_per_s"] * (tracker.exposure_s / tracker.detector.gain_e_per_dn)
         for k in np.flatnonzero(wanted & (match >= 0)):
-            flux_e = float(found.flux[match[k]])
-            if flux_e > 0:
-                self.tally.noisy_mag.append(magnitude(flux_e / float(expected_e[k])))
+            flux_dn = float(found.flux[match[k]])
+            if flux_dn > 0:
+                self.tally.noisy_mag.append(magnitude(flux_dn / float(expected_dn[k])))
                 off_px = found.x_px[match[k]] - seen.x_px[k], found.y_px[match[k]] - seen.y_px[k]
                 self.tally.noisy_px.append(math.hypot(*off_px))
 

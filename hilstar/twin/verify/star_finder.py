@@ -2,10 +2,11 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.frame import Bench
@@ -27,11 +28,11 @@ MIN_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
 
 
 class Difference(NamedTuple):
-    """A star in one image against itself in another: magnitudes too faint, pixels to the right and down; NaN if not found."""
+    """Stars (n,) in one image against themselves in another: magnitudes too faint, px right and down; NaN if not found."""
 
-    flux_mag: float
-    x_px: float
-    y_px: float
+    flux_mag: FloatArray
+    x_px: FloatArray
+    y_px: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +42,14 @@ class Matched:
     found: Centroids
     index: IntArray
 
-    def against(self, other: "Matched", k: int) -> Difference:
-        """Star `k` against itself in another image."""
-        i, j = self.index[k], other.index[k]
-        if i < 0 or j < 0:
-            return Difference(math.nan, math.nan, math.nan)
-        a, b = self.found, other.found
-        return Difference(magnitude(float(a.flux[i] / b.flux[j])), float(a.x_px[i] - b.x_px[j]), float(a.y_px[i] - b.y_px[j]))
+    def against(self, other: "Matched", k: IntArray) -> Difference:
+        """Stars `k` (n,) against themselves in another image."""
+        difference, a, b = Difference(*np.full((3, len(k)), np.nan)), self.found, other.found
+        both = np.flatnonzero((self.index[k] >= 0) & (other.index[k] >= 0))
+        i, j = self.index[k[both]], other.index[k[both]]
+        difference.flux_mag[both] = magnitude(np.maximum(a.flux[i] / b.flux[j], 0.0))
+        difference.x_px[both], difference.y_px[both] = a.x_px[i] - b.x_px[j], a.y_px[i] - b.y_px[j]
+        return difference
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +75,14 @@ class StarFinder:
         return Matched(found, nearest(found, x_px, y_px))
 
     def placed(
-        self, matched: Matched, image_e: FloatArray, true_px: tuple[FloatArray, FloatArray], kind: Centroider
+        self,
+        matched: Matched,
+        image: npt.NDArray[Any],
+        true_px: tuple[FloatArray, FloatArray],
+        kind: Centroider,
+        level: float = 0.0,
     ) -> Matched:
-        """The stars that a window has found where another centroider has them.
+        """The stars that a window has found where another centroider has them, above the image's `level`.
 
         A box is about the pixel of the star's true place, or as many whole pixels aside as the star is.
         """
@@ -85,7 +92,7 @@ class StarFinder:
         index, reach = matched.index[stars], self.settings.radius_px
         aside = (np.rint(seen[index] - true[stars]) for seen, true in zip((found.x_px, found.y_px), true_px, strict=True))
         column, row = (np.rint(true[stars] + by).astype(np.intp) for true, by in zip(true_px, aside, strict=True))
-        stamps = squares(image_e, 0.0, column, row, reach)[0]
+        stamps = squares(image, level, column, row, reach)[0]
         middle = np.full(len(stars), reach)
         dx_px, dy_px = star_places(stamps, kind, self.psf.width_px, (middle, middle))
         if kind == "psf" and self.told is not None:
@@ -129,13 +136,27 @@ def faintest_e_per_s(bench: Bench) -> float:
 
 def nearest(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
     """For each place (n,) the star found nearest within MATCH_PX, -1 for none."""
-    from scipy.spatial import KDTree
+    place, seen, distance = neighbours(np.stack([x_px, y_px], axis=1), np.stack([found.x_px, found.y_px], axis=1), MATCH_PX)
+    index = np.full(len(x_px), -1, dtype=np.intp)
+    order = np.argsort(-distance, kind="stable")
+    index[place[order]] = seen[order]  # the nearest is written last
+    return index
 
-    if not len(found):
-        return np.full(len(x_px), -1, dtype=np.intp)
-    places = np.nan_to_num(np.stack([x_px, y_px], axis=1), nan=-1e9)
-    distance, index = KDTree(np.stack([found.x_px, found.y_px], axis=1)).query(places)
-    return np.asarray(np.where(distance <= MATCH_PX, index, -1), dtype=np.intp)
+
+def neighbours(places: FloatArray, others: FloatArray, within: float) -> tuple[IntArray, IntArray, FloatArray]:
+    """Pairs (m,) of places (n, 2) and others (k, 2) within a distance of each other, and it, by a sweep along x; none of NaN.
+
+    For the few thousand stars of a field it takes as long as a tree of SciPy's, whose import takes 0.1 s.
+    """
+    order = np.argsort(others[:, 0])
+    x, at = others[order, 0], np.nan_to_num(places[:, 0], nan=np.inf)
+    first, end = np.searchsorted(x, at - within), np.searchsorted(x, at + within, side="right")
+    count = end - first
+    one = np.repeat(np.arange(len(places)), count)
+    other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
+    distance = np.hypot(*(places[one] - others[other]).T)
+    near = distance <= within
+    return one[near], other[near], distance[near]
 
 
 def shared(match: IntArray) -> npt.NDArray[np.bool_]:
@@ -146,14 +167,10 @@ def shared(match: IntArray) -> npt.NDArray[np.bool_]:
 
 def crowded(x_px: FloatArray, y_px: FloatArray, flux: FloatArray, radius_px: int, psf: Psf) -> npt.NDArray[np.bool_]:
     """True for stars (n,) into whose window any other brings more than CROWDED_SHARE of their own light."""
-    from scipy.spatial import KDTree
-    from scipy.special import ndtr
-
-    places, half = np.nan_to_num(np.stack([x_px, y_px], axis=1), nan=-1e9), radius_px + 0.5
-    close = KDTree(places).query_pairs(math.sqrt(2) * half + WING_SIGMAS * max(psf.width_px), output_type="ndarray")
-    result = np.zeros(len(flux), dtype=np.bool_)
-    for a, b in (close.T, close.T[::-1]):
-        offset = places[b] - np.rint(places[a])
-        share = (ndtr((offset + half) / psf.width_px) - ndtr((offset - half) / psf.width_px)).prod(axis=1)
-        result[a[flux[b] * share > CROWDED_SHARE * flux[a]]] = True
+    places, half, result = np.stack([x_px, y_px], axis=1), radius_px + 0.5, np.zeros(len(flux), dtype=np.bool_)
+    a, b, _ = neighbours(places, places, math.sqrt(2) * half + WING_SIGMAS * max(psf.width_px))
+    a, b = a[a != b], b[a != b]
+    offset = places[b] - np.rint(places[a])
+    share = (ndtr((offset + half) / psf.width_px) - ndtr((offset - half) / psf.width_px)).prod(axis=1)
+    result[a[flux[b] * share > CROWDED_SHARE * flux[a]]] = True
     return result

@@ -3,8 +3,9 @@
 The twin of a bench: from an attitude to what falls on the tracker's detector, and what that reads out.
 """
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from hilstar.frame.faults import FaultLayer
 from hilstar.frame.view import STILL, View
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.monitor.quantise import Panel, primary_lights
+from hilstar.monitor.quantise import LitLight, Panel, lit_light, primary_levels
 from hilstar.monitor.response import Response, table_response
 from hilstar.process.closing import Closing
 from hilstar.rotation import to_matrix
@@ -42,8 +43,8 @@ PHASES = 4  # frames of a sequence with which an exposure may begin
 
 def exposure_lights(
     bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel], faults: FaultLayer | None = None
-) -> list[FloatArray]:
-    """The mean light (primaries, H, W), electrons per second, of each panel over an exposure from frame `first_frame` on.
+) -> list[list[LitLight]]:
+    """The mean light of each primary, electrons per second, of each panel over an exposure from frame `first_frame` on.
 
     There is one light of all primaries where they are not driven apart.
 
@@ -51,19 +52,20 @@ def exposure_lights(
     """
     count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
     exposed = bench.quantiser.exposure(first_frame % PHASES, count)
-    lights = [np.zeros((len(panel.primaries) or 1, *frame.levels.shape[:2])) for panel in panels]
+    size = frame.levels.shape[:2]
+    total = [[np.zeros(size if len(exposed) > 1 else 0) for _ in panel.primaries or (panel,)] for panel in panels]
     for number in range(exposed.stop):
         levels = frame.levels
         if number:
             sprites = bench.light(bench.view(frame.q_icrs_to_cam, None, frame.t_ns), faults)
             levels = bench.draw_sprites(sprites, first_frame + number).levels
         if number in exposed:
-            for light, panel in zip(lights, panels, strict=True):
-                for whole, part in zip(light, primary_lights(levels, panel), strict=True):
-                    whole += part
-    for light in lights:
-        light /= len(exposed)
-    return lights
+            lit = [[lit_light(*each) for each in primary_levels(levels, panel)] for panel in panels]
+            if len(exposed) == 1:
+                return lit
+            for whole, part in zip(itertools.chain(*total), itertools.chain(*lit), strict=True):
+                whole.ravel()[part.place] += part.e_per_s
+    return [[LitLight.of(light / len(exposed)) for light in each] for each in total]
 
 
 def true_panel(bench: Bench) -> Panel:
@@ -167,6 +169,7 @@ class Twin(Closing):
         panels = [self.true_panel, self.bench.panel] if self.differs else [self.true_panel]
         view = rolled(self._exposure_at(frame), self.config.tracker)
         glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s
+        lights: Sequence[Iterable[FloatArray | LitLight]]
         if view.scan.scanout_s and exposure_s:
             phase_s = self._phase_s(first_frame)
             seen = zip((self.true_optics, self.sky_optics), panels, strict=False)
@@ -176,7 +179,7 @@ class Twin(Closing):
             lights = exposure_lights(self.bench, frame, first_frame, panels)
         by_primary = self.true_optics.images_e_per_s(lights[0], self.primaries) * exposure_s
         pixels_e, bayer = self._mosaic.shown(by_primary), self._mosaic.bayer
-        sky = self._found_in(np.array(skies).sum(axis=0) if bayer is None else in_pixels(skies, bayer))
+        sky = self._found_in(sum(skies[1:], start=skies[0]) if bayer is None else in_pixels(skies, bayer))
         shown = assumed = self._found_in(pixels_e)
         if self.differs:
             as_assumed = self.sky_optics.images_e_per_s(lights[1], self.primaries) * exposure_s
@@ -196,8 +199,8 @@ class Twin(Closing):
             truth["electrons_per_s"] *= of_channels @ [bayer.count(channel) / len(bayer) for channel in CHANNELS]
         return TwinField(shown, assumed, sky, truth, x_px, y_px, pixels_e, found, under_e, by_channel)
 
-    def _found_in(self, pixels_e: npt.NDArray[np.floating[Any]]) -> FloatArray:
-        return np.asarray(software_image(pixels_e, self.config.tracker.detector))
+    def _found_in(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return software_image(pixels, self.config.tracker.detector)
 
     def _exposure_at(self, frame: Frame) -> View:
         return View.exposure(frame.q_icrs_to_cam, STILL, self.config.tracker.exposure_s, frame.t_ns)
@@ -208,15 +211,16 @@ class Twin(Closing):
             return -self.config.tracker.exposure_s / 2
         return (first_frame * GOLDEN % 1.0) / self.config.monitor.refresh_hz
 
-    def detected_e(self, seen: TwinField, rng: np.random.Generator) -> FloatArray:
-        """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted.
+    def detected_dn(self, seen: TwinField, rng: np.random.Generator) -> npt.NDArray[Any]:
+        """One noisy exposure (h, w), DN, the mean of glow and background subtracted unless all pixels have the same.
 
         A frame transfer's smear is in these alone: in images without noise, sky and display would have the same.
         """
         exposure_s, under_e = self.config.tracker.exposure_s, np.broadcast_to(seen.under_e, seen.pixels_e.shape)
         dn = self.detector.expose(seen.pixels_e + under_e, exposure_s, rng)
         collected_e = self.detector.collected_e(under_e, exposure_s)
-        return self._found_in(dn * self.config.tracker.detector.gain_e_per_dn - collected_e)
+        alike = collected_e.min() == collected_e.max()
+        return self._found_in(dn if alike else dn - collected_e / self.config.tracker.detector.gain_e_per_dn)
 
     @property
     def monitor_px_per_px(self) -> float:

@@ -175,13 +175,17 @@ def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
     assert seen[40, 7] == 12
     plain = Detector(DetectorSettings(gain_e_per_dn=1.0, bits=16), (40, 50))
     assert (plain.expose_noiseless(light, 0.01) == np.rint(light)).all()
-    tables = {"tracker.detector": {"shutter": "frame-transfer", "row_shift_us": 5.0}, "background": {"electrons_per_px": 3000}}
+    tables = {
+        "tracker.detector": {"shutter": "frame-transfer", "row_shift_us": 5.0},
+        "background": {"electrons_per_px": 3000, "gradient_electrons_across": [300, 0]},
+    }
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, tables))
     with Twin(read_bench_file(tmp_path / "bench.toml")) as twin:
-        seen = twin.detected_e(twin.field(np.array(ORION_Q), 0), np.random.default_rng(1))
+        seen = twin.detected_dn(twin.field(np.array(ORION_Q), 0), np.random.default_rng(1))
         rows, exposure_s = seen.shape[0], twin.config.tracker.exposure_s
+        step_e = twin.config.tracker.detector.gain_e_per_dn
     smeared_e = 3000 * rows * 5e-6 / exposure_s  # 60 e- that the mean background's smear would leave
-    assert abs(np.median(seen)) < 0.2 * smeared_e
+    assert abs(np.median(seen) * step_e) < 0.2 * smeared_e
 
 
 @pytest.mark.parametrize(

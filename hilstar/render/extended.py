@@ -1,9 +1,11 @@
-"""Extended light, drawn into the linear image before the sprites: maps, glows and discs, each in its rectangle, in their order.
+"""Extended light, drawn into the linear image before the sprites: maps, glows and discs, each in its rectangle, in order.
 
-A large disc is divided into tiles. Far from limb and terminator a Lambert or lunar face changes little over a tile, as does
-air over a part of its scale height: light is computed at the corners and interpolated linearly, within SMOOTH of the radiance
-under a zenith Sun, and within AIR_SMOOTH for air. Tiles at the edges are drawn ray by ray, and tiles without light not at all.
-On llvmpipe this draws a disc that fills the field several times faster.
+A large disc is divided into tiles. Far from limb and terminator a Lambert or lunar face changes little over a tile: its light
+is computed at the corners and interpolated linearly, within SMOOTH. Of air it is the rays and the light of ground that they
+touch. Tiles at the edges are divided anew, and what is left is drawn ray by ray.
+
+Where a disc is all extended light that a frame has, its levels need no linear image but about sprites and edges: other tiles
+are drawn as levels, tiles over white as one level, and tiles under the first level not at all (`Sure`).
 """
 
 from collections.abc import Sequence
@@ -14,23 +16,20 @@ import moderngl
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, FloatArray
-from hilstar.render.encoder import build_program
+from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.render.encoder import build_program, draw_tiles
 from hilstar.scene.camera import Camera, ray_shifts
 from hilstar.scene.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
 from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, gauss_legendre
 
-TILE_PX = 24
+TILE_PX, FINE_PX = 32, 8  # of tiles, and of the parts of those at edges
 MIN_TILED_PX = 40_000  # a rectangle of fewer pixels is drawn whole
-SMOOTH = 5e-4  # share of the radiance under a zenith Sun
-STEEP = 4 * SMOOTH  # tile width in radii: over a wider tile the terminator bends light by more than SMOOTH
-# Scale heights per interpolated part. The second derivative of air's light, 1 - exp(-depth exp(-height)), is at most 0.2 of its
-# maximum per squared scale height.
-AIR_STEP = 0.4
-AIR_SMOOTH = AIR_STEP**2 / 8 * 0.2
-MAX_PARTS = 6  # per side of a tile: thinner air is drawn ray by ray
+SMOOTH = 2.5e-4  # share of the light: half a level of 12 bits
+SPREAD = 1e-3  # share that the Gaussian changes air's light by more than tile.glsl says: thinner air is drawn ray by ray
 REACH_SIGMAS = 5.0
 WIDER = 1.5  # factor on the angle across a tile: allows for a lens, a field's corner and a flattened body
+# Light between the corners of a tile is over and under theirs by less; a limb spreads half of it.
+SMOOTH_TIMES, SURE_TIMES = 1.5, 4.0
 CORNERS = ((0, 0), (0, 1), (1, 0), (0, 1), (1, 1), (1, 0))  # rows and columns of two triangles
 
 Mask = npt.NDArray[np.bool_]
@@ -39,61 +38,148 @@ LAWS = ("uniform", "lambert", "lunar-lambert", "limb-darkened")  # by their numb
 NODES = 16  # as in disc.frag
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Sure:
+    """A frame's levels: light of `dark_e_per_s` and less has level 0, and of `white_e_per_s` and more white.
+
+    Sprites (n,) whose light lies up to `reach_px` from their pixels `sprites_px` (n, 2) are added to the disc's.
+    """
+
+    dark_e_per_s: float
+    white_e_per_s: float
+    sprites_px: IntArray
+    reach_px: int
+
+    def levels(self, e_per_s: FloatArray, smooth: Mask) -> tuple[Mask, Mask]:
+        """Which tiles of lattices (..., rows, columns) of light are white and which black; `smooth` ones have no limb."""
+        times = np.where(smooth, SMOOTH_TIMES, SURE_TIMES)
+        rows, columns = smooth.shape[-2:]
+        corners = [e_per_s[..., row : row + rows, column : column + columns] for row, column in set(CORNERS)]
+        brightest, darkest = np.maximum.reduce(corners), np.minimum.reduce(corners)
+        return darkest > times * self.white_e_per_s, brightest * times < self.dark_e_per_s
+
+    def apart(self, left: int, top: int, rows: int, columns: int) -> Mask:
+        """Which tiles (rows, columns) from a corner of the image on have no sprite's light."""
+        apart, reach = np.ones((rows + 1, columns + 1), dtype=np.bool_), self.reach_px
+        for across in range(-reach, reach + TILE_PX, TILE_PX):
+            for down in range(-reach, reach + TILE_PX, TILE_PX):
+                away = min(across, reach) - left, min(down, reach) - top
+                column, row = np.clip((self.sprites_px + away) // TILE_PX, -1, (columns, rows)).T
+                apart[row, column] = False  # those off the tiles in a row or column that is not used
+        return apart[:-1, :-1]
+
+
 @dataclass(frozen=True, slots=True)
 class Tiles:
-    """Tiles in `region`: corners (n, 4) of two triangles each, as x and y from the image's edge (px), light (e-/s) and cover.
+    """Tiles in `region`: corners (n, 6) of two triangles each: x and y from the image's edge (px), light (e-/s), three values.
 
-    Tiles of `linear` are interpolated. Those of `edges` are drawn ray by ray, and their light and cover are not used.
+    Light on a `face` is its own, with its cover first; that of `air` is what a ray has that is stopped, with the ray in the
+    sphere's axes. `edges` are drawn ray by ray, and `white` is white: their values are not used. `face_levels` and `air_levels`
+    are as `face` and `air`, but are drawn as levels alone. `of_air` is the uniform `air` of tile.glsl.
     """
 
     region: Rectangle
-    linear: Float32Array
+    face: Float32Array
+    air: Float32Array
     edges: Float32Array
+    white: Float32Array
+    face_levels: Float32Array
+    air_levels: Float32Array
+    of_air: tuple[float, float, float, float]
 
 
-def disc_tiles(light: DiscLight, region: Rectangle) -> Tiles | None:
+@dataclass(frozen=True, slots=True)
+class _Lattice:
+    """Corners (..., rows, columns, 6) as in Tiles and their light; masks of the tiles, one less along rows and columns."""
+
+    face: FloatArray
+    air: FloatArray
+    e_per_s: FloatArray
+    is_face: Mask
+    is_air: Mask
+    is_beside: Mask
+    spread: float
+
+
+def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) -> Tiles | None:
     """The tiles of a disc in a rectangle of its image; None where the rectangle has fewer than MIN_TILED_PX pixels."""
     left, top, width, height = region
     if width * height < MIN_TILED_PX:
         return None
-    x, y = (begin + TILE_PX * np.arange(-(-size // TILE_PX) + 1) for begin, size in ((left, width), (top, height)))
-    places = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
-    seen, sr = _rays(light, places.reshape(-1, 2))
-    directions, shape = seen @ light.icrs_to_image, places.shape[:2]
-    impact = light.disc.impact(directions).reshape(shape)
-    rates = (light.disc.radiance(directions) * sr * light.times).reshape(shape)
-    disc, px_per_rad, sigma_px = light.disc, light.camera.scales_px_rad()[0], max(light.psf.variance_px2) ** 0.5
-    # Corners so far away that neither the disc, its air nor the Gaussian reaches their tiles
-    on_sphere = directions @ disc.to_sphere.T
-    angle = np.arctan2(np.hypot(on_sphere[:, 0], on_sphere[:, 1]), on_sphere[:, 2])
-    rim = np.arcsin(min(1.0, (1 + AIR_TOP * disc.air_radii) / disc.distance_radii))
-    far = angle > rim + WIDER * (TILE_PX * np.sqrt(2) + REACH_SIGMAS * sigma_px) / px_per_rad
-    beside = _all(far.reshape(shape))
-    margin = REACH_SIGMAS * sigma_px * disc.distance_radii / px_per_rad  # maximum reach of the Gaussian, in radii
-    # Tiles far enough within the limb, and off the terminator where that would be seen. A face's height over the plane of its
-    # limb goes as the root of 1 - impact^2, whose second derivative is its power -3/2.
-    inside, lit = np.minimum(impact, 1.0), rates > 0  # NaN stays
-    tile_radii = TILE_PX * np.sqrt(np.maximum(disc.distance_radii**2 - inside**2, 0.0)) / px_per_rad
-    flat = ((1 - inside**2) ** 1.5 > tile_radii**2 / (8 * SMOOTH)) & (impact < 1 - margin)
-    face = _all(flat) & (_all(lit) | _all(~lit) | _all(tile_radii < STEEP)) & ~beside
-    # Parts per side of a tile of air: thinner air, and that of a body from within, is drawn ray by ray. A height at the limb,
-    # px: impact grows by the cosine of the angle from the middle there.
-    parts = 0
-    if disc.air is not None and disc.distance_radii > 1:
-        scale_px = disc.air_radii * px_per_rad / np.sqrt(disc.distance_radii**2 - 1)
-        parts = int(np.ceil(TILE_PX / (AIR_STEP * scale_px)))
-    air = _all(impact > 1 + margin) & ~beside if 0 < parts <= MAX_PARTS else np.zeros_like(face)
-    drawn = np.argwhere(~beside)
-    if not len(drawn):
-        return Tiles((left, top, 0, 0), *np.empty((2, 0, 4), dtype=np.float32))
-    (first_y, first_x), (last_y, last_x) = drawn.min(axis=0) * TILE_PX, (drawn.max(axis=0) + 1) * TILE_PX
+    x, y = (begin + TILE_PX * np.arange(-1, -(-size // TILE_PX) + 2) for begin, size in ((left, width), (top, height)))
+    whole = _lattice(light, np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64), TILE_PX)
+    drawn, white = ~whole.is_beside, np.zeros_like(whole.is_face)
+    apart = white
+    if sure is not None:
+        smooth = whole.is_face | whole.is_air
+        white, dark = sure.levels(whole.e_per_s, smooth)
+        apart = sure.apart(left, top, *white.shape)
+        # A limb may bulge into a tile between its corners, but not without a corner of a tile beside it.
+        around = _all(_all(np.pad(dark, 1, constant_values=True)))
+        drawn &= ~(apart & dark & (smooth | around))
+    some, of_air = np.argwhere(drawn), (light.disc.distance_radii, light.disc.air_radii, light.disc.slant_depth, whole.spread)
+    nothing = np.empty((0, 6), dtype=np.float32)
+    if not len(some):
+        return Tiles((left, top, 0, 0), nothing, nothing, nothing, nothing, nothing, nothing, of_air)
+    (first_y, first_x), (last_y, last_x) = some.min(axis=0) * TILE_PX, (some.max(axis=0) + 1) * TILE_PX
     inner = left + first_x, top + first_y, min(width, last_x) - first_x, min(height, last_y) - first_y
-    of_face = np.concatenate([places, rates[..., None], np.ones((*shape, 1))], axis=-1)
+    drawn &= ~white
+    # Tiles at the edges in parts: in the linear image, for their sprites and rays are encoded tile by tile.
+    steps = np.arange(-FINE_PX, TILE_PX + FINE_PX + 1, FINE_PX)
+    edges = whole.face[:-1, :-1, :2][drawn & ~whole.is_face & ~whole.is_air]
+    fine = _lattice(light, edges[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1), FINE_PX)
+    fine_white = np.zeros_like(fine.is_face) if sure is None else sure.levels(fine.e_per_s, fine.is_face | fine.is_air)[0]
+    fine_face, fine_air = fine.is_face & ~fine_white, fine.is_air & ~fine_white
+    face, air = whole.is_face & drawn, whole.is_air & drawn
     return Tiles(
         (int(inner[0]), int(inner[1]), int(inner[2]), int(inner[3])),
-        np.concatenate([_corners(of_face, face), _air(light, places[:-1, :-1][air], parts)]),
-        _corners(of_face, ~face & ~air & ~beside),
+        np.concatenate([_corners(whole.face, face & ~apart), _corners(fine.face, fine_face)]),
+        np.concatenate([_corners(whole.air, air & ~apart), _corners(fine.air, fine_air)]),
+        _corners(fine.face, ~fine.is_face & ~fine.is_air & ~fine.is_beside & ~fine_white),
+        np.concatenate([_runs(x[1:-1], y[1:-1], white), _corners(fine.face, fine_white)]),
+        _corners(whole.face, face & apart),
+        _corners(whole.air, air & apart),
+        of_air,
     )
+
+
+def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
+    """The light at lattices of places (..., rows, columns, 2), `size_px` apart, and between them, but for the outer ones."""
+    disc, px_per_rad, sigma_px = light.disc, light.camera.scales_px_rad()[0], max(light.psf.variance_px2) ** 0.5
+    shape, distance = places.shape[:-1], disc.distance_radii
+    seen, sr = _rays(light, places.reshape(-1, 2))
+    directions = seen @ light.icrs_to_image
+    on_sphere = directions @ disc.to_sphere.T
+    impact = disc.impact(directions).reshape(shape)
+    face = (disc.radiance(directions) * sr * light.times).reshape(shape)
+    # Corners so far away that neither the disc, its air nor the Gaussian reaches their tiles
+    angle = np.arctan2(np.hypot(on_sphere[:, 0], on_sphere[:, 1]), on_sphere[:, 2]).reshape(shape)
+    rim = np.arcsin(min(1.0, (1 + AIR_TOP * disc.air_radii) / distance))
+    beside = _all(angle > rim + WIDER * (size_px * np.sqrt(2) + REACH_SIGMAS * sigma_px) / px_per_rad)
+    # Tiles far enough within the limb, and off the terminator where that would be seen. A face's height over the plane of its
+    # limb goes as the root of 1 - impact^2, whose second derivative is its power -3/2.
+    inside, lit = np.minimum(impact, 1.0), face > 0  # NaN stays
+    radii_per_px = np.sqrt(np.maximum(distance**2 - inside**2, 0.0)) / px_per_rad
+    margin = REACH_SIGMAS * sigma_px * np.minimum(WIDER * radii_per_px, distance / px_per_rad)  # the Gaussian's reach, radii
+    most = (size_px * radii_per_px) ** 2 / 8 * (disc.normal_e_per_s_sr * light.times * sr).reshape(shape)
+    flat = (SMOOTH * face * (1 - inside**2) ** 1.5 >= most * lit) & (impact < 1 - margin)
+    is_face = _all(flat) & ~beside
+    is_face[..., 1:-1, 1:-1] &= _even(lit)
+    is_air, touched, hidden, spread = np.zeros_like(is_face), np.zeros_like(face), np.zeros_like(face), 0.0
+    if disc.air is not None and distance > 1:
+        touched = (disc.touched_light(directions) * sr * light.times).reshape(shape)
+        hidden = -np.expm1(-disc.slant_depth * np.exp(-np.maximum(impact - 1, 0.0) / disc.air_radii))
+        # The variances of the Gaussian in scale heights: half of their mean by tile.glsl, and what it leaves out.
+        along_x, along_y = np.array(light.psf.variance_px2) * (distance**2 - 1) / (disc.air_radii * px_per_rad) ** 2
+        spread = (along_x + along_y) / 4
+        if abs(along_x - along_y) / 4 + max(along_x, along_y) ** 2 / 8 < SPREAD:
+            is_air = _all(impact > 1 + margin) & ~beside
+            is_air[..., 1:-1, 1:-1] &= _even(touched > 0)
+    of_face = np.concatenate([places, face[..., None], np.ones((*shape, 3))], axis=-1)
+    of_air = np.concatenate([places, touched[..., None], on_sphere.reshape(*shape, 3)], axis=-1)
+    e_per_s, inner = np.where(impact < 1, face, touched * hidden), (..., slice(1, -1), slice(1, -1))
+    masks = is_face[inner], is_air[inner], beside[inner]
+    return _Lattice(of_face[*inner, :], of_air[*inner, :], e_per_s[inner], *masks, spread)
 
 
 def _rays(light: DiscLight, places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -107,29 +193,36 @@ def _rays(light: DiscLight, places: FloatArray) -> tuple[FloatArray, FloatArray]
     return seen, 1 / ((a * d - b * c) * np.linalg.norm(seen, axis=1) ** 3)
 
 
-def _air(light: DiscLight, tiles: FloatArray, parts: int) -> Float32Array:
-    """Corners of the parts of tiles of air, whose first corners are (n, 2)."""
-    if not len(tiles):
-        return np.empty((0, 4), dtype=np.float32)
-    steps = TILE_PX / parts * np.arange(parts + 1)
-    places = tiles[:, None, None, :] + np.stack(np.meshgrid(steps, steps), axis=-1)
-    seen, sr = _rays(light, places.reshape(-1, 2))
-    radiance, cover = light.disc.air_light(seen @ light.icrs_to_image)
-    corners = np.concatenate([places.reshape(-1, 2), (radiance * sr * light.times)[:, None], cover[:, None]], axis=1)
-    return _corners(corners.reshape(*places.shape[:3], 4))
-
-
 def _all(nodes: Mask) -> Mask:
-    """Which tiles are true at all four corners."""
-    return nodes[:-1, :-1] & nodes[1:, :-1] & nodes[:-1, 1:] & nodes[1:, 1:]
+    """Which tiles of lattices (..., rows, columns) are true at all four corners."""
+    return nodes[..., :-1, :-1] & nodes[..., 1:, :-1] & nodes[..., :-1, 1:] & nodes[..., 1:, 1:]
 
 
-def _corners(nodes: FloatArray, tiles: Mask | None = None) -> Float32Array:
-    """The corners (n, 4) of two triangles a tile, from lattices (..., rows, columns, 4); `tiles` selects (None: all)."""
+def _even(nodes: Mask) -> Mask:
+    """Which tiles but the outer ones are alike, true or not, at all corners and those of the tiles beside them."""
+    return np.logical_or(*(_all(_all(_all(alike))) for alike in (nodes, ~nodes)))
+
+
+def _corners(nodes: FloatArray, tiles: Mask) -> Float32Array:
+    """The corners (n, 6) of two triangles for each of `tiles`, from lattices (..., rows, columns, 6)."""
+    if not tiles.any():
+        return np.empty((0, 6), dtype=np.float32)
     size = nodes.shape[-3] - 1, nodes.shape[-2] - 1
-    parts = [nodes[..., row : row + size[0], column : column + size[1], :] for row, column in CORNERS]
-    found = np.stack(parts, axis=-2)
-    return (found if tiles is None else found[tiles]).reshape(-1, 4).astype(np.float32)
+    parts = [nodes[..., row : row + size[0], column : column + size[1], :][tiles] for row, column in CORNERS]
+    return np.stack(parts, axis=-2).reshape(-1, 6).astype(np.float32)
+
+
+def _runs(x: IntArray, y: IntArray, tiles: Mask) -> Float32Array:
+    """The corners of tiles (rows, columns) between `x` and `y`, as one that follow each other in a row, or equal rows."""
+    row, begin = np.nonzero(np.diff(tiles, axis=1, prepend=False) & tiles)
+    end = np.nonzero(np.diff(tiles, axis=1, append=False) & tiles)[1] + 1
+    order = np.lexsort((row, end, begin))
+    row, begin, end = row[order], begin[order], end[order]
+    goes_on = (np.diff(begin) == 0) & (np.diff(end) == 0) & (np.diff(row) == 1)
+    first, last = np.append(True, ~goes_on)[: len(row)], np.append(~goes_on, True)[: len(row)]
+    sides = (y[row[first]], y[row[last] + 1]), (x[begin[first]], x[end[first]])
+    places = [np.stack([sides[1][k], sides[0][j], *[np.zeros(first.sum())] * 4], axis=-1) for j, k in CORNERS]
+    return np.stack(places, axis=-2).reshape(-1, 6).astype(np.float32)
 
 
 class ExtendedLayer:
@@ -144,18 +237,22 @@ class ExtendedLayer:
         self._programs: dict[tuple[str, ...], tuple[moderngl.Program, moderngl.VertexArray]] = {}
         self._textures: dict[int, tuple[object, moderngl.Texture]] = {}
 
-    def draw(self, fbo: moderngl.Framebuffer, lights: Sequence[ExtendedLight]) -> tuple[Rectangle, ...]:
-        """Add `lights` to a linear image, in their order; the rectangles that they may have changed."""
-        ctx, regions = self._ctx, []
+    def draw(
+        self, fbo: moderngl.Framebuffer, lights: Sequence[ExtendedLight], sure: Sure | None = None
+    ) -> tuple[tuple[Rectangle, ...], Tiles | None]:
+        """Add `lights` to a linear image, in their order; the rectangles that they may have changed.
+
+        Where a frame is `sure` of its levels and a disc alone is on the image, what its `Tiles` have as levels is left out.
+        """
+        ctx, regions, found = self._ctx, [], None
+        on_image = [(light, region) for light in lights if (region := light.region(self._resolution_px)) is not None]
+        sure = sure if len(on_image) == 1 else None
         fbo.use()
         ctx.enable(moderngl.BLEND)
         # Alpha is the share of a pixel that the light's body covers: what was drawn before it is behind it.
         ctx.blend_func = (moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
-        for light in lights:
-            region = light.region(self._resolution_px)
-            if region is None:
-                continue
-            tiles = disc_tiles(light, region) if isinstance(light, DiscLight) else None
+        for light, region in on_image:
+            tiles = disc_tiles(light, region, sure) if isinstance(light, DiscLight) else None
             if isinstance(light, DiscLight) and tiles is not None:
                 region = tiles.region
                 if not region[2]:
@@ -163,13 +260,14 @@ class ExtendedLayer:
                 fbo.viewport, fbo.scissor = (0, 0, *self._resolution_px), region
                 self._draw_tiles(light, tiles)
                 fbo.scissor = None  # type: ignore[assignment]  # as its documentation has it: no test
+                found = tiles if sure is not None else None
             else:
                 fbo.viewport = region
                 self._draw_one(light)
             regions.append(region)
         ctx.blend_func = (moderngl.ONE, moderngl.ONE)
         ctx.disable(moderngl.BLEND)
-        return tuple(regions)
+        return tuple(regions), found
 
     def _draw_one(self, light: ExtendedLight) -> None:
         if isinstance(light, LightMap):
@@ -203,24 +301,15 @@ class ExtendedLayer:
             texture.release()
 
     def _draw_tiles(self, light: DiscLight, tiles: Tiles) -> None:
-        program, _ = self._program("tile.frag", vertex="tile.vert")
-        program["covers"] = float(light.covers)
-        self._draw_corners(program, tiles.linear)
-        program, _ = self._with_rays("disc.frag", light.camera, "tile.vert")
-        _set_disc(program, light)
-        self._draw_corners(program, tiles.edges)
-
-    def _draw_corners(self, program: moderngl.Program, corners: Float32Array) -> None:
-        if not len(corners):
-            return
-        program["size_px"] = self._resolution_px
-        buffer = self._ctx.buffer(corners)
-        layout = "2f 2f" if "given" in program else "2f 8x"
-        names = ("place_px", "given") if "given" in program else ("place_px",)
-        triangles = self._ctx.vertex_array(program, [(buffer, layout, *names)])
-        triangles.render(moderngl.TRIANGLES)
-        triangles.release()
-        buffer.release()
+        for corners, defines in ((tiles.face, ()), (tiles.air, ("AIR",))):
+            if len(corners):
+                program, _ = self._program("tile.frag", ("tile.glsl",), *defines, vertex="tile.vert")
+                program["covers"] = float(light.covers)
+                draw_tiles(program, corners, self._resolution_px, tiles.of_air)
+        if len(tiles.edges):
+            program, _ = self._with_rays("disc.frag", light.camera, "tile.vert")
+            _set_disc(program, light)
+            draw_tiles(program, tiles.edges, self._resolution_px)
 
     def _with_rays(
         self, fragment: str, camera: Camera, vertex: str = "full.vert"

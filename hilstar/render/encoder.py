@@ -511,7 +511,7 @@ class Encoder:
 
     def _draw_tiles(self, tiles: "Tiles", uniforms: Mapping[str, float]) -> None:
         self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
-        of_image = np.concatenate([tiles.face, tiles.air, tiles.edges])
+        of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
         given = ((of_image, ()), (tiles.face_levels, ("TILE",)), (tiles.air_levels, ("TILE", "AIR")))
         for program, corners in [(self._program("tile.vert", *defines), corners) for corners, defines in given if len(corners)]:
             for name, value in uniforms.items():

@@ -2,7 +2,7 @@
 
 A large disc is divided into tiles. Far from limb and terminator a Lambert or lunar face changes little over a tile: its light
 is computed at the corners and interpolated linearly, within SMOOTH. Of air it is the rays and the light of ground that they
-touch. Tiles at the edges are divided anew, and what is left is drawn ray by ray.
+touch. Nearer to the limb pixels have a ray each, and tiles at the edges, which are divided anew, all that is spread to them.
 
 Where a disc is all extended light that a frame has, its levels need no linear image but about sprites and edges: other tiles
 are drawn as levels, tiles over white as one level, and tiles under the first level not at all (`Sure`).
@@ -24,9 +24,10 @@ from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, gauss_legendre
 
 TILE_PX, FINE_PX = 32, 8  # of tiles, and of the parts of those at edges
 MIN_TILED_PX = 40_000  # a rectangle of fewer pixels is drawn whole
-SMOOTH = 2.5e-4  # share of the light: half a level of 12 bits
+SMOOTH = 5e-4  # share of the light: a level of 12 bits
 SPREAD = 1e-3  # share that the Gaussian changes air's light by more than tile.glsl says: thinner air is drawn ray by ray
 REACH_SIGMAS = 5.0
+LARGE_PX = 200.0  # of a radius: from here one ray is within 4e-5 of the spread light of a face, as in disc.frag
 WIDER = 1.5  # factor on the angle across a tile: allows for a lens, a field's corner and a flattened body
 # Light between the corners of a tile is over and under theirs by less; a limb spreads half of it.
 SMOOTH_TIMES, SURE_TIMES = 1.5, 4.0
@@ -74,13 +75,14 @@ class Tiles:
     """Tiles in `region`: corners (n, 6) of two triangles each: x and y from the image's edge (px), light (e-/s), three values.
 
     Light on a `face` is its own, with its cover first; that of `air` is what a ray has that is stopped, with the ray in the
-    sphere's axes. `edges` are drawn ray by ray, and `white` is white: their values are not used. `face_levels` and `air_levels`
-    are as `face` and `air`, but are drawn as levels alone. `of_air` is the uniform `air` of tile.glsl.
+    sphere's axes. `inside` and `edges` are drawn ray by ray, and `white` is white: their values are not used. `face_levels` and
+    `air_levels` are as `face` and `air`, but are drawn as levels alone. `of_air` is the uniform `air` of tile.glsl.
     """
 
     region: Rectangle
     face: Float32Array
     air: Float32Array
+    inside: Float32Array
     edges: Float32Array
     white: Float32Array
     face_levels: Float32Array
@@ -96,6 +98,7 @@ class _Lattice:
     air: FloatArray
     e_per_s: FloatArray
     is_face: Mask
+    is_inside: Mask
     is_air: Mask
     is_beside: Mask
     spread: float
@@ -111,7 +114,7 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     drawn, white = ~whole.is_beside, np.zeros_like(whole.is_face)
     apart = white
     if sure is not None:
-        smooth = whole.is_face | whole.is_air
+        smooth = whole.is_inside | whole.is_air
         white, dark = sure.levels(whole.e_per_s, smooth)
         apart = sure.apart(left, top, *white.shape)
         # A limb may bulge into a tile between its corners, but not without a corner of a tile beside it.
@@ -120,22 +123,23 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     some, of_air = np.argwhere(drawn), (light.disc.distance_radii, light.disc.air_radii, light.disc.slant_depth, whole.spread)
     nothing = np.empty((0, 6), dtype=np.float32)
     if not len(some):
-        return Tiles((left, top, 0, 0), nothing, nothing, nothing, nothing, nothing, nothing, of_air)
+        return Tiles((left, top, 0, 0), nothing, nothing, nothing, nothing, nothing, nothing, nothing, of_air)
     (first_y, first_x), (last_y, last_x) = some.min(axis=0) * TILE_PX, (some.max(axis=0) + 1) * TILE_PX
     inner = left + first_x, top + first_y, min(width, last_x) - first_x, min(height, last_y) - first_y
     drawn &= ~white
     # Tiles at the edges in parts: in the linear image, for their sprites and rays are encoded tile by tile.
     steps = np.arange(-FINE_PX, TILE_PX + FINE_PX + 1, FINE_PX)
-    edges = whole.face[:-1, :-1, :2][drawn & ~whole.is_face & ~whole.is_air]
+    edges = whole.face[:-1, :-1, :2][drawn & ~whole.is_inside & ~whole.is_air]
     fine = _lattice(light, edges[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1), FINE_PX)
-    fine_white = np.zeros_like(fine.is_face) if sure is None else sure.levels(fine.e_per_s, fine.is_face | fine.is_air)[0]
-    fine_face, fine_air = fine.is_face & ~fine_white, fine.is_air & ~fine_white
-    face, air = whole.is_face & drawn, whole.is_air & drawn
+    fine_white = np.zeros_like(fine.is_face) if sure is None else sure.levels(fine.e_per_s, fine.is_inside | fine.is_air)[0]
+    fine_inside, fine_air = fine.is_inside & ~fine_white, fine.is_air & ~fine_white
+    face, inside, air = whole.is_face & drawn, whole.is_inside & drawn & ~whole.is_face, whole.is_air & drawn
     return Tiles(
         (int(inner[0]), int(inner[1]), int(inner[2]), int(inner[3])),
-        np.concatenate([_corners(whole.face, face & ~apart), _corners(fine.face, fine_face)]),
+        _corners(whole.face, face & ~apart),
         np.concatenate([_corners(whole.air, air & ~apart), _corners(fine.air, fine_air)]),
-        _corners(fine.face, ~fine.is_face & ~fine.is_air & ~fine.is_beside & ~fine_white),
+        np.concatenate([_corners(whole.face, inside), _corners(fine.face, fine_inside)]),
+        _corners(fine.face, ~fine.is_inside & ~fine.is_air & ~fine.is_beside & ~fine_white),
         np.concatenate([_runs(x[1:-1], y[1:-1], white), _corners(fine.face, fine_white)]),
         _corners(whole.face, face & apart),
         _corners(whole.air, air & apart),
@@ -162,9 +166,9 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     radii_per_px = np.sqrt(np.maximum(distance**2 - inside**2, 0.0)) / px_per_rad
     margin = REACH_SIGMAS * sigma_px * np.minimum(WIDER * radii_per_px, distance / px_per_rad)  # the Gaussian's reach, radii
     most = (size_px * radii_per_px) ** 2 / 8 * (disc.normal_e_per_s_sr * light.times * sr).reshape(shape)
-    flat = (SMOOTH * face * (1 - inside**2) ** 1.5 >= most * lit) & (impact < 1 - margin)
-    is_face = _all(flat) & ~beside
-    is_face[..., 1:-1, 1:-1] &= _even(lit)
+    is_inside = _all((impact < 1 - margin) & (radii_per_px * LARGE_PX < 1)) & ~beside
+    is_inside[..., 1:-1, 1:-1] &= _even(lit)
+    is_face = _all(SMOOTH * face * (1 - inside**2) ** 1.5 >= most * lit) & is_inside
     is_air, touched, hidden, spread = np.zeros_like(is_face), np.zeros_like(face), np.zeros_like(face), 0.0
     if disc.air is not None and distance > 1:
         touched = (disc.touched_light(directions) * sr * light.times).reshape(shape)
@@ -178,7 +182,7 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     of_face = np.concatenate([places, face[..., None], np.ones((*shape, 3))], axis=-1)
     of_air = np.concatenate([places, touched[..., None], on_sphere.reshape(*shape, 3)], axis=-1)
     e_per_s, inner = np.where(impact < 1, face, touched * hidden), (..., slice(1, -1), slice(1, -1))
-    masks = is_face[inner], is_air[inner], beside[inner]
+    masks = is_face[inner], is_inside[inner], is_air[inner], beside[inner]
     return _Lattice(of_face[*inner, :], of_air[*inner, :], e_per_s[inner], *masks, spread)
 
 
@@ -306,16 +310,17 @@ class ExtendedLayer:
                 program, _ = self._program("tile.frag", ("tile.glsl",), *defines, vertex="tile.vert")
                 program["covers"] = float(light.covers)
                 draw_tiles(program, corners, self._resolution_px, tiles.of_air)
-        if len(tiles.edges):
-            program, _ = self._with_rays("disc.frag", light.camera, "tile.vert")
-            _set_disc(program, light)
-            draw_tiles(program, tiles.edges, self._resolution_px)
+        for corners, defines in ((tiles.inside, ("INSIDE",)), (tiles.edges, ())):
+            if len(corners):
+                program, _ = self._with_rays("disc.frag", light.camera, *defines, vertex="tile.vert")
+                _set_disc(program, light)
+                draw_tiles(program, corners, self._resolution_px)
 
     def _with_rays(
-        self, fragment: str, camera: Camera, vertex: str = "full.vert"
+        self, fragment: str, camera: Camera, *defines: str, vertex: str = "full.vert"
     ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """A program whose pixels know their directions through `camera`, whose image this is."""
-        defines = () if camera.lens is None else ("LENS",)
+        defines = (*defines, *["LENS"] * (camera.lens is not None))
         program, triangle = self._program(fragment, ("rays.glsl",), *defines, vertex=vertex)
         program["principal_px"] = camera.principal_point_px
         program["focal_px"] = camera.focal_length_px
@@ -361,23 +366,27 @@ class ExtendedLayer:
 def _set_disc(program: moderngl.Program, light: DiscLight) -> None:
     """The body, its face, the turn and the Gaussian, in a program of disc.frag."""
     disc, shear = light.disc, light.shear
-    from_image = disc.to_sphere @ light.icrs_to_image.T
-    program["to_sphere"] = tuple(from_image.T.ravel().tolist())  # column by column
-    program["variance_px"] = light.psf.variance_px2
-    program["times"] = light.times
-    program["covers"] = float(light.covers)
-    program["turn_rad_s"] = (0.0, 0.0, 0.0) if shear is None else tuple(shear.rate_image_rad_s.tolist())
-    program["late_s_per_px"] = (0.0, 0.0) if shear is None else shear.s_per_px
-    program["middle_px"] = (0.0, 0.0) if shear is None else shear.middle_px
-    place, weight = gauss_legendre(NODES)
-    program["node"] = ((place + 1) / 2).tolist()
-    program["weight"] = (weight / 2).tolist()
-    program["distance_radii"] = disc.distance_radii
-    program["sun"] = tuple(disc.sun_sphere.tolist())
-    program["normal_e_per_s_sr"] = disc.normal_e_per_s_sr
-    program["law"] = LAWS.index(disc.law)
-    program["lunar_share"] = disc.lunar_share
-    program["solar_limb"] = SOLAR_LIMB
-    program["air_radii"] = disc.air_radii
-    program["slant_depth"] = disc.slant_depth
-    program["air_top"] = AIR_TOP
+    from_image, (place, weight) = disc.to_sphere @ light.icrs_to_image.T, gauss_legendre(NODES)
+    values: dict[str, Any] = {
+        "to_sphere": tuple(from_image.T.ravel().tolist()),  # column by column
+        "variance_px": light.psf.variance_px2,
+        "times": light.times,
+        "covers": float(light.covers),
+        "turn_rad_s": (0.0, 0.0, 0.0) if shear is None else tuple(shear.rate_image_rad_s.tolist()),
+        "late_s_per_px": (0.0, 0.0) if shear is None else shear.s_per_px,
+        "middle_px": (0.0, 0.0) if shear is None else shear.middle_px,
+        "node": ((place + 1) / 2).tolist(),
+        "weight": (weight / 2).tolist(),
+        "distance_radii": disc.distance_radii,
+        "sun": tuple(disc.sun_sphere.tolist()),
+        "normal_e_per_s_sr": disc.normal_e_per_s_sr,
+        "law": LAWS.index(disc.law),
+        "lunar_share": disc.lunar_share,
+        "solar_limb": SOLAR_LIMB,
+        "air_radii": disc.air_radii,
+        "slant_depth": disc.slant_depth,
+        "air_top": AIR_TOP,
+    }
+    for name, value in values.items():
+        if name in program:  # a smooth face needs few
+            program[name] = value

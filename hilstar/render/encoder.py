@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -20,13 +20,11 @@ from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, Target
 from hilstar.render.context import is_software
+from hilstar.render.disc_tiles import Tiles
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
-
-if TYPE_CHECKING:
-    from hilstar.render.extended import Tiles
 
 TABLE_WIDTH = 1024  # that of encode.frag
 TABLE_UNIT = 15  # the last texture unit that every OpenGL has: nothing else takes it
@@ -469,7 +467,7 @@ class Encoder:
         covered_px: int,
         uniforms: Mapping[str, float],
         regions: Sequence[Rectangle] = (),
-        tiles: "Tiles | None" = None,
+        tiles: Tiles | None = None,
         *,
         is_black: bool = True,
     ) -> None:
@@ -509,7 +507,7 @@ class Encoder:
         if self._steps is not None:
             self._steps.bind_to_uniform_block(0)
 
-    def _draw_tiles(self, tiles: "Tiles", uniforms: Mapping[str, float]) -> None:
+    def _draw_tiles(self, tiles: Tiles, uniforms: Mapping[str, float]) -> None:
         self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
         of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
         given = ((of_image, ()), (tiles.face_levels, ("TILE",)), (tiles.air_levels, ("TILE", "AIR")))

@@ -18,6 +18,7 @@ from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
 from hilstar.render.context import Context, check_limits, computes_in_software, create_context
+from hilstar.render.disc_tiles import Sure, Tiles
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
     CUT_WINGS,
@@ -34,7 +35,7 @@ from hilstar.render.encoder import (
     sprites_array,
 )
 from hilstar.render.exact_pass import ExactPass
-from hilstar.render.extended import ExtendedLayer, Sure, Tiles
+from hilstar.render.extended import ExtendedLayer
 from hilstar.render.host_image import HostImage
 from hilstar.render.presenter import Presenter, changed_codes
 from hilstar.render.star_passes import LightUnits, StarPasses

@@ -20,7 +20,8 @@ from hilstar.frame.view import Canvas, View
 from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels
 from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import Target
-from hilstar.render.extended import ExtendedLayer, disc_tiles
+from hilstar.render.disc_tiles import disc_tiles
+from hilstar.render.extended import ExtendedLayer
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg

@@ -11,7 +11,7 @@ import hilstar.render.extended as layer
 from hilstar.monitor.quantise import dither_levels, round_levels
 from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import Target
-from hilstar.render.extended import MIN_TILED_PX, SMOOTH, disc_tiles
+from hilstar.render.disc_tiles import MIN_TILED_PX, SMOOTH, disc_tiles
 from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, Shear

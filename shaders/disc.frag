@@ -129,6 +129,7 @@ bool near_cusp(Sight s, float fall, float sigma) {
     return abs(dot(s.side, sun.xy) - rim * sun.z) < 2.0 * sigma * fall * length(sun.xy);
 }
 
+// With INSIDE all pixels are on a smooth and large face.
 void main() {
     light = vec4(0.0);
     vec2 px = vec2(ivec2(gl_FragCoord.xy));
@@ -136,9 +137,13 @@ void main() {
     vec3 turning = cross(turn_rad_s, seen);
     seen += dot(late_s_per_px, px - middle_px) * turning;
     mat2 slopes = ray_slopes(px);
+    float sr = (slopes[0][0] * slopes[1][1] - slopes[0][1] * slopes[1][0]) / pow(dot(seen, seen), 1.5);
+    Sight here = sight(seen);
+#ifdef INSIDE
+    light = vec4(vec3(times * normal_e_per_s_sr * sr * shaded(here, 1.0 - here.impact)), covers);
+#else
     vec3 s = to_sphere * seen;
     if (s.z <= 0.0) return;
-    Sight here = sight(seen);
     // How the impact grows along x and y.
     float size = length(s), sine = length(s.xy) / size;
     vec3 along_x = to_sphere * (vec3(slopes[0], 0.0) + late_s_per_px.x * turning);
@@ -149,7 +154,6 @@ void main() {
     vec2 outward = growth / fall;
     float sigma = sqrt(dot(outward * outward, variance_px));
     float depth_px = (1.0 - here.impact) / fall;
-    float sr = (slopes[0][0] * slopes[1][1] - slopes[0][1] * slopes[1][0]) / pow(dot(seen, seen), 1.5);
     vec2 found = vec2(0.0);
     bool inside = depth_px > REACH * sigma;
     if (depth_px < -REACH * sigma - air_top * air_radii / fall) return;
@@ -168,4 +172,5 @@ void main() {
         found.x += shaded(there, 1.0 - there.impact) / float(rays);
     }
     light = vec4(vec3(times * normal_e_per_s_sr * sr * found.x), covers * clamp(found.y, 0.0, 1.0));
+#endif
 }

@@ -5,7 +5,10 @@
 // With RISES the thresholds are the edges of another quantiser, whose shader says whether a pixel gets the next level instead.
 // With UNIFORMITY each pixel's light is first multiplied by its gain.
 // With IMAGES light is loaded from an image (OpenGL 4.2): on llvmpipe in two thirds of the time of a texture's texel.
-#ifdef IMAGES
+// With TILE light is that of tile.glsl, and no image's.
+#ifdef TILE
+#define LIGHT(pixel) vec4(tile_light().x)
+#elif defined(IMAGES)
 layout(IMAGES) readonly uniform image2D linear_e_per_s;
 #define LIGHT(pixel) imageLoad(linear_e_per_s, pixel)
 #else

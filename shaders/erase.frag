@@ -1,5 +1,5 @@
 #version 330 core
-// Black under each sprite: faster than clearing an image that is mostly black. With LEVELS the image holds levels.
+// Black under each sprite: faster than clearing an image that is mostly black. With LEVELS the image holds levels, and has that one.
 
 #ifdef LEVELS
 out uvec4 nothing;
@@ -9,7 +9,7 @@ out vec4 nothing;
 
 void main() {
 #ifdef LEVELS
-    nothing = uvec4(0u);
+    nothing = uvec4(LEVELS);
 #else
     nothing = vec4(0.0);
 #endif

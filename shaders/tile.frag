@@ -1,12 +1,11 @@
 #version 330 core
-// Light and cover that are linear over a tile.
+// A tile's light and cover in the linear image; after tile.glsl.
 
 uniform float covers;
-
-in vec2 here;
 
 out vec4 light;
 
 void main() {
-    light = vec4(here.xxx, covers * here.y);
+    vec2 found = tile_light();
+    light = vec4(found.xxx, covers * found.y);
 }

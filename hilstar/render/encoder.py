@@ -6,7 +6,7 @@ Primaries that are driven apart are planes of one image, whose pixels and sprite
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import moderngl
@@ -20,6 +20,7 @@ from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, Target
 from hilstar.render.context import is_software
+from hilstar.render.disc_tiles import Tiles
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import Psf
@@ -182,6 +183,7 @@ INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primarie
 SPRITE_PIXEL_COST = 4  # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
 # Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
 MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
+MAX_ERASED_REGION = 0.25  # as much of rectangles, which sprites' overheads do not slow
 # On a graphics card: an H100 cleared 7680 x 4320 in 4 ms, and erased 10 000 sprites on it in 0.1 ms.
 MAX_ERASED_BY_CARD = 1.0
 IMAGES_VERSION = 420  # the OpenGL that has images in shaders
@@ -244,7 +246,8 @@ class Eraser:
         self._size_px = size_px
         on_processor = MAX_ERASED_LEVELS if of_levels else MAX_ERASED_LIGHT
         self._most_px = size_px[0] * size_px[1] * (on_processor if is_software(ctx) else MAX_ERASED_BY_CARD)
-        defines = ("LEVELS",) if of_levels else ()
+        self._most_share = MAX_ERASED_REGION if is_software(ctx) else MAX_ERASED_BY_CARD
+        defines = ("LEVELS 0u",) if of_levels else ()
         self._program = build_program(ctx, "star.vert", "erase.frag", defines)
         self._program["resolution_px"] = size_px
         self._triangle = ctx.vertex_array(build_program(ctx, "full.vert", "erase.frag", defines), [])
@@ -256,7 +259,8 @@ class Eraser:
         if not regions:
             return
         fbo.use()
-        if (0, 0, *self._size_px) in regions:
+        width, height = self._size_px
+        if sum(wide * high for _, _, wide, high in regions) >= self._most_share * width * height:
             fbo.clear()
             return
         for region in regions:
@@ -284,6 +288,26 @@ class Eraser:
             margin = self._footprint_px
             fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
             self._vao.render(moderngl.POINTS, vertices=count)
+
+
+def draw_tiles(
+    program: moderngl.Program,
+    corners: Float32Array,
+    size_px: tuple[int, int],
+    of_air: tuple[float, float, float, float] | None = None,
+) -> None:
+    """Draw tiles by their corners (n, 6) with a program of tile.vert, into an image whose framebuffer is in use."""
+    if not len(corners):
+        return
+    program["size_px"] = size_px
+    if "air" in program:
+        program["air"] = of_air
+    buffer, has_given = program.ctx.buffer(corners), "given" in program
+    names = ("place_px", "given") if has_given else ("place_px",)
+    triangles = program.ctx.vertex_array(program, [(buffer, "2f 4f" if has_given else "2f 16x", *names)])
+    triangles.render(moderngl.TRIANGLES)
+    triangles.release()
+    buffer.release()
 
 
 class LevelTexture:
@@ -381,14 +405,12 @@ class Encoder:
         steps = None if table is None else table_rows(table[0], ctx)
         defines += [] if table is None else [f"STEPS {0 if steps is None else len(steps)}"]
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
-        defines += [f"IMAGES {linear_format(planes)}"] * (self._linear_image is not None)
+        of_image = [f"IMAGES {linear_format(planes)}"] * (self._linear_image is not None)
         last = ["levels.glsl"] * (table is not None) + [rises] * bool(rises)
-        self.sprite_program, self._whole = (
-            build_program(ctx, vertex, "encode.frag", defines, ("planes.glsl",), last) for vertex in ("star.vert", "full.vert")
-        )
-        self.sprite_program["resolution_px"] = linear.size
-        self._whole_vao = ctx.vertex_array(self._whole, [])
+        self._built = partial(build_program, ctx, fragment="encode.frag", last=last)
+        self._defines, self._of_image = tuple(defines), tuple(of_image)
         self._sprite_vao: moderngl.VertexArray | None = None
+        self._white = planes.panels[0].response.white
         self._textures = {"linear_e_per_s": linear}
         self._steps = None if steps is None else ctx.buffer(steps.tobytes())
         if table is None:
@@ -405,10 +427,23 @@ class Encoder:
         if gain is not None:
             self._textures["gain"] = self._texture(gain)
         self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}
-        for program in (self.sprite_program, self._whole):
-            planes.set(program, bins=bins, thresholds=counts)
+        self._bins = bins, counts
+        self._programs: dict[tuple[str, ...], moderngl.Program] = {}
+        self.sprite_program, self._whole = (self._program(vertex) for vertex in ("star.vert", "full.vert"))
+        self.sprite_program["resolution_px"] = linear.size
+        self._whole_vao = ctx.vertex_array(self._whole, [])
+
+    def _program(self, vertex: str, *of_tiles: str) -> moderngl.Program:
+        """The program that encodes the linear image with a vertex shader, or tiles' own light; made when first asked for."""
+        if (key := (vertex, *of_tiles)) not in self._programs:
+            include = ("planes.glsl", *["tile.glsl"] * bool(of_tiles))
+            program = self._built(vertex=vertex, defines=(*self._defines, *(of_tiles or self._of_image)), include=include)
+            self._planes.set(program, bins=self._bins[0], thresholds=self._bins[1])
             for unit, name in enumerate(self._textures):
-                program[name] = unit
+                if name in program:
+                    program[name] = unit
+            self._programs[key] = program
+        return self._programs[key]
 
     def _texture(self, values: npt.NDArray[Any]) -> moderngl.Texture:
         """A texture of float32 or uint32 `values` (height, width), read texel by texel."""
@@ -437,9 +472,13 @@ class Encoder:
         covered_px: int,
         uniforms: Mapping[str, float],
         regions: Sequence[Rectangle] = (),
+        tiles: Tiles | None = None,
+        *,
         is_black: bool = True,
     ) -> None:
         """Encode the linear image under the first `count` sprites of the buffer and in `regions`; the rest is black.
+
+        Of a disc in `tiles` the linear image has `face`, `air` and `edges`.
 
         `uniforms` are the quantiser's of this frame. Each star has `per_star` sprites; together they cover `covered_px`, and
         where that is most of the image the pass covers all of it. `is_black` says that the levels were erased before.
@@ -451,12 +490,7 @@ class Encoder:
         self._fbo.use()
         if not is_black and whole not in regions:
             self._fbo.clear()
-        for unit, texture in enumerate(self._textures.values()):
-            texture.use(unit)
-        if self._linear_image is not None:
-            self._linear_image.bind_to_image(0, read=True, write=False)
-        if self._steps is not None:
-            self._steps.bind_to_uniform_block(0)
+        self._bind()
         for name, value in uniforms.items():
             self.sprite_program[name] = self._whole[name] = value
         for region in regions:
@@ -467,6 +501,29 @@ class Encoder:
             margin = self._footprint_px
             self._fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
             self._sprite_vao.render(moderngl.POINTS, vertices=count)
+        if tiles is not None:
+            self._draw_tiles(tiles, uniforms)
+
+    def _bind(self) -> None:
+        for unit, texture in enumerate(self._textures.values()):
+            texture.use(unit)
+        if self._linear_image is not None:
+            self._linear_image.bind_to_image(0, read=True, write=False)
+        if self._steps is not None:
+            self._steps.bind_to_uniform_block(0)
+
+    def _draw_tiles(self, tiles: Tiles, uniforms: Mapping[str, float]) -> None:
+        self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
+        of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
+        given = ((of_image, ()), (tiles.face_levels, ("TILE",)), (tiles.air_levels, ("TILE", "AIR")))
+        for program, corners in [(self._program("tile.vert", *defines), corners) for corners, defines in given if len(corners)]:
+            for name, value in uniforms.items():
+                program[name] = value
+            draw_tiles(program, corners, self._size_px, tiles.of_air)
+        if (key := ("white",)) not in self._programs:
+            self._programs[key] = build_program(self._ctx, "tile.vert", "erase.frag", (f"LEVELS {self._white}u",))
+        draw_tiles(self._programs[key], tiles.white, self._size_px)  # last, for sprites add to it
+        self._fbo.scissor = None  # type: ignore[assignment]  # as its documentation has it: no test
 
 
 def linear_format(planes: Planes) -> str:

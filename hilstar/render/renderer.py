@@ -13,11 +13,12 @@ import numpy as np
 
 from hilstar.arrays import Float32Array
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import DitherQuantiser
+from hilstar.monitor.quantise import DitherQuantiser, PixelQuantiser
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
 from hilstar.render.context import Context, check_limits, computes_in_software, create_context
+from hilstar.render.disc_tiles import Sure, Tiles
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
     CUT_WINGS,
@@ -86,6 +87,7 @@ class Renderer(Backend):
         self._level_eraser = Eraser(ctx, target.resolution_px, planes, of_levels=True)
         self._extended = ExtendedLayer(ctx, target.resolution_px)
         self._regions: tuple[Rectangle, ...] = ()  # where extended light is on the images
+        self._tiles: Tiles | None = None  # of a disc whose levels need no linear image everywhere
         self._cut_sides = self._wider(target.sides)
         self._build_levels()
         set_sides(self._splat, self._cut_sides)
@@ -248,14 +250,15 @@ class Renderer(Backend):
                 splat["reach_per_e"] = reach_per_e
                 self._planes.set(splat, unit_e_per_s=unit_e_per_s)
         cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
-        self._draw_linear(sprites, whole=not (self.target.sides or cut), in_units=in_units)
+        sure = None if sprites is None or not sprites.extended or covered_px >= few_px else self._sure(self._by_pixel, sprites)
+        self._draw_linear(sprites, whole=not (self.target.sides or cut), in_units=in_units, sure=sure)
         if self._encoder is not None:
             with self._stage("encode"):
                 count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
                 uniforms = self._by_pixel.uniforms(self._last_frame)
-                self._encoder.draw(count, per_star, covered_px, uniforms, self._regions, self._levels_black)
+                self._encoder.draw(count, per_star, covered_px, uniforms, *self._lit(), is_black=self._levels_black)
                 self._levels_black = True  # but for what this frame has
-        if in_units or (cut and not self.target.sides):
+        if in_units or (cut and not self.target.sides) or self._tiles is not None:
             self._undrawn = (sprites, True)  # without what is left out, when somebody asks
         self._choose(sprites, None)
 
@@ -300,21 +303,39 @@ class Renderer(Backend):
         if self._floor_encoder is None:
             self._floor_encoder = Encoder(self._ctx, self._linear, levels, self._planes, DitherQuantiser)
         self._erase()
-        self._draw_extended(sprites)
+        self._draw_extended(sprites, self._sure(DitherQuantiser, None))
         levels.fbo.clear()
-        self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions)
+        self._floor_encoder.draw(0, 1, 0, {"shift": turn}, *self._lit())
         self._floor_key, self._floor_levels = key, Levels(levels.read().copy())
         return self._floor_levels
 
-    def _draw_extended(self, sprites: Sprites) -> None:
+    def _sure(self, quantiser: type[PixelQuantiser], sprites: Sprites | None) -> Sure | None:
+        """What a quantiser's levels need not know of a disc's light, where there is one plane."""
+        if self._planes.apart or not self._planes.panels:
+            return None
+        panel = self._planes.panels[0]
+        gain = panel.gain()
+        least, most = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
+        dark_e_per_s, white_e_per_s = quantiser.dark_e_per_s(panel) / most, panel.flux_at_white_e_per_s / least
+        places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]
+        return Sure(dark_e_per_s, white_e_per_s, places_px, self.footprint_px)
+
+    def _lit(self) -> tuple[tuple[Rectangle, ...], Tiles | None]:
+        """Where extended light has to be encoded from the linear image, and the tiles of a disc that has its own."""
+        return (self._regions, None) if self._tiles is None else ((), self._tiles)
+
+    def _draw_extended(self, sprites: Sprites, sure: Sure | None = None) -> None:
         """Add extended light to the linear image, that of each primary to its plane alone."""
         fbo, self._regions = self._linear_fbo, ()
         for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
             fbo.color_mask = tuple(plane == k or not self._planes.apart for k in range(4))  # type: ignore[assignment]
-            self._regions += self._extended.draw(fbo, lights)
+            regions, self._tiles = self._extended.draw(fbo, lights, sure)
+            self._regions += regions
         fbo.color_mask = True, True, True, True
 
-    def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False) -> None:
+    def _draw_linear(
+        self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False, sure: Sure | None = None
+    ) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn, sprites = None, as_maps(sprites, self.target)
         self._on_host = self._host is not None and whole and not (sprites is not None and sprites.extended)
@@ -324,7 +345,7 @@ class Renderer(Backend):
         with self._stage("erase"):
             self._erase(levels)
         if sprites is not None and sprites.extended:
-            self._draw_extended(sprites)
+            self._draw_extended(sprites, sure)
         if sprites is not None and len(sprites):
             with self._stage("upload"):
                 if len(sprites) > self._capacity:
@@ -360,7 +381,7 @@ class Renderer(Backend):
                 self._level_eraser.erase_regions(self._levels.fbo, self._regions)
         self._eraser.erase(self._linear_fbo, self._last_count)
         self._eraser.erase_regions(self._linear_fbo, self._regions)
-        self._regions = ()
+        self._regions, self._tiles = (), None
         self._last_count = 0
 
     def levels(self) -> Levels:

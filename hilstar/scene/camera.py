@@ -34,7 +34,7 @@ WITHIN = 1 - 1e-12  # the lens, whatever rounding does
 MAX_TANGENT = 1e3  # a longer step has diverged
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ResidualField:
     """A smooth shift of pixels: sums of Chebyshev polynomials over the image, `x` and `y` (n, n) coefficients in px.
 

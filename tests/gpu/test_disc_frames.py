@@ -20,7 +20,8 @@ from hilstar.frame.view import Canvas, View
 from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels
 from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import Target
-from hilstar.render.extended import ExtendedLayer, disc_tiles
+from hilstar.render.disc_tiles import disc_tiles
+from hilstar.render.extended import ExtendedLayer
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import from_radec_roll_deg
@@ -198,7 +199,7 @@ def test_a_large_disc_in_tiles_is_that_of_the_reference(face, law):
     one = replace(disc(face[0], 50.0, face[1]), law=law, polar_km=0.93, pole=np.array([0.6, 0.8, 0.0]), lunar_share=0.4)
     light = DiscLight(one, np.eye(3), cam, GaussianPsf((0.85, 1.1)))
     tiles = disc_tiles(light, light.region(size))
-    assert tiles is not None and len(tiles.linear) + len(tiles.edges) > 2
+    assert tiles is not None and len(tiles.face) + len(tiles.edges) > 2
     with Renderer(Target(size, GaussianPsf((0.85, 1.1)))) as gl:
         sprites = replace(sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px), extended=(light,))
         gl.draw(sprites)

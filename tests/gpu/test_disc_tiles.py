@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import hilstar.render.extended as layer
+from hilstar.monitor.quantise import dither_levels, round_levels
+from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import Target
-from hilstar.render.extended import AIR_SMOOTH, MIN_TILED_PX, SMOOTH, disc_tiles
+from hilstar.render.disc_tiles import MIN_TILED_PX, SMOOTH, disc_tiles
 from hilstar.render.renderer import Renderer
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, Shear
@@ -21,8 +23,7 @@ from tests.support.stars import sprites_at
 SIZE, SIGMA = (300, 260), (0.85, 0.85)
 MIDDLE_PX = (149.5, 129.5)
 LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
-# Straight lines in place of the air's light, and of the face's, which across a terminator are off by four times SMOOTH.
-TILE_LIMIT = max(AIR_SMOOTH, 4 * SMOOTH)
+TILE_LIMIT = 2 * SMOOTH  # straight lines in place of the face's light, along both axes
 assert SIZE[0] * SIZE[1] > MIN_TILED_PX
 
 
@@ -82,11 +83,39 @@ def test_light_and_cover_are_those_of_the_disc_drawn_whole(gl, name, monkeypatch
         assert np.abs(mine - whole).max() < TILE_LIMIT * whole.max()
 
 
+@pytest.mark.parametrize("method", ["round", "dither", "exact"])
+def test_tiles_without_a_linear_image_have_its_levels(method, rng):
+    """Black, white and between, about sprites, the limb and the terminator; exact's stars are added to dither's levels."""
+    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as whole:
+        stars = sprites_at(rng.uniform(0, SIZE, (12, 2)), 10.0 ** rng.uniform(4, 6, 12), whole.footprint_px)
+        for name, white_share in (("low orbit, limb", 2e-3), ("low orbit, limb", 2.0), ("low orbit, terminator", 1e-2)):
+            light = SCENES[name]
+            whole.draw(replace(stars, extended=(light,)))
+            linear = whole.linear().copy()
+            target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(12), white_share * float(linear.max()), method)
+            with Renderer(target) as gl:
+                for sprites in (stars, replace(stars, data=stars.data[:0], star=stars.star[:0])):
+                    gl.draw(replace(sprites, extended=(light,)))
+                    levels = gl.levels().copy()
+                    wanted = (round_levels if method == "round" else dither_levels)(gl.linear(), target.panel())
+                    if method != "exact" or not len(sprites):
+                        assert np.mean(levels != wanted) < 2e-4  # ties alone
+                    assert np.abs(gl.linear() - linear).max() <= (
+                        1e-6 * linear.max() if len(sprites) else stars.data["electrons_per_s"].max()
+                    )
+                gl.draw(stars)
+                assert not (gl.levels() >= target.response.white).all()
+                black = gl.levels().copy()
+                gl.forget_images()
+                gl.draw(stars)
+                assert (gl.levels() == black).all()
+
+
 def test_most_of_a_full_field_is_linear_and_what_lies_beside_a_limb_is_not_drawn():
     whole = (0, 0, *SIZE)
     full = disc_tiles(SCENES["low orbit, full field"], whole)
     assert full is not None
-    assert len(full.linear) > 10 * len(full.edges)
+    assert len(full.face) > 10 * len(full.edges)
     beside = disc_tiles(looking(EQUATOR_KM + 400, 1500.0, 30.0, 60.0), whole)
     assert beside is not None
     assert beside.region[2:] == (0, 0)

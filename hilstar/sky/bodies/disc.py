@@ -182,14 +182,21 @@ class Disc:
 
         It is as bright as ground that a ray just touches on that side, by the share of light that it stops.
         """
+        height = np.maximum(self.impact(directions) - 1, 0.0) / (self.air_radii or 1.0)
+        hidden = -np.expm1(-self.slant_depth * np.exp(-height))
+        return self.touched_light(directions) * hidden, hidden
+
+    def touched_light(self, directions: FloatArray) -> FloatArray:
+        """Electrons per second and steradian (n,) of ground that rays just touch, by the share of light that air stops there.
+
+        The rays have the sides of ICRS directions (n, 3).
+        """
         seen = directions @ self.to_sphere.T
         side = seen[:, :2] / np.hypot(seen[:, 0], seen[:, 1])[:, None]
         sine = 1 / self.distance_radii
         up = np.column_stack((side * np.sqrt(1 - sine**2), np.full(len(side), -sine)))
         mu0 = np.maximum(0.0, up @ self.sun_sphere / np.linalg.norm(up @ self.to_sphere, axis=1))
-        height = np.maximum(self._impact(seen) - 1, 0.0) / (self.air_radii or 1.0)
-        hidden = -np.expm1(-self.slant_depth * np.exp(-height))
-        return self.normal_e_per_s_sr * mu0 * hidden / -np.expm1(-self.slant_depth), hidden
+        return np.asarray(self.normal_e_per_s_sr * mu0 / -np.expm1(-self.slant_depth))
 
     def _shaded(self, place: FloatArray, seen: FloatArray) -> FloatArray:
         """The law at places of the sphere (n, 3), along `seen` (n, 3): unit rays, but in the sphere's axes."""

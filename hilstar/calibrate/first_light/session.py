@@ -8,7 +8,6 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -124,136 +123,32 @@ BEFORE_FILE = "bench-before.toml"
 LOCK_FILE = ".lock"
 
 
-@dataclass(frozen=True, slots=True)
-class SessionStep:
-    """One step: what it measures, and what to do where it fails; what it shows, what it wants back, the steps it needs.
+class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One step of steps.toml: what it measures, and what to do where it fails; what it shows, and what it wants back.
 
-    `tables` are those of the bench file that it depends on; `writes` has the keys that it may set.
+    `tables` are those of the bench file that it depends on; `writes` has the keys that it may set, `needs` the steps before it.
     """
 
-    name: str
     measures: str
     cure: str
-    run: Callable[[StepContext], StepOutcome]
+    wants: str
     shows: str = ""
-    wants: str = ""
     needs: tuple[str, ...] = ()
     tables: tuple[str, ...] = ("monitor", "collimator", "tracker")
     writes: tuple[str, ...] = ()
+    name: str = ""
 
 
-STEPS = (
-    SessionStep(
-        "machine",
-        "What this machine has: OpenGL, links, files.",
-        "Install or free what is missing; `hilstar doctor` shows all checks.",
-        machine,
-        wants="OpenGL, links and files that work",
-        tables=(),
-    ),
-    SessionStep(
-        "display",
-        "Size and rate of the display, by 120 black frames.",
-        "Set the monitor's mode as the bench file has it, without a compositor, or mend [monitor].",
-        display,
-        "120 black frames",
-        "a display with the bench file's size and rate",
-        tables=("monitor",),
-    ),
-    SessionStep(
-        "orientation",
-        "Which way up the tracker sees the screen, by three squares.",
-        "Let the tracker see the whole screen in the dark, and look at the focal lengths and pitches in the bench file.",
-        orientation,
-        "three squares: the largest at a corner, the next to its right, the smallest below it",
-        "one image of the tracker",
-        needs=("machine", "display"),
-        writes=("monitor.flip_x", "monitor.flip_y", "monitor.rotate_deg", "monitor.resolution_px"),
-    ),
-    SessionStep(
-        "focus",
-        "Width of the tracker's PSF, by dots that do not saturate it.",
-        "Turn the focus until the PSF is narrowest, or write [tracker] psf_sigma_px as it is.",
-        focus,
-        "dots",
-        "one image, and fainter ones while they saturate",
-        needs=("orientation",),
-    ),
-    SessionStep(
-        "warm-up",
-        "White against time, by the light of dots, until it changes by less than 0.2 % in ten minutes.",
-        "Leave the monitor on for as long as the line says.",
-        warm_up,
-        "dots",
-        "an image every ten seconds",
-        needs=("focus",),
-        writes=("certify.warm_up_percent",),
-    ),
-    SessionStep(
-        "geometry",
-        "Where the tracker sees each pixel: lens, tilt and centre, by dots that blink their own codes.",
-        "Look at focus and stray light, and at whether the mount moved, and check the focal lengths in the bench file.",
-        geometry,
-        "frames of dots, each of which blinks its own code",
-        "an image of each frame",
-        needs=("orientation",),
-        writes=("collimator.geometry",),
-    ),
-    SessionStep(
-        "uniformity",
-        "Light against place on the screen, by dots on four lattices.",
-        "Look at the images: dust, stray light, or light that is not steady.",
-        uniformity,
-        "dots on four lattices over the whole screen",
-        "an image of each",
-        needs=("geometry",),
-        writes=("monitor.calibration",),
-    ),
-    SessionStep(
-        "photometry",
-        "Light against code, with the tracker as a photometer.",
-        "Switch off dynamic contrast and local dimming, let the monitor warm up, and take more readings (--patches).",
-        photometry,
-        "dots on lattices, in one code after the other",
-        "an image of each",
-        needs=("geometry",),
-        tables=("monitor", "tracker"),
-        writes=("monitor.calibration",),
-    ),
-    SessionStep(
-        "scale",
-        "How much light white is, by stars on the screen.",
-        "Measure the response first (photometry), and see that the background is dark.",
-        scale,
-        "fields of stars",
-        "an image of each",
-        needs=("geometry",),
-        tables=("monitor", "collimator", "tracker", "sky", "render"),
-        writes=("render.flux_at_white_e_per_s", "render.brightest_v_mag", "certify.flux_at_white_relative"),
-    ),
-    SessionStep(
-        "latency",
-        "Time from the buffer swap to light, by a photodiode.",
-        "Look at the photodiode's place over the square, and at [monitor] scanout_ms.",
-        latency,
-        "the photodiode's square",
-        "its edges",
-        needs=("display",),
-        tables=("monitor",),
-        writes=("monitor.panel_delay_ms", "certify.panel_delay_u_ms"),
-    ),
-    SessionStep(
-        "verify",
-        "Stars on the screen against the sky: their places and their light, and those of the twin.",
-        "Repeat the step that the line names, then this one.",
-        verify,
-        "fields of stars",
-        "an image of each, and a twin that passes",
-        needs=("geometry",),
-        tables=("monitor", "collimator", "tracker", "sky", "render", "background", "verify"),
-    ),
+STEPS_FILE = Path(__file__).with_name("steps.toml")
+STEPS = tuple(
+    msgspec.structs.replace(step, name=name)
+    for name, step in msgspec.toml.decode(STEPS_FILE.read_bytes(), type=dict[str, SessionStep]).items()
 )
 NAMES = tuple(step.name for step in STEPS)
+RUNS: dict[str, Callable[[StepContext], StepOutcome]] = {
+    run.__name__.replace("_", "-"): run
+    for run in (machine, display, orientation, focus, warm_up, geometry, uniformity, photometry, scale, latency, verify)
+}
 
 
 class FirstLightSession:
@@ -322,8 +217,7 @@ class FirstLightSession:
         if unmet is not None:
             outcome = StepOutcome("skipped", f"needs {unmet}, which is not done")
         else:
-            if step.shows or step.wants:
-                say(f"{step.name:12} shows {step.shows or 'nothing'}; wants {step.wants}")
+            say(f"{step.name:12} shows {step.shows or 'nothing'}; wants {step.wants}")
             # An interrupted attempt's images can be used where nothing they depend on has changed.
             goes_on = not afresh and self.unfinished.get(step.name) == self._attempt(number)
             context = self._context(step, goes_on)
@@ -347,7 +241,7 @@ class FirstLightSession:
 
     def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
         try:
-            outcome = step.run(context)
+            outcome = RUNS[step.name](context)
             self.file = rewrite(self.file, outcome.changes)
         except Stopped:
             raise

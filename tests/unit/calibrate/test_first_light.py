@@ -184,11 +184,12 @@ class Counted:
     def __init__(self, monkeypatch):
         self.runs, self.failing = [], set()
         steps = (
-            SessionStep("first", "", "", self.step("first"), tables=("monitor",), writes=("monitor.flip_x",)),
-            SessionStep("second", "", "", self.step("second"), needs=("first",), tables=("monitor",)),
-            SessionStep("third", "", "", self.step("third"), tables=("collimator",)),
+            SessionStep("", "", "", name="first", tables=("monitor",), writes=("monitor.flip_x",)),
+            SessionStep("", "", "", name="second", needs=("first",), tables=("monitor",)),
+            SessionStep("", "", "", name="third", tables=("collimator",)),
         )
         monkeypatch.setattr(sessions, "STEPS", steps)
+        monkeypatch.setattr(sessions, "RUNS", {step.name: self.step(step.name) for step in steps})
         monkeypatch.setattr(sessions, "NAMES", tuple(step.name for step in steps))
 
     def step(self, name):
@@ -276,7 +277,8 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, m
             taken.append((path.name, path.stat().st_mtime_ns))
         return StepOutcome("done", "found")
 
-    monkeypatch.setattr(sessions, "STEPS", (SessionStep("frames", "", "", frames, tables=("monitor",)),))
+    monkeypatch.setattr(sessions, "STEPS", (SessionStep("", "", "", name="frames", tables=("monitor",)),))
+    monkeypatch.setattr(sessions, "RUNS", {"frames": frames})
     monkeypatch.setattr(sessions, "NAMES", ("frames",))
     grab = f"sh -c 'cp {{pattern}} {{output}}; case {{output}} in *frame_2*) test -e {tmp_path / 'mended'};; esac'"
 

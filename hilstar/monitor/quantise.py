@@ -128,11 +128,6 @@ class Quantiser(ABC):
         return float(panel.response.threshold[0]) * panel.flux_at_white_e_per_s
 
     @classmethod
-    def dark_e_per_s(cls, panel: Panel) -> float:
-        """Light of less leaves a pixel at a level of 0."""
-        return cls.lit_from_e_per_s(panel)
-
-    @classmethod
     def faintest_e_per_s(cls, panel: Panel, psf: Psf) -> float:
         """The rate below which a single star lights no pixel at any phase; 0 where it always may."""
         return 0.0
@@ -215,11 +210,6 @@ class DitherQuantiser(PixelQuantiser):
     def lit_from_e_per_s(cls, panel: Panel) -> float:
         """0: any light may."""
         return 0.0
-
-    @classmethod
-    def dark_e_per_s(cls, panel: Panel) -> float:
-        """The first step by the mask's smallest threshold, at all of its turns."""
-        return float(panel.response.light[1]) * panel.flux_at_white_e_per_s * 0.5 / MASK_TURNS
 
     @classmethod
     def masks(cls) -> dict[str, Float32Array]:

@@ -63,6 +63,13 @@ def _source(main: str, defines: Sequence[str], before: Sequence[str] = (), after
     return "\n".join([version, *(f"#define {name}" for name in defines), *first, body, *last])
 
 
+def set_uniforms(program: moderngl.Program | moderngl.ComputeShader, values: Mapping[str, Any]) -> None:
+    """Set the uniforms of a program by name; compilers drop what it does not need."""
+    for name, value in values.items():
+        if name in program:
+            program[name] = value
+
+
 @dataclass(frozen=True, slots=True)
 class Planes:
     """The planes of an image: one, or one for each of the primaries that a target drives apart.
@@ -128,8 +135,7 @@ class Planes:
             if name in program:  # an array ends with its last element that is used
                 length = getattr(program[name], "array_length", 1)
                 program[name] = list(each[:length]) if length > 1 else each[0]
-        if "margin_px" in program:
-            program["margin_px"] = self.margin_px
+        set_uniforms(program, {"margin_px": self.margin_px})
 
 
 class Shares:
@@ -145,11 +151,7 @@ class Shares:
 
     def set(self, program: moderngl.Program | moderngl.ComputeShader) -> None:
         """Set the uniforms of a program; compilers drop what a program does not need."""
-        for name, value in self._uniforms.items():
-            if name in program:
-                program[name] = value
-        if "share_table" in program:
-            program["share_table"] = TABLE_UNIT
+        set_uniforms(program, {**self._uniforms, "share_table": TABLE_UNIT})
 
     def bind(self) -> None:
         """Bind the table, if there is one, for the next passes: another renderer of the context may have bound its own."""
@@ -299,9 +301,7 @@ def draw_tiles(
     """Draw tiles by their corners (n, 6) with a program of tile.vert, into an image whose framebuffer is in use."""
     if not len(corners):
         return
-    program["size_px"] = size_px
-    if "air" in program:
-        program["air"] = of_air
+    set_uniforms(program, {"size_px": size_px, "air": of_air})
     buffer, has_given = program.ctx.buffer(corners), "given" in program
     names = ("place_px", "given") if has_given else ("place_px",)
     triangles = program.ctx.vertex_array(program, [(buffer, "2f 4f" if has_given else "2f 16x", *names)])
@@ -439,9 +439,7 @@ class Encoder:
             include = ("planes.glsl", *["tile.glsl"] * bool(of_tiles))
             program = self._built(vertex=vertex, defines=(*self._defines, *(of_tiles or self._of_image)), include=include)
             self._planes.set(program, bins=self._bins[0], thresholds=self._bins[1])
-            for unit, name in enumerate(self._textures):
-                if name in program:
-                    program[name] = unit
+            set_uniforms(program, {name: unit for unit, name in enumerate(self._textures)})
             self._programs[key] = program
         return self._programs[key]
 
@@ -478,21 +476,21 @@ class Encoder:
     ) -> None:
         """Encode the linear image under the first `count` sprites of the buffer and in `regions`; the rest is black.
 
-        Of a disc in `tiles` the linear image has `face`, `air` and `edges`.
+        Instead of `regions` it may have `tiles`, of which the image has what is no level.
 
         `uniforms` are the quantiser's of this frame. Each star has `per_star` sprites; together they cover `covered_px`, and
         where that is most of the image the pass covers all of it. `is_black` says that the levels were erased before.
         """
         width, height = self._size_px
-        whole = (0, 0, width, height)
+        whole, regions = (0, 0, width, height), regions if tiles is None else ()
         if covered_px * SPRITE_PIXEL_COST >= width * height or whole in regions:
             regions, count = (whole,), 0
         self._fbo.use()
         if not is_black and whole not in regions:
             self._fbo.clear()
         self._bind()
-        for name, value in uniforms.items():
-            self.sprite_program[name] = self._whole[name] = value
+        for program in (self.sprite_program, self._whole):
+            set_uniforms(program, uniforms)
         for region in regions:
             self._fbo.viewport = region
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
@@ -517,8 +515,7 @@ class Encoder:
         of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
         given = ((of_image, ()), (tiles.face_levels, ("TILE",)), (tiles.air_levels, ("TILE", "AIR")))
         for program, corners in [(self._program("tile.vert", *defines), corners) for corners, defines in given if len(corners)]:
-            for name, value in uniforms.items():
-                program[name] = value
+            set_uniforms(program, uniforms)
             draw_tiles(program, corners, self._size_px, tiles.of_air)
         if (key := ("white",)) not in self._programs:
             self._programs[key] = build_program(self._ctx, "tile.vert", "erase.frag", (f"LEVELS {self._white}u",))

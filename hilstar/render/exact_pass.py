@@ -16,7 +16,7 @@ from hilstar.monitor.exact import CARRIED, KEPT_BEFORE, ExactQuantiser, Left
 from hilstar.monitor.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.render.backend import Target, Turn
-from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, linear_format, write
+from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, linear_format, set_uniforms, write
 from hilstar.render.star_passes import StarPasses, turns_of
 from hilstar.scene.psf import PIXEL_VARIANCE
 from hilstar.scene.sprites import Sprites
@@ -113,9 +113,7 @@ class ExactPass:
             "few_steps": weights.few_steps,
             "last_light": weights.last_light,
         } | ({"gain": 0} if self._gain is not None else {})
-        for name, value in values.items():
-            if name in program:  # compilers drop what they do not need
-                program[name] = value
+        set_uniforms(program, values)
         self._programs[paths, summed] = program
         return program
 

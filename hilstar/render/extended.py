@@ -7,7 +7,7 @@ import moderngl
 import numpy as np
 
 from hilstar.render.disc_tiles import Sure, Tiles, disc_tiles
-from hilstar.render.encoder import build_program, draw_tiles
+from hilstar.render.encoder import build_program, draw_tiles, set_uniforms
 from hilstar.scene.camera import Camera, ray_shifts
 from hilstar.scene.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
 from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, gauss_legendre
@@ -155,7 +155,7 @@ def _set_disc(program: moderngl.Program, light: DiscLight) -> None:
     """The body, its face, the turn and the Gaussian, in a program of disc.frag."""
     disc, shear = light.disc, light.shear
     from_image, (place, weight) = disc.to_sphere @ light.icrs_to_image.T, gauss_legendre(NODES)
-    values: dict[str, Any] = {
+    values = {
         "to_sphere": tuple(from_image.T.ravel().tolist()),  # column by column
         "variance_px": light.psf.variance_px2,
         "times": light.times,
@@ -175,6 +175,4 @@ def _set_disc(program: moderngl.Program, light: DiscLight) -> None:
         "slant_depth": disc.slant_depth,
         "air_top": AIR_TOP,
     }
-    for name, value in values.items():
-        if name in program:  # a smooth face needs few
-            program[name] = value
+    set_uniforms(program, values)

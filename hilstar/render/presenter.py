@@ -11,7 +11,7 @@ from hilstar.monitor.window.x11 import GL_LIBRARY, X11_LIBRARY
 from hilstar.render.backend import ScreenView
 from hilstar.render.context import is_software
 from hilstar.render.driver import Driver
-from hilstar.render.encoder import TABLE_WIDTH, build_program
+from hilstar.render.encoder import TABLE_WIDTH, build_program, set_uniforms
 
 GL_DITHER = 0x0BD0
 MAX_LEVELS = 2**16
@@ -93,9 +93,7 @@ class Presenter:
             "screen_px": view.screen_px,
             "cross_px": (round(view.cross_px[0]), round(view.cross_px[1])),
         }
-        for name, value in values.items():
-            if name in program:  # a compiler removes what a variant does not use
-                program[name] = value
+        set_uniforms(program, values)
         return program, self._ctx.vertex_array(program, [])
 
     def set_triples(self, triples: npt.NDArray[np.uint16] | None) -> None:

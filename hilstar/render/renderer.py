@@ -13,7 +13,7 @@ import numpy as np
 
 from hilstar.arrays import Float32Array
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import DitherQuantiser, PixelQuantiser
+from hilstar.monitor.quantise import MASK_TURNS, DitherQuantiser, PixelQuantiser
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
@@ -256,7 +256,8 @@ class Renderer(Backend):
             with self._stage("encode"):
                 count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
                 uniforms = self._by_pixel.uniforms(self._last_frame)
-                self._encoder.draw(count, per_star, covered_px, uniforms, *self._lit(), is_black=self._levels_black)
+                lit = self._regions, self._tiles
+                self._encoder.draw(count, per_star, covered_px, uniforms, *lit, is_black=self._levels_black)
                 self._levels_black = True  # but for what this frame has
         if in_units or (cut and not self.target.sides) or self._tiles is not None:
             self._undrawn = (sprites, True)  # without what is left out, when somebody asks
@@ -305,7 +306,7 @@ class Renderer(Backend):
         self._erase()
         self._draw_extended(sprites, self._sure(DitherQuantiser, None))
         levels.fbo.clear()
-        self._floor_encoder.draw(0, 1, 0, {"shift": turn}, *self._lit())
+        self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions, self._tiles)
         self._floor_key, self._floor_levels = key, Levels(levels.read().copy())
         return self._floor_levels
 
@@ -314,15 +315,12 @@ class Renderer(Backend):
         if self._planes.apart or not self._planes.panels:
             return None
         panel = self._planes.panels[0]
-        gain = panel.gain()
+        gain, white_e_per_s = panel.gain(), panel.flux_at_white_e_per_s
         least, most = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
-        dark_e_per_s, white_e_per_s = quantiser.dark_e_per_s(panel) / most, panel.flux_at_white_e_per_s / least
+        # The first step by the smallest threshold of a mask, at all of its turns
+        dark_e_per_s = quantiser.lit_from_e_per_s(panel) or float(panel.response.light[1]) * white_e_per_s / (2 * MASK_TURNS)
         places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]
-        return Sure(dark_e_per_s, white_e_per_s, places_px, self.footprint_px)
-
-    def _lit(self) -> tuple[tuple[Rectangle, ...], Tiles | None]:
-        """Where extended light has to be encoded from the linear image, and the tiles of a disc that has its own."""
-        return (self._regions, None) if self._tiles is None else ((), self._tiles)
+        return Sure(dark_e_per_s / most, white_e_per_s / least, places_px, self.footprint_px)
 
     def _draw_extended(self, sprites: Sprites, sure: Sure | None = None) -> None:
         """Add extended light to the linear image, that of each primary to its plane alone."""

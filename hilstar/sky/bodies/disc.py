@@ -192,7 +192,7 @@ class Disc:
         The rays have the sides of ICRS directions (n, 3).
         """
         seen = directions @ self.to_sphere.T
-        side = seen[:, :2] / np.hypot(seen[:, 0], seen[:, 1])[:, None]
+        side = seen[:, :2] / np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-30)[:, None]  # any at the middle
         sine = 1 / self.distance_radii
         up = np.column_stack((side * np.sqrt(1 - sine**2), np.full(len(side), -sine)))
         mu0 = np.maximum(0.0, up @ self.sun_sphere / np.linalg.norm(up @ self.to_sphere, axis=1))

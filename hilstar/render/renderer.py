@@ -123,7 +123,8 @@ class Renderer(Backend):
         self._floor_levels: Levels | None = None
         if not planes.panels:
             return
-        panel = planes.lit
+        panel, gain = planes.lit, planes.panels[0].gain()
+        self._gains = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
         self._levels = LevelTexture(self._ctx, target.resolution_px, planes)
         by_star, ctx = self._by_star, self._ctx
         if by_star is not None and by_star.takes(target.psf, ctx.version_code):
@@ -314,9 +315,8 @@ class Renderer(Backend):
         """What a quantiser's levels need not know of a disc's light, where there is one plane."""
         if self._planes.apart or not self._planes.panels:
             return None
-        panel = self._planes.panels[0]
-        gain, white_e_per_s = panel.gain(), panel.flux_at_white_e_per_s
-        least, most = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
+        panel, (least, most) = self._planes.panels[0], self._gains
+        white_e_per_s = panel.flux_at_white_e_per_s
         # The first step by the smallest threshold of a mask, at all of its turns
         dark_e_per_s = quantiser.lit_from_e_per_s(panel) or float(panel.response.light[1]) * white_e_per_s / (2 * MASK_TURNS)
         places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]

@@ -27,7 +27,7 @@ from hilstar.reading import read_bytes
 # flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the cost of one pixel.
 # results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
-MAX_FOOTPRINT_PX = 100_000
+MAX_GAUSSIAN_PX = 100_000
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
 SQRT2 = math.sqrt(2.0)
 # Error of the polynomial in a pixel along one axis, relative to a star's flux. The float32 erf is 4.4e-7 off.
@@ -153,7 +153,7 @@ class GaussianPsf(Psf):
     @cached_property
     def footprint_px(self) -> int:
         """The side of the smallest square that cuts at most MAX_CUT of a star's flux. InputError where none is enough."""
-        sizes = range(1, MAX_FOOTPRINT_PX + 1)
+        sizes = range(1, MAX_GAUSSIAN_PX + 1)
         place = bisect_left(sizes, -MAX_CUT, key=lambda size: -self.cut_share(size))
         if place == len(sizes):
             raise InputError(f"sprite sigma {self.sigma_px} px: too large for any footprint; write a few pixels")

@@ -109,6 +109,8 @@ def type_in(block: Block, port: str) -> None:
             words = shlex.split(step.command.replace(DEFAULT_PORT, port))
             if words[:2] == ["hilstar", "send"] and "--to" not in words:
                 words += ["--to", f"tcp://127.0.0.1:{port}"]
+            if words[:2] == ["hilstar", "campaign"]:  # each worker is a process, which takes a second to start
+                words += ["--workers", "1"]
             if step.beside:
                 beside.enter_context(running(words))
                 if words[:2] == ["hilstar", "send"]:  # a busy machine takes seconds to start it

@@ -138,7 +138,7 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
     disc = Disc("Earth", direction, distance_km, EARTH_KM, 6356.752, pole, sun, "lambert", 1e6, 1.0, Air(*AIR))
     (light,) = lights(disc, cam, covers=True)
     got = drawn(gl, light)
-    truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng)
+    truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng, finer=2)
     assert got.sum() == pytest.approx(truth.sum(), rel=FLUX_LIMIT)
     assert np.abs(got - truth).max() < FLUX_LIMIT * truth.max()
     # What the sky behind lets through: a map of 1 drawn before the disc.

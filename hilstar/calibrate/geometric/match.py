@@ -72,26 +72,32 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
 
 
 def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """The projective map (3, 3) from (u, v) to (x, y) by least squares (Hartley and Zisserman 2004, 4.1, normalised)."""
+    """The projective map (..., 3, 3) from (u, v) to (x, y), (..., n) each, by least squares.
+
+    Hartley and Zisserman 2004, 4.1, normalised.
+    """
     into, out = _normal(u, v), _normal(x, y)
-    a, b, _ = into @ np.stack([u, v, np.ones_like(u)])
-    c, d, _ = out @ np.stack([x, y, np.ones_like(x)])
-    zero, one = np.zeros_like(a), np.ones_like(a)
+    zero, one = np.zeros_like(u), np.ones_like(u)
+    a, b, _ = np.moveaxis(into @ np.stack([u, v, one], axis=-2), -2, 0)
+    c, d, _ = np.moveaxis(out @ np.stack([x, y, one], axis=-2), -2, 0)
     rows = np.concatenate(
         [
-            np.stack([a, b, one, zero, zero, zero, -c * a, -c * b, -c], axis=1),
-            np.stack([zero, zero, zero, a, b, one, -d * a, -d * b, -d], axis=1),
-        ]
+            np.stack([a, b, one, zero, zero, zero, -c * a, -c * b, -c], axis=-1),
+            np.stack([zero, zero, zero, a, b, one, -d * a, -d * b, -d], axis=-1),
+        ],
+        axis=-2,
     )
-    solution = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    solution = np.linalg.svd(rows)[2][..., -1, :].reshape(into.shape)
     found = np.linalg.inv(out) @ solution @ into
-    return np.asarray(found / found[2, 2])
+    return np.asarray(found / found[..., 2:, 2:])
 
 
 def _normal(x: FloatArray, y: FloatArray) -> FloatArray:
-    """A similarity (3, 3) that centres points on the origin with a mean square distance of 2."""
-    scale = np.sqrt(2.0) / max(float(np.sqrt(np.var(x) + np.var(y))), 1e-300)
-    return np.array([[scale, 0.0, -scale * x.mean()], [0.0, scale, -scale * y.mean()], [0.0, 0.0, 1.0]])
+    """A similarity (..., 3, 3) that centres points (..., n) on the origin with a mean square distance of 2."""
+    scale = np.sqrt(2.0) / np.maximum(np.sqrt(x.var(axis=-1) + y.var(axis=-1)), 1e-300)
+    zero, one = np.zeros_like(scale), np.ones_like(scale)
+    rows = [[scale, zero, -scale * x.mean(axis=-1)], [zero, scale, -scale * y.mean(axis=-1)], [zero, zero, one]]
+    return np.asarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
 
 
 def mapped(matrix: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -162,12 +168,10 @@ def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Gene
     u, v = nominal.tracker.tangents(found.x_px, found.y_px)
     x, y = plan.x_px[found.dot], plan.y_px[found.dot]
     best = np.zeros(len(u), dtype=bool)
-    for _ in range(TRIALS if len(u) >= MIN_DECODED else 0):
-        four = rng.choice(len(u), 4, replace=False)
-        try:
-            seen_x, seen_y = mapped(homography(u[four], v[four], x[four], y[four]), u, v)
-        except np.linalg.LinAlgError:
-            continue
+    fours = np.array([rng.choice(len(u), 4, replace=False) for _ in range(TRIALS if len(u) >= MIN_DECODED else 0)], dtype=int)
+    fours = fours[np.isfinite((u + v)[fours]).all(axis=-1)].reshape(-1, 4)
+    for trial in homography(u[fours], v[fours], x[fours], y[fours]):
+        seen_x, seen_y = mapped(trial, u, v)
         with np.errstate(invalid="ignore"):
             inlier = np.hypot(seen_x - x, seen_y - y) < INLIER_SHARE * nominal.monitor.resolution_px[0]
         if inlier.sum() > best.sum():

@@ -143,6 +143,7 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
     assert "drift" in {each["name"] for each in again["inputs"]}  # by the checks between
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run: Planted) -> None:
     bench, truth = plant(tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n")
     words = ("certify", bench, "-o", tmp_path / "out", "--virtual", truth, "--quick", "--json")

@@ -6,11 +6,11 @@ import pytest
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import bench_stars
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.electrons import Photometry, band_mean, library_electrons_per_s, load_library, tabulate_pickles
+from hilstar.sky.electrons import VEGA_V0_W_M2_M, Photometry, band_mean, library_electrons_per_s, load_library, tabulate_pickles
 from hilstar.sky.facts import facts_of
 from hilstar.sky.spectral_types import bare_and_dusty, fit_types, read_types, star_types, tabulate_types
 from hilstar.sky.spectrum import DATA_DIR, read_curve_csv
-from hilstar.sky.synthetic import VEGA_V0_W_M2_M, ZERO_W_M2_M
+from hilstar.sky.synthetic import ZERO_W_M2_M
 from hilstar.study.settings import held_out_by_type, held_out_errors
 from hilstar.units import magnitude
 from tests.authority.test_pickles import BARE, REDDEST_VI_MAG, SENSORS

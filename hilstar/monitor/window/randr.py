@@ -12,17 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from hilstar.monitor.window.output_settings import IDENTITY, NVIDIA, NVIDIA_ATTRIBUTES, OutputState, Pair, Value, property_value
-from hilstar.monitor.window.x11 import (
-    INT,
-    NUMBER,
-    POINTER,
-    TEXT,
-    X11_LIBRARY,
-    Survival,
-    has_extension,
-    is_composited,
-    load_library,
-)
+from hilstar.monitor.window.x11 import INT, NUMBER, POINTER, TEXT, Survival, has_extension, is_composited, load_library, xlib
 from hilstar.process.closing import Closing
 
 XRANDR_LIBRARY = "libXrandr.so.2"
@@ -82,13 +72,6 @@ class _Provider(ctypes.Structure):  # XRRProviderInfo, its beginning
     )
 
 
-X11_FUNCTIONS: dict[str, tuple[Any, ...]] = {
-    "XOpenDisplay": (POINTER, TEXT),
-    "XCloseDisplay": (INT, POINTER),
-    "XDefaultRootWindow": (_Id, POINTER),
-    "XGetAtomName": (POINTER, POINTER, _Id),
-    "XFree": (INT, POINTER),
-}
 XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "XRRGetScreenResourcesCurrent": (POINTER, POINTER, _Id),
     "XRRGetOutputInfo": (POINTER, POINTER, POINTER, _Id),
@@ -112,7 +95,7 @@ class Randr(Closing):
     """
 
     def __init__(self, survival: Survival | None = None) -> None:
-        self._x11, self._xrandr = load_library(X11_LIBRARY, **X11_FUNCTIONS), load_library(XRANDR_LIBRARY, **XRANDR_FUNCTIONS)
+        self._x11, self._xrandr = xlib(), load_library(XRANDR_LIBRARY, **XRANDR_FUNCTIONS)
         self._display: Any = self._x11.XOpenDisplay(None)
         if not self._display:
             raise OSError("no X server")

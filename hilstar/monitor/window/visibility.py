@@ -7,7 +7,7 @@ import threading
 from dataclasses import dataclass
 from typing import Any, Self
 
-from hilstar.monitor.window.x11 import INT, NUMBER, POINTER, TEXT, X11_LIBRARY, Survival, load_library
+from hilstar.monitor.window.x11 import INT, NUMBER, POINTER, Survival, load_library, xlib
 
 # X.h
 VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
@@ -54,7 +54,7 @@ class Visibility:
     def of(cls, window: int, place: ScreenArea | None, survival: Survival) -> Self | None:
         """Watch a window that has to fill `place` (None: that may be anywhere); None without a connection to the server."""
         try:
-            x11 = _library()
+            x11 = xlib()
         except (OSError, AttributeError):
             return None
         connection = x11.XOpenDisplay(None)
@@ -129,7 +129,7 @@ def _sleep_of(connection: int) -> Any:
         library = load_library("libXext.so.6", DPMSCapable=(INT, POINTER), DPMSInfo=(INT, POINTER, POINTER, POINTER))
         parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
         # Asked for a missing extension, Xlib prints to stderr.
-        if not _library().XQueryExtension(connection, b"DPMS", *parts) or not library.DPMSCapable(connection):
+        if not xlib().XQueryExtension(connection, b"DPMS", *parts) or not library.DPMSCapable(connection):
             return bool
     except (OSError, AttributeError):
         return bool
@@ -140,20 +140,3 @@ def _sleep_of(connection: int) -> Any:
         return bool(known and enabled.value and level.value)
 
     return asleep
-
-
-def _library() -> Any:
-    return load_library(
-        X11_LIBRARY,
-        XOpenDisplay=(POINTER, TEXT),
-        XCloseDisplay=(INT, POINTER),
-        XConnectionNumber=(INT, POINTER),
-        XDefaultRootWindow=(NUMBER, POINTER),
-        XSelectInput=(INT, POINTER, NUMBER, ctypes.c_long),
-        XQueryExtension=(INT, POINTER, TEXT, *[POINTER] * 3),
-        XPending=(INT, POINTER),
-        XNextEvent=(INT, POINTER, POINTER),
-        XSync=(INT, POINTER, INT),
-        XGetGeometry=(INT, POINTER, NUMBER, *[POINTER] * 7),
-        XTranslateCoordinates=(INT, POINTER, NUMBER, NUMBER, INT, INT, *[POINTER] * 3),
-    )

@@ -9,6 +9,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from hilstar.units import NS_PER_US
@@ -40,10 +41,34 @@ def load_library(name: str, **functions: tuple[Any, ...]) -> Any:
     return library
 
 
+@cache
+def xlib() -> Any:
+    """libX11 with the types of what is called here. Raises OSError without it."""
+    return load_library(
+        X11_LIBRARY,
+        XOpenDisplay=(POINTER, TEXT),
+        XCloseDisplay=(INT, POINTER),
+        XConnectionNumber=(INT, POINTER),
+        XDefaultRootWindow=(NUMBER, POINTER),
+        XFree=(INT, POINTER),
+        XGetAtomName=(POINTER, POINTER, NUMBER),
+        XGetGeometry=(INT, POINTER, NUMBER, *[POINTER] * 7),
+        XGetSelectionOwner=(NUMBER, POINTER, NUMBER),
+        XInternAtom=(NUMBER, POINTER, TEXT, INT),
+        XNextEvent=(INT, POINTER, POINTER),
+        XPending=(INT, POINTER),
+        XQueryExtension=(INT, POINTER, TEXT, *[POINTER] * 3),
+        XSelectInput=(INT, POINTER, NUMBER, ctypes.c_long),
+        XServerVendor=(TEXT, POINTER),
+        XSync=(INT, POINTER, INT),
+        XTranslateCoordinates=(INT, POINTER, NUMBER, NUMBER, INT, INT, *[POINTER] * 3),
+        XVendorRelease=(INT, POINTER),
+    )
+
+
 def server_of() -> str:
     """The X server of `DISPLAY`: its maker and release; "" without one. Raises OSError without libX11."""
-    asked = {"XServerVendor": (TEXT, POINTER), "XVendorRelease": (INT, POINTER)}
-    library = load_library(X11_LIBRARY, XOpenDisplay=(POINTER, TEXT), XCloseDisplay=(INT, POINTER), **asked)
+    library = xlib()
     display = library.XOpenDisplay(None)
     if not display:
         return ""
@@ -191,9 +216,8 @@ def has_extension(x_display: int | None, name: bytes) -> bool:
     """Whether an X server has an extension."""
     if not x_display:
         return False
-    library = load_library(X11_LIBRARY, XQueryExtension=(INT, POINTER, TEXT, *[POINTER] * 3))
     parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
-    return bool(library.XQueryExtension(x_display, name, *parts))
+    return bool(xlib().XQueryExtension(x_display, name, *parts))
 
 
 def is_composited(x_display: int | None) -> bool:
@@ -201,10 +225,7 @@ def is_composited(x_display: int | None) -> bool:
     if not x_display:
         return False
     try:
-        library = load_library(
-            X11_LIBRARY, XInternAtom=(NUMBER, POINTER, TEXT, INT), XGetSelectionOwner=(NUMBER, POINTER, NUMBER)
-        )
-        atom = library.XInternAtom(x_display, b"_NET_WM_CM_S0", 1)
-        return bool(atom and library.XGetSelectionOwner(x_display, atom))
+        atom = xlib().XInternAtom(x_display, b"_NET_WM_CM_S0", 1)
+        return bool(atom and xlib().XGetSelectionOwner(x_display, atom))
     except (OSError, AttributeError):
         return False

@@ -15,16 +15,9 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_calibration, calibration_source, open_bench, orientation_of
 from hilstar.bench.cameras import bench_camera, tracker_camera, tracker_psf
+from hilstar.calibrate.first_light import image_sources
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.geometry import sharpness
-from hilstar.calibrate.first_light.image_sources import (
-    DiodeRecording,
-    ImageSource,
-    Pattern,
-    black,
-    refuse_other_bench,
-    virtual_diode,
-)
 from hilstar.calibrate.first_light.photometry import Assumed, Photometer
 from hilstar.calibrate.geometric.dots import DOT_PX
 from hilstar.calibrate.latency import pair, swap_to_square_ms
@@ -96,7 +89,7 @@ def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
     return x[kept], y[kept]
 
 
-def delays_of(recording: DiodeRecording | None, file: BenchFile) -> FloatArray:
+def delays_of(recording: image_sources.DiodeRecording | None, file: BenchFile) -> FloatArray:
     """Delays (n,) from the swap to the first row's light, ms, by a photodiode's recording. Raises InputError."""
     if recording is None:
         return np.zeros(0)
@@ -115,7 +108,7 @@ class VirtualReader:
     centroid_px = 0.0
 
     def __init__(self, file: BenchFile, truth: BenchFile, seed: int, turn: int = 0) -> None:
-        refuse_other_bench(file, truth)
+        image_sources.refuse_other_bench(file, truth)
         if orientation_of(file.config.monitor) != orientation_of(truth.config.monitor):
             raise InputError(f"{truth.path}: its screen is mounted otherwise; run the orientation first (hilstar first-light)")
         self.file, self.truth, self._rng = file, truth, np.random.default_rng((seed, 0xCE27, turn))
@@ -166,7 +159,7 @@ class VirtualReader:
         """A simulated photodiode."""
         if not self.file.config.monitor.photodiode_px:
             return np.zeros(0)
-        return delays_of(virtual_diode(self.file, self.truth, WATCHED_S, self._rng), self.file)
+        return delays_of(image_sources.virtual_diode(self.file, self.truth, WATCHED_S, self._rng), self.file)
 
 
 def white_of(file: BenchFile) -> float:
@@ -183,7 +176,7 @@ class ImageReader:
     """Readings by the tracker's images of an image source, which go to `folder`."""
 
     file: BenchFile
-    source: ImageSource
+    source: image_sources.ImageSource
     folder: Path
     truth: BenchFile | None = None
     centroid_px: float = CENTROID_PX
@@ -218,11 +211,11 @@ class ImageReader:
         code = code_of_light(self.file, DOT_LIGHT)
         dark = context.read(context.dark())
         while True:
-            codes, half = black(context.resolution_px), DOT_PX // 2
+            codes, half = image_sources.black(context.resolution_px), DOT_PX // 2
             for down in range(-half, half + 1):
                 for right in range(-half, half + 1):
                     codes[y_px + down, x_px + right] = code
-            looked = [context.look(Pattern(f"dots_{code:05}_{number}", codes), dark) for number in range(images)]
+            looked = [context.look(image_sources.Pattern(f"dots_{code:05}_{number}", codes), dark) for number in range(images)]
             if not context.is_too_bright(looked[0]):
                 break
             code = context.darker(code)

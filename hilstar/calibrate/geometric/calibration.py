@@ -13,27 +13,8 @@ import hilstar
 from hilstar.arrays import BoolArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.cameras import ideal_monitor, tracker_camera
+from hilstar.calibrate.geometric import fit as fits
 from hilstar.calibrate.geometric.dots import DotPlan, read_plan
-from hilstar.calibrate.geometric.fit import (
-    BROWN_CONRADY,
-    PINHOLE,
-    RADIAL,
-    TRACKER_STEPS,
-    Candidate,
-    Fit,
-    MatchedDots,
-    Model,
-    Nominal,
-    Problem,
-    Uncertainty,
-    best_of,
-    candidates,
-    directions_in_cam,
-    fit,
-    noise_of_repeats,
-    residuals_px,
-    uncertainty_of,
-)
 from hilstar.calibrate.geometric.match import FirstLook, first_look, match_by_geometry, match_by_maps, refuse_motion
 from hilstar.calibrate.geometric.observed import Observed, measure_images, read_observed
 from hilstar.charts import BLUE, SMALL_PT, chart
@@ -62,12 +43,12 @@ MISFIT_FLOOR_ARCSEC = 1.0
 class Calibrated:
     """The result of a geometric calibration: the fit, the models compared, its uncertainty, and the centroids' fate."""
 
-    problem: Problem
-    data: MatchedDots
-    fit: Fit
-    models: list[Candidate]
-    chosen: Candidate
-    uncertainty: Uncertainty
+    problem: fits.Problem
+    data: fits.MatchedDots
+    fit: fits.Fit
+    models: list[fits.Candidate]
+    chosen: fits.Candidate
+    uncertainty: fits.Uncertainty
     centroids: int
     tracker_known: bool
 
@@ -110,7 +91,7 @@ def calibrate_files(
     """Fit the geometry of a bench file to a table of centroids, or to the tracker's images. Raises InputError."""
     config = file.config
     monitor = ideal_monitor(config)
-    nominal = Nominal(monitor, np.array(config.collimator.q_cam_to_mon), tracker_camera(config.tracker, file.folder))
+    nominal = fits.Nominal(monitor, np.array(config.collimator.q_cam_to_mon), tracker_camera(config.tracker, file.folder))
     dots = read_plan(plan)
     width, height = monitor.resolution_px
     if dots.x_px.max() > width - 1 or dots.y_px.max() > height - 1:
@@ -126,7 +107,7 @@ def calibrate_files(
 
 
 def calibrate_geometry(
-    plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator, *, tracker_known: bool
+    plan: DotPlan, nominal: fits.Nominal, seen: Observed, rng: np.random.Generator, *, tracker_known: bool
 ) -> Calibrated:
     """Fit a bench's geometry to what the tracker saw of the dots.
 
@@ -141,16 +122,16 @@ def calibrate_geometry(
             " [tracker] distortion, take a second pose (turn the tracker by 90 or 180 degrees about its boresight),"
             " or add --tracker-is-ideal"
         )
-    tracker_names = () if tracker_known else tuple(TRACKER_STEPS)
+    tracker_names = () if tracker_known else tuple(fits.TRACKER_STEPS)
     look = first_look(plan, nominal, seen, rng)
     problem, data = matched(plan, nominal, seen, look, tracker_names)
     found = len(np.unique(data.dot))
     if found < MIN_DOTS:
         raise InputError(f"{found} dots were recognised and {MIN_DOTS} are needed; show more --dots or more --frames")
-    models = candidates(problem, data, tracker_names)
-    chosen = best_of(models)
-    final = bounded_to_field(problem, fit(problem, chosen.model, chosen.field_degree, data))
-    uncertainty = uncertainty_of(problem, final, data)
+    models = fits.candidates(problem, data, tracker_names)
+    chosen = fits.best_of(models)
+    final = bounded_to_field(problem, fits.fit(problem, chosen.model, chosen.field_degree, data))
+    uncertainty = fits.uncertainty_of(problem, final, data)
     calibrated = Calibrated(problem, data, final, models, chosen, uncertainty, len(seen), tracker_known)
     _refuse_gaps(calibrated)
     expected, error = calibrated.held_out_noise_arcsec, chosen.rms_arcsec
@@ -162,7 +143,7 @@ def calibrate_geometry(
     return calibrated
 
 
-def bounded_to_field(problem: Problem, fit: Fit) -> Fit:
+def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     """The fit with its lens limited to the tracker's field, where part of the screen lies outside of it."""
     geometry, monitor = fit.geometry, fit.geometry.monitor
     if monitor.lens is None or all(inside.all() for inside in _in_view(problem, fit)):
@@ -171,15 +152,15 @@ def bounded_to_field(problem: Problem, fit: Fit) -> Fit:
     corners = np.array([-0.5, width - 0.5, -0.5, width - 0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
     reach = 0.0
     for pose in range(len(geometry.q_poses)):
-        rays = directions_in_cam(geometry, np.full(4, pose), *corners) @ monitor.cam_to_image.T
+        rays = fits.directions_in_cam(geometry, np.full(4, pose), *corners) @ monitor.cam_to_image.T
         reach = max(reach, float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2])))
     lens = replace(monitor.lens, max_tangent=KNOWN_MARGIN * reach)
     return replace(fit, geometry=replace(geometry, monitor=replace(monitor, lens=lens)))
 
 
 def matched(
-    plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...] = ()
-) -> tuple[Problem, MatchedDots]:
+    plan: DotPlan, nominal: fits.Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...] = ()
+) -> tuple[fits.Problem, fits.MatchedDots]:
     """Match centroids to dots, first by the codes' map and then by a fitted lens; the problem to fit, and its data.
 
     Raises InputError where the image moved between frames.
@@ -187,19 +168,19 @@ def matched(
     data = match_by_maps(plan, nominal, seen, look)
     refuse_motion(data)
     for _ in range(MATCH_ROUNDS):
-        problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or DEFAULT_NOISE_PX)
+        problem = fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX)
         # The largest model that these centroids can determine.
-        names = next((names for names in (BROWN_CONRADY, RADIAL) if len(data) > 2 * len(names)), PINHOLE)
-        model = Model(names, tracker_names if names is BROWN_CONRADY else (), len(look.q_poses))
-        rough = fit(problem, model, 0, data)
+        names = next((names for names in (fits.BROWN_CONRADY, fits.RADIAL) if len(data) > 2 * len(names)), fits.PINHOLE)
+        model = fits.Model(names, tracker_names if names is fits.BROWN_CONRADY else (), len(look.q_poses))
+        rough = fits.fit(problem, model, 0, data)
         reach_px = max(REACH_PX, REACH_SIGMAS * problem.noise_px) * problem.monitor_px_per_px
         data = match_by_geometry(plan, seen, rough.geometry, reach_px)
         if len(data) < MIN_DOTS:
             break
-    return Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or DEFAULT_NOISE_PX), data
+    return fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX), data
 
 
-def _in_view(problem: Problem, fit: Fit) -> list[BoolArray]:
+def _in_view(problem: fits.Problem, fit: fits.Fit) -> list[BoolArray]:
     """For each pose, a mask of the dots (n,) in the tracker's field."""
     geometry = fit.geometry
     directions = geometry.monitor.rays(problem.plan.x_px, problem.plan.y_px)
@@ -264,7 +245,7 @@ def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _both(error: Candidate | Uncertainty) -> dict[str, float]:
+def _both(error: fits.Candidate | fits.Uncertainty) -> dict[str, float]:
     return {"rms_arcsec": error.rms_arcsec, "max_arcsec": error.max_arcsec}
 
 
@@ -299,7 +280,7 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
     for name, value in zip(("k1", "k2", "k3", "p1", "p2"), (*lens.radial, *lens.tangential), strict=True):
         values[name] = (value, sigma.get(name, 0.0))
     own = found.fit.geometry.tracker.lens or Lens()
-    for name, value in zip(TRACKER_STEPS, (*own.radial[:2], *own.tangential), strict=True):
+    for name, value in zip(fits.TRACKER_STEPS, (*own.radial[:2], *own.tangential), strict=True):
         if name in found.fit.model.tracker_names:
             values[name] = (value, sigma[name])
     return {name: FittedParameter(float(value), float(s)) for name, (value, s) in values.items()}
@@ -351,7 +332,7 @@ def draw_geometry(path: Path, found: Calibrated) -> None:
         f" {found.uncertainty.max_arcsec:.2g} at most; held-out dots {found.chosen.rms_arcsec:.2g} rms"
     )
     dot, place, count = np.unique(found.data.dot, return_inverse=True, return_counts=True)
-    residual = residuals_px(found.problem, found.fit.geometry, found.data)
+    residual = fits.residuals_px(found.problem, found.fit.geometry, found.data)
     right, down = (np.bincount(place, part) / count for part in residual)
     to_arcsec = ARCSEC_PER_RAD / found.problem.nominal.tracker.focal_length_px
     median = max(float(np.median(np.hypot(right, down))), 1e-9)

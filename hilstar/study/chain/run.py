@@ -11,21 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hilstar import charts
 from hilstar.bench.bench_file import BenchFile
-from hilstar.charts import (
-    BLUE,
-    GREEN,
-    INK,
-    ORANGE,
-    PURPLE,
-    RED,
-    capital,
-    chart,
-    name_at_side,
-    two_digits,
-    value_bars,
-    write_records,
-)
 from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.study.chain.choices import DENSE, QUANTISATIONS, Parts, five_scenes, shortened_line
@@ -51,13 +38,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 NOT_JUDGED = "the times were taken on a busy machine: no combination is named the faster"
-COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (PURPLE, ORANGE, GREEN, BLUE), strict=True))
+COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (charts.PURPLE, charts.ORANGE, charts.GREEN, charts.BLUE), strict=True))
 PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
 FLOOR_SHARE = 1e-3  # share of the smallest error at which 0 is drawn on a logarithmic axis
 LESS = 0.9  # a point on the front is named if its error is below this share of the last named one's
 ALIKE = 1.5  # scenes of one rate are drawn once where auto's error differs by less than this factor
 WORDS = {"refresh": "panel's refresh", "codes": "quantisation", "sprites": "cut sprites", WHOLE: "all of it"}
-CHOSEN = {DEFAULT: INK, AUTO: RED}
+CHOSEN = {DEFAULT: charts.INK, AUTO: charts.RED}
 OUTPUTS = (
     *(f"{name}{ending}" for name in ("chain", "chain_budget") for ending in (".png", ".svg")),
     "chain.csv",
@@ -215,9 +202,9 @@ def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
 def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str, glass: list[GlassRow]) -> None:
     """Error against time, a panel for each scene that differs, two for a glass. Raises InputError where it cannot write."""
     scenes = differing(rows)
-    note = f"The line is the front: nothing else is as right and as fast. Pale: all other choices. {capital(machine)}."
+    note = f"The line is the front: nothing else is as right and as fast. Pale: all other choices. {charts.capital(machine)}."
     count = len(scenes) + (2 if glass else 0)
-    with chart(path, finding, count, note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * count) as grid:
+    with charts.chart(path, finding, count, note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * count) as grid:
         for axes, (scene, alike) in zip(grid, scenes.items(), strict=False):
             own = [row for row in rows if row.scene == scene]
             axes.set_title(f"{scene}, {own[0].stars} stars" + (f" (the same in: {', '.join(alike)})" if alike else ""))
@@ -232,7 +219,7 @@ def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
     floor = FLOOR_SHARE * min((row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0)
     at = [(row.time_ms, max(row.error_arcsec, floor)) for row in rows]
     front = [(row, place) for row, place in zip(rows, at, strict=True) if row.on_front == "true"]
-    axes.step(*zip(*(place for _, place in front), strict=True), where="post", color=INK, lw=1.2, zorder=2)
+    axes.step(*zip(*(place for _, place in front), strict=True), where="post", color=charts.INK, lw=1.2, zorder=2)
     for row, place in zip(rows, at, strict=True):
         colour, on_front = COLOURS[row.quantisation], row.on_front == "true"
         early, late = max(place[0] - row.noise_ms, place[0] / 2), place[0] + row.noise_ms
@@ -249,13 +236,14 @@ def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
             last = place[1]
     for row, place in zip(rows, at, strict=True):
         if row.chosen:
-            label = f"{row.chosen.replace(' ', ', ')}: {two_digits(row.error_arcsec)} arcsec, {two_digits(row.time_ms)} ms"
+            arcsec, ms = (charts.two_digits(value) for value in (row.error_arcsec, row.time_ms))
+            label = f"{row.chosen.replace(' ', ', ')}: {arcsec} arcsec, {ms} ms"
             named.append((label, place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT]))
     for name, colour in COLOURS.items():
         if not any(colour == other for *_, other in named):  # the best of what has no place on the front
             mine = [each for each in zip(rows, at, strict=True) if each[0].quantisation == name]
             named += [(short_words(row, own), place, colour) for row, place in sorted(mine, key=lambda each: each[1][1])[:1]]
-    name_at_side(axes, named)
+    charts.name_at_side(axes, named)
 
 
 def short_words(row: CombinationRow, own: CombinationRow) -> str:
@@ -283,19 +271,19 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
     longest = max(stages, key=lambda one: one.time_ms)
     finding = f"Of auto's error most is {', '.join(most)}; of its time most is {longest.stage}"
     height = TITLE_INCH + BARS_INCH * len(scenes)
-    with chart(path, finding, len(scenes), 3, note=note, share_x=False, height_inch=height) as grid:
+    with charts.chart(path, finding, len(scenes), 3, note=note, share_x=False, height_inch=height) as grid:
         for k, scene in enumerate(scenes):
             by_step = {part.step: part for part in budget if part.scene == scene}
             place, light, times = grid[3 * k : 3 * k + 3]
             place.set_title(scene)
             for axes, error, unit in ((place, "error_arcsec", "arcsec"), (light, "error_mag", "mag")):
                 values = [getattr(by_step[step], error) for step in shown]
-                colours = [RED if step == WHOLE else BLUE for step in shown]
-                value_bars(axes, [WORDS.get(step, step) for step in shown], values, colours)
+                colours = [charts.RED if step == WHOLE else charts.BLUE for step in shown]
+                charts.value_bars(axes, [WORDS.get(step, step) for step in shown], values, colours)
                 axes.set_xlabel(f"error, rms [{unit}]" if scene == last else "")
             light.set_yticklabels([])
             mine = [one for one in stages if one.scene == scene]
-            value_bars(times, [one.stage for one in mine], [one.time_ms for one in mine], PURPLE)
+            charts.value_bars(times, [one.stage for one in mine], [one.time_ms for one in mine], charts.PURPLE)
             times.set_xlabel("time of a frame [ms]" if scene == last else "")
 
 
@@ -331,7 +319,7 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
     make_directory(directory)
     for name, records in (("chain", rows), ("chain_budget", budget), ("chain_time", stages), ("chain_psf", glass)):
         if records:
-            write_records(directory / f"{name}.csv", records)
+            charts.write_records(directory / f"{name}.csv", records)
     notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([busy_line(others_cores)] if busy else [])]
     draw(directory / "chain", rows, headline(rows, busy), "; ".join(notes), glass)
     draw_budget(directory / "chain_budget", rows, budget, stages)

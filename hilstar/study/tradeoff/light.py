@@ -22,22 +22,8 @@ from hilstar.render.renderer import Renderer
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.psf import MAX_CUT
 from hilstar.scene.sprites import Sprites, make_sprites, pack_sprites
+from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.electrons import (
-    TABLE_DEGREE,
-    TABLE_RANGE_K,
-    Optics,
-    Photometry,
-    RateTable,
-    ags_electrons_per_s,
-    dgs_electrons_per_s,
-    library_electrons_per_s,
-    load_library,
-    reference_mean_w_m2_m,
-    star_temperatures_k,
-    tabulate,
-    tabulate_pickles,
-)
 from hilstar.sky.spectrum import GAUSS_ORDER, PLANCK_J_S, TEMPERATURE_SCALES, Curve, blackbody_exitance_w_m2_m, load_curve
 from hilstar.sky.stars import Stars
 from hilstar.study.codes import AIMS, FRAME_PX, JUDGE, STARS, WAYS, code_errors, response_of, star_field
@@ -53,7 +39,7 @@ ADAPTIVE = "adaptive quadrature"
 COLOURS = 3000
 STEPS_NM = (1.0, 5.0, 10.0, 20.0)
 ORDERS = (1, 2, 3, 4, GAUSS_ORDER)
-DEGREES = (5, 10, 20, TABLE_DEGREE)
+DEGREES = (5, 10, 20, electrons.TABLE_DEGREE)
 BV_TABLE_SIZES = (16, 128, 1024)
 # quad_vec is asked for this, relative to the largest of all stars' integrals, each near 1 by its own scale.
 QUAD = 1e-12
@@ -85,8 +71,8 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     del stack, quick
     # Equal shares of the catalogue, the bluest and the reddest star among them.
     bv_mag = np.quantile(load_catalog().bv_mag, np.linspace(0, 1, COLOURS), method="nearest")
-    optics, photometry, temperature = study_optics(SENSOR), Photometry(), SkySettings().temperature
-    kelvin = star_temperatures_k(bv_mag, temperature)
+    optics, photometry, temperature = study_optics(SENSOR), electrons.Photometry(), SkySettings().temperature
+    kelvin = electrons.star_temperatures_k(bv_mag, temperature)
 
     def by_rule(rule: Rule) -> FloatArray:
         def integral(integrand: Callable[[FloatArray], FloatArray], *curves: Curve) -> FloatArray:
@@ -96,15 +82,17 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
         return _rates(kelvin, optics, integral)
 
     def by_table(degree: int) -> FloatArray:
-        if degree == TABLE_DEGREE:
-            return tabulate("dgs", optics, photometry).electrons_per_s(np.zeros(COLOURS), kelvin)
-        domain = [1 / TABLE_RANGE_K[1], 1 / TABLE_RANGE_K[0]]
-        log_rate = Chebyshev.interpolate(lambda x: np.log(dgs_electrons_per_s(1 / x, optics, photometry)), degree, domain)
-        return RateTable(log_rate).electrons_per_s(np.zeros(COLOURS), kelvin)
+        if degree == electrons.TABLE_DEGREE:
+            return electrons.tabulate("dgs", optics, photometry).electrons_per_s(np.zeros(COLOURS), kelvin)
+        domain = [1 / electrons.TABLE_RANGE_K[1], 1 / electrons.TABLE_RANGE_K[0]]
+        log_rate = Chebyshev.interpolate(
+            lambda x: np.log(electrons.dgs_electrons_per_s(1 / x, optics, photometry)), degree, domain
+        )
+        return electrons.RateTable(log_rate).electrons_per_s(np.zeros(COLOURS), kelvin)
 
     def by_colour(size: int) -> FloatArray:
         at_mag = np.linspace(bv_mag.min(), bv_mag.max(), size)
-        rate = dgs_electrons_per_s(star_temperatures_k(at_mag, temperature), optics, photometry)
+        rate = electrons.dgs_electrons_per_s(electrons.star_temperatures_k(at_mag, temperature), optics, photometry)
         return np.asarray(np.exp(np.interp(bv_mag, at_mag, np.log(rate))))
 
     tables = {degree: f"table over 1/T, degree {degree}" for degree in DEGREES}
@@ -113,12 +101,12 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     works |= {f"Gauss-Legendre, {n} per knot": partial(by_rule, partial(gauss, n)) for n in ORDERS}
     works |= {name: partial(by_table, degree) for degree, name in tables.items()}
     works |= {f"straight lines over B-V, {n}": partial(by_colour, n) for n in BV_TABLE_SIZES}
-    works["AGS"] = lambda: np.full(COLOURS, ags_electrons_per_s(optics, photometry))
+    works["AGS"] = lambda: np.full(COLOURS, electrons.ags_electrons_per_s(optics, photometry))
     exact, trials = adaptive_rates(kelvin, optics), []
     for name, work in works.items():
         error = np.abs(magnitude(work() / exact))
         figures = float(error.max()), float(np.median(error))
-        trials.append(Trial(name, *figures, work, name == tables[TABLE_DEGREE], name == ADAPTIVE))
+        trials.append(Trial(name, *figures, work, name == tables[electrons.TABLE_DEGREE], name == ADAPTIVE))
     return Trials(
         "brightness",
         f"{COLOURS} black bodies, tables included",
@@ -130,7 +118,7 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
-def adaptive_rates(kelvin: FloatArray, optics: Optics) -> FloatArray:
+def adaptive_rates(kelvin: FloatArray, optics: electrons.Optics) -> FloatArray:
     """Electron rates of V = 0 black bodies (n,) by adaptive quadrature between the curves' knots."""
 
     def integral(integrand: Callable[[FloatArray], FloatArray], *curves: Curve) -> FloatArray:
@@ -145,7 +133,7 @@ def adaptive_rates(kelvin: FloatArray, optics: Optics) -> FloatArray:
     return _rates(kelvin, optics, integral)
 
 
-def _rates(kelvin: FloatArray, optics: Optics, integral: Callable[..., FloatArray]) -> FloatArray:
+def _rates(kelvin: FloatArray, optics: electrons.Optics, integral: Callable[..., FloatArray]) -> FloatArray:
     """Thesis eq. 3.1 with whatever integrates; spectra are scaled to 1 at 550 nm, so that one tolerance fits all stars."""
     passband, curves = load_curve("johnson-v", "johnson-v"), (optics.quantum_efficiency, optics.transmission)
     scale = blackbody_exitance_w_m2_m(np.array([550.0]), kelvin[:, None])
@@ -155,9 +143,9 @@ def _rates(kelvin: FloatArray, optics: Optics, integral: Callable[..., FloatArra
 
     v_band = integral(lambda nm: spectrum(nm) * passband(nm), passband)
     width = integral(lambda nm: passband(nm)[None], passband)
-    electrons = integral(lambda nm: spectrum(nm) * (curves[0](nm) * curves[1](nm) * nm * 1e-9), *curves)
-    per_spectrum = optics.area_m2 * reference_mean_w_m2_m(Photometry()) / (PLANCK_J_S * LIGHT_M_S)
-    return np.asarray(per_spectrum * electrons * width / v_band)
+    detected = integral(lambda nm: spectrum(nm) * (curves[0](nm) * curves[1](nm) * nm * 1e-9), *curves)
+    per_spectrum = optics.area_m2 * electrons.reference_mean_w_m2_m(electrons.Photometry()) / (PLANCK_J_S * LIGHT_M_S)
+    return np.asarray(per_spectrum * detected * width / v_band)
 
 
 def trapezoid(step_nm: float, *curves: Curve) -> tuple[FloatArray, FloatArray]:
@@ -187,11 +175,17 @@ def shared_knots(*curves: Curve) -> FloatArray:
 def spectrum(stack: ExitStack, quick: bool) -> Trials:
     """Spectra from colours: error, mag, 95 % and median of the Pickles library bluer than V-I = 2.5."""
     del stack, quick
-    library, optics = load_library(), study_optics(SENSOR)
-    exact, zero = library_electrons_per_s(library, optics, Photometry()), np.zeros(len(library.spectral_type))
+    library, optics = electrons.load_library(), study_optics(SENSOR)
+    exact, zero = (
+        electrons.library_electrons_per_s(library, optics, electrons.Photometry()),
+        np.zeros(len(library.spectral_type)),
+    )
     sure, sky = library.vi_mag < MAX_RELIABLE_VI_MAG, SkySettings()
-    real, bodies = tabulate_pickles(optics, Photometry()), tabulate("dgs", optics, Photometry())
-    average = tabulate("ags", optics, Photometry())
+    real, bodies = (
+        electrons.tabulate_pickles(optics, electrons.Photometry()),
+        electrons.tabulate("dgs", optics, electrons.Photometry()),
+    )
+    average = electrons.tabulate("ags", optics, electrons.Photometry())
 
     def trial(name: str, rates: FloatArray, work: Callable[[], object], settings: tuple[str, ...]) -> Trial:
         error = np.abs(magnitude(rates / exact))[sure]
@@ -199,7 +193,7 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
         figures = float(np.percentile(error, 95)), float(np.median(error))
         return Trial(name, *figures, work, settings == default, name == OWN_SPECTRUM)
 
-    by_own = partial(library_electrons_per_s, library, optics, Photometry())
+    by_own = partial(electrons.library_electrons_per_s, library, optics, electrons.Photometry())
     colours = zero, library.bv_mag, library.vi_mag
     held_out = exact * (1 + held_out_errors(exact))
     trials = [
@@ -209,7 +203,7 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
     for scale in TEMPERATURE_SCALES:
 
         def body(scale: str = scale) -> FloatArray:
-            return bodies.electrons_per_s(zero, star_temperatures_k(library.bv_mag, scale))
+            return bodies.electrons_per_s(zero, electrons.star_temperatures_k(library.bv_mag, scale))
 
         trials.append(trial(f"black body, {scale}", body(), body, ("dgs", "blackbody", scale)))
     ags = partial(average.electrons_per_s, zero, np.full(len(zero), 9602.0))

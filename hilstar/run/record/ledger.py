@@ -246,9 +246,7 @@ class Ledger(Closing):
         self._file, self._writer = self._begin(path, overwrite)
         self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
         self._begun_s = self._alive_s = time.monotonic()
-        self._each_s = 0.0
-        self._probe = ProcessProbe()
-        self._closing = threading.Event()
+        self._each_s, self._probe, self._closing = 0.0, ProcessProbe(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-ledger", daemon=True)
         self._thread.start()
 

@@ -32,10 +32,8 @@ class RunningStatistics:
 
     def __init__(self) -> None:
         self._counts = np.zeros(2 * BINS + 1, dtype=np.int64)
-        self.count = 0
-        self.max = -math.inf
-        self._mean = 0.0
-        self._squares = 0.0
+        self.count, self.max = 0, -math.inf
+        self._mean = self._squares = 0.0
 
     def add(self, value: float) -> None:
         """Count one value."""
@@ -82,7 +80,3 @@ class RunningStatistics:
     def percentiles(self) -> Percentiles:
         """Median, 99th percentile and maximum."""
         return Percentiles(self.percentile(50), self.percentile(99), self.max if self.count else None)
-
-    def summary(self) -> dict[str, float | None]:
-        """`p50`, `p99` and `max`; nulls without a value."""
-        return {"p50": self.percentile(50), "p99": self.percentile(99), "max": self.max if self.count else None}

@@ -69,7 +69,7 @@ def replay(
         running.page_listener(console, control, token, console_name) as listener,
         running.optional_pulse(file, notices) as pulse,
         # The frames of an earlier run have the codes that it had.
-        running.shown_bench(file, headless, windowed, force, timed=play.paced and not play.past) as (bench, screen),
+        running.shown_bench(file, headless, windowed, force, timed=play.paced and not play.moving) as (bench, screen),
         FrameImages(output, bench) as record,
         running.optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         running.run_with_faults(bench, faults, notices, kept, play.recording) as wrong,

@@ -132,7 +132,7 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
 
 
 def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> list[dict[str, Any]]:
-    recording = read_recording(ledger)
+    recording = read_recording(ledger, run.faults)
     frames = run.keyframes.chosen(run.last)
     # Where a fault froze the sky, the picture is an earlier frame's.
     frozen = {number for number, fault in recording.faults.items() if isinstance(fault, Freeze)}
@@ -147,7 +147,7 @@ def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> 
         found.append(picture | told | {"t_s": round(t_s, 3)})
 
     if chosen:
-        play = played_again([record for record, _ in chosen], 0, False, recording)
+        play = played_again(lambda: (record for record, _ in chosen), len(chosen), 0, False, recording)
         replay(bench, play, take, Outlet(notices=_Unreported()))
     # As many pictures, evenly over the run, as fit.
     while len(found) > 1 and sum(len(picture["data"]) for picture in found) > MAX_BYTES:
@@ -207,7 +207,7 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
     with np.errstate(all="ignore"):  # absurd figures of a foreign file become no value
         return {
             "about": about,
-            "verdict": verdict(summary, run.late),
+            "verdict": verdict(summary, run.counted["late"]),
             "summary": rows[:-3],
             "facts": rows[-3:],
             "bench_text": run.head.get("bench_text", ""),

@@ -7,7 +7,7 @@ refused and counted; nothing of it is kept.
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,11 +134,14 @@ class Recording:
 NO_RECORDING = Recording({}, 0, Path())
 
 
-def read_recording(path: Path) -> Recording:
-    """The faults of a run. Raises InputError for damage, and for a measured map that is not the run's any more."""
+def read_recording(path: Path, records: Sequence[FaultRecord] | None = None) -> Recording:
+    """The faults of a run, from its `records` of them where these are read already.
+
+    Raises InputError for damage, and for a measured map that is not the run's any more.
+    """
     faults: dict[int, Fault] = {}
     seed, folder = 0, Path()
-    records = tuple(fault_records(path))
+    records = tuple(fault_records(path) if records is None else records)
     for record in records:
         if record.event != "start":
             continue
@@ -206,9 +209,6 @@ class RunFaults:
         """Set the time of the timeline from which a scenario counts; by default that of the first frame with an attitude."""
         self.schedule.begin(zero_ns)
 
-    def recall(self, record: FrameRecord | None) -> None:
-        """Do nothing: these faults come from the schedule."""
-
     @contextmanager
     def listening(self, settings: FaultSettings, folder: Path) -> Iterator[str]:
         """Take faults from the stream that a bench file names; says where it listens, "" where it names none.
@@ -254,16 +254,11 @@ class ReplayedFaults:
             for record in recording.records:
                 ledger.fault(record)
 
-    def begin(self, zero_ns: int) -> None:
-        """Do nothing: the recording says which faults each frame had."""
-
-    def recall(self, record: FrameRecord | None) -> None:
+    def recall(self, record: FrameRecord) -> None:
         """Take the faults of the frame that is drawn next: those of light, and what freezes it.
 
         A recorded attitude is the one that was shown: a wrong one is not made wrong again. A dropped frame was never recorded.
         """
-        if record is None:
-            return
         recorded = zip(record.faults, record.fault_since_ns, strict=False)
         known = ((number, self._faults[number], since_ns) for number, since_ns in recorded if number in self._faults)
         self._now = tuple(

@@ -56,9 +56,7 @@ class LiveAnswers:
         self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
         self._judge = AnswerJudge(rules, self._frames)
         self._allowance = Allowance(MAX_JUDGED_HZ, MAX_JUDGED_HZ)
-        self._too_many = 0
-        self._figures_ns = 0
-        self._untold = False
+        self._too_many, self._figures_ns, self._untold = 0, 0, False
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-answers", daemon=True)
 

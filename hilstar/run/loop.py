@@ -129,8 +129,7 @@ class FrameLoop:
         faults: FaultyFrames | None = None,
     ) -> None:
         settings, motion = bench.config.attitude, bench.config.render.motion
-        self._bench = bench
-        self._sink = sink
+        self._bench, self._sink, self._faults = bench, sink, faults
         self._period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         self._blank_when_stale = settings.on_stale == "blank"
         self.pacer = Pacer(self._period_ns) if pacer is None else pacer
@@ -141,7 +140,6 @@ class FrameLoop:
         self.gate = StaleGate(policy_of(settings).stale_after_ns)
         self.notices = Notices() if notices is None else notices
         self._presence = AttitudeWatch(self.notices, self.pacer.clock)
-        self._faults = faults
         self.watch = FrameWatch(self._period_ns, self.notices, self.pacer.clock)
         self._gpu = GpuWatch(bench.renderer, self.notices, self.stop, self.pacer.clock)
 
@@ -216,10 +214,7 @@ class FrameLoop:
         return self._bench.light(view, faults)
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
-        """Whether the frame's moment has passed so far that the next is begun instead.
-
-        Never two in a row, so that even a machine too slow for its display shows something.
-        """
+        # Never two in a row, so that even a machine too slow for its display shows something.
         late_ns = 0 if moment.due_ns is None else self.pacer.clock.now_ns() - moment.due_ns
         if late_ns <= GIVEN_UP_PERIODS * self._period_ns or not moment.may_be_given_up:
             return False
@@ -286,7 +281,6 @@ class FrameLoop:
         self.tally = RunTally()
 
     def _missed_between(self, last: Moment, slot: int, gave_up: bool, limit: Limit) -> int:
-        """The number of slots just before `slot` without a frame of their own; counts those since `last` as missed."""
         if self.tally.frames >= limit.frames:
             return 0
         between = int(min(slot, limit.slots)) - last.slot - 1

@@ -24,9 +24,7 @@ class Aids:
     """Switches that cover or stop the sky. Written by the frame loop's thread alone."""
 
     def __init__(self) -> None:
-        self.paused = False
-        self._overlay = 0
-        self._patch = -1
+        self.paused, self._overlay, self._patch = False, 0, -1
 
     @property
     def overlay(self) -> int:
@@ -129,16 +127,12 @@ class Operator:
         requests: SwitchRequests | None = None,
         levels: AidLevels | None = None,
     ) -> None:
-        self.aids = aids
-        self._notices = notices
-        self._hidden = hidden
+        self.aids, self._notices, self._hidden, self._levels = aids, notices, hidden, levels
         self._requests = deque() if requests is None else requests
-        self._levels = levels
         self._told = HEADLESS
         self._held: tuple[Attitude, int] | None = None  # what a paused screen shows, and the time that it was for
         self._last_swap_ns: int | None = None
-        self._frames = {"operator": 0, "hidden": 0}
-        self._lasted_ns = {"operator": 0, "hidden": 0}
+        self._frames, self._lasted_ns = {"operator": 0, "hidden": 0}, {"operator": 0, "hidden": 0}
 
     def look(self) -> OnScreen:
         """State of the switches and the window now, once what was requested is done. Reports what has changed."""

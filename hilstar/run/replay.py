@@ -26,10 +26,10 @@ from hilstar.files import make_directory, refuse_ledger
 from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
-from hilstar.run.faults import NO_RECORDING, Recording, ReplayedFaults, read_recording
+from hilstar.run.faults import NO_RECORDING, Recording, ReplayedFaults, RunFaults, read_recording
 from hilstar.run.loop import Limit, policy_of
 from hilstar.run.pacer import FrameSink, Moment, Shown, ignore
-from hilstar.run.record.ledger_records import FrameRecord, codes_ms_of, drawable_frames, read_head
+from hilstar.run.record.ledger_records import FrameRecord, codes_ms_of, drawable_frames, frame_records, read_head
 from hilstar.run.serve import Outlet, Running
 from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
@@ -74,11 +74,12 @@ class DrawnBy:
 
 
 class PlayedFrame(NamedTuple):
-    """Number, time and attitude of a frame to be replayed; without an attitude it is blank."""
+    """Number, time and attitude of a frame to be replayed, and an earlier run's record; without an attitude it is blank."""
 
     number: int
     t_ns: int
     attitude: Attitude | None
+    past: FrameRecord | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,7 @@ class Play:
 
     `first_ns` is the time of the first frame, and `zero_ns` that from which a scenario counts its seconds: the log's first
     sample, or the run's first frame. `moving` says whether stars are drawn along their paths; None: as the bench file says.
-    `told` are events to report before it begins. Only an earlier run has `past` frames, faults in its `recording`, and a
+    `told` are events to report before it begins. Only an earlier run has faults in its `recording`, and a
     renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same renderer draws the same codes from
     them bit for bit; another draws them within `DrawnBy.other_codes`.
     """
@@ -101,25 +102,34 @@ class Play:
     moving: bool | None = None
     told: Sequence[tuple[str, str]] = ()
     conventions: Conventions = PACKETS
-    past: Sequence[FrameRecord] = ()
     recording: Recording = NO_RECORDING
     drawn_by: DrawnBy | None = None
     codes_ms: tuple[float, float] | None = None
 
 
-def played_again(frames: Sequence[FrameRecord], packet_count: int, paced: bool, recording: Recording) -> Play:
-    """The play of an earlier run's frames, each with the attitude and the motion that it had."""
+def played_again(
+    read: Callable[[], Iterator[FrameRecord]], count: int, packet_count: int, paced: bool, recording: Recording
+) -> Play:
+    """The play of an earlier run's `count` frames, each with the attitude and the motion that it had.
+
+    They are read as they are played, in order, so that memory does not grow with the run.
+    """
+    frames, at = read(), -1
+    past = first = next(read())
 
     def frame(slot: int) -> PlayedFrame:
-        past = frames[slot]
+        nonlocal at, past
+        while at < slot:
+            if (found := next(frames, None)) is None:
+                raise InputError("the ledger became shorter while it was replayed; replay it again")
+            past, at = found, at + 1
         if past.q is None:
-            return PlayedFrame(past.frame, past.t_ns, None)
+            return PlayedFrame(past.frame, past.t_ns, None, past)
         rate, velocity, place = (None if v is None else np.array(v) for v in (past.rate, past.velocity_km_s, past.place_km))
         attitude = Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate, velocity_km_s=velocity, place_km=place)
-        return PlayedFrame(past.frame, past.t_ns, attitude)
+        return PlayedFrame(past.frame, past.t_ns, attitude, past)
 
-    t_ns = frames[0].t_ns
-    return Play(frame, len(frames), packet_count, paced, t_ns, t_ns, moving=True, past=frames, recording=recording)
+    return Play(frame, count, packet_count, paced, first.t_ns, first.t_ns, moving=True, recording=recording)
 
 
 def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = NOTHING_STATED) -> Play:
@@ -130,9 +140,12 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     """
     factor = wanted.speed
     if is_mcap(log) and not holds_ros(log):
-        frames = list(drawable_frames(log, math.radians(config.attitude.max_rate_deg_s)))
-        if frames:
-            return _plan_run(log, wanted, factor, frames)
+        frames = drawable_frames(log, math.radians(config.attitude.max_rate_deg_s))
+        first = last = next(frames, None)
+        for last in frames:  # noqa: B007 - all of them are looked at, and only the last is kept
+            pass
+        if first is not None and last is not None:
+            return _plan_run(log, wanted, first, last)
     read = open_log(log, stated)
     samples = read.samples
     for number, sample in enumerate(samples, start=1):  # what a stream would refuse
@@ -160,22 +173,25 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     return replace(play, told=[*read.told, *joins.told], conventions=read.conventions)
 
 
-def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord]) -> Play:
-    if wanted.step_s is not None or factor not in {1.0, math.inf}:
+def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) -> Play:
+    if wanted.step_s is not None or wanted.speed not in {1.0, math.inf}:
         raise InputError(f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no --step")
-    first_ns = frames[0].swap_ns
-    start_s, stop_s = _span(log, wanted, (frames[-1].swap_ns - first_ns) / NS_PER_S)
-    kept = [frame for frame in frames if start_s <= (frame.swap_ns - first_ns) / NS_PER_S <= stop_s + 1e-9]
-    if not kept:
+    start_s, stop_s = _span(log, wanted, (last.swap_ns - first.swap_ns) / NS_PER_S)
+
+    def kept() -> Iterator[FrameRecord]:
+        frames = frame_records(log, tell=False)
+        return (one for one in frames if start_s <= (one.swap_ns - first.swap_ns) / NS_PER_S <= stop_s + 1e-9)
+
+    count = sum(1 for _ in kept())
+    if not count:
         raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
-    play = played_again(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor), read_recording(log))
+    play = played_again(kept, count, sum(1 for _ in read_attitudes(log)), not math.isinf(wanted.speed), read_recording(log))
     head, names = read_head(log), ("gl_renderer", "gl_version", "render_path")
     drawn_by = DrawnBy(*(printable(head[name]) for name in names)) if set(names) <= head.keys() else None
-    return replace(play, zero_ns=frames[0].t_ns, drawn_by=drawn_by, codes_ms=codes_ms_of(head))
+    return replace(play, zero_ns=first.t_ns, drawn_by=drawn_by, codes_ms=codes_ms_of(head))
 
 
 def _tell_other_renderer(before: DrawnBy | None, bench: Bench, notices: Notices) -> None:
-    """Say where another renderer drew the run, and how far its codes may be from these."""
     renderer = bench.renderer
     now = DrawnBy(printable(renderer.gl_renderer), printable(renderer.gl_version), renderer.path)
     if before is not None and before != now:
@@ -198,7 +214,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     if outlet.faults is None and play.recording.faults:
         outlet = replace(outlet, faults=ReplayedFaults(bench, play.recording, outlet.ledger))
     faults = outlet.faults
-    if faults is not None:
+    if isinstance(faults, RunFaults):
         faults.begin(play.zero_ns)
     loop = outlet.loop(bench, sink, play.moving)
     clock = loop.pacer.clock
@@ -207,9 +223,9 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     _tell_other_renderer(play.drawn_by, bench, outlet.notices)
 
     def draw_slot(moment: Moment) -> Shown | None:
-        if faults is not None:
-            faults.recall(play.past[moment.slot] if play.past else None)
-        number, t_ns, attitude = play.frame(moment.slot)
+        number, t_ns, attitude, past = play.frame(moment.slot)
+        if isinstance(faults, ReplayedFaults) and past is not None:
+            faults.recall(past)
         shown = loop.draw(number, t_ns, attitude, moment)
         if shown is not None:
             outlet.record(bench, loop, shown, t_ns)
@@ -235,9 +251,7 @@ class FrameImages:
     """Writes `frame_000000.png` and on, and `frames.csv`; without a directory it writes nothing."""
 
     def __init__(self, directory: Path | None, bench: Bench) -> None:
-        self._directory = directory
-        self._bench = bench
-        self._table = Path()
+        self._directory, self._bench, self._table = directory, bench, Path()
         self._bits = bench.config.monitor.bits
         self._stack = ExitStack()
 

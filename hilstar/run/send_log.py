@@ -50,10 +50,7 @@ class BadCable:
     """Passes packets on; each meets at most one fault."""
 
     def __init__(self, faults: Faults, rng: np.random.Generator, put: Callable[[bytes], None]) -> None:
-        self.tally = Tally()
-        self._faults = faults
-        self._rng = rng
-        self._put = put
+        self.tally, self._faults, self._rng, self._put = Tally(), faults, rng, put
         self._held: bytes | None = None
 
     def delay_s(self) -> float:

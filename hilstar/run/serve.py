@@ -260,9 +260,7 @@ class StatusMaker:
     """
 
     def __init__(self, ledger: Ledger | LedgerSwitch | None = None) -> None:
-        self._ledger = ledger
-        self._missed = 0
-        self._refused = 0
+        self._ledger, self._missed, self._refused = ledger, 0, 0
         self._told: dict[str, int] = {}
 
     def status(self, shown: Shown, light_t_ns: int, loop: FrameLoop, counts: PacketCounts, synchronised: bool) -> Status:

@@ -4,6 +4,7 @@ from typing import Any
 
 import msgspec
 from msgspec import UNSET, UnsetType
+from msgspec.structs import asdict
 
 from hilstar.answers.judge import TrackerFigures
 from hilstar.attitude.clock.sender_clock import ClockSummary
@@ -80,9 +81,7 @@ class SwapTally:
     """When frames were swapped onto a screen."""
 
     def __init__(self) -> None:
-        self._interval_ms = RunningStatistics()
-        self._late_ms = RunningStatistics()
-        self._packet_ms = RunningStatistics()
+        self._interval_ms, self._late_ms, self._packet_ms = (RunningStatistics() for _ in range(3))
         self._last_ns: int | None = None
 
     def add(self, swap_ns: int, predicted_ns: int, missed_before: int, received_ns: int | None) -> None:
@@ -100,8 +99,8 @@ class SwapTally:
             return {}
         return {
             "pacing_jitter_ms": self._interval_ms.deviation,
-            "swap_late_ms": self._late_ms.summary(),
-            "packet_to_swap_ms": self._packet_ms.summary(),
+            "swap_late_ms": asdict(self._late_ms.percentiles()),
+            "packet_to_swap_ms": asdict(self._packet_ms.percentiles()),
         }
 
 
@@ -109,16 +108,10 @@ class RunTally:
     """The figures of all frames of a run."""
 
     def __init__(self) -> None:
-        self._frame_ms = RunningStatistics()
-        self._age_ms = RunningStatistics()
-        self._stars = RunningStatistics()
-        self._clipped_max = 0
+        self._frame_ms, self._age_ms, self._stars = (RunningStatistics() for _ in range(3))
         self.clipped_hip: set[int | str] = set()
         self.swaps = SwapTally()
-        self.missed_frames = 0
-        self.stale_frames = 0
-        self.capped_frames = 0
-        self.given_up_frames = 0
+        self._clipped_max = self.missed_frames = self.stale_frames = self.capped_frames = self.given_up_frames = 0
 
     @property
     def frames(self) -> int:

@@ -16,8 +16,7 @@ class AttitudeWatch:
     """Watches the attitude of each frame, before an operator's keys change it."""
 
     def __init__(self, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
-        self._notices = notices
-        self._clock = clock
+        self._notices, self._clock = notices, clock
         self._begun_ns: int | None = None
         self._seen = self._missed = False
         self._stale_ns: int | None = None  # since when, host time
@@ -56,10 +55,8 @@ class FrameWatch:
     """Takes the stages of each frame from the loop's thread; a second thread reports a stage that does not end."""
 
     def __init__(self, period_ns: float, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
-        self._clock = clock
         self._late_ns = max(LATE_PERIODS * period_ns, LATE_NS)
-        self._notices = notices
-        self._number = 0
+        self._clock, self._notices, self._number = clock, notices, 0
         self._stages: list[tuple[str, int]] = []  # name and begin; one list, so that the other thread reads a whole one
         self._told_ns = 0
         self.alive_ns = 0  # when the loop last was between two stages, host time; 0 before its first frame

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.running_statistics import STEP, RunningStatistics
+from hilstar.running_statistics import STEP, Percentiles, RunningStatistics
 
 # A value is known to half a bin; a percentile of n values besides to the gap between its neighbours, here far less.
 RELATIVE = STEP
@@ -20,11 +20,11 @@ def test_percentiles_are_those_of_the_values(values, rng):
     statistics = RunningStatistics()
     for value in rng.permutation(values):
         statistics.add(float(value))
-    summary = statistics.summary()
+    found = statistics.percentiles()
     for name, percent in (("p50", 50), ("p99", 99)):
         exact = np.percentile(values, percent, method="inverted_cdf")
-        assert summary[name] == pytest.approx(exact, rel=RELATIVE, abs=2e-6)
-    assert summary["max"] == values.max()
+        assert getattr(found, name) == pytest.approx(exact, rel=RELATIVE, abs=2e-6)
+    assert found.max == values.max()
     assert statistics.mean == pytest.approx(values.mean(), abs=1e-12)
     if len(values) > 1:
         assert statistics.deviation == pytest.approx(values.std(), rel=1e-9, abs=1e-12)
@@ -32,7 +32,7 @@ def test_percentiles_are_those_of_the_values(values, rng):
 
 def test_no_values_have_no_statistics():
     statistics = RunningStatistics()
-    assert statistics.summary() == {"p50": None, "p99": None, "max": None}
+    assert statistics.percentiles() == Percentiles(None, None, None)
     assert statistics.mean is None and statistics.deviation is None
 
 
@@ -40,5 +40,5 @@ def test_what_lies_beyond_the_bins_is_counted_in_the_last():
     statistics = RunningStatistics()
     for value in (1e15, -1e15, 1.0):
         statistics.add(value)
-    assert statistics.summary()["max"] == 1e15
+    assert statistics.percentiles().max == 1e15
     assert statistics.percentile(50) == pytest.approx(1.0, rel=RELATIVE)

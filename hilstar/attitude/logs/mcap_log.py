@@ -22,22 +22,26 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple, Self
+from types import MappingProxyType
+from typing import IO, Any, NamedTuple, Self
 
 import lz4.frame
 import msgspec
-import zstandard
 from mcap import records as kinds
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import RecordLengthLimitExceeded
 from mcap.opcode import Opcode
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
+from zstandard import ZstdCompressor
+from zstandard import ZstdDecompressor as Zstd
 
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.errors import InputError
 from hilstar.reading import MCAP_MAGIC, NOT_JSON, open_regular, size_text
 
+Topics = Mapping[int, str]  # by channel
+Messages = list[tuple[int, bytes]]  # channel and content
 RUN_METADATA = "hilstar"  # the name of a ledger's head
 ROS_ENCODINGS = frozenset({"cdr", "ros1"})
 OWN_TOPICS = frozenset({"/attitude", "/frame"})
@@ -47,12 +51,14 @@ ADVICE = "give an MCAP file, such as the ledger of a run"
 MAX_CHUNK_BYTES = 64_000_000  # unpacked; writers make them of about 1 MB
 MAX_RECORD_BYTES = 256_000_000
 MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # limits for a whole file; logs pack to a tenth
-_record_head = struct.Struct("<BQ")
-_message_head = struct.Struct("<HIQQ")
+_record_head, _message_head, _chunk_head = (struct.Struct(form) for form in ("<BQ", "<HIQQ", "<QQQI8sQ"))
+_message_record, _footer_head = struct.Struct("<BQHIQQ"), struct.Struct("<BQQQ")
+_message_start, ZSTD = struct.Struct("<BQH").unpack_from, b"\4\0\0\0zstd"
+MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = map(int, (Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX))
+HEAD_BYTES = 31  # of a message: opcode, length, channel, sequence and two times
+PIECE_BYTES = 1 << 18
 MAX_INDEX_BYTES = 16_000_000  # about six hours at five chunks a second
 LEVEL = 3  # zstd compression level
-_message_record = struct.Struct("<BQHIQQ")
-_footer_head = struct.Struct("<BQQQ")
 ATTITUDE_TOPIC = "/attitude"
 ATTITUDE_SCHEMA_NAME = "hilstar.Attitude"
 # Plain types only: Foxglove refuses a whole file over ["integer", "null"]. Unknown values are null in the message.
@@ -100,19 +106,23 @@ def parts_of(path: Path) -> list[Path]:
     return parts
 
 
-def read_topics(path: Path, *, tell: bool = True) -> Iterator[tuple[str, bytes]]:
-    """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
+def read_chunks(path: Path, *, tell: bool = True) -> Iterator[tuple[Topics, Messages]]:
+    """Every message of a run's files, in order, up to where its writer was killed: channel and content, a chunk's at once.
 
-    If `tell`, the log gets a line of the first file that lacks its end, once all are read. Raises InputError for damage, and
-    for anything but a regular file.
+    With them come the topics by channel, the same object until one changes. If `tell`, the log gets a line of the first file
+    that lacks its end, once all are read. Raises InputError for damage, and for anything but a regular file.
     """
     for part in parts_of(path):
-        channels: dict[int, str] = {}
-        for record in records_of(part):
-            if isinstance(record, kinds.Channel):
-                channels[record.id] = record.topic
-            elif isinstance(record, kinds.Message) and record.channel_id in channels:
-                yield channels[record.channel_id], record.data
+        topics: dict[int, str] = {}
+        told: Topics = {}
+        for record in records_of(part, topics):
+            if isinstance(record, list):
+                yield told, record
+            elif isinstance(record, kinds.Channel):
+                topics[record.id] = record.topic
+                told = dict(topics)
+            elif isinstance(record, kinds.Message) and record.channel_id in topics:
+                yield told, [(record.channel_id, record.data)]
     unfinished = unfinished_part(path) if tell else None
     if unfinished is not None:
         log.warning("%s %s", unfinished, NO_END)
@@ -128,8 +138,9 @@ def unfinished_part(path: Path) -> Path | None:
 
 
 def read_messages(path: Path, topic: str, *, tell: bool = True) -> Iterator[bytes]:
-    """The contents of the messages of one topic, as `read_topics`. Raises InputError for damage."""
-    yield from (data for name, data in read_topics(path, tell=tell) if name == topic)
+    """The contents of the messages of one topic, as `read_chunks`."""
+    for topics, messages in read_chunks(path, tell=tell):
+        yield from [data for channel, data in messages if topics[channel] == topic]
 
 
 def topics_of(path: Path) -> list[str]:
@@ -153,17 +164,16 @@ def is_mcap(path: Path) -> bool:
 
 def holds_ros(path: Path) -> bool:
     """Whether the first channel that is hilstar's or ROS's is ROS's. Raises InputError for damage before it."""
-    for record in records_of(path):
-        if isinstance(record, kinds.Channel):
-            if record.message_encoding in ROS_ENCODINGS:
-                return True
-            if record.message_encoding == "json" and record.topic in OWN_TOPICS:
-                return False
-    return False
+    channels = (record for record in records_of(path) if isinstance(record, kinds.Channel))
+    encodings = (one.message_encoding for one in channels if one.message_encoding != "json" or one.topic in OWN_TOPICS)
+    return next((one in ROS_ENCODINGS for one in encodings if one in {*ROS_ENCODINGS, "json"}), False)
 
 
-def records_of(path: Path) -> Iterator[kinds.McapRecord]:
-    """Every record of one file, chunks unpacked into their schemas, channels and messages. Raises InputError for damage."""
+def records_of(path: Path, topics: Topics = MappingProxyType({})) -> Iterator[Any]:
+    """Every record of one file but its indexes, chunks unpacked into their schemas, channels and messages.
+
+    A chunk that is messages of known `topics` alone comes as one list. Raises InputError for damage.
+    """
     with open_regular(path, ADVICE) as file:
         finished = _is_finished(file)
         size = file.seek(0, os.SEEK_END)
@@ -171,71 +181,106 @@ def records_of(path: Path) -> Iterator[kinds.McapRecord]:
         if not MCAP_MAGIC.startswith(file.read(len(MCAP_MAGIC))):
             raise InputError(f"{path}: is no MCAP file; {ADVICE}")
         file.seek(0)
-        capped = _Capped(file, size)
-        reader = _Reader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
-        records = reader.records
-        room = FREE_BYTES + MAX_INFLATION * size
+        reader = _Reader(file, size)
+        records = reader.all()
+        room, zstd = FREE_BYTES + MAX_INFLATION * size, Zstd()  # making one takes longer than unpacking a chunk
         while True:
             try:
                 record = next(records, None)
-                data = _unpacked(record, room) if isinstance(record, kinds.Chunk) else None
+                data = _unpacked(record, room, zstd) if isinstance(record, kinds.Chunk) else None
             except Exception as error:  # the reader passes on what struct, zstd, lz4 and UTF-8 raise
-                cut_off = isinstance(error, RecordLengthLimitExceeded) or not capped.left
+                cut_off = isinstance(error, RecordLengthLimitExceeded) or reader.place == size
                 if cut_off and not finished and not isinstance(error, TooLargeError):
                     return
-                raise _refused(path, file, error) from error
+                raise _refused(path, reader.place, error) from error
             if record is None:
                 return
             if data is None:
                 yield record
                 continue
             room -= len(data)
+            messages = _messages_in(data, topics)
             try:
-                yield from _inside(data)
+                yield from _inside(data) if messages is None else (messages,)
             except Exception as error:
-                raise _refused(path, file, error) from error
+                raise _refused(path, reader.place, error) from error
 
 
 class _Reader(StreamReader):
-    """Skips the indexes of messages, which nothing here uses and the library takes apart entry by entry."""
+    """Takes whole chunks from many of a file's bytes at once, and skips indexes, which nothing here uses.
 
-    def _read_record(self, opcode: int, length: int) -> kinds.McapRecord | None:
-        return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
-
-
-class _Capped:
-    """A file that is never asked for more than it has, whatever length a record states."""
+    The library reads field by field, which takes as long as all else of a report. It still has whatever is not plain. It never
+    asks for more than the file has, whatever length a record states.
+    """
 
     def __init__(self, file: IO[bytes], size: int) -> None:
-        self._file, self.left = file, size
+        super().__init__(self, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
+        self._file, self._size, self.place = file, size, 0
 
     def read(self, length: int) -> bytes:
-        """At most `length` bytes. Raises TooLargeError for a record over MAX_RECORD_BYTES."""
-        if MAX_RECORD_BYTES < length <= self.left:
+        """At most `length` bytes, for the library. Raises TooLargeError for a record over MAX_RECORD_BYTES."""
+        left = self._size - self.place
+        if MAX_RECORD_BYTES < length <= left:
             raise TooLargeError(f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read")
-        data = self._file.read(min(length, self.left))
-        self.left -= len(data)
+        data = self._file.read(min(length, left))
+        self.place += len(data)
         return data
+
+    def all(self) -> Iterator[kinds.McapRecord]:
+        """Every record, each ending before the byte `place`. Raises what the library does."""
+        for record in self.records:
+            yield record
+            if isinstance(record, kinds.Chunk | kinds.ChunkIndex):
+                yield from self._plain_chunks()
+
+    def _plain_chunks(self) -> Iterator[kinds.Chunk]:
+        """The chunks from here to the first record that is neither one nor an index, or in which something is odd."""
+        at = PIECE_BYTES
+        while at:
+            begin, at = self.place, 0
+            piece = self._file.read(min(PIECE_BYTES, self._size - begin))
+            while at + 9 <= len(piece):
+                opcode, length = _record_head.unpack_from(piece, at)
+                body, end = at + 9, at + 9 + length
+                if end > len(piece):
+                    break
+                if opcode == CHUNK and length >= _chunk_head.size:
+                    first_ns, last_ns, size, crc, packing, packed = _chunk_head.unpack_from(piece, body)
+                    if packing != ZSTD or packed != length - _chunk_head.size:
+                        break
+                    self.place = begin + end
+                    yield kinds.Chunk("zstd", piece[end - packed : end], last_ns, first_ns, crc, size)
+                elif opcode == CHUNK_INDEX and length >= 68:
+                    offsets = (length - 68).to_bytes(4, "little") if (length - 68) % 10 == 0 else b""
+                    if piece[body + 32 : body + 36] != offsets or piece[end - 24 : end - 16] != ZSTD:
+                        break
+                elif opcode != MESSAGE_INDEX:
+                    break
+                at = end
+            self._stream._crc = zlib.crc32(memoryview(piece)[:at], self._stream.checksum())
+            self.place = self._file.seek(begin + at)
+
+    def _read_record(self, opcode: int, length: int) -> kinds.McapRecord | None:
+        return None if opcode == MESSAGE_INDEX else super()._read_record(opcode, length)
 
 
 def _is_finished(file: IO[bytes]) -> bool:
-    """Whether a file has the end that a writer gives it, and not what a crash leaves."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - len(MCAP_MAGIC)))
     return size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
 
 
-def _refused(path: Path, file: IO[bytes], error: Exception) -> InputError:
+def _refused(path: Path, place: int, error: Exception) -> InputError:
     if isinstance(error, TooLargeError):
         return InputError(f"{path}: {error}; {ADVICE}")
     detail = str(error) if isinstance(error, DamageError) else f"{type(error).__name__} {error}".strip()
-    return InputError(f"{path}: is damaged before byte {file.tell()} ({detail}); record the log again")
+    return InputError(f"{path}: is damaged before byte {place} ({detail}); record the log again")
 
 
-def unpacked(data: bytes, compression: str, limit: int, exact: bool = True) -> bytes:
+def unpacked(data: bytes, compression: str, limit: int, exact: bool = True, zstd: Zstd | None = None) -> bytes:
     """What was packed: `limit` bytes, or if not `exact` at most so many. Raises DamageError, and what the unpackers raise."""
     if compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+        with (zstd or Zstd()).stream_reader(data) as stream:
             whole = stream.read(limit + 1)
     elif compression in {"bz2", "lz4"}:
         unpacker = bz2.BZ2Decompressor() if compression == "bz2" else lz4.frame.LZ4FrameDecompressor()
@@ -247,8 +292,7 @@ def unpacked(data: bytes, compression: str, limit: int, exact: bool = True) -> b
     return whole
 
 
-def _unpacked(chunk: kinds.Chunk, room: int) -> bytes:
-    """A chunk's content, once its size and CRC are those that it states."""
+def _unpacked(chunk: kinds.Chunk, room: int, zstd: Zstd) -> bytes:
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
         raise TooLargeError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
@@ -256,10 +300,21 @@ def _unpacked(chunk: kinds.Chunk, room: int) -> bytes:
         raise TooLargeError(f"unpacks to more than {MAX_INFLATION} times its size")
     if chunk.compression not in {"", "zstd", "lz4"}:
         raise DamageError(f"compression {chunk.compression[:20]!r} is neither zstd nor lz4")
-    data = unpacked(chunk.data, chunk.compression, size)
+    data = unpacked(chunk.data, chunk.compression, size, zstd=zstd)
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise DamageError("the CRC-32 of a chunk does not match")
     return data
+
+
+def _messages_in(data: bytes, topics: Topics) -> Messages | None:
+    place, end, found = 0, len(data), []
+    while place + HEAD_BYTES <= end:
+        opcode, length, channel = _message_start(data, place)
+        if opcode != MESSAGE or length < _message_head.size or channel not in topics:
+            return None
+        body, place = place + HEAD_BYTES, place + 9 + length
+        found.append((channel, data[body:place]))
+    return found if place == end else None
 
 
 def _inside(data: bytes) -> Iterator[kinds.McapRecord]:
@@ -314,7 +369,7 @@ class McapWriter:
         self._counts: Counter[int] = Counter()
         self._chunks = 0
         self._times_ns: list[int] = []  # the first and the last of all messages
-        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._compressor = ZstdCompressor(level=LEVEL)
         head = kinds.Metadata(metadata_name, dict(metadata))
         before = MCAP_MAGIC + _bytes_of(kinds.Header("", "hilstar"))
         whole = _bytes_of(head)

@@ -316,9 +316,7 @@ class Bag:
     """A bag that is open for reading."""
 
     def __init__(self, path: Path, files: list[Storage], told: list[tuple[str, str]]) -> None:
-        self.path = path
-        self._files = files
-        self._told = told
+        self.path, self._files, self._told = path, files, told
         self._topics: list[BagTopic] | None = None
 
     def topics(self) -> list[BagTopic]:

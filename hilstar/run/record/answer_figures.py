@@ -17,6 +17,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 
 AROUND_S = 10.0  # before and after a fault
 MAX_FAULTS = 500
+VERDICTS = ("right", "wrong", "invalid", "unpaired")
 MAX_WRONG = 1000  # whose times are kept
 
 
@@ -72,7 +73,7 @@ class AnswerReport(msgspec.Struct, frozen=True, kw_only=True):
 class SpanTally:
     """Counts and sums of the answers of a part of a run."""
 
-    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("right", "wrong", "invalid", "unpaired"), 0))
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(VERDICTS, 0))
     total: FloatArray = field(default_factory=lambda: np.zeros(3))
     squares: FloatArray = field(default_factory=lambda: np.zeros(3))
     largest_arcsec: float | None = None
@@ -109,9 +110,7 @@ class SpanTally:
             share = round(min(self.counts["right"] / max(round(length_s / cycle_s), 1), 1.0), 4)
         return AnswerSpan(
             length_s=round(length_s, 3),
-            right=self.counts["right"],
-            wrong=self.counts["wrong"],
-            invalid=self.counts["invalid"],
+            **{verdict: self.counts[verdict] for verdict in VERDICTS[:3]},
             availability=share,
             rms_arcsec=self.rms(),
             largest_arcsec=None if self.largest_arcsec is None else round(self.largest_arcsec, 3),
@@ -120,8 +119,6 @@ class SpanTally:
 
 @dataclass(slots=True)
 class _Fault:
-    """A fault of the run, with what was answered about it; host times, ns."""
-
     record: FaultRecord
     start_ns: int
     end_ns: int | None = None
@@ -180,12 +177,11 @@ class AnswerTally:
     """The answers of a run, record by record. Faults older than the ledger's begin, `begun_ns`, are those of a replayed run."""
 
     def __init__(self, begun_ns: int = 0) -> None:
-        self.whole = SpanTally()
+        self.whole, self._begun_ns = SpanTally(), begun_ns
         self.wrong_ns: list[int] = []
         self.faults: list[_Fault] = []
-        self._begun_ns = begun_ns
         self._open: list[_Fault] = []
-        self._replayed: dict[int, FaultRecord] = {}
+        self.replayed: dict[int, FaultRecord] = {}
         self._shown: frozenset[int] = frozenset()
         self._lately: deque[AnswerRecord] = deque()
         self._interval_s, self._latency_ms = RunningStatistics(), RunningStatistics()
@@ -211,7 +207,7 @@ class AnswerTally:
     def fault(self, record: FaultRecord) -> None:
         """Add a fault's begin or end. Those of a replayed run come before its frames, which say when they are on."""
         if record.event == "start" and record.host_ns < self._begun_ns:
-            self._replayed[record.number] = record
+            self.replayed[record.number] = record
         elif record.event == "start":
             self._begin(record, record.host_ns)
         elif record.event == "end":
@@ -219,12 +215,12 @@ class AnswerTally:
 
     def frame(self, record: FrameRecord) -> None:
         """Follow the faults of a replayed run."""
-        if not self._replayed:
+        if not self.replayed:
             return
         shown = frozenset(record.faults)
         for number in shown - self._shown:
-            if number in self._replayed:
-                self._begin(self._replayed[number], record.swap_ns)
+            if number in self.replayed:
+                self._begin(self.replayed[number], record.swap_ns)
         for number in self._shown - shown:
             self._end(number, record.swap_ns)
         self._shown = shown
@@ -254,10 +250,7 @@ class AnswerTally:
         end_ns = self._last_ns + round((cycle_s or 0.0) * NS_PER_S)  # the last answer stands for the time to the next
         return AnswerReport(
             answers=answers,
-            right=counts["right"],
-            wrong=counts["wrong"],
-            invalid=counts["invalid"],
-            unpaired=counts["unpaired"],
+            **{verdict: counts[verdict] for verdict in VERDICTS},
             rate_hz=round(1 / cycle_s, 3) if cycle_s else None,
             availability=round(min(counts["right"] / due, 1.0), 4) if due > 0 else None,
             mean_arcsec=self.whole.mean(),

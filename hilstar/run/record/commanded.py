@@ -1,5 +1,6 @@
 """The attitudes that a run commanded: read from its ledger, and interpolated between its frames."""
 
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -108,15 +109,15 @@ class CommandedRun:
 
 def read_commanded(ledger: Path) -> CommandedRun:
     """The commanded attitudes in a ledger. Raises InputError for what is no ledger, for damage, for under two frames."""
-    shown: dict[int, tuple[float, ...]] = {}
-    changed = 0
+    light, shown, changed = array("q"), array("d"), 0
     for record in frame_records(ledger):
         plain = record.q is not None and not record.operator and not record.hidden
         changed += record.q is not None and not plain
-        shown[record.light_ns] = record.q if plain and record.q is not None else NOT_SHOWN
-    if len(shown) < 2:
-        raise InputError(f"{ledger}: {NO_FRAMES if not shown else 'has one frame; give the ledger of a longer run'}")
-    light_ns = np.array(sorted(shown), dtype=np.int64)
-    zero_ns = int(light_ns[0])
-    q = np.array([shown[int(t)] for t in light_ns])
-    return CommandedRun(Commanded((light_ns - zero_ns) / NS_PER_S, q), zero_ns, changed)
+        light.append(record.light_ns)
+        shown.extend(record.q if plain and record.q is not None else NOT_SHOWN)
+    # Of frames of one moment the last counts.
+    light_ns, last = np.unique(np.array(light, dtype=np.int64)[::-1], return_index=True)
+    if len(light_ns) < 2:
+        raise InputError(f"{ledger}: {'has one frame; give the ledger of a longer run' if len(light_ns) else NO_FRAMES}")
+    q = np.array(shown).reshape(-1, 4)[::-1][last]
+    return CommandedRun(Commanded((light_ns - light_ns[0]) / NS_PER_S, q), int(light_ns[0]), changed)

@@ -18,6 +18,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal, Self
 
@@ -42,13 +43,8 @@ from hilstar.notices import Notice, Notices
 from hilstar.process.closing import Closing
 from hilstar.process.interrupts import caught, stop_on_signal
 from hilstar.run.record.ledger_records import (
-    ANSWER_TOPIC,
-    COUNT_TOPIC,
-    EVENT_TOPIC,
-    FAULT_TOPIC,
-    FRAME_TOPIC,
     MAX_RAW_BYTES,
-    PROCESS_TOPIC,
+    RECORDS,
     AnswerRecord,
     CountRecord,
     EventRecord,
@@ -67,28 +63,19 @@ ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000, "ans
 
 
 @dataclass(frozen=True, slots=True)
-class ReceivedPacket:
-    """A packet's bytes with its attitude, or the reason for its refusal."""
-
-    raw: bytes
-    sample: AttitudeSample | None
-    refusal: Refusal | None
-
-
-@dataclass(frozen=True, slots=True)
 class QueueEntry:
-    """A record to be written: its host time, a sequence number, and its content."""
+    """A message to be written: its host time, a sequence number, its JSON once the writer asks for it, and a packet's bytes."""
 
     kind: Kind
     time_ns: int
     sequence: int
-    content: ReceivedPacket | FrameRecord | EventRecord | FaultRecord | AnswerRecord
+    encoded: Callable[[], bytes]
+    raw_bytes: int = 0
 
     @property
     def size_bytes(self) -> int:
         """Approximate size in memory."""
-        raw_bytes = len(self.content.raw) if isinstance(self.content, ReceivedPacket) else 0
-        return ENTRY_BYTES[self.kind] + raw_bytes
+        return ENTRY_BYTES[self.kind] + self.raw_bytes
 
 
 class LedgerQueue:
@@ -126,8 +113,7 @@ class Allowance:
 
     def __init__(self, burst: float, per_s: float) -> None:
         self._burst, self._per_s = burst, per_s
-        self._left = burst
-        self._last_ns = 0
+        self._left, self._last_ns = burst, 0
 
     def take(self, now_ns: int) -> bool:
         """Whether one more message is recorded in full."""
@@ -253,23 +239,18 @@ class Ledger(Closing):
             "run_id": uuid.uuid4().hex,
         }
         self._queue, self._filter = LedgerQueue(), FloodFilter()
-        self._lost = self._counted = 0
-        self._thin = False
-        self._part = 0
+        self._lost = self._counted = self._part = 0
+        self._thin = self._moved = False
         self._renewed_s, self._rest_s = -math.inf, EACH_S
-        self._moved = False
         self.standing: Callable[[], list[FaultRecord]] = list  # records that a file begun during a run repeats
         self._file, self._writer = self._begin(path, overwrite)
         self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
         self._begun_s = self._alive_s = time.monotonic()
-        self._each_s = 0.0
-        self._probe = ProcessProbe()
-        self._closing = threading.Event()
+        self._each_s, self._probe, self._closing = 0.0, ProcessProbe(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-ledger", daemon=True)
         self._thread.start()
 
     def _begin(self, path: Path, overwrite: bool) -> tuple[NewFile, McapWriter]:
-        """Create a file and write its head. Raises InputError."""
         file = NewFile(path, overwrite)
         try:
             writer = McapWriter(file.fd, TOPICS, RUN_METADATA, self._head | {"part": str(self._part)})
@@ -292,16 +273,19 @@ class Ledger(Closing):
 
     def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
         """Record a packet; see `attitude.receiver.Watch`."""
-        if refusal is None and sample is None:
-            refusal = Refusal("format", "")
-        if not self._filter.keeps("packet", "accepted" if refusal is None else refusal.reason, host_ns):
-            return
-        sequence = 0 if sample is None else sample.sequence
-        self._queue.put(QueueEntry("packet", host_ns, sequence, ReceivedPacket(raw[:MAX_RAW_BYTES], sample, refusal)))
+        raw = raw[:MAX_RAW_BYTES]
+        if sample is not None and refusal is None:
+            reason, sequence, encoded = "accepted", sample.sequence, partial(attitude_message, sample, host_ns, raw)
+        else:
+            refusal, sequence = refusal or Refusal("format", ""), 0 if sample is None else sample.sequence
+            reason, detail = refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS]
+            encoded = partial(refused_message, reason, detail, host_ns, raw)
+        if self._filter.keeps("packet", reason, host_ns):
+            self._queue.put(QueueEntry("packet", host_ns, sequence, encoded, len(raw)))
 
     def frame(self, record: FrameRecord) -> None:
         """Record a frame."""
-        self._queue.put(QueueEntry("frame", record.swap_ns, record.frame, record))
+        self._queue.put(QueueEntry("frame", record.swap_ns, record.frame, partial(msgspec.json.encode, record)))
         if time.monotonic() - self._alive_s > STALLED_S:
             self._notices.begin(
                 "ledger-stalled", f"{self.path}: the disk has accepted nothing for {STALLED_S:g} s; the display goes on"
@@ -311,16 +295,16 @@ class Ledger(Closing):
         """Record an event of the run."""
         if self._filter.keeps("event", notice.kind, notice.host_ns):
             record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail, who=notice.who)
-            self._queue.put(QueueEntry("event", notice.host_ns, 0, record))
+            self._queue.put(QueueEntry("event", notice.host_ns, 0, partial(msgspec.json.encode, record)))
 
     def fault(self, record: FaultRecord) -> None:
         """Record the beginning or the end of a fault; a replay needs each."""
-        self._queue.put(QueueEntry("fault", record.host_ns, record.number, record))
+        self._queue.put(QueueEntry("fault", record.host_ns, record.number, partial(msgspec.json.encode, record)))
 
     def answer(self, record: AnswerRecord) -> None:
         """Record an answer of the tracker."""
         if self._filter.keeps("answer", "accepted", record.host_ns):
-            self._queue.put(QueueEntry("answer", record.host_ns, 0, record))
+            self._queue.put(QueueEntry("answer", record.host_ns, 0, partial(msgspec.json.encode, record)))
 
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""
@@ -343,7 +327,10 @@ class Ledger(Closing):
             elif last or time.monotonic() - self._renewed_s > self._rest_s:
                 self._renew(harm, last)
             for entry in self._queue.take():
-                self._take(entry)
+                if entry.kind == "frame" and self._thin:
+                    self._lose("frame", 1)
+                else:
+                    self._add(entry.kind, entry.time_ns, entry.encoded(), entry.sequence)
             now_s = time.monotonic()
             if last or now_s - self._each_s >= EACH_S:
                 self._each_s = now_s
@@ -360,20 +347,6 @@ class Ledger(Closing):
                 self._lose("packet", self._writer.drop())
         self._alive_s = time.monotonic()
         self._notices.end("ledger-stalled", "ledger-back", f"{self.path}: the disk accepts the ledger again")
-
-    def _take(self, entry: QueueEntry) -> None:
-        if entry.kind == "frame" and self._thin:
-            self._lose("frame", 1)
-            return
-        content, at_ns = entry.content, entry.time_ns
-        if not isinstance(content, ReceivedPacket):
-            data = msgspec.json.encode(content)
-        elif content.refusal is not None or content.sample is None:
-            refusal = content.refusal or Refusal("format", "")
-            data = refused_message(refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS], at_ns, content.raw)
-        else:
-            data = attitude_message(content.sample, at_ns, content.raw)
-        self._add(entry.kind, at_ns, data, entry.sequence)
 
     def _add(self, key: str, time_ns: int, data: bytes, sequence: int = 0) -> None:
         self._writer.add(key, log_time_ns(time_ns), data, sequence)
@@ -395,7 +368,6 @@ class Ledger(Closing):
         self._look_at_disk()
 
     def _renew(self, harm: str, last: bool) -> None:
-        """Go on in another file where this one was deleted, truncated or overwritten."""
         if self._renewed_s > 0:  # repeated damage must not fill the disk with files
             self._rest_s = min(2 * self._rest_s, MAX_REST_S)
         self._renewed_s = time.monotonic()
@@ -421,14 +393,12 @@ class Ledger(Closing):
         old.close()
 
     def _say_lost(self, line: str) -> None:
-        """Report each loss; the condition lasts until another ledger is begun."""
         if "ledger-lost" in self._notices.active:
             self._notices.tell("ledger-lost", line)
         else:
             self._notices.begin("ledger-lost", line)
 
     def _look_at_place(self) -> None:
-        """Report once that the file was moved: it is still complete."""
         if self._moved:
             return
         place = part_path(self.path, self._part)
@@ -440,10 +410,8 @@ class Ledger(Closing):
             self._notices.tell("ledger-moved", f"{place}: was moved while it is written; the ledger goes on where it is now")
 
     def _lose(self, kind: Kind | str, number: int) -> None:
-        """Count messages that were lost for lack of room."""
         self._lost += number
-        own: Kind = "frame" if kind == "frame" else "packet" if kind == "packet" else "answer" if kind == "answer" else "event"
-        self._filter.count(own, NO_ROOM, number)
+        self._filter.count(kind if kind in {"frame", "packet", "answer"} else "event", NO_ROOM, number)
 
     def _look_at_disk(self) -> None:
         disk = os.fstatvfs(self._file.fd)
@@ -462,7 +430,6 @@ class Ledger(Closing):
             self._notices.end("ledger-thin", "ledger-whole", f"{left}: frames are recorded again")
 
     def _flush(self) -> None:
-        """Write the chunk; if there is no room for it, without its frames."""
         try:
             self._writer.flush()
         except OSError:
@@ -481,7 +448,6 @@ class Ledger(Closing):
         self._notices.begin("ledger-failed", f"{self.path}: cannot be written ({self.failure}); the display goes on")
 
     def _go_on_in_another(self) -> None:
-        """Open the next file, then finish this one."""
         self._part += 1
         try:
             file, writer = self._begin(part_path(self.path, self._part), self._overwrite)
@@ -521,14 +487,7 @@ class Ledger(Closing):
 
 TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
     key: JsonTopic(topic, f"hilstar.{key.title()}", schema_of(record, f"hilstar.{key.title()}"))
-    for key, topic, record in (
-        ("frame", FRAME_TOPIC, FrameRecord),
-        ("event", EVENT_TOPIC, EventRecord),
-        ("process", PROCESS_TOPIC, ProcessRecord),
-        ("count", COUNT_TOPIC, CountRecord),
-        ("fault", FAULT_TOPIC, FaultRecord),
-        ("answer", ANSWER_TOPIC, AnswerRecord),
-    )
+    for key, (topic, record) in RECORDS.items()
 }
 
 
@@ -539,8 +498,7 @@ class LedgerSwitch:
     """
 
     def __init__(self, ledger: Ledger | None = None) -> None:
-        self.current = ledger
-        self.last = ledger  # the newest one
+        self.current = self.last = ledger  # `last` is the newest one
         self._ending = threading.Lock()  # the end of a run waits for an end that an operator asked for
         self._scenario: list[FaultRecord] = []
         self._faults_on: dict[int, FaultRecord] = {}
@@ -559,32 +517,27 @@ class LedgerSwitch:
 
     def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
         """Record a packet; see `attitude.receiver.Watch`."""
-        ledger = self.current
-        if ledger is not None:
+        if (ledger := self.current) is not None:
             ledger.packet(host_ns, raw, sample, refusal)
 
     def frame(self, record: FrameRecord) -> None:
         """Record a frame."""
-        ledger = self.current
-        if ledger is not None:
+        if (ledger := self.current) is not None:
             ledger.frame(record)
 
     def notice(self, notice: Notice) -> None:
         """Record an event of the run."""
-        ledger = self.current
-        if ledger is not None:
+        if (ledger := self.current) is not None:
             ledger.notice(notice)
 
     def answer(self, record: AnswerRecord) -> None:
         """Record an answer of the tracker."""
-        ledger = self.current
-        if ledger is not None:
+        if (ledger := self.current) is not None:
             ledger.answer(record)
 
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""
-        ledger = self.current
-        if ledger is not None:
+        if (ledger := self.current) is not None:
             ledger.pulse(what)
 
     def fault(self, record: FaultRecord) -> None:
@@ -595,14 +548,12 @@ class LedgerSwitch:
             self._faults_on[record.number] = record
         else:
             self._faults_on.pop(record.number, None)
-        ledger = self.current
-        if ledger is not None:
+        if (ledger := self.current) is not None:
             ledger.fault(record)
 
     def begin(self, make: Callable[[], Ledger]) -> Ledger:
         """Begin a ledger if there is none; the current ledger. Raises InputError where it cannot be made."""
-        ledger = self.current
-        if ledger is None:
+        if (ledger := self.current) is None:
             ledger = make()
             ledger.standing = self._standing
             for record in self._standing():

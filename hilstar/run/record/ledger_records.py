@@ -4,15 +4,24 @@ There is a record for each frame, each event, each second of the process, and fo
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
+import numpy as np
 
 from hilstar.answers.judge import Judged
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC, RUN_METADATA, read_messages, read_metadata, read_topics
+from hilstar.attitude.logs.mcap_log import (
+    ATTITUDE_TOPIC,
+    RUN_METADATA,
+    Topics,
+    read_chunks,
+    read_messages,
+    read_metadata,
+)
 from hilstar.attitude.wire.packet import MAX_PLACE_KM, MAX_SPEED_KM_S, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config import BenchConfig
@@ -31,10 +40,9 @@ HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, whic
 AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # a sender's clock, or the difference to the host's
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
-Record = TypeVar("Record")
 
 
-class FrameRecord(msgspec.Struct, kw_only=True):
+class FrameRecord(msgspec.Struct, kw_only=True, gc=False):
     """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of this host's.
 
     `q` is the attitude at `light_ns`, when the middle row lights. `rate` (rad/s, cam) is the turn along which stars are drawn
@@ -167,7 +175,7 @@ class CountRecord(msgspec.Struct, kw_only=True):
     count: Count
 
 
-class PacketForm(msgspec.Struct):
+class PacketForm(msgspec.Struct, gc=False):
     """What a report reads of a packet."""
 
     accepted: bool = True
@@ -178,29 +186,36 @@ class PacketForm(msgspec.Struct):
 RunRecord = FrameRecord | ProcessRecord | PacketForm | CountRecord | EventRecord | FaultRecord | AnswerRecord
 
 
+# The topic and the record of each kind that a ledger is given, beside packets.
+RECORDS: dict[str, tuple[str, type[msgspec.Struct]]] = {
+    "frame": (FRAME_TOPIC, FrameRecord),
+    "event": (EVENT_TOPIC, EventRecord),
+    "process": (PROCESS_TOPIC, ProcessRecord),
+    "count": (COUNT_TOPIC, CountRecord),
+    "fault": (FAULT_TOPIC, FaultRecord),
+    "answer": (ANSWER_TOPIC, AnswerRecord),
+}
+_DECODERS: dict[str, msgspec.json.Decoder[Any]] = {topic: msgspec.json.Decoder(record) for topic, record in RECORDS.values()}
+_DECODERS[ATTITUDE_TOPIC] = msgspec.json.Decoder(PacketForm)
+
+
 def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> FrameRecord:
     """The ledger's record of a frame; `light_ns` is on the sender's clock, `missed` counts the run's missed frames
     so far, and `below_step` the stars in view that are too faint for the monitor.
     """
     attitude, drawn = shown.attitude, shown.drawn
+    names = ("t_ns", "draw_ns", "predicted_swap_ns", "swap_ns", "timestamp_source", "stale", "missed_before", "marker")
     record = FrameRecord(
         frame=shown.number,
-        t_ns=shown.t_ns,
         light_ns=light_ns,
-        draw_ns=shown.draw_ns,
-        predicted_swap_ns=shown.predicted_swap_ns,
-        swap_ns=shown.swap_ns,
-        timestamp_source=shown.timestamp_source,
-        stale=shown.stale,
         stars_drawn=drawn.star_count,
         clipped=len(drawn.clipped_hip),
         below_step=below_step,
         capped=drawn.capped,
-        missed_before=shown.missed_before,
         missed=missed,
-        marker=shown.marker,
         operator=shown.on_screen.operator,
         hidden=shown.on_screen.hidden,
+        **{name: getattr(shown, name) for name in names},
     )
     if shown.faults:
         record.faults = tuple(one.number for one in shown.faults)
@@ -242,7 +257,6 @@ def answer_record(judged: Judged) -> AnswerRecord:
 
 
 def _numbers(values: FloatArray | None) -> Any:
-    """An array as a record has it."""
     return None if values is None else tuple(values.tolist())
 
 
@@ -258,36 +272,33 @@ def _within_64_bits(value_ns: int) -> int:
 NO_FRAMES = "has no frames; give the ledger of serve or replay --ledger"
 MAX_REASONS, MAX_REASON_CHARACTERS = 50, 40
 
-_frame_decoder = msgspec.json.Decoder(FrameRecord)
 
-
-def frame_records(path: Path) -> Iterator[FrameRecord]:
+def frame_records(path: Path, *, tell: bool = True) -> Iterator[FrameRecord]:
     """The frames of a ledger as they were written, none if the file is no ledger. Raises InputError for damage."""
-    for number, data in enumerate(read_messages(path, FRAME_TOPIC), start=1):
-        yield _decoded(_frame_decoder, data, f"{path}: message {number} of {FRAME_TOPIC}")
+    return _records(path, FRAME_TOPIC, tell)
 
 
 def fault_records(path: Path) -> Iterator[FaultRecord]:
     """The beginnings and ends of faults in a ledger. Raises InputError for damage; says nothing of a missing end."""
-    return _records(path, FAULT_TOPIC, FaultRecord)
+    return _records(path, FAULT_TOPIC)
 
 
 def answer_records(path: Path) -> Iterator[AnswerRecord]:
     """The tracker's answers in a ledger, none if the run had none. Raises InputError for damage."""
-    return _records(path, ANSWER_TOPIC, AnswerRecord)
+    return _records(path, ANSWER_TOPIC)
 
 
-def _records(path: Path, topic: str, record: type[Record]) -> Iterator[Record]:
-    decoder = msgspec.json.Decoder(record)
-    for number, data in enumerate(read_messages(path, topic, tell=False), start=1):
-        yield _decoded(decoder, data, f"{path}: message {number} of {topic}")
+def _records(path: Path, topic: str, tell: bool = False) -> Iterator[Any]:
+    for number, data in enumerate(read_messages(path, topic, tell=tell), start=1):
+        try:
+            record = _DECODERS[topic].decode(data)
+        except NOT_JSON as error:
+            raise _not_ours(path, f"{number} of {topic}", error) from error
+        yield record
 
 
-def _decoded(decoder: msgspec.json.Decoder[Any], data: bytes, where: str) -> Any:
-    try:
-        return decoder.decode(data)
-    except NOT_JSON as error:
-        raise InputError(f"{where} is not one of hilstar's ({error})") from error
+def _not_ours(path: Path, which: str, error: Exception) -> InputError:
+    return InputError(f"{path}: message {which} is not one of hilstar's ({error})")
 
 
 def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[FrameRecord]:
@@ -315,26 +326,54 @@ def wrong_in_frame(record: FrameRecord, max_rate_rad_s: float = math.inf) -> str
 
 def run_records(path: Path) -> Iterator[RunRecord]:
     """The records of a ledger, in order. Raises InputError for a file that is no ledger or is damaged."""
-    decoders: dict[str, msgspec.json.Decoder[Any]] = {
-        FRAME_TOPIC: _frame_decoder,
-        PROCESS_TOPIC: msgspec.json.Decoder(ProcessRecord),
-        ATTITUDE_TOPIC: msgspec.json.Decoder(PacketForm),
-        COUNT_TOPIC: msgspec.json.Decoder(CountRecord),
-        EVENT_TOPIC: msgspec.json.Decoder(EventRecord),
-        FAULT_TOPIC: msgspec.json.Decoder(FaultRecord),
-        ANSWER_TOPIC: msgspec.json.Decoder(AnswerRecord),
-    }
+    for block in run_blocks(path, 1):
+        yield from block
+
+
+def run_blocks(path: Path, size: int) -> Iterator[list[RunRecord]]:
+    """The records of a ledger, in order, `size` at once. Raises InputError as `run_records`."""
+    block: list[RunRecord] = []
+    last: Topics = {}
     try:
-        for number, (topic, data) in enumerate(read_topics(path), start=1):
-            if topic in decoders:
-                record = _decoded(decoders[topic], data, f"{path}: message {number}, of {topic},")
-                q = record.q if isinstance(record, FrameRecord) else None
-                # `checked_sample` has the same rule, and costs ten times as much.
-                if q is not None and abs(math.hypot(*q) - 1.0) > NORM_TOLERANCE:
-                    raise InputError(f"{path}: message {number}, of {topic}: {wrong_in_frame(record)}")
-                yield record
+        for topics, messages in read_chunks(path):
+            if topics is not last:
+                last, decode = topics, {k: _DECODERS[topic].decode for k, topic in topics.items() if topic in _DECODERS}
+            block += [decode[channel](data) for channel, data in messages if channel in decode]
+            while len(block) >= size:
+                yield _checked(block[:size])
+                block = block[size:]
+        yield _checked(block)
     except OSError as error:
         raise cannot_read(path, error, "give the ledger of a run") from error
+    except (*NOT_JSON, ArithmeticError) as error:
+        raise _first_fault(path, error) from error
+
+
+def attitudes_of(records: Sequence[Any]) -> FloatArray:
+    """The attitudes (n, 4) of the frames that have one."""
+    q = [record.q for record in records if type(record) is FrameRecord and record.q is not None]
+    return np.fromiter(chain.from_iterable(q), np.float64, 4 * len(q)).reshape(-1, 4)
+
+
+def _checked(records: list[RunRecord]) -> list[RunRecord]:
+    # `checked_sample` has the same rule, and costs ten times as much.
+    with np.errstate(over="ignore"):
+        if (np.abs(np.linalg.norm(attitudes_of(records), axis=1) - 1.0) > NORM_TOLERANCE).any():
+            raise ArithmeticError("a quaternion's norm is not 1")
+    return records
+
+
+def _first_fault(path: Path, error: Exception) -> InputError:
+    every = ((topics[channel], data) for topics, messages in read_chunks(path, tell=False) for channel, data in messages)
+    for number, (topic, data) in enumerate(every, start=1):
+        which = f"{number}, of {topic}"
+        try:
+            record = _DECODERS[topic].decode(data) if topic in _DECODERS else None
+        except NOT_JSON as wrong:
+            return _not_ours(path, f"{which},", wrong)
+        if isinstance(record, FrameRecord) and record.q is not None and abs(math.hypot(*record.q) - 1.0) > NORM_TOLERANCE:
+            return InputError(f"{path}: message {which}: {wrong_in_frame(record)}")
+    return _not_ours(path, "", error)
 
 
 class PacketTally:
@@ -346,11 +385,12 @@ class PacketTally:
     def add(self, record: RunRecord) -> None:
         """Add a recorded packet, or a count of packets."""
         if isinstance(record, PacketForm):
-            self._count("accepted" if record.accepted else (record.reason or "format").split(":")[0], 1)
+            self.count("accepted" if record.accepted else (record.reason or "format").split(":")[0], 1)
         elif isinstance(record, CountRecord) and record.kind == "packet":
-            self._count(record.reason, record.count)
+            self.count(record.reason, record.count)
 
-    def _count(self, reason: str, number: int) -> None:
+    def count(self, reason: str, number: int) -> None:
+        """Add packets of one kind."""
         key = reason[:MAX_REASON_CHARACTERS] if len(self.counts) < MAX_REASONS or reason in self.counts else "others"
         self.counts[key] = self.counts.get(key, 0) + number
 

@@ -1,8 +1,9 @@
 """The figures of a run's report, from its ledger: added in blocks, in memory that does not grow with the run."""
 
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,9 +30,10 @@ from hilstar.run.record.ledger_records import (
     PacketTally,
     ProcessRecord,
     RunRecord,
+    attitudes_of,
     config_of,
     read_head,
-    run_records,
+    run_blocks,
 )
 from hilstar.running_statistics import Percentiles, RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -46,9 +48,7 @@ class ThinnedRows:
 
     def __init__(self, columns: int, capacity: int = SAMPLES, kind: type = float) -> None:
         self._rows: npt.NDArray[Any] = np.zeros((capacity, columns), dtype=kind)
-        self._kept = 0
-        self.stride = 1
-        self._seen = 0
+        self._kept, self._seen, self.stride = 0, 0, 1
 
     def add(self, rows: npt.NDArray[Any]) -> None:
         """Add rows (n, columns), or skip them."""
@@ -103,7 +103,6 @@ class SpanTable:
             rows = rows[count:]
 
     def _add(self, rows: FloatArray, spans: int) -> None:
-        """Add frames to the last span, or as `spans` whole spans from it on."""
         values = rows[:, 1:].reshape(spans, -1, rows.shape[1] - 1)
         place = slice(self._used - 1, self._used - 1 + spans)
         self._begin[self._used : place.stop] = rows[:: max(len(rows) // spans, 1), 0][1:spans]
@@ -139,8 +138,7 @@ class TimeBins:
     def __init__(self, kinds: int, capacity: int = SPANS) -> None:
         self._counts = np.zeros((capacity, kinds), dtype=np.int64)
         self._first_ns: int | None = None
-        self._used = 0
-        self.width_ns = NS_PER_S
+        self._used, self.width_ns = 0, NS_PER_S
 
     def add(self, at_ns: npt.NDArray[np.int64], kinds: IntArray, number: int = 1) -> None:
         """Count `number` arrivals of `kinds` (n,) at host times (n,); a time before the first counts in the first bin."""
@@ -204,13 +202,12 @@ METRICS = {
     **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
 }
 HEAD = ("bench_sha256", "calibration", "calibration_sha256", "certificate", "gl_renderer", "gl_version", "render_path")
-COUNTED = (
-    *("frames", "duration_s", "stale_frames", "right_frames", "blank_frames", "operator_frames", "hidden_frames"),
-    *("capped_frames", "events", "pulses", "memory_growth_mb"),
-)
+FAULTS = ("stale_frames", "blank_frames", "operator_frames", "hidden_frames")
+COUNTED = ("frames", "right_frames", "capped_frames", *FAULTS)
 # The columns of the spans: METRICS, then these.
 COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
 ACCEPTED, REFUSED = range(2)
+NUMBERS, WORDS = ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step"), ("operator", "hidden")
 
 
 @dataclass(slots=True)
@@ -221,14 +218,8 @@ class RunFigures:
     packets: PacketTally = field(default_factory=PacketTally)
     events: dict[str, int] = field(default_factory=dict)
     pulses: dict[str, int] = field(default_factory=dict)  # by PULSES; {} where none was due
-    frames: int = 0
-    stale_frames: int = 0
-    blank_frames: int = 0
-    late: int = 0  # stale, with an attitude
-    capped_frames: int = 0
-    operator_frames: int = 0
-    hidden_frames: int = 0
-    right_frames: int = 0  # with none of these faults
+    # Frames, with how many of each fault, "right_frames" with none and "late" stale ones with an attitude.
+    counted: Counter[str] = field(default_factory=Counter)
     most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
     last: FrameRecord | None = None
     first_swap_ns: int = 0
@@ -241,6 +232,7 @@ class RunFigures:
     keyframes: Keyframes = field(default_factory=Keyframes)
     packet_times: TimeBins = field(default_factory=lambda: TimeBins(2))
     answers: AnswerTally = field(default_factory=AnswerTally)
+    faults: list[FaultRecord] = field(default_factory=list)
     residuals: ThinnedRows = field(default_factory=lambda: ThinnedRows(4, SAMPLES // 4))  # host time in s, x, y, z in arcsec
     first_events: list[EventRecord] = field(default_factory=list)
     last_events: deque[EventRecord] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
@@ -265,20 +257,22 @@ class RunFigures:
 
     def add(self, *records: RunRecord) -> None:
         """Add records of the ledger, in their order: many at once take a third of the time."""
-        frames: list[FrameRecord] = []
-        packets: list[PacketForm] = []
-        for record in records:
+        frames = [record for record in records if type(record) is FrameRecord]
+        packets = [record for record in records if type(record) is PacketForm]
+        others = [record for record in records if type(record) not in {FrameRecord, PacketForm}]
+        in_order = self.answers.replayed or FaultRecord in set(map(type, others))
+        for record in records if in_order else others:
             if isinstance(record, FrameRecord):
                 self.answers.frame(record)
-                frames.append(record)
-            elif isinstance(record, PacketForm):
-                self.packets.add(record)
-                if record.receive_ns is not None:
-                    packets.append(record)
-            else:
+            elif not isinstance(record, PacketForm):
                 self._add_one(record)
-        times_ns = np.array([packet.receive_ns for packet in packets], dtype=np.int64)
-        self.packet_times.add(times_ns, np.array([ACCEPTED if packet.accepted else REFUSED for packet in packets]))
+        accepted = _whole(packets, "accepted")[0] > 0
+        if plain := bool(accepted.all()) and "accepted" in self.packets.counts:
+            self.packets.count("accepted", len(packets))
+        for record in others if plain else records:
+            self.packets.add(record)
+        times_ns, known = _whole(packets, "receive_ns")
+        self.packet_times.add(times_ns[known], np.where(accepted, ACCEPTED, REFUSED)[known])
         if frames:
             self._add_frames(frames)
 
@@ -296,53 +290,45 @@ class RunFigures:
             record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
             (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(record)
         elif isinstance(record, FaultRecord):
+            self.faults.append(record)
             self.answers.fault(record)
         elif isinstance(record, AnswerRecord):
             self.answers.answer(record)
             if record.verdict == "right" and record.residual_arcsec is not None:
                 self.residuals.add(np.array([(record.middle_ns / NS_PER_S, *record.residual_arcsec)]))
-        else:
-            self.packets.add(record)
-            if record.kind == "pulse" and record.reason in PULSES:
-                self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
-                self.pulses[record.reason] += record.count
-            elif record.kind == "packet":
-                place = ACCEPTED if record.reason == "accepted" else REFUSED
-                self.packet_times.add(np.array([record.host_ns]), np.array([place]), record.count)
+        elif record.kind == "pulse" and record.reason in PULSES:
+            self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
+            self.pulses[record.reason] += record.count
+        elif record.kind == "packet":
+            place = ACCEPTED if record.reason == "accepted" else REFUSED
+            self.packet_times.add(np.array([record.host_ns]), np.array([place]), record.count)
 
     def _add_frames(self, frames: list[FrameRecord]) -> None:
         before, self.last = self.last, frames[-1]
         if before is None:
             self.first_swap_ns = frames[0].swap_ns
-        self.frames += len(frames)
-        stale, blank, operator, hidden = (
-            np.array(each, dtype=bool)
-            for each in zip(*((f.stale, f.q is None, f.operator != "", f.hidden != "") for f in frames), strict=True)
-        )
-        self.stale_frames += int(stale.sum())
-        self.blank_frames += int(blank.sum())
-        self.late += int((stale & ~blank).sum())
-        self.operator_frames += int(operator.sum())
-        self.hidden_frames += int(hidden.sum())
-        self.right_frames += int((~(stale | blank | operator | hidden)).sum())
-        self.capped_frames += sum(frame.capped > 0 for frame in frames)
-        missed, stars, clipped, below = counts = np.array(
-            [(f.missed_before, f.stars_drawn, f.clipped, f.below_step) for f in frames], dtype=np.int64
-        ).T
+        self.counted["frames"] += len(frames)
+        stale, capped, missed, stars, clipped, below = (_whole(frames, name)[0] for name in NUMBERS)
+        blank = np.array([frame.q is None for frame in frames])
+        words = [np.array([getattr(frame, name) != "" for frame in frames]) for name in WORDS]
+        masks = dict(zip(FAULTS, (stale > 0, blank, *words), strict=True))
+        masks |= {"right_frames": ~np.any([*masks.values()], axis=0), "late": (stale > 0) & ~blank, "capped_frames": capped > 0}
+        for name, mask in masks.items():
+            self.counted[name] += int(mask.sum())
         for name, number in (("clipped", clipped), ("below_step", below), ("stars_drawn", stars)):
             self.most[name] = max(self.most[name], int(number.max()))
-        swap_ns = np.array([frame.swap_ns for frame in frames], dtype=np.int64)
+        swap_ns, _ = _whole(frames, "swap_ns")
         times = _times_ms(frames, swap_ns, before, missed > 0)
         for name, values in zip(METRICS, times.T, strict=True):
             self.spreads[name].add_all(values[~np.isnan(values)])
         self.samples.add(times)
         run_s = (swap_ns - self.first_swap_ns) / NS_PER_S
-        self.spans.add(np.column_stack([run_s, times, counts.T, stale, blank]))
-        self.keyframes.add(frames, {"first stale": stale & ~blank, "most clipped stars": clipped, "most stars": stars})
+        self.spans.add(np.column_stack([run_s, times, missed, stars, clipped, below, stale, blank]))
+        self.keyframes.add(frames, {"first stale": masks["late"], "most clipped stars": clipped, "most stars": stars})
         seen = np.flatnonzero(~blank)
         if not len(seen):
             return
-        q, t_ns = np.array([frames[k].q for k in seen]), np.array([frames[k].t_ns for k in seen], dtype=np.int64)
+        q, t_ns = attitudes_of(frames), _whole(frames, "t_ns")[0][seen]
         self._first_t_ns = int(t_ns[0]) if self._first_t_ns is None else self._first_t_ns
         last_q = q[0] if self._q is None else self._q
         turned = np.cumsum(np.vstack([self._turned, _turns_rad(np.vstack([last_q, q[:-1]]), q)]), axis=0)
@@ -358,17 +344,22 @@ def _times_ms(
     intervals_ns[after_missed] = np.nan
     if before is None:
         intervals_ns[0] = np.nan
-    rest = [
-        (
-            np.nan if f.predicted_swap_ns is None else f.swap_ns - f.predicted_swap_ns,
-            f.swap_ns - f.draw_ns,
-            np.nan if f.age_ns is None else f.age_ns,
-            f.prediction_ns,
-            np.nan if f.receive_ns is None else f.swap_ns - f.receive_ns,
-        )
-        for f in frames
-    ]
-    return np.column_stack([intervals_ns, np.array(rest, dtype=np.float64)]) / NS_PER_MS
+    times_ns = [intervals_ns]
+    for name in ("predicted_swap_ns", "draw_ns", "age_ns", "prediction_ns", "receive_ns"):
+        ns, known = _whole(frames, name)
+        times_ns.append(np.where(known, ns if name in {"age_ns", "prediction_ns"} else swap_ns - ns, np.nan))
+    return np.column_stack(times_ns) / NS_PER_MS
+
+
+def _whole(records: Sequence[RunRecord], name: str) -> tuple[npt.NDArray[np.int64], BoolArray]:
+    """A whole number of each record, 0 for None, and whether it is known, (n,) each."""
+    count, known = len(records), np.ones(len(records), dtype=bool)
+    try:
+        return np.fromiter(map(attrgetter(name), records), np.int64, count), known
+    except TypeError:
+        values = list(map(attrgetter(name), records))
+        known[[number for number, value in enumerate(values) if value is None]] = False
+        return np.array([value or 0 for value in values], dtype=np.int64), known
 
 
 def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -388,16 +379,14 @@ def figures_of(path: Path) -> RunFigures:
     """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
     figures = RunFigures(read_head(path))
     figures.answers = AnswerTally(_begun_ns(figures.head))
-    records = run_records(path)
-    while block := list(islice(records, BLOCK)):
+    for block in run_blocks(path, BLOCK):
         figures.add(*block)
-    if not figures.frames:
+    if figures.last is None:
         raise InputError(f"{path}: {NO_FRAMES}")
     return figures
 
 
 def _begun_ns(head: dict[str, str]) -> int:
-    """The host time at which a ledger was begun, 0 where its head does not say."""
     text = head.get("monotonic_ns", "")
     return int(text) if text.isdecimal() else 0
 
@@ -446,7 +435,8 @@ def summarise(run: RunFigures) -> RunReport:
     config, last = config_of(run.head), run.last
     refresh_hz = None if config is None else config.monitor.refresh_hz
     times = {key: run.spreads[name].percentiles() for name, key in METRICS.items()}
-    found: dict[str, Any] = {name: getattr(run, name) for name in COUNTED} | {name: run.head.get(name) for name in HEAD}
+    found: dict[str, Any] = {name: run.counted[name] for name in COUNTED} | {name: run.head.get(name) for name in HEAD}
+    found |= {name: getattr(run, name) for name in ("duration_s", "events", "pulses", "memory_growth_mb")}
     return RunReport(
         **(found | times | run.most),
         missed_frames=0 if last is None else last.missed,

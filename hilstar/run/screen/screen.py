@@ -58,8 +58,7 @@ class SwapClock:
     PERIOD_SHARE = 0.004
 
     def __init__(self, first_ns: int, period_ns: float, paced_by_screen: bool) -> None:
-        self.period_ns = period_ns
-        self.paced_by_screen = paced_by_screen
+        self.period_ns, self.paced_by_screen = period_ns, paced_by_screen
         self._phase_ns = float(first_ns)
 
     def update(self, swap_ns: int) -> None:
@@ -222,9 +221,7 @@ class DisplayPacer(Pacer):
     ) -> None:
         operator = Operator(screen.aids, notices, lambda: screen.window.hidden, requests)
         super().__init__(screen.clock.period_ns, clock, operator)
-        self.scheduling = "normal"
-        self._screen = screen
-        self._notices = notices
+        self.scheduling, self._screen, self._notices = "normal", screen, notices
         self._gamma_frames, self._gamma_ns, self._last_swap_ns = 0, 0, 0
 
     def moments(self) -> Iterator[Moment]:

@@ -88,7 +88,7 @@ def test_the_verdict_names_everything_that_was_wrong():
         [{}, {"stale": True}, {"q": None, "stale": True}, {"missed_before": 2, "missed": 2}, {"hidden": "covered", "missed": 2}]
     ):
         figures.add(frame(k, **more))
-    told = verdict(summarise(figures), figures.late)
+    told = verdict(summarise(figures), figures.counted["late"])
     assert not told["ok"]
     assert told["reasons"] == [
         "1 of 5 frames without an attitude",

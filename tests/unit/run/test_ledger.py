@@ -19,7 +19,7 @@ from mcap.records import Chunk, Header
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from hilstar.attitude.logs.log_file import read_log
-from hilstar.attitude.logs.mcap_log import parts_of, read_topics
+from hilstar.attitude.logs.mcap_log import parts_of, read_chunks
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
 from hilstar.cli.options import parse_split
 from hilstar.errors import InputError
@@ -30,7 +30,6 @@ from hilstar.run.record.ledger import (
     LedgerQueue,
     LedgerSwitch,
     QueueEntry,
-    ReceivedPacket,
     SplitLimits,
 )
 from hilstar.run.record.ledger_records import FAULT_TOPIC, FaultRecord, FrameRecord, drawable_frames
@@ -60,6 +59,10 @@ def keep(ledger: Ledger, first: int, last: int) -> None:
         sample = AttitudeSample(k, UPRIGHT, None, k)
         ledger.packet(1000 + k, encode(sample), sample, None)
         ledger.frame(FrameRecord(frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=k + 1, q=(1, 0, 0, 0)))
+
+
+def read_topics(path):
+    return [(topics[channel], data) for topics, messages in read_chunks(path) for channel, data in messages]
 
 
 def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
@@ -216,11 +219,11 @@ def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp
 
 def test_what_waits_is_bounded_by_bytes_and_frames_go_first():
     backlog = LedgerQueue()
-    frames = sum(backlog.put(QueueEntry("frame", 0, 0, None)) for _ in range(50_000))
-    packets = sum(backlog.put(QueueEntry("packet", 0, 0, ReceivedPacket(bytes(1000), None, None))) for _ in range(50_000))
+    frames = sum(backlog.put(QueueEntry("frame", 0, 0, bytes)) for _ in range(50_000))
+    packets = sum(backlog.put(QueueEntry("packet", 0, 0, bytes, 1000)) for _ in range(50_000))
     assert 0 < frames < 50_000 and 0 < packets < 50_000
     assert sum(entry.size_bytes for entry in backlog.take()) <= MAX_WAITING_BYTES
-    assert backlog.put(QueueEntry("frame", 0, 0, None))
+    assert backlog.put(QueueEntry("frame", 0, 0, bytes))
 
 
 def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, bench):
@@ -313,7 +316,7 @@ def test_a_report_s_memory_does_not_grow_with_the_run():
                 for k in range(begin, begin + 7000)
             )
         )
-    assert figures.frames == 140_000
+    assert figures.counted["frames"] == 140_000
     assert len(figures.samples.rows) <= 1 << 16 and figures.samples.stride == 4
     assert figures.spreads["interval"].percentile(50) == pytest.approx(16.667, rel=2e-3)
     begin, (_, _, lost) = figures.spans.begin, figures.spans.column(6)

@@ -72,7 +72,7 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
 def test_a_log_has_a_frame_each_refresh_period_from_its_first_sample_to_its_last(log, config):
     play = plan_play(log, Wanted(), config)
     assert play.paced and play.frame_count == 121 and play.packet_count == 21
-    number, t_ns, attitude = play.frame(60)
+    number, t_ns, attitude, _ = play.frame(60)
     assert (number, t_ns) == (60, 101_000_000_000)
     assert attitude.q_icrs_to_cam == pytest.approx([math.cos(0.05), 0, 0, math.sin(0.05)], abs=1e-9)
 
@@ -116,8 +116,8 @@ def test_an_earlier_run_is_replayed_frame_by_frame_with_its_own_numbers_and_atti
     play = plan_play(ledger, Wanted(MAX), config)
     assert (play.frame_count, play.packet_count, play.paced, play.moving) == (10, 10, False, True)
     frames = [play.frame(k) for k in range(10)]
-    assert [(number, t_ns) for number, t_ns, _ in frames] == [(2 * k, 500 + k) for k in range(10)]
-    assert [attitude is None for _, _, attitude in frames] == [k == 3 for k in range(10)]
+    assert [(frame.number, frame.t_ns) for frame in frames] == [(2 * k, 500 + k) for k in range(10)]
+    assert [frame.attitude is None for frame in frames] == [k == 3 for k in range(10)]
     assert frames[7][2].rate_cam_rad_s is None
     assert frames[8][2].rate_cam_rad_s.tolist() == [0.0, 0.1, 0.0]
 

@@ -10,6 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from hilstar.attitude.logs import mcap_log
 from hilstar.attitude.logs.log_file import read_log, write_log
 from hilstar.attitude.logs.mcap_log import (
     ATTITUDE_SCHEMA,
@@ -132,6 +133,32 @@ def test_a_finished_file_that_is_damaged_is_refused(tmp_path):
     (tmp_path / "run.mcap").write_bytes(bytes(data))
     with pytest.raises(InputError, match="damaged before byte"):
         read_log(tmp_path / "run.mcap")
+
+
+def test_chunks_taken_at_once_read_and_are_refused_as_by_the_library(tmp_path, monkeypatch):
+    whole, rng, path = (
+        ledger([attitude_message(sample(i)) for i in range(40)], chunk_size=1500),
+        np.random.default_rng(1),
+        tmp_path / "run.mcap",
+    )
+
+    def told():
+        try:
+            return [one.t_ns for one in read_attitudes(path)]
+        except InputError as error:
+            return str(error)
+
+    refused = 0
+    for place in rng.integers(8, len(whole), 40).tolist():
+        data = bytearray(whole[: place if place % 3 == 0 else None])
+        data[int(rng.integers(8, len(data)))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(data)
+        at_once = told()
+        with monkeypatch.context() as patched:
+            patched.setattr(mcap_log, "PIECE_BYTES", 0)
+            assert told() == at_once
+        refused += isinstance(at_once, str)
+    assert 10 < refused < 40
 
 
 def test_a_sender_that_restarted_is_named_with_its_time(tmp_path):

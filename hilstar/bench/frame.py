@@ -36,7 +36,7 @@ from hilstar.scene.camera import Camera
 from hilstar.scene.extended import LightMap
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.psf import Psf
-from hilstar.scene.sprites import CLIP_TOLERANCE, Sprites, by_primary, clipped_sprites
+from hilstar.scene.sprites import CLIP_TOLERANCE, Sprites, by_primary, clipped_sprites, without_stars
 from hilstar.sky.stars import Stars, split_by_rate
 from hilstar.units import magnitude
 
@@ -342,7 +342,7 @@ class Bench:
             # Of a disc brighter than white, in the pixels of which it has most of the light
             if disc.name in sprites.over_white and self._bodies is not None:
                 alone = self._bodies.alone(disc, view)
-                self.renderer.draw_linear(replace(sprites, data=sprites.data[:0], extended=alone))
+                self.renderer.draw_linear(replace(without_stars(sprites), extended=alone))
                 own = self.renderer.linear() > MOST * wanted
                 if own.any():
                     losses[disc.name] = float(magnitude(shown[own].sum() / wanted[own].sum(dtype=np.float64)))

@@ -93,6 +93,14 @@ def test_points_beyond_a_lens_are_left_out(bench, tmp_path):
         assert 0 < len(shown.psf.field.places_px) < len(glass.places_px)
 
 
+def test_what_white_lacks_of_a_disc_is_known_beside_stars(bench):
+    sky = {"sky": {"epoch_utc": "2008-09-20T13:16:00Z"}, "sky.bodies": {"sun": True}}
+    with open_bench(bench(sky, scale=1.0)) as shown:
+        frame = shown.frame(from_radec_roll_deg(178.0, 0.9, 0.0))
+        assert len(frame.truth) > 1
+        assert shown.losses_mag(frame)["Sun"] > 15
+
+
 def test_both_backends_show_the_same_levels_by_place(bench):
     for quantisation in ("round", "exact"):
         with open_bench(bench(scale=1.0, quantisation=quantisation)) as shown:

@@ -27,6 +27,7 @@ from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 TABLE_WIDTH = 1024  # that of encode.frag
+_shader = cache(lambda name: resource_path("shaders", name).read_text())
 TABLE_UNIT = 15  # the last texture unit that every OpenGL has: nothing else takes it
 
 
@@ -49,11 +50,6 @@ def build_compute(
     """A compute program from a file of shaders/, between the files `parts` and `last`."""
     with held():  # as for any program
         return ctx.compute_shader(_source(main, defines, parts, last))
-
-
-@cache
-def _shader(name: str) -> str:
-    return resource_path("shaders", name).read_text()
 
 
 def _source(main: str, defines: Sequence[str], before: Sequence[str] = (), after: Sequence[str] = ()) -> str:

@@ -72,10 +72,7 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
 
 
 def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """The projective map (..., 3, 3) from (u, v) to (x, y), (..., n) each, by least squares.
-
-    Hartley and Zisserman 2004, 4.1, normalised.
-    """
+    """The projective maps (..., 3, 3) from (u, v) to (x, y), (..., n) each (Hartley and Zisserman 2004, 4.1, normalised)."""
     into, out = _normal(u, v), _normal(x, y)
     zero, one = np.zeros_like(u), np.ones_like(u)
     a, b, _ = np.moveaxis(into @ np.stack([u, v, one], axis=-2), -2, 0)

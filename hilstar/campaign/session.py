@@ -32,6 +32,7 @@ from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import FrameNoise, Simulator
 
 IMAGES = "images"
+OWN_THREADS = "LP_NUM_THREADS", "OMP_NUM_THREADS"  # of drawing, and of noise
 IMAGES_A_FOLDER = 1000
 
 
@@ -110,7 +111,8 @@ class Session:
     """A worker's part of a campaign. Raises InputError where the plan or the bench cannot be used here, or differ."""
 
     def __init__(self, job: Job) -> None:
-        os.environ.setdefault("LP_NUM_THREADS", "1")  # workers fill the cores
+        for name in OWN_THREADS:  # workers fill the cores
+            os.environ.setdefault(name, "1")
         self.job = job
         self.plan: Plan = parse_plan(Path(job.plan_path), job.plan_text)
         self.file = bench_file_of(Path(job.bench_path), job.bench_text)

@@ -144,22 +144,15 @@ def plain_catalog(designation: str, rows_read: int, columns: dict[str, npt.NDArr
     No motion, no parallax, no variability and no companion is known where the column is not given; the epoch is Hipparcos'.
     """
     n = len(columns["v_mag"])
-    unknown = np.full(n, np.nan)
+    unknown, zero, blank = np.full(n, np.nan), np.zeros(n), np.zeros(n, dtype="S1")
     none: dict[str, npt.NDArray[np.generic]] = {
+        **dict.fromkeys(("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "bv_mag"), zero),
+        **dict.fromkeys(("vi_mag", "parallax_mas", "maximum_jd"), unknown),
+        **dict.fromkeys(("range_mag", "period_d", "separation_arcsec"), unknown.astype(np.float32)),
+        **dict.fromkeys(("variable", "multiple"), blank),
         "hip": np.zeros(n, dtype=np.int32),
-        "pm_ra_cosdec_mas_yr": np.zeros(n),
-        "pm_dec_mas_yr": np.zeros(n),
-        "bv_mag": np.zeros(n),
-        "vi_mag": unknown,
-        "parallax_mas": unknown,
         "epoch_jyear": np.full(n, HIPPARCOS_EPOCH_JYEAR),
         "identifier": np.arange(1, n + 1, dtype=np.int64),
-        "variable": np.zeros(n, dtype="S1"),
-        "range_mag": unknown.astype(np.float32),
-        "period_d": unknown.astype(np.float32),
-        "maximum_jd": unknown,
-        "multiple": np.zeros(n, dtype="S1"),
-        "separation_arcsec": unknown.astype(np.float32),
     }
     return Catalog(**(none | columns), designation=designation, rows_read=rows_read)  # type: ignore[arg-type]
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.campaign.plan import parse_plan
-from hilstar.campaign.session import Job, Session, files_sha256
+from hilstar.campaign.session import OWN_THREADS, Job, Session, files_sha256
 from hilstar.campaign.solvers import CENTROIDS
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg
@@ -99,7 +99,7 @@ class Exposing:
 
 def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list[Skipped]]:
     """Processor times of each work in turn, and the peers that are not installed. Raises InputError, MachineError."""
-    threads = os.environ.get("LP_NUM_THREADS")
+    unset = [name for name in OWN_THREADS if name not in os.environ]
     file = read_bench_file(resource_path("configs", "demo.toml"))
     skipped: list[Skipped] = []
     with TemporaryDirectory() as folder:
@@ -135,8 +135,8 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
         cell = Cell(width, height, len(own.exposure.truth))
         session.close()
         own.simulator.close()
-    if threads is None:  # a campaign's worker sets it for its process
-        os.environ.pop("LP_NUM_THREADS", None)
+    for name in unset:  # a campaign's worker sets them for its process
+        os.environ.pop(name, None)
     rows = []
     for name, kind in sorted(works, key=lambda each: (KINDS.index(each[1]), each[0] != "hilstar", each[0])):
         ms = [one.cpu_ms for one in times[f"{name} {kind}"]]

@@ -10,7 +10,6 @@ their size; the screen's tilt (a, b) adds d' (a y' - b x') to first order. Stars
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -64,16 +63,6 @@ MIRRORS: tuple[Mirror, ...] = ("x", "y", "swap")
 
 
 @dataclass(frozen=True, slots=True)
-class Displaced:
-    """A star's place on the detector, px, and how far from it, right and down, the display shows it."""
-
-    x_px: float
-    y_px: float
-    dx_px: float
-    dy_px: float
-
-
-@dataclass(frozen=True, slots=True)
 class GeometryFit:
     """The smallest sufficient model of the displacements, as true minus assumed.
 
@@ -94,9 +83,11 @@ class GeometryFit:
     left_px: float
 
 
-def fit_geometry(displaced: Sequence[Displaced], tracker: Camera, limit_px: float) -> GeometryFit | None:
-    """The smallest model by least squares; None with too few stars. `limit_px` is what the bench allows a centroid."""
-    rows = np.array([(star.x_px, star.y_px, star.dx_px, star.dy_px) for star in displaced]).reshape(-1, 4)
+def fit_geometry(rows: FloatArray, tracker: Camera, limit_px: float) -> GeometryFit | None:
+    """The smallest model by least squares of stars (n, 4); None with too few. `limit_px` is what a centroid is allowed.
+
+    A row has a star's place on the detector, px, and how far from it, right and down, the display shows it.
+    """
     if len(rows) < MIN_STARS:
         return None
     focal_px = tracker.focal_length_px
@@ -212,16 +203,16 @@ class Star:
 class MatchTally:
     """Stars by what became of them, added up over the fields.
 
-    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` are the stars that the display
-    really shows, however far off. `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a
-    screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the detector's noise.
-    `off_px` has how far off each kind of centroider finds each of `stars`, `channels_mag` how much too faint each channel is of
-    those whose colour the primaries have; there are `out_of_gamut` others.
+    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` has the rows (`fit_geometry`)
+    of the stars that the display really shows, however far off. `vanished` counts how many fewer are found than the sky has,
+    `mirrored` those found where a screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the
+    detector's noise. `off_px` has how far off each kind of centroider finds each of `stars`, `channels_mag` how much too faint
+    each channel is of those whose colour the primaries have; there are `out_of_gamut` others.
     """
 
     stars: list[Star] = field(default_factory=list)
     lost: list[Star] = field(default_factory=list)
-    displaced: list[Displaced] = field(default_factory=list)
+    displaced: list[FloatArray] = field(default_factory=list)
     blended: int = 0
     summed: int = 0
     clipped: int = 0
@@ -424,10 +415,10 @@ class Comparison:
         """Find each star where the true lens shows it, and note how far that is from where the sky has it."""
         geometry = BenchGeometry(self.twin.true_camera, self.twin.camera)
         match = nearest(shown, *geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"]))
-        for k in np.flatnonzero(wanted & (match >= 0) & ~shared(match)):
-            x_px, y_px = float(seen.x_px[k]), float(seen.y_px[k])
-            off_px = float(shown.x_px[match[k]]) - x_px, float(shown.y_px[match[k]]) - y_px
-            self.tally.displaced.append(Displaced(x_px, y_px, *off_px))
+        k = np.flatnonzero(wanted & (match >= 0) & ~shared(match))
+        x_px, y_px = seen.x_px[k], seen.y_px[k]
+        off_px = shown.x_px[match[k]] - x_px, shown.y_px[match[k]] - y_px
+        self.tally.displaced.append(np.column_stack([x_px, y_px, *off_px]))
 
     def _count_mirrored(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
         """Count the stars that are where a mirrored screen would have them."""
@@ -447,12 +438,11 @@ class Comparison:
         found = self.finder.placed(matched, dn, true_px, self.finder.centroider, under.level).found
         tracker = self.twin.config.tracker
         expected_dn = seen.truth["electrons_per_s"] * (tracker.exposure_s / tracker.detector.gain_e_per_dn)
-        for k in np.flatnonzero(wanted & (match >= 0)):
-            flux_dn = float(found.flux[match[k]])
-            if flux_dn > 0:
-                self.tally.noisy_mag.append(magnitude(flux_dn / float(expected_dn[k])))
-                off_px = found.x_px[match[k]] - seen.x_px[k], found.y_px[match[k]] - seen.y_px[k]
-                self.tally.noisy_px.append(math.hypot(*off_px))
+        k = np.flatnonzero(wanted & (match >= 0))
+        k = k[found.flux[match[k]] > 0]
+        its = match[k]
+        self.tally.noisy_mag += magnitude(found.flux[its] / expected_dn[k]).tolist()
+        self.tally.noisy_px += np.hypot(found.x_px[its] - seen.x_px[k], found.y_px[its] - seen.y_px[k]).tolist()
 
     def _inside(self, seen: TwinField) -> npt.NDArray[np.bool_]:
         """Stars whose window is whole on the detector and whose sprite is whole on the monitor."""

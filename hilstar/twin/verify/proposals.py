@@ -134,7 +134,7 @@ def codes_at_fault(verdict: Verdict) -> bool:
     limits, errors = verdict.measured.config.verify, verdict.errors
     if not errors.looked_for:
         return False
-    beyond = p95(np.abs(errors.codes_mag())) > limits.flux_mag or p95(errors.codes_px()) > limits.centroid_px
+    beyond = p95(np.abs(errors.of("codes_mag"))) > limits.flux_mag or p95(errors.of("codes_px")) > limits.centroid_px
     # A star that the codes lose even as assumed has no error of theirs.
     lost = sum(not math.isfinite(star.codes_mag) for star in errors.lost)
     return beyond or abs(errors.codes_zero_point_mag) > limits.flux_mag or lost > limits.lost_share * errors.looked_for
@@ -147,8 +147,8 @@ def _not_the_codes(verdict: Verdict) -> str | None:
     if elsewhere > limits.lost_share * errors.looked_for:
         return f"{elsewhere} of {errors.looked_for} stars are lost that the codes alone would show"
     for what, unit, whole, codes, limit in (
-        ("centroids are", "px", errors.centroid_px(), errors.codes_px(), limits.centroid_px),
-        ("flux is", "mag", np.abs(errors.flux_mag()), np.abs(errors.codes_mag()), limits.flux_mag),
+        ("centroids are", "px", errors.centroid_px(), errors.of("codes_px"), limits.centroid_px),
+        ("flux is", "mag", np.abs(errors.of("flux_mag")), np.abs(errors.of("codes_mag")), limits.flux_mag),
     ):
         left = math.sqrt(max(p95(whole) ** 2 - p95(codes) ** 2, 0.0))
         if left > limit:
@@ -209,7 +209,7 @@ def _excess(verdict: Verdict) -> float:
     """The largest of a verdict's errors as a multiple of its limit."""
     limits, errors = verdict.measured.config.verify, verdict.errors
     lost = len(errors.lost) / errors.looked_for
-    shares = p95(np.abs(errors.flux_mag())) / limits.flux_mag, p95(errors.centroid_px()) / limits.centroid_px
+    shares = p95(np.abs(errors.of("flux_mag"))) / limits.flux_mag, p95(errors.centroid_px()) / limits.centroid_px
     return max(*shares, lost / limits.lost_share if limits.lost_share else math.inf * lost if lost else 0.0)
 
 

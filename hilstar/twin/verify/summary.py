@@ -61,10 +61,14 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
     tally, fit, centroid_px = measured.tally, errors.geometry, errors.centroid_px()
     noisy_mag = np.abs(np.array(tally.noisy_mag) - errors.zero_point_mag)
     noisy_px, glow, calibration = np.array(tally.noisy_px), measured.glow, measured.calibration
+
+    def spread(name: str) -> ErrorSpread:
+        return error_spread(np.abs(errors.of(name)))
+
     return {
         "fields": measured.field_count,
         "stars": len(errors.stars),
-        "flux_error_mag": error_spread(np.abs(errors.flux_mag())),
+        "flux_error_mag": spread("flux_mag"),
         "centroid_error_px": error_spread(centroid_px),
         "centroid_error_arcsec": error_spread(centroid_px * ARCSEC_PER_RAD / measured.camera.focal_length_px),
         "centroider": measured.config.verify.centroider or USUAL,
@@ -86,10 +90,10 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
         "k1": None if fit is None else fit.k1,
         "distortion_px": None if fit is None else fit.distortion_px,
         "black_e_per_s_px": {"assumed": glow.assumed_e_per_s_px, "seen": glow.seen_e_per_s_px},
-        "estimator_floor": {"flux_mag": error_spread(errors.floor_mag()), "centroid_px": error_spread(errors.floor_px())},
+        "estimator_floor": {"flux_mag": spread("floor_mag"), "centroid_px": spread("floor_px")},
         "codes_alone": {
-            "flux_mag": error_spread(np.abs(errors.codes_mag())),
-            "centroid_px": error_spread(errors.codes_px()),
+            "flux_mag": spread("codes_mag"),
+            "centroid_px": spread("codes_px"),
             "zero_point_mag": _finite(errors.codes_zero_point_mag),
         },
         "noisy": {"stars": len(noisy_px), "flux_mag": error_spread(noisy_mag), "centroid_px": error_spread(noisy_px)},
@@ -109,7 +113,7 @@ def _finite(value: float) -> float | None:
 def _by_magnitude(errors: DisplayErrors) -> list[dict[str, Any]]:
     """The errors of the stars of each whole magnitude."""
     rows = []
-    v_mag, flux, centroid = np.array([star.v_mag for star in errors.stars]), np.abs(errors.flux_mag()), errors.centroid_px()
+    v_mag, flux, centroid = errors.of("v_mag"), np.abs(errors.of("flux_mag")), errors.centroid_px()
     for low in range(math.floor(v_mag.min(initial=0.0)), math.ceil(v_mag.max(initial=0.0)) + 1):
         there = (v_mag >= low) & (v_mag < low + 1)
         if there.any():
@@ -165,7 +169,7 @@ def write_report(directory: Path, verdict: Verdict) -> None:
 
 def _draw_errors(path: Path, verdict: Verdict) -> None:
     errors, limits = verdict.errors, verdict.measured.config.verify
-    v_mag, flux, centroid = np.array([star.v_mag for star in errors.stars]), errors.flux_mag(), errors.centroid_px()
+    v_mag, flux, centroid = errors.of("v_mag"), errors.of("flux_mag"), errors.centroid_px()
     word = "passes" if verdict.passed else "does not pass"
     finding = (
         f"The bench {word}: flux within {p95(np.abs(flux)):.3f} mag, places within {p95(centroid):.3f} px, for 95 % of stars"
@@ -185,7 +189,7 @@ def _draw_errors(path: Path, verdict: Verdict) -> None:
 
 
 def _draw_field(path: Path, errors: DisplayErrors, resolution_px: tuple[int, int]) -> None:
-    x, y, dx, dy = (np.array([getattr(star, name) for star in errors.stars]) for name in ("x_px", "y_px", "dx_px", "dy_px"))
+    x, y, dx, dy = (errors.of(name) for name in ("x_px", "y_px", "dx_px", "dy_px"))
     longest, arrow_px = max(p95(np.hypot(dx, dy)), 1e-9), ARROW_SHARE * resolution_px[0]
     finding = f"Centroid errors of {len(x)} stars over the tracker's field; {len(errors.lost)} stars are lost"
     note = f"Arrows are enlarged {arrow_px / longest:.0f} times." + (" Red crosses: lost stars." if errors.lost else "")

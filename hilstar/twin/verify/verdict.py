@@ -37,29 +37,13 @@ class DisplayErrors:
         """How many stars should have been found."""
         return len(self.stars) + len(self.lost)
 
-    def flux_mag(self) -> FloatArray:
-        """Flux errors (n,), magnitudes, positive too faint."""
-        return np.array([star.flux_mag for star in self.stars])
+    def of(self, name: str) -> FloatArray:
+        """One of the stars' errors (n,), by the name of `Star`'s field; NaN of codes that lose the star."""
+        return np.array([getattr(star, name) for star in self.stars])
 
     def centroid_px(self) -> FloatArray:
         """Centroid errors (n,), tracker pixels."""
-        return np.array([math.hypot(star.dx_px, star.dy_px) for star in self.stars])
-
-    def codes_mag(self) -> FloatArray:
-        """Flux errors (n,) of the codes alone, magnitudes, NaN where the codes alone lose the star."""
-        return np.array([star.codes_mag for star in self.stars])
-
-    def codes_px(self) -> FloatArray:
-        """Centroid errors (n,) of the codes alone, tracker pixels."""
-        return np.array([star.codes_px for star in self.stars])
-
-    def floor_mag(self) -> FloatArray:
-        """Flux errors (n,) of the estimator itself, magnitudes, none of them negative."""
-        return np.abs([star.floor_mag for star in self.stars])
-
-    def floor_px(self) -> FloatArray:
-        """Centroid errors (n,) of the estimator itself, tracker pixels."""
-        return np.array([star.floor_px for star in self.stars])
+        return np.asarray(np.hypot(self.of("dx_px"), self.of("dy_px")))
 
 
 def display_errors(measured: Measured) -> DisplayErrors:
@@ -67,7 +51,8 @@ def display_errors(measured: Measured) -> DisplayErrors:
     stars = measured.tally.stars
     zero_point, codes_zero_point = median([s.flux_mag for s in stars]), median([s.codes_mag for s in stars])
     stars = [replace(s, flux_mag=s.flux_mag - zero_point, codes_mag=s.codes_mag - codes_zero_point) for s in stars]
-    geometry = fit_geometry(measured.tally.displaced, measured.camera, measured.config.verify.centroid_px)
+    displaced = np.concatenate([np.empty((0, 4)), *measured.tally.displaced])
+    geometry = fit_geometry(displaced, measured.camera, measured.config.verify.centroid_px)
     return DisplayErrors(stars, measured.tally.lost, zero_point, codes_zero_point, geometry)
 
 
@@ -153,7 +138,7 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
     """Errors of the field's stars relative to each other, then the error that all have in common."""
     verify, found = measured.config.verify, []
     limit = verify.flux_mag
-    seen, alone = p95(np.abs(errors.flux_mag())), p95(np.abs(errors.codes_mag()))
+    seen, alone = p95(np.abs(errors.of("flux_mag"))), p95(np.abs(errors.of("codes_mag")))
     if seen > limit:
         response = math.sqrt(max(seen**2 - alone**2, 0.0)) > limit
         cause = ": light does not follow the codes as assumed, look at the monitor's response and uniformity"
@@ -180,7 +165,7 @@ def _black(measured: Measured) -> list[str]:
 def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
     """The linear image against the catalogue: where that exceeds the limits, the differences above say nothing."""
     limits = measured.config.verify
-    mag, px = p95(errors.floor_mag()), p95(errors.floor_px())
+    mag, px = p95(np.abs(errors.of("floor_mag"))), p95(errors.of("floor_px"))
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
     glass = measured.glass
@@ -200,7 +185,7 @@ def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
 def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
     """The errors of the codes alone, with all else as assumed, and the keys that make codes finer."""
     limits, render = measured.config.verify, measured.config.render
-    mag, px = p95(np.abs(errors.codes_mag())), p95(errors.codes_px())
+    mag, px = p95(np.abs(errors.of("codes_mag"))), p95(errors.of("codes_px"))
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
     # What is proposed has to suit the monitor as it is, too.

@@ -71,9 +71,9 @@ def check_sizes(found: DecomposedRun, planted: Planted, sizes: Sizes) -> None:
 
 
 def test_what_is_not_there_is_not_found() -> None:
-    """With noise alone the two parts that repeat are what 8500 answers and 400 degrees of freedom leave by chance."""
-    found = assessed(plant(scan, Sizes(fov=0.0, pixel=0.0, wild=0), np.random.default_rng(3), seconds=900.0))
-    by_chance = 1.0 * (2 * 400) ** 0.25 / 8500**0.5  # of an rms, where the variance is uncertain by sqrt(2 p) sigma^2 / n
+    """With noise alone the two parts that repeat are what 17 000 answers and 400 degrees of freedom leave by chance."""
+    found = assessed(plant(scan, Sizes(fov=0.0, pixel=0.0, wild=0), np.random.default_rng(3)))
+    by_chance = 1.0 * (2 * 400) ** 0.25 / 17_000**0.5  # of an rms, where the variance is uncertain by sqrt(2 p) sigma^2 / n
     assert found.fov_arcsec.cross == pytest.approx(0.0, abs=3 * by_chance)
     assert found.pixel_arcsec.cross == pytest.approx(0.0, abs=3 * by_chance)
     assert found.noise_arcsec.cross == pytest.approx(1.0, rel=0.03)
@@ -81,7 +81,7 @@ def test_what_is_not_there_is_not_found() -> None:
 
 
 def test_a_constant_slew_tells_the_drift_and_not_the_offset() -> None:
-    found = assessed(plant(slew, Sizes(fov=0.0, pixel=0.0), np.random.default_rng(4), seconds=900.0))
+    found = assessed(plant(slew, Sizes(fov=0.0, pixel=0.0), np.random.default_rng(4)))
     assert not found.clock.offset_told
     assert found.clock.drift_told
     assert found.clock.drift * 1e6 == pytest.approx(20.0, abs=5 * 1e6 * found.clock.sigma_drift)

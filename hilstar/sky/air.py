@@ -35,8 +35,10 @@ def air_mass(altitude_rad: FloatArray) -> FloatArray:
 def scintillation(aperture_mm: float, masses: FloatArray, height_m: float, exposure_s: float) -> FloatArray:
     """One sigma of a star's light relative to its mean, (n,) (Young 1967): 0.09 D^(-2/3) X^1.75 exp(-h / 8 km) / sqrt(2 t).
 
-    D is in cm. The law is of exposures that are long against the time of a shadow's passage, some 10 ms.
+    D is in cm. The law is of exposures that are long against the time of a shadow's passage, some 10 ms; without one it is 1.
     """
+    if not exposure_s:
+        return np.full_like(masses, MAX_TWINKLE)
     across, down = (aperture_mm / 10) ** (-2 / 3), np.exp(-height_m / 8000)
     return np.asarray(np.minimum(0.09 * across * masses**1.75 * down / np.sqrt(2 * exposure_s), MAX_TWINKLE))
 

@@ -21,7 +21,7 @@ from hilstar.bench.bench_file import bench_file_of
 from hilstar.bench.build import bench_channels, bench_sources, bench_stars, site_air
 from hilstar.bench.site import site_glow_e_per_s_sr
 from hilstar.rotation import from_radec_roll_deg, rotate
-from hilstar.sky.air import air_mass, extinction_curve
+from hilstar.sky.air import air_mass, extinction_curve, scintillation
 from hilstar.sky.electrons import Photometry, library_electrons_per_s, load_library
 from hilstar.sky.spectrum import TEMPERATURE_SCALES, Curve
 from hilstar.sky.stars import unit_vectors_icrs
@@ -220,6 +220,7 @@ def test_stars_twinkle_by_youngs_law(tmp_path):
     assert light.std(ddof=1, axis=0).mean() == pytest.approx(sigma, rel=0.1 + 4 / math.sqrt(2 * freedom))
     correlation = np.corrcoef(light.T)[np.triu_indices(light.shape[1], 1)]
     assert abs(correlation.mean()) < 4 / math.sqrt(60 * len(correlation))  # each by itself
+    assert scintillation(18.4, np.array([1.0, 2.0]), 0.0, exposure_s=0.0).tolist() == [1.0, 1.0]  # and no warning
 
 
 def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:

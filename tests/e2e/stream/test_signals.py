@@ -331,13 +331,22 @@ def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
         context.term()
 
 
+def ctrl_c_is_blocked(worker: Path) -> bool:
+    (line,) = (line for line in (worker / "status").read_text().splitlines() if line.startswith("SigBlk"))
+    return bool(int(line.split()[1], 16) & 1 << signal.SIGINT - 1)
+
+
 def test_a_pool_of_workers_ends_with_its_command(tmp_path, small_bench_file):
+    """A terminal's Ctrl-C reaches all of them, and is for the command alone."""
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t},1,0,0,0\n" for t in range(5000)))
     out = tmp_path / "out"
     for number in (signal.SIGTERM, signal.SIGKILL):
         with running(program("simulate", small_bench_file, "--log", log, "-o", out / str(number))) as process:
             wait_for(lambda number=number: list((out / str(number)).glob("*.fits")))
+            children = map(Path("/proc").joinpath, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split())
+            workers = [child for child in children if b"spawn_main" in (child / "cmdline").read_bytes()]
+            assert workers and all(map(ctrl_c_is_blocked, workers))
             code, _, err = ends(process, number)
         assert code == (128 + number if number == signal.SIGTERM else -number)
         assert "Traceback" not in err

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from tests.support.campaign_tracker import FOCAL_PX, WAVE_PX, Planted, wave
 from tests.support.campaigns import plan_text, read_columns
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
+from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
 pytestmark = pytest.mark.e2e
@@ -33,9 +33,7 @@ COMMAND = ("campaign", "plan.toml", "-o", "out", "--headless", "--json")
 
 def write_bench(folder: Path, *vary: dict[str, Any], **keys: Any) -> Planted:
     """Bench and plan in a folder, and the tracker that answers there."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     planted = Planted(str(folder / "out" / "now.json"), port)
     tracker = {"focal_length_mm": FOCAL_PX * 13e-3, "exposure_s": planted.exposure_s}
     answers = {"source": "udp", "bind": f"127.0.0.1:{port}", "format": "json", "clock": "host"}

@@ -16,7 +16,7 @@ from hilstar.run.record.ledger_records import frame_records
 from tests.support.commands import assert_refused, run_hilstar
 from tests.support.forks import HILSTAR, Started
 from tests.support.heads import MOUNTINGS, heads_file
-from tests.support.senders import publisher, talking
+from tests.support.senders import free_port, publisher, talking
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.screens import recorded
 
@@ -70,10 +70,13 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
 
 
 def test_a_page_s_port_that_is_taken_is_found_before_a_head_begins(tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as taken, publisher() as (_, port):
-        path, page = heads_file(tmp_path, port), taken.getsockname()[1] - 1  # the second head's
+    page = free_port()
+    while (second := free_port()) != page + 1:  # each head's page has the port after the one before
+        page = second
+    with socket.create_server(("127.0.0.1", second)), publisher() as (_, port):
+        path = heads_file(tmp_path, port)
         options = ["--headless", "--console", f"127.0.0.1:{page}", "--duration", "5"]
-        assert_refused(run_hilstar("serve", path, *options), 2, f"--console 127.0.0.1:{page + 1}: cannot listen there")
+        assert_refused(run_hilstar("serve", path, *options), 2, f"--console 127.0.0.1:{second}: cannot listen there")
 
 
 def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):

@@ -10,9 +10,9 @@ from hilstar.arrays import FloatArray
 from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, propagate, to_rotation_vector
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
-KEPT_NS = 20 * NS_PER_S  # of frames: an answer that comes later than that is not compared
+KEPT_NS = 20 * NS_PER_S  # how long a frame is kept: an answer that comes later than that is not compared
 MAX_HELD_NS = NS_PER_S // 2  # a frame without a following one is taken to stay for so long
-MIN_LIT_SHARE = 0.5  # of an exposure; one that was darker shows no commanded attitude
+MIN_LIT_SHARE = 0.5  # an exposure that was darker shows no commanded attitude
 MAX_STEP_RAD = np.radians(2.0)  # between two frames of an exposure: a larger step is a jump, and the exposure has two skies
 
 

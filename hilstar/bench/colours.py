@@ -30,11 +30,11 @@ from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectrum import Curve, blackbody_exitance_w_m2_m, integration_nodes
 from hilstar.sky.stars import BV_MAG, Stars
 
-STEP_NM = 0.25  # of the spectra of primaries
+STEP_NM = 0.25  # in the spectra of primaries
 KNOT_STEPS = 8
 MEAN_WEIGHT = 1e3  # per nm: a mean wavelength within reach is met to 1e-3 nm
 LATERAL_WEIGHT = 1e3  # times that, of a lens's lateral colour against as much of the mean wavelength
-LEAST_PX, LEAST_PART = 1e-5, 1e-2  # of lateral colour, and of its first part, that counts
+LEAST_PX, LEAST_PART = 1e-5, 1e-2  # lateral colour, and its first part, that counts
 ASIDE_STARS, ASIDE_COST = 500, 1e-3  # stars by colour, and a square px of all against one of those that are out of reach
 MOVED = 1 + len(PRIMARIES)  # the first column of what is wanted that is a lens's
 UNSEEN = 1e-6  # share of white
@@ -178,7 +178,7 @@ class Colours:
             gram = gram + lens.weight * lens.by_primary @ lens.by_primary.T
             near = near + lens.weight * (wanted[:, MOVED:] + lens.aside) @ lens.by_primary.T
         found = nearest_mixtures(gram, near, whole=True)
-        return np.asarray(found / found.sum(axis=1, keepdims=True))  # of 1e-11
+        return np.asarray(found / found.sum(axis=1, keepdims=True))  # to 1e-11
 
     def on(self, stars: Stars) -> Stars:
         """The stars with the light of each primary."""

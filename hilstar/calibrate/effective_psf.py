@@ -29,14 +29,14 @@ from hilstar.optics.psf_file import Glass, Stack, facts_of, glass_of
 
 MAX_HALF_PX, MIN_HALF_PX = 12, 4
 SEEN_SIGMAS, SEEN_SHARE = 3.0, 3e-4  # a ring about the dots is light above so many sigmas, and so much of the middle's
-NODES = 9  # of the quadrature over dot and pixel, along each axis
+NODES = 9  # quadrature over dot and pixel, along each axis
 KNOT_PX = 0.5
 PRIOR_SHARE = 0.03  # sigma of a spline's coefficient, share of a dot's light in a pixel
-MAX_DEGREE = 2  # of the polynomials over the field
+MAX_DEGREE = 2  # polynomials over the field
 DOTS_A_TERM = 5
 FOLDS = 4
 FIT_ROUNDS, PLACE_ROUNDS, SPLINE_ROUNDS, SPLINE_STEPS = 8, 1, 2, 90
-STEP_PX, STEP_PX2 = 1e-3, 1e-3  # of numerical derivatives
+STEP_PX, STEP_PX2 = 1e-3, 1e-3  # for numerical derivatives
 MIN_VARIANCE_PX2 = 0.15**2
 QUANTISED_DN2 = 1 / 12
 ASKS_SIGMAS = 3.0  # by which held-out dots have to prefer the spline

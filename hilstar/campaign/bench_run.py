@@ -69,7 +69,7 @@ class OpenDisplay(NamedTuple):
 Display = Callable[[BenchFile], AbstractContextManager[OpenDisplay]]
 
 
-class Order:
+class BenchOrder:
     """The order in which cases (and, from `cases` on, check cases) are shown; `keys` are the varied keys of the renderer."""
 
     def __init__(self, plan: Plan, cases: int, maker: CaseMaker, design: Design) -> None:
@@ -159,7 +159,7 @@ class BenchRun:
 
     def __init__(
         self,
-        order: Order,
+        order: BenchOrder,
         columns: dict[str, Any],
         directory: Directory,
         *,

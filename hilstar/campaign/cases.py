@@ -18,7 +18,7 @@ from hilstar.attitude.wire.source import Mounting
 from hilstar.bench.bench_file import BenchFile, dated
 from hilstar.bench.scenario import Scenario, read_scenario
 from hilstar.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
-from hilstar.campaign.solvers import Answer, CentroidErrors
+from hilstar.campaign.solvers import CentroidErrors, SolverAnswer
 from hilstar.campaign.store import Row
 from hilstar.errors import InputError
 from hilstar.frame.view import View
@@ -64,7 +64,7 @@ BENCH_AFTER = (
     *(f"{what}_{name}" for what in ("solved", "lit") for name in Q),
     *AFTER[AFTER.index("error_x_arcsec") :],
 )
-RECOVERY = ("fault_end_s", "recovery_s")  # of a plan that varies scenario
+RECOVERY = ("fault_end_s", "recovery_s")  # only in a plan that varies scenario
 CENTROIDS = (
     *("stars", "found", "matched", "false", "measured"),
     *("centroid_dx_px", "centroid_dy_px", "centroid_sigma_x_px", "centroid_sigma_y_px"),
@@ -327,7 +327,7 @@ class CaseTally:
         self.stars_in_view += len(exposure.truth)
         self._digest.update(np.ascontiguousarray(exposure.dn))
 
-    def hear(self, exposure: Exposure, answer: Answer, end_s: float) -> None:
+    def hear(self, exposure: Exposure, answer: SolverAnswer, end_s: float) -> None:
         """Count the answer to an exposure that ends so long after the case's begin."""
         if answer.star_errors is not None:
             self.star_errors.append(answer.star_errors)

@@ -41,8 +41,8 @@ MAX_VALUES = 10_000
 MAX_SEED = 2**63 - 1
 DEFAULT_ANSWERS, DEFAULT_TIMEOUT_S = 5, 10.0
 MAX_BENCH_CASES = 1_000_000
-BENCH_KEYS = ("answers", "settle_s", "timeout_s", "blank_s", "silent_s", "check_every")  # of through = "bench" alone
-TRACKER_KEYS = ("frames", "step_s", "noise", "centroids")  # of the others
+BENCH_KEYS = ("answers", "settle_s", "timeout_s", "blank_s", "silent_s", "check_every")  # for through = "bench" alone
+TRACKER_KEYS = ("frames", "step_s", "noise", "centroids")  # for the others
 
 Sampling = Literal["grid", "latin-hypercube", "sobol"]
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]

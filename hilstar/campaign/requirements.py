@@ -36,8 +36,8 @@ COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
     **{"<=": operator.le, "<": operator.lt, ">=": operator.ge, ">": operator.gt, "==": operator.eq, "!=": operator.ne}
 }
 MET, NOT_MET, NOT_SHOWN = "met", "not met", "not shown"
-TIME_SHARE = 0.95  # of a time without `share`
-MAX_BLOCKS, DRAWS = 200, 1000  # of the bootstrap
+TIME_SHARE = 0.95  # a time's share where `share` is not given
+MAX_BLOCKS, DRAWS = 200, 1000  # the bootstrap's
 MIN_TESTED, GAUSSIAN_P = 20, 0.01  # values, and the probability below which they are not Gaussian
 MAX_MORE = 10_000_000  # cases: more are not worth a figure
 WAVE_COLUMNS = 2 * len(HARMONICS)

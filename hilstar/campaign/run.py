@@ -117,11 +117,11 @@ class Campaign:
         """
         from hilstar.answers.judge import AnswerRules
         from hilstar.answers.reader import open_answers
-        from hilstar.campaign.bench_run import CHECKS, BenchRun, Order, write_checks
+        from hilstar.campaign.bench_run import CHECKS, BenchOrder, BenchRun, write_checks
 
         config = self.file.config
         rules = replace(AnswerRules.of(config), wrong_arcsec=self.plan.wrong_above_arcsec)
-        order = Order(self.plan, self.cases, self.maker, self.design)
+        order = BenchOrder(self.plan, self.cases, self.maker, self.design)
         with open_answers(config, self.file.folder, notices) as source:
             source.await_ready()
             run = BenchRun(order, self.columns, directory, source=source, rules=rules, notices=notices, on_done=on_done)

@@ -32,7 +32,7 @@ from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import FrameNoise, Simulator
 
 IMAGES = "images"
-OWN_THREADS = "LP_NUM_THREADS", "OMP_NUM_THREADS"  # of drawing, and of noise
+OWN_THREADS = "LP_NUM_THREADS", "OMP_NUM_THREADS"  # threads that draw, and that make noise
 IMAGES_A_FOLDER = 1000
 
 

@@ -80,7 +80,7 @@ class CentroidErrors:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class SolverAnswer:
     """An attitude, or None and the reason; from the centroider also the centroids' errors."""
 
     q_icrs_to_cam: FloatArray | None
@@ -91,7 +91,7 @@ class Answer:
 class Solver(Protocol):
     """Anything that solves an image. Raises SolverFault."""
 
-    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
+    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
         """The attitude of one exposure."""
         ...
 
@@ -120,7 +120,7 @@ class CentroidSolver:
         self._wanted, self._folder = settings, folder
         self._told: tuple[str, Psf, StarGlass | None] | None = None
 
-    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
+    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
         """Centroid errors, and the attitude by the matched stars."""
         wanted, psf, detector = self._wanted, tracker.canvas.psf, tracker.config.tracker.detector
         if wanted.centroider == "psf" and detector.bayer is not None:
@@ -154,12 +154,12 @@ class CentroidSolver:
         counts = len(truth), len(found), matched, len(found) - matched
         errors = CentroidErrors(*counts, dx_px, dy_px, truth["v_mag"][good], truth[good])
         if len(x_px) < MIN_STARS:
-            return Answer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
+            return SolverAnswer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
         true = normalise(tracker.camera.rays(x_px, y_px))
         known = flight_camera(tracker.config.tracker, tracker.file.folder, tracker.camera)
         seen = normalise(known.rays(x_px + dx_px, y_px + dy_px))
         # Weights are the stars' light, the inverse of photon noise's variance.
-        return Answer(multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors)
+        return SolverAnswer(multiply(wahba(seen, true, flux[good]), exposure.view.q_icrs_to_cam), "", errors)
 
     def _fitted(self, exposure: Exposure, tracker: SolvedTracker, truth: npt.NDArray[np.void], first: Places) -> Places:
         """Places (n,) of stars by the PSF that is told, from where a window found them; their spectra are known."""
@@ -214,7 +214,7 @@ class FunctionSolver:
             raise InputError(f"--solver {name}: {module} has no function {function}; {FORM}")
         self._function: Callable[..., Any] = found
 
-    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
+    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
         """The function's answer. Raises SolverFault where it raises, takes too long, or its answer is no attitude."""
         try:
             with time_limit(self._timeout_s):
@@ -224,8 +224,8 @@ class FunctionSolver:
         except Exception as error:
             raise SolverFault(one_line(f"the solver raised {type(error).__name__}: {error}")) from error
         if answer is None:
-            return Answer(None, "the solver found no attitude")
-        return Answer(checked_attitude(answer, "the solver"))
+            return SolverAnswer(None, "the solver found no attitude")
+        return SolverAnswer(checked_attitude(answer, "the solver"))
 
 
 def given_image(exposure: Exposure, tracker: SolvedTracker) -> npt.NDArray[np.uint16]:
@@ -288,7 +288,7 @@ class CommandSolver:
             )
         self._folder, self._timeout_s = folder, timeout_s
 
-    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
+    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
         """The command's answer. Raises SolverFault where it fails, takes too long, or its answer is no attitude."""
         from astropy.io import fits
 
@@ -325,7 +325,9 @@ class CommandSolver:
             line = said[0].replace(str(image), IMAGE).replace(str(picture), PICTURE).replace(str(folder), "")
             raise SolverFault(one_line(f"the solver ended with code {code}: {line}"))
         q = printed_attitude(child.out)
-        return Answer(None, "the solver found no attitude") if q is None else Answer(checked_attitude(q, "the solver"))
+        return (
+            SolverAnswer(None, "the solver found no attitude") if q is None else SolverAnswer(checked_attitude(q, "the solver"))
+        )
 
 
 def printed_attitude(text: str) -> object | None:

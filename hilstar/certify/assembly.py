@@ -24,10 +24,10 @@ from hilstar.sky.facts import errors_of, motion_at
 from hilstar.sky.star_table import choose_catalog, table_facts
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 
-SEED = 5  # of the order of readings
+SEED = 5  # for the order of readings
 DOT_IMAGES = 4
 READINGS_A_ROUND = 8  # between one black and white and the next
-LIBRARY_MAG = 0.013  # of stars' light by library spectra of their V-I: results/tradeoff.csv, 0.026 mag at 95 %
+LIBRARY_MAG = 0.013  # stars' light by library spectra of their V-I: results/tradeoff.csv, 0.026 mag at 95 %
 SKY = (("star_flux", "mag"), ("star_place_along", "arcsec"), ("star_place_across", "arcsec"))
 
 

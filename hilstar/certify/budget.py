@@ -18,7 +18,7 @@ from hilstar.arrays import FloatArray
 
 Distribution = Literal["normal", "Student t", "rectangular", "triangular"]
 COVERAGE = 0.95
-STEP = 1e-3  # of a standardised variable, for slopes
+STEP = 1e-3  # in a standardised variable, for slopes
 BATCH = 5000
 DIFFER = 0.05  # relative to the expanded uncertainty: both ways are shown where an end of the interval differs by more
 SMALLEST = 1e-12
@@ -69,7 +69,7 @@ class Combined:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class BudgetTrials:
     """Figures by trials: mean, standard deviation and the shortest-tailed interval (figures,), and whether two digits stand."""
 
     mean: FloatArray
@@ -100,7 +100,7 @@ def first_order(model: Model, inputs: list[Input]) -> Combined:
     return Combined(value, standard, dof, value - k * standard, value + k * standard, contribution)
 
 
-def by_trials(model: Model, inputs: list[Input], rng: np.random.Generator, max_trials: int) -> Drawn:
+def by_trials(model: Model, inputs: list[Input], rng: np.random.Generator, max_trials: int) -> BudgetTrials:
     """Draw trials until two digits of every standard uncertainty and interval stand, or `max_trials` are drawn."""
     tails = (1 - COVERAGE) / 2, (1 + COVERAGE) / 2
     batches: list[FloatArray] = []
@@ -116,10 +116,10 @@ def by_trials(model: Model, inputs: list[Input], rng: np.random.Generator, max_t
             tolerance = 0.5 * 10.0 ** (np.floor(np.log10(np.maximum(standard, SMALLEST))) - 1)
             settled = bool((error[1:] <= tolerance)[:, standard > SMALLEST].all())
     mean, standard, low, high = np.stack(batches).mean(axis=0)
-    return Drawn(mean, standard, low, high, len(batches) * BATCH, settled)
+    return BudgetTrials(mean, standard, low, high, len(batches) * BATCH, settled)
 
 
-def why_they_differ(combined: Combined, drawn: Drawn, inputs: list[Input], number: int) -> str:
+def why_they_differ(combined: Combined, drawn: BudgetTrials, inputs: list[Input], number: int) -> str:
     """Why the intervals of a figure by both ways differ; "" where they agree within DIFFER of their half width."""
     half = (combined.upper[number] - combined.lower[number]) / 2
     off = max(abs(combined.lower[number] - drawn.lower[number]), abs(combined.upper[number] - drawn.upper[number]))

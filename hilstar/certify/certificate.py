@@ -14,7 +14,7 @@ from hilstar.bench.certificate import KIND, ByTrials, Certificate, CertifiedFigu
 from hilstar.bench.config import CertifySettings
 from hilstar.bench.measured_on import measured_on
 from hilstar.certify.assembly import Assembled, assemble, read_bench
-from hilstar.certify.budget import MAX_DOF, Combined, Drawn, by_trials, first_order, why_they_differ
+from hilstar.certify.budget import MAX_DOF, BudgetTrials, Combined, by_trials, first_order, why_they_differ
 from hilstar.certify.check import take_check
 from hilstar.certify.model import THIRDS, true_deviations
 from hilstar.certify.readings import Reader
@@ -135,7 +135,7 @@ def _never_assessed(settings: CertifySettings) -> list[str]:
 
 
 def _figures(
-    file: BenchFile, budget: Assembled, combined: Combined, drawn: Drawn, truth: np.ndarray[Any, Any] | None
+    file: BenchFile, budget: Assembled, combined: Combined, drawn: BudgetTrials, truth: np.ndarray[Any, Any] | None
 ) -> list[CertifiedFigure]:
     found, settings = [], file.config.certify
     unknown = {each.partition(":")[0] for each in budget.not_assessed}

@@ -26,7 +26,7 @@ from hilstar.errors import InputError, shortened
 from hilstar.reading import NOT_JSON, exists, read_bytes, read_text
 
 PATCHES, REPEATS, DOT_IMAGES = 12, 3, 4
-FALSE_ALARM = 1e-4  # of a whole check
+FALSE_ALARM = 1e-4  # for a whole check
 FAINT = 3  # codes by which the floor of the readings is known
 REST_DEGREES = (3,)
 ALARMED_DOF = 1e6

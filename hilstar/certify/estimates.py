@@ -28,7 +28,7 @@ from hilstar.scene.camera import field_terms
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
 PLACE_DEGREES, EVEN_DEGREES = (7, 9, 11, 13), (4, 6, 8, 10)
-BETTER_P = 0.001  # of the F test by which a larger degree is taken
+BETTER_P = 0.001  # by the F test: a larger degree is taken below it
 WILD_SIGMAS = 6.0
 DOTS_A_TERM = 4
 MAP = (16, 9)  # fields of a usual map of light, columns and rows

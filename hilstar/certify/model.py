@@ -27,7 +27,7 @@ ALONE_SIGMAS, REACH_SIGMAS = 9.0, 4.0  # in sprites: stars nearer than this shar
 EDGE_TRACKER_PX = 10.0
 STARS_A_THIRD = 4
 NO_LIGHT = 1e-6
-MIN_STARS = 3  # of an attitude
+MIN_STARS = 3  # for an attitude
 THIRDS = ("left third", "middle third", "right third")
 
 

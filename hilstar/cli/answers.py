@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 SHOWN_WITHIN_S, PAGE_WITHIN_S = 2.0, 0.5
 MAX_STATE_BYTES = 1_000_000
-MAX_ROWS = 100_000  # of the JSON object: the newest
+MAX_ROWS = 100_000  # the newest, in the JSON object
 
 
 def answers(

@@ -31,7 +31,7 @@ HZ = 60  # the demo bench's refresh
 USUAL_S, LOOP_S = 10.0, 60.0
 MAX_MISSED = 0.01  # share of frames from which the budget is no longer the tracker's alone
 FREE_PORT = "tcp://127.0.0.1:*"
-BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01  # of the tracker of --loop
+BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01  # the tracker of --loop
 PLANTED = ["--bias", ",".join(map(str, BIAS_ARCSEC)), "--fov-error", str(FOV_ARCSEC), "--pixel-error", str(PIXEL_ARCSEC)]
 PLANTED += ["--wrong", str(WRONG)]
 

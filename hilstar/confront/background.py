@@ -23,7 +23,7 @@ NAMES = ("response of pixels", "offsets of pixels", "of columns", "of rows")
 
 
 @dataclass(frozen=True, slots=True)
-class Pattern:
+class FixedPattern:
     """One sigma of the pixels' response, as a share of the light, and of offsets of pixels, of columns and of rows, DN.
 
     `squares` has the square of each, without what noise adds, and `errors` one sigma of these.
@@ -52,10 +52,10 @@ class Pattern:
         return ", ".join(said)
 
 
-NO_PATTERN = Pattern()
+NO_PATTERN = FixedPattern()
 
 
-def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]]) -> Pattern | None:
+def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]]) -> FixedPattern | None:
     """The pattern by products of each two of several photographs, whose noise has mean 0; None with fewer than two.
 
     Each gives its pixels less their smooth level, that level above the pedestal, DN, and which pixels count (height, width).
@@ -89,7 +89,7 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
     )
     if offset < FOUND_SIGMAS * offset_error:
         response, response_error = both / lit, both_error / lit
-    return Pattern((response, offset, column, row), (response_error, offset_error, column_error, row_error))
+    return FixedPattern((response, offset, column, row), (response_error, offset_error, column_error, row_error))
 
 
 class _Pairs:
@@ -201,7 +201,7 @@ MAX_MASK_PX = 80  # half of what is left out about a long source
 
 
 @dataclass(frozen=True, slots=True)
-class Sources:
+class FoundSources:
     """Sources (n,) of a photograph, brightest first: places, px, signal over noise, and the length and width of each, px.
 
     Length and width are of all that stands out, `fwhm_px` is a circle's as large as what has half of the peak. `single` says
@@ -225,7 +225,7 @@ class Sources:
         return (self.length_px > MIN_TRAIL_PX) & (self.length_px > MIN_TRAIL_RATIO * self.width_px)
 
 
-def find_sources(sigmas: FloatArray) -> Sources:
+def find_sources(sigmas: FloatArray) -> FoundSources:
     """Sources of an image in sigmas: connected pixels of it, smoothed, above THRESHOLD."""
     norm = float(np.sqrt((_kernel(sigmas.shape) ** 2).sum()))
     smooth = ndimage.gaussian_filter(sigmas, KERNEL_PX, mode="nearest", truncate=4.0) / norm
@@ -248,10 +248,10 @@ def find_sources(sigmas: FloatArray) -> Sources:
     fwhm = 2 * np.sqrt(np.bincount(blob, value > peak[blob] / 2, minlength=count) / np.pi)
     order = np.argsort(-peak * np.sqrt(area), kind="stable")[:MAX_SOURCES]
     single = _single(sigmas, mx[order], my[order])
-    return Sources(mx[order], my[order], peak[order], length[order], width[order], fwhm[order], single)
+    return FoundSources(mx[order], my[order], peak[order], length[order], width[order], fwhm[order], single)
 
 
-def source_mask(sources: Sources, sigmas: FloatArray, grow_px: int) -> BoolArray:
+def source_mask(sources: FoundSources, sigmas: FloatArray, grow_px: int) -> BoolArray:
     """Pixels of an image (height, width) within some pixels of a source, or of an end of a long one."""
     height, width = sigmas.shape
     spots = sigmas > THRESHOLD

@@ -21,7 +21,7 @@ REFRACTION_RAD = 2.826e-4  # 58.3 arcsec times tan z, at 1010 hPa and 10 C (Astr
 MIN_COS_ZENITH = 0.1  # the formula is wrong by 20 arcsec at 84 deg
 MAX_STEPS, MAX_DAMPINGS, FIRST_DAMPING = 30, 10, 1e-4
 MIN_GAIN = 1e-3  # a step that lowers the loss by less, in half squares of a sigma, is the last
-DIFFERENCE = 1e-4  # of a number, for its derivative
+DIFFERENCE = 1e-4  # step of a number, for its derivative
 HUBER = 2.0
 FOLDS = 5
 EDGE_PX = 10.0  # beyond an image's edges, to which its lens is used
@@ -144,7 +144,7 @@ def with_values(camera: Camera, values: dict[str, float]) -> Camera:
     )
 
 
-class _Loss:
+class _CameraLoss:
     """The residuals of places in sigmas by a camera's numbers, each photograph's turn, and its zenith where that is fitted."""
 
     def __init__(
@@ -239,7 +239,7 @@ def fit_model(
 
     `base` is the camera about which the numbers count. A pointing with a zenith has it fitted.
     """
-    loss = _Loss(base, pointings, photographs, names, floor_px)
+    loss = _CameraLoss(base, pointings, photographs, names, floor_px)
     numbers, hessian = minimised(loss.residuals, loss.slopes, loss.start())
     covariance = np.asarray(np.linalg.pinv(hessian), dtype=np.float64)
     return *loss.unpacked(numbers), covariance[: len(names), : len(names)]

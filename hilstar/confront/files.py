@@ -15,7 +15,7 @@ from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.build import bench_optics
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import glass_in
-from hilstar.confront.background import Pattern
+from hilstar.confront.background import FixedPattern
 from hilstar.confront.light import NO_CORRECTION, LightFit, PixelFit
 from hilstar.confront.session import FixedCamera, Session, corrected, radius2_of
 from hilstar.confront.star_psf import HALF, STAMP_PX, Stamps, StarPsf, fit_psf
@@ -29,7 +29,7 @@ from hilstar.sky.spectrum import Curve
 GRID = 4  # field points along each side of the PSF file
 PER_PX, HALF_PX = 4, 6  # samples a pixel, and half of a PSF image's side
 MODEL = "confront: "  # before the PSF's own numbers in the file's history
-SCREEN_PX, SCREEN_PITCH_UM, FILLED = (1920, 1080), 265.5, 0.95  # of a bench whose file has no monitor: a 24 inch screen
+SCREEN_PX, SCREEN_PITCH_UM, FILLED = (1920, 1080), 265.5, 0.95  # a 24 inch screen, for a bench whose file has no monitor
 PLACEHOLDER = "[monitor]\nresolution_px = [1920, 1080]\npixel_pitch_um = 265.5\n[collimator]\nfocal_length_mm = 1000.0\n"
 UNDATED = '[sky]\nepoch_utc = "2000-01-01T00:00:00Z"\n'
 NAMES = ("tracker.toml", "tracker_distortion.toml", "tracker_qe.csv", "tracker_psf.fits")
@@ -211,7 +211,7 @@ def fixed_camera(file: BenchFile, step_dn: float) -> FixedCamera:
         {},
         np.empty((0, 2)),
         (),
-        Pattern((detector.prnu**2, 0.0, 0.0, 0.0), (0.0,) * 4),
+        FixedPattern((detector.prnu**2, 0.0, 0.0, 0.0), (0.0,) * 4),
     )
     return FixedCamera(camera, psf, light, pixels)
 

@@ -23,14 +23,14 @@ FITS_MAGIC = b"SIMPLE  ="
 MAX_BYTES = 500_000_000
 BAYER = re.compile(r"^(RGGB|BGGR|GRBG|GBRG)$")
 BAYER_KEYS = ("BAYERPAT", "COLORTYP", "FILTER")
-MAP_KEYS = {"CENTAZ", "CENTEL"}  # of DASC's maps of azimuth and elevation
+MAP_KEYS = {"CENTAZ", "CENTEL"}  # in DASC's maps of azimuth and elevation
 DATE_KEYS = ("DATE-OBS", "DATE-BEG", "OBSDATE")
 EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE", "XPOSURE")
 EXIF_IFD, EXIF_DATE, EXIF_OFFSET, EXIF_EXPOSURE = 0x8769, 0x9003, 0x9011, 0x829A
 UTC = re.compile(r"^\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d+)?)?)?Z?$")
 NAMED_TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:_]?(\d\d)[-:_]?(\d\d)")
 MIN_SIDE_PX = 64
-BRIGHT_SHARE, GREY_SPREAD = 1e-3, 0.05  # of an RGB picture's brightest pixels, by how much channels of a grey one may differ
+BRIGHT_SHARE, GREY_SPREAD = 1e-3, 0.05  # an RGB picture's brightest pixels, and how far channels of a grey one may differ there
 SATURATED_PIXELS = 3  # so many at the largest value, and none near below it, is a clipped level
 MAX_SATURATED_SHARE = 0.05
 

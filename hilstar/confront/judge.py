@@ -27,7 +27,7 @@ from hilstar.units import flux_ratio
 
 ALL_STARS_MAG = 25.0
 LISTED_SNR = 8.0  # from which a source that nothing explains counts
-EXPECTED_SNR = 15.0  # of a star that is missing where no source is
+EXPECTED_SNR = 15.0  # expected of a star that is missing where no source is
 NEFF_PX = 4 * math.pi  # pixels whose noise a source's signal has: those of the Gaussian of 1 px by which it was found
 SAME_LIGHT = 0.15  # a star explains a source where it has so much of its light
 SATELLITE_RAD = math.radians(0.2)  # elements are off by 1 to 3 km a day, which is 0.2 degrees at 400 km

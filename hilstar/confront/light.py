@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.confront.background import NO_PATTERN, Pattern
+from hilstar.confront.background import NO_PATTERN, FixedPattern
 from hilstar.confront.star_psf import MEAN_BV_MAG
 from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import MAD_TO_SIGMA
@@ -32,8 +32,8 @@ MIN_STARS = 8
 MIN_MASSES, CLOUD_MAG = 0.3, 0.01  # air masses that tell extinction, and by how much skies differ beside it
 BLOCK_PX = 32
 MIN_VARIANCE_DN2 = 1e-9
-SKY_CURVATURE = 0.03  # of the sky's light: by how much its shade differs from one photograph to another beyond a slope
-MIN_LEVEL_RANGE = 1.25  # of background levels, from which their noise tells the gain
+SKY_CURVATURE = 0.03  # by how much the shade of the sky's light differs from one photograph to another beyond a slope
+MIN_LEVEL_RANGE = 1.25  # ratio of background levels from which their noise tells the gain
 LINEAR_OFF, LINEAR_SIGMAS = 0.04, 4.0  # by how much a power differs from 1 where a tone curve is stated
 
 Correction = tuple[float, float]
@@ -301,7 +301,7 @@ class PixelFit:
     sigma: dict[str, float]
     points: FloatArray
     notes: tuple[str, ...] = ()
-    pattern: Pattern = NO_PATTERN
+    pattern: FixedPattern = NO_PATTERN
 
     def variance_dn2(self, level_dn: FloatArray) -> FloatArray:
         """Variance of a pixel at a level."""
@@ -337,7 +337,7 @@ def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> Float
 
 
 def fit_pixels(
-    points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: DetectorSettings, pattern: Pattern
+    points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: DetectorSettings, pattern: FixedPattern
 ) -> PixelFit:
     """The detector by photon transfer, that of the bench file where photographs cannot tell it.
 

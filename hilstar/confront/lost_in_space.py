@@ -21,25 +21,25 @@ from hilstar.rotation import from_matrix
 # Half steps of 5 % about each hypothesis cover +-22 %.
 HYPOTHESES = (1.0, 1.1, 0.91, 1.2, 0.83)
 STEP = 0.055
-MAX_RATIO_OFF = 0.004  # of a triangle's sides relative to its longest: a distortion of 0.1 over 6 deg is 0.001
+MAX_RATIO_OFF = 0.004  # a triangle's sides relative to its longest: a distortion of 0.1 over 6 deg is 0.001
 STARS_A_CIRCLE, SOURCES_A_CIRCLE = 9, 9  # whose triangles are compared
 CIRCLE = 0.5  # radius, of the field's smaller side
 MIN_SIDE = 0.15  # shortest side of a triangle, of the circle's diameter
 MAX_SOURCES = 60  # brightest sources that may prove an attitude
-NEAR = 0.006  # of the image's diagonal: within it a star and a source are one
+NEAR = 0.006  # a share of the image's diagonal: within it a star and a source are one
 # Chance is that of as many random places on the image; with 1e5 candidates at most, 1e-9 leaves 1e-4 for a false attitude.
 MAX_CHANCE = 1e-9
-MAX_CANDIDATES = 20_000  # of a hypothesis
+MAX_CANDIDATES = 20_000  # for one hypothesis
 MIN_MATCHED = 5
 # The triangles of one sky serve others of about its date: an arcminute changes a ratio by less than a tenth of its tolerance.
 KEPT_STARS, KEPT_RAD = 1000, 3e-4
-STRETCH = np.array([MAX_RATIO_OFF / STEP, 1.0, 1.0])  # of triangles' keys, so that one distance is every tolerance
+STRETCH = np.array([MAX_RATIO_OFF / STEP, 1.0, 1.0])  # scales the triangles' keys, so that one distance is every tolerance
 Triangles = tuple[IntArray, FloatArray, cKDTree]  # triples (t, 3), which way round they go (t,), and their stretched keys
 _KEPT: dict[float, tuple[FloatArray, Triangles]] = {}
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
+class SolvedField:
     """An attitude and a focal length, with the sources and stars (m,) that agree on it."""
 
     q_icrs_to_cam: FloatArray
@@ -49,7 +49,7 @@ class Solved:
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class SourceField:
     """Sources (n, 2) of an image, px from its middle, brightest first, and the image's size, px."""
 
     places_px: FloatArray
@@ -67,7 +67,9 @@ class Field:
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def solve_lost(field: Field, focal_length_px: float, vectors: FloatArray, near: FloatArray | None = None) -> Solved | None:
+def solve_lost(
+    field: SourceField, focal_length_px: float, vectors: FloatArray, near: FloatArray | None = None
+) -> SolvedField | None:
     """The attitude of a field whose focal length is known to 20 %; `vectors` (n, 3) are stars, ICRS, brightest first.
 
     With a direction `near` (3,) of the boresight, known to a field or so, only stars about it are looked at.
@@ -89,7 +91,7 @@ def solve_lost(field: Field, focal_length_px: float, vectors: FloatArray, near: 
     return _solved(field, focal_length_px, vectors, kept[1])
 
 
-def _solved(field: Field, focal_length_px: float, vectors: FloatArray, sky: Triangles) -> Solved | None:
+def _solved(field: SourceField, focal_length_px: float, vectors: FloatArray, sky: Triangles) -> SolvedField | None:
     tries = (_by_hypothesis(field, focal_length_px * times, vectors, sky) for times in HYPOTHESES)
     return next((found for found in tries if found is not None), None)
 
@@ -141,7 +143,7 @@ def _keys(triples: IntArray, vectors: FloatArray) -> tuple[IntArray, FloatArray,
     return triples, keys, turn
 
 
-def _image_triples(field: Field) -> Iterator[tuple[int, int, int]]:
+def _image_triples(field: SourceField) -> Iterator[tuple[int, int, int]]:
     """Triples of the brightest sources in circles over the image, those of the brightest ones first."""
     radius = CIRCLE * min(field.width_px, field.height_px)
     ways = [
@@ -159,7 +161,7 @@ def _image_triples(field: Field) -> Iterator[tuple[int, int, int]]:
     yield from sorted(found, key=sum)
 
 
-def _by_hypothesis(field: Field, focal_px: float, vectors: FloatArray, sky: Triangles) -> Solved | None:
+def _by_hypothesis(field: SourceField, focal_px: float, vectors: FloatArray, sky: Triangles) -> SolvedField | None:
     triples, turns, tree = sky
     rays = field.rays(focal_px)
     mine = np.array(list(_image_triples(field)), dtype=np.intp).reshape(-1, 3)
@@ -186,7 +188,7 @@ def _by_hypothesis(field: Field, focal_px: float, vectors: FloatArray, sky: Tria
 class _Proof:
     """Whether the other bright stars of a field lie on sources too."""
 
-    def __init__(self, field: Field, vectors: FloatArray) -> None:
+    def __init__(self, field: SourceField, vectors: FloatArray) -> None:
         self.field, self.vectors = field, vectors
         self.places = field.places_px[:MAX_SOURCES]
         self.tree = cKDTree(self.places)
@@ -194,7 +196,7 @@ class _Proof:
         self.chance = min(0.5, len(self.places) * math.pi * self.radius_px**2 / (field.width_px * field.height_px))
         self.sky = cKDTree(vectors)
 
-    def of(self, sources: IntArray, stars: IntArray, focal_px: float) -> Solved | None:
+    def of(self, sources: IntArray, stars: IntArray, focal_px: float) -> SolvedField | None:
         """The attitude by three pairs, where it holds."""
         matrix = turned(self.field.rays(focal_px)[sources], self.vectors[stars])
         seen = self._seen(matrix, focal_px)
@@ -209,7 +211,7 @@ class _Proof:
             star, source = self._pairs(self._seen(matrix, focal_px), matrix, focal_px)
             if len(star) < MIN_MATCHED:
                 return None
-        return Solved(from_matrix(matrix), focal_px, source, star)
+        return SolvedField(from_matrix(matrix), focal_px, source, star)
 
     def _seen(self, matrix: FloatArray, focal_px: float) -> IntArray:
         """The brightest stars on the image, as many as there are sources."""

@@ -24,7 +24,7 @@ from hilstar.files import make_directory
 from hilstar.scene.camera import Camera
 
 OUTPUTS = ("index.html", "stars.csv", "sources.csv", *NAMES)
-MEMORY_PX = 20_000_000  # of photographs in memory, with their backgrounds 0.5 GB; those beyond lie in files
+MEMORY_PX = 20_000_000  # photographs in memory, with their backgrounds 0.5 GB; those beyond lie in files
 STAR_COLUMNS = (
     "image",
     "hip",

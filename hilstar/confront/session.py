@@ -16,8 +16,8 @@ from hilstar.bench.config.sky import SiteSettings
 from hilstar.bench.site import site_glow_e_per_s_sr
 from hilstar.confront.background import (
     NO_PATTERN,
+    FoundSources,
     SkyLevel,
-    Sources,
     find_sources,
     fixed_pattern,
     is_round,
@@ -40,7 +40,7 @@ from hilstar.confront.light import (
     transfer_points,
     with_extinction,
 )
-from hilstar.confront.lost_in_space import MAX_SOURCES, MIN_MATCHED, NEAR, Field, Solved, nearest_once, solve_lost
+from hilstar.confront.lost_in_space import MAX_SOURCES, MIN_MATCHED, NEAR, SolvedField, SourceField, nearest_once, solve_lost
 from hilstar.confront.sky import DatedSky, dated_sky
 from hilstar.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
 from hilstar.errors import InputError
@@ -53,7 +53,7 @@ from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 MATCH_PX = 2.5
 FIRST_PX = 0.15  # error of a source's place before it is measured
-BEYOND, FURTHER, MAX_ROUNDS = 1.25, 1.05, 12  # of the radius of a match, where it is continued, and while it grows so
+BEYOND, FURTHER, MAX_ROUNDS = 1.25, 1.05, 12  # a match's radius: where it is continued, and while it grows so
 BLEND_PX, BLEND_MAG = 6.0, 3.0  # a neighbour so near, and not so much fainter, spoils a star's place and flux
 PSF_STARS = 60
 TRAILED_RATIO, TRAILED_PX, WIDE_PX = 2.5, 8.0, 9.0
@@ -77,11 +77,11 @@ class Shot:
 
     photo: Photograph
     level: SkyLevel
-    sources: Sources
+    sources: FoundSources
     sky: DatedSky
     pointing: Pointing
     focal_length_px: float
-    matched: Solved
+    matched: SolvedField
     star: IntArray
     stamps: Stamps | None = None
     measured: Measured | None = None
@@ -180,13 +180,13 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     )
 
 
-def _field(sources: Sources, points: BoolArray, photo: Photograph) -> Field:
+def _field(sources: FoundSources, points: BoolArray, photo: Photograph) -> SourceField:
     width, height = photo.size_px
     places = np.column_stack([sources.x_px - (width - 1) / 2, sources.y_px - (height - 1) / 2])[points]
-    return Field(places, width, height)
+    return SourceField(places, width, height)
 
 
-def _solve(field: Field, base: Camera, sky: DatedSky, start: FloatArray | None) -> Solved | None:
+def _solve(field: SourceField, base: Camera, sky: DatedSky, start: FloatArray | None) -> SolvedField | None:
     if start is not None:
         near = rotate(conjugate(start), np.array([[0.0, 0.0, 1.0]]))[0]
         found = solve_lost(field, base.focal_length_px, sky.vectors, near)
@@ -195,7 +195,9 @@ def _solve(field: Field, base: Camera, sky: DatedSky, start: FloatArray | None) 
     return solve_lost(field, base.focal_length_px, sky.vectors)
 
 
-def _why_not(field: Field, base: Camera, sky: DatedSky, sources: Sources, points: BoolArray, start: FloatArray | None) -> str:
+def _why_not(
+    field: SourceField, base: Camera, sky: DatedSky, sources: FoundSources, points: BoolArray, start: FloatArray | None
+) -> str:
     """What is seen of a photograph without an attitude, and what to do."""
     bright = np.flatnonzero(points)[:BRIGHTEST]
     length, width = np.median(sources.length_px[bright]), np.median(sources.width_px[bright])

@@ -22,7 +22,7 @@ from hilstar.units import NS_PER_S
 
 AU_KM, DAY_S = 149_597_870.7, 86_400.0
 PLANETS = ("Mercury", "Venus", "", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")  # ERFA's numbers from 1; 3 is the Earth
-DOUBLES, VARIABLES = (b"C", b"G", b"O", b"V", b"X"), (b"P", b"U")  # of CDS I/239's H59 and H52
+DOUBLES, VARIABLES = (b"C", b"G", b"O", b"V", b"X"), (b"P", b"U")  # flags of CDS I/239's H59 and H52
 DAY_NS = 86_400 * NS_PER_S
 
 

@@ -10,11 +10,11 @@ import msgspec
 from hilstar.errors import printable
 from hilstar.toml_tables import Table
 
-TABLE = "monitor_identity"  # of a calibration or geometry file
+TABLE = "monitor_identity"  # in a calibration or geometry file
 STRAIGHT = "straight"
 NO_SERIALS = frozenset({0, 1, 0x01010101, 0xFFFFFFFF})  # what makers write who number nothing
 MAX_WEEK = 54  # 0: not stated; 255: the year is the model's (VESA E-EDID 1.4, 3.4.4)
-SHOWN_DIGITS = 20  # of a SHA-256 in a line; names and modes are shorter
+SHOWN_DIGITS = 20  # a SHA-256 in a line; names and modes are shorter
 
 
 class MonitorIdentity(Table, frozen=True):

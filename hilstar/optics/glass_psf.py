@@ -264,7 +264,7 @@ class GlassPsf(SampledPsf):
             line @ np.diff(table, 3, axis=0).swapaxes(1, 2)
             for line, table in zip(lines, self._tabulated(PLACES_A_PX), strict=True)
         ]
-        cubic = max(float(np.abs(one).max()) for one in each) * PLACES_A_PX**3 / 192  # of a square of 1 px, by Chebyshev's
+        cubic = max(float(np.abs(one).max()) for one in each) * PLACES_A_PX**3 / 192  # over a square of 1 px, by Chebyshev's
         return int(np.clip(math.ceil(np.cbrt(cubic / CUBIC_TOLERANCE)), MIN_SQUARES, MAX_SQUARES))
 
     @cached_property

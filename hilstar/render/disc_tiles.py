@@ -16,12 +16,12 @@ from hilstar.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.scene.extended import DiscLight, Rectangle
 from hilstar.sky.bodies.disc import AIR_TOP
 
-TILE_PX, FINE_PX = 32, 8  # of tiles, and of the parts of those at edges
+TILE_PX, FINE_PX = 32, 8  # tiles, and the parts of those at edges
 MIN_TILED_PX = 40_000  # a rectangle of fewer pixels is drawn whole
 SMOOTH = 5e-4  # share of the light: a level of 12 bits
 SPREAD = 1e-3  # share that the Gaussian changes air's light by more than tile.glsl says: thinner air is drawn ray by ray
 REACH_SIGMAS = 5.0
-LARGE_PX = 200.0  # of a radius: from here one ray is within 4e-5 of the spread light of a face, as in disc.frag
+LARGE_PX = 200.0  # a radius: from here one ray is within 4e-5 of the spread light of a face, as in disc.frag
 WIDER = 1.5  # factor on the angle across a tile: allows for a lens, a field's corner and a flattened body
 # Light between the corners of a tile is over and under theirs by less; a limb spreads half of it.
 SMOOTH_TIMES, SURE_TIMES = 1.5, 4.0

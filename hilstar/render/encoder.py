@@ -177,7 +177,7 @@ def sprites_array(program: moderngl.Program, buffer: moderngl.Buffer, planes: Pl
 
 MAX_RATE = 3e38  # in float32
 APART_DTYPE = np.dtype([*SPRITE_DTYPE.descr, ("primaries_e_per_s", "<f4", 3)])
-INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}  # of star.vert
+INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}  # star.vert's
 SPRITE_PIXEL_COST = 4  # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
 # Share of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
 MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03

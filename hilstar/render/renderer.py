@@ -87,7 +87,7 @@ class Renderer(Backend):
         self._level_eraser = Eraser(ctx, target.resolution_px, planes, of_levels=True)
         self._extended = ExtendedLayer(ctx, target.resolution_px)
         self._regions: tuple[Rectangle, ...] = ()  # where extended light is on the images
-        self._tiles: Tiles | None = None  # of a disc whose levels need no linear image everywhere
+        self._tiles: Tiles | None = None  # a disc whose levels need no linear image everywhere
         self._cut_sides = self._wider(target.sides)
         self._build_levels()
         set_sides(self._splat, self._cut_sides)

@@ -32,7 +32,7 @@ class Faults:
 
 
 @dataclass(slots=True)
-class Tally:
+class SendTally:
     """The fate of the packets: `sent` left intact and in order, `corrupted` and `reordered` left, `lost` did not."""
 
     sent: int = 0
@@ -50,7 +50,7 @@ class BadCable:
     """Passes packets on; each meets at most one fault."""
 
     def __init__(self, faults: Faults, rng: np.random.Generator, put: Callable[[bytes], None]) -> None:
-        self.tally, self._faults, self._rng, self._put = Tally(), faults, rng, put
+        self.tally, self._faults, self._rng, self._put = SendTally(), faults, rng, put
         self._held: bytes | None = None
 
     def delay_s(self) -> float:

@@ -144,7 +144,7 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
         shown = loop.draw(moment.slot, t_ns, timeline.at(t_ns), moment)
         if shown is None:
             return None
-        light_ns = t_ns - receiver.jumps.correction_ns  # of the sender's own clock
+        light_ns = t_ns - receiver.jumps.correction_ns  # by the sender's own clock
         outlet.record(bench, loop, shown, light_ns)
         if link.two_way:
             receiver.back.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))

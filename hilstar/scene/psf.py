@@ -39,7 +39,7 @@ BOUND_PLACES = 200
 MAX_SAMPLED_CUT = 1e-4
 MAX_NEGATIVE = 0.02  # share of a PSF's light below zero, of noise or of a spline's overshoot: it is set to zero
 MAX_UNEVEN = 0.05  # by which the light of a star's pixels may change with its place in a pixel
-SPLINE_DEGREE: Final = 5  # of the spline through the samples
+SPLINE_DEGREE: Final = 5  # the spline through the samples
 BLACK_SAMPLES = 12  # so many stand round them
 # Shares are tabulated at most so finely, and with so many places along a side, or twice as many for FINE_STEPS_A_PX.
 # Interpolated linearly they are off by an eighth of the squared step times their curvatures: 7e-5 of a star's light in a pixel

@@ -67,7 +67,7 @@ FRAME_PX = (800, 600)
 FIELDS, QUICK_FIELDS, ROUNDS, QUICK_ROUNDS = 40, 3, 15, 3
 BRIGHTEST_V_MAG, FAINTEST_V_MAG = 1.0, 5.5
 LONE = Isolation(5.0, 1e-3)
-PUBLISHED_SUBTYPES = 6.55  # of a rig with an OLED of 2025
+PUBLISHED_SUBTYPES = 6.55  # a rig with an OLED of 2025
 # Sigmas of a mosaic's stars, px, their black bodies, and the places along two pixels at which they stand.
 SIGMAS_PX, STARS_K, PHASES, TILE_PX = (0.55, 0.8, 1.0, 1.5), (3500.0, 6000.0, 12_000.0), 16, 24
 Row = tuple[str | float, ...]

@@ -13,7 +13,7 @@ from hilstar.errors import InputError
 from hilstar.rotation import from_matrix, normalise, to_matrix
 
 MIN_STARS = 4  # identified, for an answer: three confirm a fourth
-MIN_SHARE = 0.5  # of the stars found that have to be the catalogue's
+MIN_SHARE = 0.5  # part of the stars found that have to be the catalogue's
 RADII_PX = (12.0, 3.0, 1.5)  # how far a found star may be from where it is expected, at each step
 CENTROID_E_PX2, CENTROID_FLOOR_PX = 0.4, 0.02  # a centroid's variance: 0.4 px^2 an electron, and the display's own share
 REFITS, REJECTED = 4, 4.0  # stars farther off than so many times the median are left out

@@ -81,10 +81,10 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     #: `"global"`: all pixels at once. `"rolling"`: each row begins `row_time_us` after the one before. `"frame-transfer"`: no
     #: shutter while rows are shifted under the mask, so light smears along the columns ([real glass](optics.md#the-shutter)).
     shutter: Literal["global", "rolling", "frame-transfer"] = "global"
-    row_time_us: Amount = 0.0  #: Of `rolling`: from the beginning of a row's exposure to the next row's.
-    #: Of `rolling`: `"down"`, the top row first, or `"up"`, the bottom row first.
+    row_time_us: Amount = 0.0  #: With `rolling`: from the beginning of a row's exposure to the next row's.
+    #: With `rolling`: `"down"`, the top row first, or `"up"`, the bottom row first.
     row_direction: Literal["down", "up"] = "down"
-    row_shift_us: Amount = 0.0  #: Of `frame-transfer`: the time in which charge is shifted by one row.
+    row_shift_us: Amount = 0.0  #: With `frame-transfer`: the time in which charge is shifted by one row.
     sense_capacitance_ff: Amount = 0.0  #: Capacitance whose reset adds kTC noise; 0: none, as with correlated double sampling.
     dark_e_per_s: Amount = 0.0  #: Dark current of a pixel at the reference temperature.
     dsnu_e_per_s: Amount = 0.0  #: Sigma of the dark current over the device (DSNU).

@@ -40,10 +40,10 @@ from hilstar.units import NS_PER_S
 
 TRACKING, LOST, TOO_FEW, BLINDED = "tracking", "lost in space", "too few stars", "blinded"
 KEPT_NS = 10 * NS_PER_S  # frames that an exposure may still be of
-SEEN_SIGMAS = 3.0  # of a pixel's noise: fainter stars are not expected in an image
+SEEN_SIGMAS = 3.0  # in a pixel's noise: fainter stars are not expected in an image
 MAX_EXPECTED = 300  # brightest stars that are
 MAX_REPORTED = 30  # stars
-BLINDED_SHARE = 0.05  # of the detector's pixels at the last code
+BLINDED_SHARE = 0.05  # detector pixels at the last code
 STREAK_PX = 0.5  # from this streak on, the window is as wide as it, and no S-curve is removed
 MAX_WINDOW_PX = 6.0
 STALE_S, TURN_S = 5.0, 1.0  # an attitude older than this predicts no other; two further apart than that tell no rate

@@ -79,8 +79,8 @@ class Tracker(Table, frozen=True):
     #: `wavelength_nm,value`, or one number for all wavelengths. Default: **required**, or the next three
     quantum_efficiency: str | float | None = None
     quantum_efficiency_r: str | float | None = None  #: The same of the red channel alone. Default: one channel
-    quantum_efficiency_g: str | float | None = None  #: Of the green channel. Default: one channel
-    quantum_efficiency_b: str | float | None = None  #: Of the blue channel. Default: one channel
+    quantum_efficiency_g: str | float | None = None  #: The green channel's. Default: one channel
+    quantum_efficiency_b: str | float | None = None  #: The blue channel's. Default: one channel
     #: Of the tracker's optics: `"n-bk7-10mm"` (10 mm of uncoated glass), the path of a CSV file as above, or one number.
     transmission: str | float = 1.0
     exposure_s: NotNegative = 0.1  #: Exposure time.
@@ -144,8 +144,8 @@ class PrimariesSettings(Table, frozen=True):
     #: In place of `file`, with the next two: CIE 1931 x and y of each primary. Its spectrum is a Gaussian of about that
     #: chromaticity, and all three together are D65: approximate, as every run says. Default: by `file`
     xy_r: Chromaticity | None = None
-    xy_g: Chromaticity | None = None  #: Of green. Default: by `file`
-    xy_b: Chromaticity | None = None  #: Of blue. Default: by `file`
+    xy_g: Chromaticity | None = None  #: For green. Default: by `file`
+    xy_b: Chromaticity | None = None  #: For blue. Default: by `file`
     width_nm: Annotated[float, Meta(ge=1, le=200)] = 30.0  #: Full width at half maximum of each primary that is given by `xy_`.
     #: `"white"`: all three have their light in the pixel's middle. `"rgb-stripe"`, `"bgr-stripe"`: side by side, a third of a
     #: pixel apart. `"vertical"`: red above green above blue. A pixel with a fourth subpixel, or that shares subpixels, is

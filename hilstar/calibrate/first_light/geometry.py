@@ -255,7 +255,7 @@ PLAN_SEED = 0
 FRAMES = 20
 MIN_LIT, MAX_LIT = 12, 60  # dots in a frame
 TRACKER_PX_A_DOT = 40.0  # tracker px between neighbouring dots of a frame
-OVERSAMPLING = 4  # of the effective PSF
+OVERSAMPLING = 4  # for the effective PSF
 BLURRED = 1.3  # times the bench file's sigma
 BLURRED_BY_PX = 0.1
 

@@ -315,7 +315,7 @@ def verify(context: StepContext) -> StepOutcome:
     line += f": {'; '.join(reasons)}" if reasons else ""
     verdict: Verdict = "failed" if reasons else "done"
     rms_arcsec = float(figures["star_rms_arcsec"])
-    error = rms_arcsec / math.sqrt(4 * len(off_px))  # of an rms over two axes
+    error = rms_arcsec / math.sqrt(4 * len(off_px))  # from an rms over two axes
     number = StepNumber(rms_arcsec, error, "arcsec", f"rms distance of {len(off_px)} stars from where the sky has them")
     return StepOutcome(verdict, line, figures, (*pictures, *seen.images), tuple(pictures), number=number)
 

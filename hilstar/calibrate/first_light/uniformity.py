@@ -170,7 +170,7 @@ def warm_up(context: StepContext) -> StepOutcome:
         slope = change / tau_s * math.exp(-ended_s / tau_s) + virtual.drift_percent_per_h / 100 / S_PER_H
         figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
         stable_s = tau_s * math.log(max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / found.limit)
-        figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)  # of its exponential alone
+        figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)  # by its exponential alone
     changes = context.change("certify", "warm_up_percent", float(f"{100 * found.bound:.3g}")) if found.is_stable else ()
     per_h = StepNumber(found.drift_percent_per_h, found.drift_error_percent_per_h, "%/h", "drift of white at the last reading")
     return StepOutcome(

@@ -384,7 +384,7 @@ def best_of(found: list[Candidate]) -> Candidate:
 
 
 MAP_PLACES = (17, 11)
-MODE_SHARE = 1e-6  # of the variance over the screen: less is in no interval's digits
+MODE_SHARE = 1e-6  # a share of the variance over the screen: less is in no interval's digits
 
 
 @dataclass(frozen=True, slots=True)

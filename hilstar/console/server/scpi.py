@@ -39,7 +39,7 @@ UNREAD_S = 10.0
 MAX_WRONG_TOKENS = 5
 WRONG_TOKEN_S = 0.5
 HTTP = re.compile(r"[A-Z]+ \S+ HTTP/\d")  # a browser that another site's page made ask here
-ORDER_ERRORS = {400: -224, 404: -224, 409: -221, 500: -250, 504: -365}  # of an order's HTTP status; else -310
+ORDER_ERRORS = {400: -224, 404: -224, 409: -221, 500: -250, 504: -365}  # by an order's HTTP status; else -310
 UNLOCKED = {"*IDN?", "*CLS", "SYSTem:AUTHenticate", "SYSTem:ERRor[:NEXT]?", "SYSTem:ERRor:COUNt?", "SYSTem:VERSion?"}
 
 # Bits of the operation and the questionable status; SCPI-1999 leaves bits 8 to 12 and 9 to 12 to a device.
@@ -235,7 +235,7 @@ class Connection:
                 raise ScpiError(-363, f"a line has at most {scpi.MAX_LINE_BYTES} bytes")
             for unit in HEADERS.units(line):
                 await self._do(unit)
-        except ScpiError as error:  # of the syntax: the rest of the line has no meaning
+        except ScpiError as error:  # bad syntax: the rest of the line has no meaning
             self.status.add(error)
         return ";".join(self._answers)
 

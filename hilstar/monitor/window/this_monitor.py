@@ -16,7 +16,7 @@ from hilstar.monitor.window.watch import is_straight
 from hilstar.monitor.window.window import displays
 
 DRM = Path("/sys/class/drm")
-EDID_BYTES = 128  # of the first block
+EDID_BYTES = 128  # the first block
 VCP = {"10": "brightness", "12": "contrast", "14": "colour_preset", "C0": "hours"}  # VESA MCCS 2.2a
 DDC_S = 10.0  # ddcutil looks at every bus, and asks again where a monitor does not answer
 

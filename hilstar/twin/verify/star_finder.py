@@ -23,7 +23,7 @@ MATCH_PX = 3.0
 # 0.02, a neighbour 0.1 mag off adds 0.002 mag.
 CROWDED_SHARE = 0.02
 WING_SIGMAS = 6.0  # how far a neighbour's light reaches: 1e-9 of it, and Sirius is 4e3 times a star of the seventh magnitude
-MOSAIC_SHARE = 0.25  # of a star's light that a mosaic has: at least that of red alone
+MOSAIC_SHARE = 0.25  # least part of a star's light that a mosaic has: that of red alone
 MIN_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
 
 

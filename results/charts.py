@@ -65,7 +65,7 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
             limits = count / case_s, seconds / case_s / 3.3e-3, 1 / (60e-6 + 1.8e-3 * case_s / seconds)
             paper[words].append(min(limits))
     title = "Frames grow with stars up to the cap on pixels, reports with hours; one scheduler feeds 1000 cores by longer tasks"
-    with chart(DOCS / "scale", title, 3, 2, share_x=False) as panels:
+    with chart(DOCS / "scale.svg", title, 3, 2, share_x=False) as panels:
         stars, pixels, memory, workers, packets, hours = panels
         stars.plot(*points("stars", "time"), "o-", color=RED)
         stars.axvline(250_000, color=BLUE, ls=":", label="only the brightest are drawn")
@@ -105,7 +105,7 @@ def draw_tracker(rows: list[dict[str, str]]) -> None:
         "Medians of processor time, ms, in turn, beside other work. 1024 x 1024 px of the demo's tracker, all noise; peers have"
         " hilstar's expected image or DN. verify: one field. First frame: a process from exec to its end, 1920 x 1080."
     )
-    with chart(DOCS / "tracker_speed", finding, note=note, height_inch=3.6) as (axes,):
+    with chart(DOCS / "tracker_speed.svg", finding, note=note, height_inch=3.6) as (axes,):
         value_bars(axes, names, ms, [colours[row["method"]] for row in rows])
 
 

@@ -158,22 +158,18 @@ export class Chart {
     context.strokeStyle = this.ink[name];
     context.fillStyle = this.ink[name];
     context.lineWidth = 1.5;
+    context.lineCap = "round"; // a sample alone is a dot
     context.beginPath();
-    let pen = false;
-    let gap = 0;
-    const spread = Math.max(2, Math.ceil(lows.length / 24));
-    for (let k = 0; k < lows.length; k += 1) {
-      if (!Number.isFinite(lows[k])) {
-        gap += 1;
-        if (gap > spread) pen = false;
-        continue;
-      }
+    // Columns without a value are a gap where they are more than those between the series' own samples.
+    const known = [...lows.keys()].filter((k) => Number.isFinite(lows[k]));
+    const apart = known.slice(1).map((k, n) => k - known[n]).sort((one, other) => one - other);
+    const spread = Math.max(3, lows.length / 24 + 1, 2.5 * (apart[apart.length >> 1] || 0));
+    known.forEach((k, n) => {
       const x = LEFT + k + 0.5;
-      context[pen ? "lineTo" : "moveTo"](x, this.y(lows[k]));
-      context.lineTo(x, this.y(highs[k]) - (pen ? 0 : 0.01));
-      pen = true;
-      gap = 0;
-    }
+      const joined = n > 0 && k - known[n - 1] <= spread;
+      context[joined ? "lineTo" : "moveTo"](x, this.y(lows[k]));
+      context.lineTo(x, this.y(highs[k]) - (joined ? 0 : 0.01));
+    });
     context.stroke();
   }
 

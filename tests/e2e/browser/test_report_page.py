@@ -11,6 +11,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
 import hilstar
+from hilstar.attitude.wire.packet import decode
 from hilstar.notices import Notice
 from hilstar.rotation import from_rotation_vector, multiply
 from hilstar.run.record.ledger import Ledger
@@ -19,6 +20,7 @@ from tests.support.benches import ORION_Q, SMALL_BENCH
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.commands import run_hilstar_here
 from tests.support.run_page import levels_of, run_data_of
+from tests.support.senders import packet
 
 pytestmark = [pytest.mark.e2e, pytest.mark.gpu]
 FRAMES, PERIOD_NS = 600, 16_666_667
@@ -61,6 +63,8 @@ def report_file(tmp_path_factory) -> Path:
             ledger.frame(record(k))
             if k % 6 == 0:
                 ledger.answer(answer(k))
+                raw = packet(k, k * PERIOD_NS)
+                ledger.packet(10**12 + k * PERIOD_NS, raw, decode(raw), None)
         ledger.packet(10**12 + 10**9, b"?", None, None)
         ledger.notice(Notice(10**12 + 5 * 10**9, "stale", "the attitude is stale"))
         ledger.notice(Notice(10**12 + 7 * 10**9, "mark", "<img src=x onerror=alert(1)>"))
@@ -89,6 +93,19 @@ def test_it_says_what_was_wrong_and_shows_the_whole_run(report):
     age = chart_aria(report, "age")
     assert "8.0 to 400.0" in age and "30 stale frames" in age
     assert "2 missed" in chart_aria(report, "pacing")
+
+
+def test_what_comes_once_a_second_is_a_line_in_a_short_run_too(report):
+    inked = report.run("""
+        const canvas = document.querySelector("#chart-packets canvas");
+        const {width, height} = canvas;
+        const {data} = canvas.getContext("2d").getImageData(0, 0, width, height);
+        const at = (x, y, part) => data[4 * (y * width + x) + part];
+        const blue = (x, y) => at(x, y, 3) > 99 && at(x, y, 2) > at(x, y, 0) + 60;
+        const columns = [...Array(width).keys()];
+        return columns.filter((x) => [...Array(height).keys()].some((y) => blue(x, y))).length / width;
+    """)
+    assert inked > 0.5
 
 
 def test_the_trackers_residual_is_charted_with_its_faults_shaded_and_their_effect_said(report):

@@ -61,6 +61,7 @@ STYLE: Any = {
     "axes.edgecolor": MUTED,
     "axes.facecolor": PAPER,
     "axes.grid": True,
+    "axes.formatter.useoffset": False,
     "axes.axisbelow": True,
     "axes.labelsize": SMALL_PT + 0.5,
     "axes.titlesize": TEXT_PT,

@@ -274,6 +274,7 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     run = read_ledger(ledger)
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
     centroids: Sequence[Centroids] = ()
+    overlap = True
     if telemetry is None:
         answers, stamp, ahead_ns, centroids = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
         base_ns, telemetry = zero_ns + ahead_ns, ledger
@@ -296,7 +297,7 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     right, wrong = np.zeros(len(t_s), dtype=np.bool_), np.zeros(len(t_s), dtype=np.bool_)
     right[valid[found.row]], wrong[valid[found.wrong]] = True, True
     off_deg = np.degrees(np.linalg.norm(found.clock.residual_arcsec, axis=1) / ARCSEC_PER_RAD)
-    notes = _notes(run, found, base_s)
+    notes = _notes(run, found, 0.0 if overlap else base_s)
     # The error by rate and by magnitude, and the display's own.
     parts = found.components
     error = parts.fov.fitted + parts.pixel.fitted + parts.left

@@ -1,5 +1,6 @@
 """The page of a certificate, one file that needs no other and prints on A4: statement, conformity, budget, identity, files."""
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -156,11 +157,9 @@ def text_lines(found: Certificate, digest: str, folder: Path) -> list[tuple[str,
                 continue
             each = max(members, key=lambda e: max(abs(e.lower), abs(e.upper)))
             half = (each.upper - each.lower) / 2
-            lines.append(
-                (
-                    f"{quantity} {region or ''}".strip(),
-                    f"{each.value:+.4g} +- {half:.2g} {each.unit} (the worst of {len(members)})",
-                )
-            )
+            places = max(1 - math.floor(math.log10(half)), 0) if half > 0 else 4  # two digits of the uncertainty
+            value = f"{round(each.value, places) + 0.0:+.{places}f}"
+            text = f"{value} +- {half:.{places}f} {each.unit} (the worst of {len(members)})"
+            lines.append((f"{quantity} {region or ''}".strip(), text))
     lines += [("not assessed", each) for each in found.not_assessed]
     return [*lines, ("valid until", found.valid_until), ("sha256", digest), ("page", str(folder / "index.html"))]

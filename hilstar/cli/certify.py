@@ -111,7 +111,7 @@ def _certify(
     write_whole(path, raw)
     write_certificate_page(output / PAGE, found, digest)
     told = {**msgspec.to_builtins(found), "sha256": digest, "page": str(output / PAGE)}
-    print_found(as_json, told, (f"{name:24}{text}" for name, text in text_lines(found, digest, output)))
+    print_found(as_json, told, (f"{name:26}{text}" for name, text in text_lines(found, digest, output)))
 
 
 def _check(

@@ -9,10 +9,12 @@ import csv
 import gzip
 import io
 import math
+import struct
+import zlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -232,20 +234,26 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
     image = (
         np.asarray(codes, dtype=np.uint8) if bits <= 8 else np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
     )
-    written(path, lambda file: _save_png(file, image))
+    written(path, lambda file: file.write(png_of(image)))
 
 
-def _save_png(file: IO[bytes], image: npt.NDArray[Any]) -> None:
-    if image.ndim == 2 or image.dtype == np.uint8:
-        from PIL import Image
+def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
+    """A PNG of values (height, width) or (height, width, 3), uint8 or uint16, of which `meant_bits` mean something (sBIT).
 
-        Image.fromarray(image).save(file, "PNG", compress_level=1)
-        return
-    # Pillow has no RGB of 16 bits.
-    import png
-
-    height, width, _ = image.shape
-    png.Writer(width, height, bitdepth=16, greyscale=False, compression=1).write(file, image.reshape(height, -1))
+    Its rows are not filtered: a tracker's frame, which is noise, takes half the time of Pillow's, and 12 % fewer bytes.
+    """
+    height, width = image.shape[:2]
+    colour, bits = 2 * (image.ndim == 3), 8 * image.itemsize
+    rows = np.zeros((height, 1 + image[0].nbytes), dtype=np.uint8)  # the 0 ahead of each row: no filter
+    rows[:, 1:] = np.ascontiguousarray(image, f">u{image.itemsize}").reshape(height, -1).view(np.uint8)
+    chunks = {b"IHDR": struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)}
+    if meant_bits is not None:
+        chunks[b"sBIT"] = bytes([meant_bits])
+    chunks |= {b"IDAT": zlib.compress(rows.data, 1), b"IEND": b""}
+    parts = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks.items()
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:
@@ -253,13 +261,12 @@ def write_preview_png(path: Path, codes: Codes) -> None:
 
     It is stretched to the brightest pixel of the frame.
     """
-    from PIL import Image
     from scipy.ndimage import gaussian_filter
 
     codes = codes if codes.ndim == 2 else codes.max(axis=2)
     signal = codes.astype(np.float32) / np.float32(max(int(codes.max()), 1))
     smooth = gaussian_filter(_discs(signal) ** PREVIEW_POWER, PREVIEW_BLUR_PX)
-    written(path, lambda file: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(file, "PNG"))
+    written(path, lambda file: file.write(png_of((255 * np.clip(smooth, 0, 1)).astype(np.uint8))))
 
 
 def _discs(signal: Float32Array) -> Float32Array:

@@ -3,7 +3,6 @@
 In the picture for people bright stars are discs, because saturated pixels cannot tell them apart.
 """
 
-import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
-from hilstar.bench.frame_files import sky_header, write_fits
+from hilstar.bench.frame_files import png_of, sky_header, write_fits
 from hilstar.bench.scenario import NO_SCENARIO, Scenario
 from hilstar.files import written
 from hilstar.frame.fault_kinds import Drop, Freeze, Now
@@ -112,17 +111,15 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
 
 def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     """A picture of a tracker's frame for a person (see `twin.picture`)."""
-    from PIL import Image
-
-    written(path, lambda file: Image.fromarray(exposure_picture(dn)).save(file, "PNG"))
+    written(path, lambda file: file.write(png_of(exposure_picture(dn))))
 
 
 def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     """The DN themselves, unscaled, as 16-bit greyscale: TIFF where the name ends in .tif or .tiff, else PNG."""
     from PIL import Image
 
-    form = "TIFF" if path.suffix.lower() in {".tif", ".tiff"} else "PNG"
-    written(path, lambda file: Image.fromarray(dn).save(file, form))
+    tiff = path.suffix.lower() in {".tif", ".tiff"}
+    written(path, lambda file: Image.fromarray(dn).save(file, "TIFF") if tiff else file.write(png_of(dn)))
 
 
 class TrackerPictures:
@@ -163,11 +160,4 @@ def dn_png(dn: npt.NDArray[np.uint16], bits: int) -> bytes:
 
     The leading bits are the DN's, so that a reader that keeps 8 of them still sees a picture.
     """
-    from PIL import Image, PngImagePlugin
-
-    about: Any = PngImagePlugin.PngInfo()
-    about.add(b"sBIT", bytes([bits]))
-    image = Image.fromarray(np.left_shift(dn, PNG_BITS - bits, dtype=np.uint16))
-    data = io.BytesIO()
-    image.save(data, "PNG", compress_level=1, pnginfo=about)
-    return data.getvalue()
+    return png_of(np.left_shift(dn, PNG_BITS - bits, dtype=np.uint16), bits)

@@ -23,7 +23,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import calibration_source, open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera
-from hilstar.bench.frame_files import write_codes_png
+from hilstar.bench.frame_files import png_of, write_codes_png
 from hilstar.bench.measured_on import check_monitor
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
@@ -537,13 +537,11 @@ class VirtualBench(ImageSource):
         return virtual_diode(file, self.truth, seconds, np.random.default_rng((self._seed, zlib.crc32(b"diode"))))
 
     def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
-        from PIL import Image
-
         mean_e = (light_e_per_s + self._sky_e_per_s) * exposure_s
         rng = np.random.default_rng((self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode())))
-        image = Image.fromarray(self._detector.expose(mean_e, exposure_s, rng))
+        image = png_of(self._detector.expose(mean_e, exposure_s, rng))
         path = stem.with_name(stem.name + ".png")
-        written(path, lambda file: image.save(file, "PNG", compress_level=1))
+        written(path, lambda file: file.write(image))
         return path
 
     def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:

@@ -3,19 +3,23 @@
 A packet has two names on its way in: what arrived (`RawMessage`, once decoded `Arrival`), and the `AttitudeSample` in it.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from operator import add, sub
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
-from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal, Status
 from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.notices import Notices
 from hilstar.process.closing import Closing
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from hilstar.arrays import FloatArray
 
 MAX_PACKETS_PER_S = 3000  # decoded: some 10 % of one core, and more than any serial line carries
 MAX_BURST = 1000  # as many as may have waited while the receiver was stopped
@@ -45,10 +49,10 @@ class LinkCounts:
         """The counts by name."""
         return asdict(self)
 
-    def __add__(self, other: "LinkCounts") -> "LinkCounts":
+    def __add__(self, other: LinkCounts) -> LinkCounts:
         return LinkCounts(*map(add, astuple(self), astuple(other)))
 
-    def __sub__(self, other: "LinkCounts") -> "LinkCounts":
+    def __sub__(self, other: LinkCounts) -> LinkCounts:
         return LinkCounts(*map(sub, astuple(self), astuple(other)))
 
 
@@ -61,7 +65,7 @@ class FloodGate:
         self._seen_ns = clock.now_ns()
         self._dropped_ns = self._seen_ns - OVER_NS - 1
 
-    def newest(self, waiting: "list[RawMessage]", declares_discontinuity: Callable[[bytes], bool]) -> "list[RawMessage]":
+    def newest(self, waiting: list[RawMessage], declares_discontinuity: Callable[[bytes], bool]) -> list[RawMessage]:
         """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses where others are passed over.
 
         The newest passed-over message whose last part declares a discontinuity is taken too: no attitude is interpolated across

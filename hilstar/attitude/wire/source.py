@@ -1,13 +1,15 @@
 """What a source of attitudes means by its numbers, and how the attitude of a body becomes that of the camera."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.rotation import conjugate, from_radec_roll_deg, multiply, normalise, to_matrix
+
+if TYPE_CHECKING:  # NumPy takes 70 ms, and a process that only stamps packets needs none
+    from hilstar.arrays import FloatArray
 
 Components = tuple[float, float, float, float]
 IDENTITY: Components = (1.0, 0.0, 0.0, 0.0)
@@ -26,6 +28,10 @@ class Mounting:
     """
 
     def __init__(self, q_body_to_cam: Components | None = None) -> None:
+        import numpy as np
+
+        from hilstar.rotation import normalise, to_matrix
+
         self.q_body_to_cam = normalise(np.array(q_body_to_cam or IDENTITY, dtype=np.float64))
         self.told = [] if q_body_to_cam else [("mounting", UNSTATED)]
         self._matrix = to_matrix(self.q_body_to_cam)
@@ -35,6 +41,8 @@ class Mounting:
         """The camera's attitude and motion of a sample that holds the body's: q_icrs_to_body, rate in body components."""
         if self._plain:
             return body
+        from hilstar.rotation import multiply
+
         rate, acceleration = body.rate_cam_rad_s, body.acceleration_cam_rad_s2
         return replace(
             body,
@@ -45,6 +53,8 @@ class Mounting:
 
     def q_icrs_to_body(self, q_icrs_to_cam: FloatArray) -> FloatArray:
         """The body's attitude of the camera's."""
+        from hilstar.rotation import conjugate, multiply
+
         return multiply(conjugate(self.q_body_to_cam), q_icrs_to_cam)
 
 
@@ -67,6 +77,8 @@ class Conventions:
 
     def lines(self, mounting: Mounting) -> list[str]:
         """The conventions, and the self-check, for a person."""
+        from hilstar.rotation import from_radec_roll_deg
+
         q = from_radec_roll_deg(*CHECK_RADEC_DEG, 0.0)
         own = mounting.q_icrs_to_body(q) if self.of_body else q
         ra_deg, dec_deg = CHECK_RADEC_DEG

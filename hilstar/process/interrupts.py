@@ -160,9 +160,10 @@ def held() -> Iterator[None]:
 
 
 def leave(code: int) -> NoReturn:
-    """End the process: after a signal, or where a thread still waits for something, without asking Python's own end.
+    """End the process without asking Python's own end, which takes every module apart (20 ms) and waits for threads.
 
-    That waits for threads, and stumbles over one that is in the middle of writing.
+    After a signal, or where a thread still waits for something, nothing else is asked either: a thread may be in the middle of
+    writing. A profiler, and a stdout that cannot be written, get Python's own end.
     """
     for number in ENDING:
         with contextlib.suppress(ValueError):  # not the main thread
@@ -170,9 +171,15 @@ def leave(code: int) -> NoReturn:
     _let_guard_go()
     own = {"hilstar-signals", "hilstar-stderr"}
     others = [thread for thread in threading.enumerate() if thread.name not in own]
-    if _ending.signal is not None or len(others) > 1:
-        os._exit(code)
-    sys.exit(code)
+    if _ending.signal is None and len(others) == 1:
+        try:
+            sys.stdout.flush()
+        except (OSError, ValueError):
+            sys.exit(code)
+        if sys.getprofile() is not None:
+            sys.exit(code)
+        atexit._run_exitfuncs()
+    os._exit(code)
 
 
 def _let_guard_go() -> None:

@@ -246,10 +246,9 @@ def test_without_opengl_verify_measures_the_same(small_bench_file, no_opengl):
 
 def test_where_numpy_draws_moderngl_is_not_imported(small_bench_file, tmp_path, no_opengl):
     script = (
-        "import sys; from hilstar import cli;"
-        f"sys.argv = ['hilstar', 'frame', {str(small_bench_file)!r}, '--radec', '1,2,3', '-o', {str(tmp_path / 'x.fits')!r}]\n"
-        "try: cli.main()\n"
-        "except SystemExit as end: assert not end.code\n"
+        "import sys; from hilstar.cli import run_command\n"
+        f"words = ['frame', {str(small_bench_file)!r}, '--radec', '1,2,3', '-o', {str(tmp_path / 'x.fits')!r}]\n"
+        "assert not run_command(words)\n"
         "print('moderngl' in sys.modules)"
     )
     done = subprocess.run(

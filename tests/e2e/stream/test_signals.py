@@ -395,8 +395,10 @@ def test_with_stderr_closed_stdout_holds_no_line_of_it(tmp_path):
     assert (result.returncode, result.stdout) == (2, "")
 
 
-def test_a_run_with_all_standard_streams_closed_shows_its_frames(tmp_path, small_bench_file):
-    command = program("serve", small_bench_file, "--headless", "--frames", "2", "--ledger", tmp_path / "run.mcap")
+def test_a_run_with_all_standard_streams_closed_shows_its_frames(tmp_path):
+    command = program(
+        "serve", serve_file(tmp_path, free_port()), "--headless", "--frames", "2", "--ledger", tmp_path / "run.mcap"
+    )
     result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=PATIENCE_S, check=False)
     assert result.returncode == NO_ATTITUDE
     assert (tmp_path / "run.mcap").stat().st_size > 0

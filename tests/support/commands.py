@@ -22,7 +22,13 @@ def run_hilstar(
     *arguments: str | Path, cwd: Path | None = None, timeout: float = PATIENCE_S, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
     """The command as a user runs it, in a process of its own, without the half second of its imports (see `Started`)."""
-    command = [*HILSTAR, *map(str, arguments)]
+    return run_started([*HILSTAR, *map(str, arguments)], cwd, timeout, env)
+
+
+def run_started(
+    command: list[str], cwd: Path | None = None, timeout: float = PATIENCE_S, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Any command of Python's, the same way."""
     env = dict(os.environ) if env is None else env
     # A group of its own: what the command has started (`demo` a sender) ends with it, however it ends.
     with Started(

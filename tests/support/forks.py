@@ -1,8 +1,9 @@
 """hilstar's commands in processes of their own that begin where the imports are over: half of what a start costs.
 
-A fork server has imported hilstar and forks itself for each command. The fork is the caller's child, with its own number,
-streams, session, folder and environment; it runs `hilstar/__main__.py` and ends as any command does. Imports, and what a
-shell limits, are tested by `subprocess.Popen` of `HILSTAR`.
+A fork server has imported hilstar and forks itself for each command, which is `python -m MODULE` or `python -c CODE`. The
+fork is the caller's child, with its own number, streams, session, folder and environment; it ends as any command does. What
+some commands import as they go, the server imports before its first fork of one. Imports, and what a shell limits, are
+tested by `subprocess.Popen` of `HILSTAR`.
 """
 
 from __future__ import annotations
@@ -22,36 +23,52 @@ import socket
 import subprocess
 import sys
 import tempfile
+import types
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest import mock
 
+from hilstar.process.interrupts import leave
 from tests.support.benches import LIVE_BENCH, SCREEN_BENCH, SMALL_BENCH
 
 HILSTAR = [sys.executable, "-m", "hilstar"]
 # What a bench imports before its first frame, and the commands that tests start most; no window, no browser, no thread.
 MODULES = ("bench.build", "console.publisher", "render.renderer", "run.loop", "run.open_link", "run.record.ledger", "run.serve")
 COMMANDS = (["serve", "none.toml"], ["replay", "none.toml", "none.csv"], ["frame", "none.toml"], ["--version"])
+# What these commands import as they go; each takes 0.2 s to a second.
+LATER = {
+    "campaign": ("hilstar.campaign.results", "hilstar.campaign.requirements_page", "hilstar.campaign.bench_run"),
+    "first-light": ("hilstar.calibrate.first_light.session", "scipy.optimize"),
+    "frame": ("astropy.io.fits",),
+    "simulate": ("astropy.io.fits", "astropy.table", "hilstar.twin.batch"),
+}
 LIMITS = (resource.RLIMIT_AS, resource.RLIMIT_CPU, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE)
 MAX_REQUEST_BYTES = 1 << 20
 ROOM = "a" * 2000  # room in the command line for those of its forks
 
 
 class Started(subprocess.Popen):
-    """A command that starts with `HILSTAR`, forked from the fork server; any other command as `subprocess.Popen` starts it."""
+    """A command of Python's, forked from the fork server, that finds the signals `ignored` as a shell or nohup leaves them.
+
+    Any other command is started as `subprocess.Popen` does it.
+    """
+
+    def __init__(self, *arguments: Any, ignored: tuple[int, ...] = (), **more: Any) -> None:
+        self._ignored = ignored
+        super().__init__(*arguments, **more)
 
     def _execute_child(self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, pass_fds: Any, cwd: Any, env: Any,
                        startupinfo: Any, creationflags: Any, shell: Any, *more: Any) -> None:  # fmt: skip
         (p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite), new_session = more[:6], bool(more[11])
         environment = dict(os.environ if env is None else env)
         is_plain = not (preexec_fn or pass_fds or shell) and python_of(environment) == python_of(os.environ)
-        if not is_plain or list(args[: len(HILSTAR)]) != HILSTAR:
+        if not is_plain or args[0] != sys.executable or args[1] not in {"-m", "-c"}:
             super()._execute_child(args, executable, preexec_fn, close_fds, pass_fds, cwd, env, startupinfo, creationflags,
                                    shell, *more)  # fmt: skip
             return
-        request = {"words": list(map(str, args[len(HILSTAR) :])), "folder": str(cwd or Path.cwd()), "new_session": new_session}
-        request |= {"environment": environment, "inherited": inherited_settings()}
+        request = {"words": list(map(str, args)), "folder": str(cwd or Path.cwd()), "new_session": new_session}
+        request |= {"environment": environment, "inherited": inherited_settings(), "ignored": self._ignored}
         streams = [own if own >= 0 else number for number, own in enumerate((p2cread, c2pwrite, errwrite))]
         self.pid = fork_server().fork(request, streams)
         self._child_created = True
@@ -101,8 +118,8 @@ def fork_server() -> ForkServer:
     return ForkServer()
 
 
-def main(made: socket.socket) -> None:
-    """Import, and make copies until nobody asks any more."""
+def prepare() -> None:
+    """Import and compute what every command would."""
     for module in MODULES:
         importlib.import_module(f"hilstar.{module}")
     from hilstar.bench.bench_file import bench_file_of
@@ -118,12 +135,22 @@ def main(made: socket.socket) -> None:
     for driver in Path("/usr/lib").glob("*/dri/swrast_dri.so"):  # and LLVM with it: 20 ms that each fork needs not spend
         with contextlib.suppress(OSError):
             ctypes.CDLL(str(driver))
-    gc.collect()
-    gc.freeze()
+
+
+def main(made: socket.socket) -> None:
+    """Prepare, and make copies until nobody asks any more."""
+    prepare()
+    later = LATER.copy()
+    settle()
     while True:
         data, streams, _, _ = socket.recv_fds(made, MAX_REQUEST_BYTES, 3)
         if not data:
             return
+        request = json.loads(data)
+        if modules := later.pop("".join(request["words"][3:4]), ()):
+            for module in modules:
+                importlib.import_module(module)
+            settle()
         read, write = os.pipe()
         between = os.fork()
         if not between:
@@ -131,7 +158,7 @@ def main(made: socket.socket) -> None:
             if not os.fork():
                 made.close()
                 os.close(read)
-                become_command(json.loads(data), streams, write)
+                become_command(request, streams, write)
             os._exit(0)
         os.close(write)
         number = os.read(read, 100)
@@ -139,6 +166,12 @@ def main(made: socket.socket) -> None:
         for each in (read, *streams):
             os.close(each)
         made.send(number)
+
+
+def settle() -> None:
+    """Keep the collector from what is there: it would write to every page of it, which the forks share."""
+    gc.collect()
+    gc.freeze()
 
 
 def become_command(request: dict[str, Any], streams: list[int], told: int) -> NoReturn:
@@ -159,12 +192,25 @@ def become_command(request: dict[str, Any], streams: list[int], told: int) -> No
     os.environ.clear()
     os.environ.update(request["environment"])
     tempfile.tempdir = None  # which the environment may say
-    sys.argv = ["hilstar", *request["words"]]
-    show_command_line([*HILSTAR, *request["words"]])
+    for number in (signal.SIGINT, signal.SIGHUP):
+        usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        signal.signal(number, signal.SIG_IGN if number in request["ignored"] else usual)
+    _, option, what, *words = request["words"]
+    sys.argv = [what if option == "-m" else "-c", *words]
+    show_command_line(request["words"])
     os.write(told, str(os.getpid()).encode())
     os.close(told)
-    runpy.run_module("hilstar", run_name="__main__", alter_sys=True)
-    sys.exit(0)
+    try:
+        if option == "-m":
+            runpy.run_module(what, run_name="__main__", alter_sys=True)
+        else:
+            sys.modules["__main__"] = main = types.ModuleType("__main__")
+            exec(what, main.__dict__)
+    except SystemExit as end:
+        if isinstance(end.code, int):
+            leave(end.code)
+        raise
+    leave(0)
 
 
 def show_command_line(command: list[str]) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,9 +10,8 @@ import pytest
 
 from hilstar.run.record.ledger_records import EventRecord, run_records
 from tests.support.benches import SMALL_BENCH, still_log
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import run_hilstar_here, run_started
 from tests.support.ledgers import read_run
-from tests.support.waiting import PATIENCE_S
 from tests.support.x11.screens import xvfb
 
 # hilstar's command line in which harm is done, once and for real, when the run first looks how long the machine has slept.
@@ -66,15 +63,7 @@ def planted(folder: Path, harm: str, slept_s: float, table: int = 0, quantisatio
     log = still_log(folder / "still.csv", seconds=LOG_S)
     how = more.get("how", "--headless")
     command = ["replay", str(bench), str(log), how, "--json", "--ledger", str(ledger)]
-    ran = subprocess.run(
-        [sys.executable, "-c", PLANTED, harm, str(table), str(slept_s), *command],
-        capture_output=True,
-        text=True,
-        env=more.get("env", dict(os.environ)),
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    return ran, ledger
+    return run_started([sys.executable, "-c", PLANTED, harm, str(table), str(slept_s), *command], env=more.get("env")), ledger
 
 
 def events_of(ledger: Path) -> list[str]:

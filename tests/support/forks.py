@@ -41,7 +41,9 @@ LATER = {
     "campaign": ("hilstar.campaign.results", "hilstar.campaign.requirements_page", "hilstar.campaign.bench_run"),
     "first-light": ("hilstar.calibrate.first_light.session", "scipy.optimize"),
     "frame": ("astropy.io.fits",),
+    "scheduler": ("distributed.cli.dask_scheduler",),
     "simulate": ("astropy.io.fits", "astropy.table", "hilstar.twin.batch"),
+    "worker": ("distributed.cli.dask_worker", "hilstar.campaign.pool"),
 }
 LIMITS = (resource.RLIMIT_AS, resource.RLIMIT_CPU, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE)
 MAX_REQUEST_BYTES = 1 << 20
@@ -196,6 +198,7 @@ def become_command(request: dict[str, Any], streams: list[int], told: int) -> No
         usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
         signal.signal(number, signal.SIG_IGN if number in request["ignored"] else usual)
     _, option, what, *words = request["words"]
+    sys.path[0] = request["folder"] if option == "-m" else ""
     sys.argv = [what if option == "-m" else "-c", *words]
     show_command_line(request["words"])
     os.write(told, str(os.getpid()).encode())

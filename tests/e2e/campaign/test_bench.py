@@ -48,7 +48,7 @@ def write_bench(folder: Path, *vary: dict[str, Any], **keys: Any) -> Planted:
 def answering(planted: Planted) -> Iterator[subprocess.Popen[str]]:
     """The tracker while this is open; what it prints comes once its input is closed."""
     command = [sys.executable, "-m", "tests.support.campaign_tracker", json.dumps(asdict(planted))]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with Started(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process
         finally:

@@ -19,7 +19,8 @@ import hilstar
 from hilstar.campaign import cluster
 from tests.support.benches import ROOT
 from tests.support.campaigns import read_columns, write_campaign
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here, run_started
+from tests.support.forks import Started
 from tests.support.waiting import PATIENCE_S, wait_for
 
 DASK = [sys.executable, "-m", "dask"]
@@ -52,9 +53,7 @@ OPTIONS = ("--solver", "python:sleepy:solve", "--json")
 def running(folder: Path, log: str, *words: str, **env: str) -> Iterator[subprocess.Popen[bytes]]:
     """A program of Dask's, whose log goes to a file, until the end of this."""
     with (folder / log).open("wb") as out:
-        process = subprocess.Popen(
-            [*DASK, *words], cwd=folder, stdout=out, stderr=out, env=os.environ | env, start_new_session=True
-        )
+        process = Started([*DASK, *words], cwd=folder, stdout=out, stderr=out, env=os.environ | env, start_new_session=True)
     try:
         yield process
     finally:
@@ -116,7 +115,7 @@ def scheduler(folder: Path, port: str = "0", *more: str) -> Iterator[tuple[subpr
 def driver_of(folder: Path, address: str) -> subprocess.Popen[bytes]:
     command = [*HILSTAR, "campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS]
     with (folder / "driver.log").open("wb") as log:
-        return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+        return Started(command, cwd=folder, stdout=log, stderr=log)
 
 
 def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_killed(folder: Path, pool_table: bytes) -> None:
@@ -170,7 +169,7 @@ def test_an_answer_that_died_with_its_worker_is_not_waited_for(folder: Path) -> 
         _, address = stack.enter_context(scheduler(folder))
         worker = stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
         command = [sys.executable, "-c", FETCH, address, str(worker.pid)]
-        fetched = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        fetched = run_started(command)
     assert fetched.stdout == "finished None\n", fetched.stderr
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from tests.support.campaigns import read_columns, write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.forks import Started
 from tests.support.waiting import PATIENCE_S, wait_for
 
 # Slow enough to be killed in its middle; its answer, and the images that it fails over, are those of the pixels alone.
@@ -38,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
 def start(folder: Path, workers: int) -> subprocess.Popen[str]:
     command = [*HILSTAR, "campaign", "plan.toml", "-o", "out", "--workers", str(workers), *OPTIONS]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+    return Started(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
 
 
 def rows_so_far(folder: Path) -> int:

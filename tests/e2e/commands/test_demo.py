@@ -12,6 +12,7 @@ import pytest
 from hilstar.bench.frame import Bench
 from hilstar.run import demo
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.forks import Started
 from tests.support.pages import live, page_of, picture_of
 from tests.support.servers import Served
 
@@ -88,7 +89,7 @@ def test_a_sender_that_ends_before_an_attitude_came_is_named(tmp_path, monkeypat
 
 def test_the_demo_can_be_watched_and_acted_on(tmp_path):
     command = [*HILSTAR, "demo", "-o", str(tmp_path / "demo"), "--duration", "60", "--console", "127.0.0.1:0", "--control"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with Started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             page = page_of(Served(process, 0))
             with live(page) as link:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from tests.support.benches import ROOT, attitude_table
 from tests.support.commands import run_hilstar, run_hilstar_here
+from tests.support.forks import Started
 from tests.support.readme import README, blocks
 from tests.support.senders import free_port
 
@@ -31,7 +32,7 @@ def test_the_sender_is_heard(tmp_path):
     port = free_port()
     sender = blocks("python")[0].replace(":5560", f":{port}")
     (tmp_path / "bench.toml").write_text(blocks("toml")[0] + attitude_table(port))
-    with subprocess.Popen([sys.executable, "-c", sender]) as process:
+    with Started([sys.executable, "-c", sender]) as process:
         try:
             result = run_hilstar("serve", "bench.toml", "--headless", "--duration", "2", cwd=tmp_path)
         finally:

@@ -32,6 +32,8 @@ from hilstar.attitude.wire.vizard import DifferenceRates, Follower, vizard_broad
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_S
+from tests.support.commands import run_started
+from tests.support.forks import Started
 from tests.support.senders import connected, free_port, packet, publisher
 from tests.support.sources.nasa42 import message
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
@@ -199,7 +201,7 @@ link.receive(1)
 print(link._reader._process.pid, flush=True)
 time.sleep(60)
 """
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+    with Started([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         child = int(process.stdout.readline())
         assert "wire.apart_child" in Path(f"/proc/{child}/cmdline").read_text()
@@ -315,7 +317,7 @@ now_s = 0.8
 prompt.tend()
 print(scheduled())
 """
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S)
+    run = run_started([sys.executable, "-c", program])
     first, busy, rested = map(int, run.stdout.split())
     assert busy == os.SCHED_OTHER
     assert rested == first

@@ -7,7 +7,6 @@ import itertools
 import json
 import resource
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -21,7 +20,7 @@ import zmq.auth
 
 from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, run_started
 from tests.support.senders import connected, packet
 from tests.support.servers import Served, bound
 from tests.support.waiting import PATIENCE_S, CoreWaits, missed_in, wait_for
@@ -133,7 +132,7 @@ while time.monotonic() < end:
 """
     ledger = tmp_path / "run.mcap"
     with bound(tmp_path, "--ledger", str(ledger)) as served, CoreWaits(served.process.pid) as waited:
-        subprocess.run([sys.executable, "-c", flood.replace("PORT", str(served.port))], check=True, timeout=PATIENCE_S)
+        assert run_started([sys.executable, "-c", flood.replace("PORT", str(served.port))]).returncode == 0
         summary = served.summary()
     assert summary["link"]["flooded"] > 5_000
     assert 1 <= summary["events"]["flood"] <= 3

@@ -21,7 +21,7 @@ from hilstar.run.record.ledger_records import drawable_frames
 from hilstar.units import NS_PER_S
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
-from tests.support.full_disk import limited_environment
+from tests.support.forks import Started
 from tests.support.pages import page_of
 from tests.support.senders import await_subscriber, connected, packet, publisher, talking
 from tests.support.servers import bound, serving, summary_of
@@ -147,16 +147,11 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
     bench = tmp_path / "bench.toml"
     with publisher() as (sender, port):
         bench.write_text(f'{LIVE_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
-        command = ["serve", str(bench), "--headless", "--json", "--ledger", str(ledger), "--duration", "3"]
+        command = ["serve", str(bench), "--headless", "--json", "--ledger", str(ledger), "--duration", "2"]
         limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES}, {LIMIT_BYTES}))"
         program = f"{limited}; from hilstar.cli import main; main()"
-        with subprocess.Popen(
-            [sys.executable, "-c", program, *command],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=limited_environment(),
-        ) as process:
+        pipe = subprocess.PIPE
+        with Started([sys.executable, "-c", program, *command], stdout=pipe, stderr=pipe, text=True) as process:
             assert process.stderr is not None
             process.stderr.readline()
             await_subscriber(sender)
@@ -167,7 +162,7 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
     assert "the display goes on" in err
     assert summary["ledger"]["failure"]
     assert summary["ledger"]["unrecorded"] > 0
-    assert summary["frames"] + summary["missed_frames"] == 180
+    assert summary["frames"] + summary["missed_frames"] == 120
     assert len(read_log(ledger)) > 20
 
 

@@ -212,7 +212,7 @@ def test_more_packets_than_a_run_looks_at_are_passed_over_and_the_run_ends_in_or
     with listening(bench, "reading serial:", "--ledger", str(ledger)) as process:
         process.shows()
         with repeating(put, FLOOD_EACH_S):
-            process.has_received(4 * MAX_PACKETS_PER_S)
+            process.has_received(2 * MAX_PACKETS_PER_S)
             process.send_signal(signal.SIGTERM)
             summary = summary_of(process)
     os.close(master)

@@ -7,7 +7,6 @@ import pty
 import re
 import select
 import signal
-import subprocess
 import time
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pytest
 from hilstar.console import run_status
 from tests.support.benches import LIVE_BENCH, attitude_table, still_log
 from tests.support.commands import HILSTAR, run_hilstar_here
+from tests.support.forks import Started
 from tests.support.senders import free_port, packet, publisher, talking
 from tests.support.servers import serving
 from tests.support.waiting import PATIENCE_S, repeating
@@ -47,7 +47,7 @@ def test_a_terminal_shows_the_attitude_and_turns_to_stale(tmp_path):
 
     with publisher() as (sender, port):
         command = [*HILSTAR, "serve", str(bench_for(tmp_path, port)), "--headless", "--ledger", str(tmp_path / "run.mcap")]
-        with subprocess.Popen(command, stdout=theirs, stderr=theirs, env={**os.environ, "COLUMNS": "120"}) as process:
+        with Started(command, stdout=theirs, stderr=theirs, env={**os.environ, "COLUMNS": "120"}) as process:
             os.close(theirs)
             try:
                 read_until("none yet: the frames are blank")

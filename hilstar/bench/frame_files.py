@@ -9,8 +9,6 @@ import csv
 import gzip
 import io
 import math
-import struct
-import zlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -35,6 +33,7 @@ MAX_DEGREE = 9  # the convention's
 FITTED, HELD_OUT = 28, 25  # places along each side of the image; the latter have its edges among them
 
 Keywords = dict[str, str | float]
+AFTER_HEADER = 33  # bytes of a PNG up to the end of its first chunk
 PREVIEW_RADIUS_PX = 9  # the brightest star's
 PREVIEW_BLUR_PX = 0.7
 PREVIEW_POWER = 0.35
@@ -240,20 +239,18 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
 def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
     """A PNG of values (height, width) or (height, width, 3), uint8 or uint16, of which `meant_bits` mean something (sBIT).
 
-    Its rows are not filtered: a tracker's frame, which is noise, takes half the time of Pillow's, and 12 % fewer bytes.
+    Its rows are not filtered: a tracker's frame, which is noise, takes half the time of Pillow's PNG, and 12 % fewer bytes.
     """
+    import png
+
     height, width = image.shape[:2]
-    colour, bits = 2 * (image.ndim == 3), 8 * image.itemsize
-    rows = np.zeros((height, 1 + image[0].nbytes), dtype=np.uint8)  # the 0 ahead of each row: no filter
-    rows[:, 1:] = np.ascontiguousarray(image, f">u{image.itemsize}").reshape(height, -1).view(np.uint8)
-    chunks = {b"IHDR": struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)}
+    rows = np.ascontiguousarray(image, f">u{image.itemsize}").view(np.uint8).reshape(height, -1)
+    data, about = io.BytesIO(), io.BytesIO()
+    png.Writer(width, height, bitdepth=8 * image.itemsize, greyscale=image.ndim == 2, compression=1).write_packed(data, rows)
     if meant_bits is not None:
-        chunks[b"sBIT"] = bytes([meant_bits])
-    chunks |= {b"IDAT": zlib.compress(rows.data, 1), b"IEND": b""}
-    parts = (
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks.items()
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+        png.write_chunk(about, b"sBIT", bytes([meant_bits]))
+    whole = data.getvalue()
+    return whole[:AFTER_HEADER] + about.getvalue() + whole[AFTER_HEADER:]
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:

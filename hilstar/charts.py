@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.text import Annotation
 
-Record = TypeVar("Record")
 SideNames = Sequence[tuple[str, tuple[float, float], str]]  # name, place in the data, colour
 Share = Literal["row", "col"]
 
@@ -99,13 +98,6 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
     write_csv(path, columns, [[getattr(record, name) for name in columns] for record in records])
 
 
-def read_records(path: Path, record: type[Record]) -> list[Record]:
-    """The rows of a table that `write_records` wrote, as dataclasses of texts, numbers and flags."""
-    convert = {name: "True".__eq__ if kind is bool else kind for name, kind in get_type_hints(record).items()}
-    with path.open(encoding="utf-8", newline="") as file:
-        return [record(**{name: convert[name](text) for name, text in row.items()}) for row in csv.DictReader(file)]
-
-
 @contextmanager
 def chart(path: Path, finding: str, panels: int = 1, columns: int = 1, **layout: Any) -> "Iterator[list[Axes]]":
     """Panels titled by their finding, laid out as `panels_of` says, and written when they are drawn.
@@ -148,29 +140,22 @@ def panels_of(
 
 
 def finish(figure: "Figure") -> None:
-    """Make labels, ticks and names at the side uniform, and lay the figure out.
-
-    Names and logarithmic ticks depend on their panel's size, which a layout tells; it is the last where they then take the room
-    that they took at the size before it.
-    """
+    """Make labels, ticks and side names uniform, and lay the figure out until they want no other room beside their panels."""
     from matplotlib.ticker import LogLocator
 
     panels, side_names = figure.axes, _SIDE_NAMES.pop(figure, [])
     for axes in panels:
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_label_text(capital(axis.get_label_text()))
         axes.set_title(capital(axes.get_title(loc="left")))
-    log_axes = [
-        axis for axes in panels for axis in (axes.xaxis, axes.yaxis) if isinstance(axis.get_major_locator(), LogLocator)
-    ]
-    engine = figure.get_layout_engine()
-    texts: list[Annotation] = []
+    every: list[Any] = [axis for axes in panels for axis in (axes.xaxis, axes.yaxis)]
+    for axis in every:
+        axis.set_label_text(capital(axis.get_label_text()))
+    log_axes = [axis for axis in every if isinstance(axis.get_major_locator(), LogLocator)]
+    engine, texts = figure.get_layout_engine(), list["Annotation"]()
 
     def place() -> tuple[list[object], ...]:
         """Ticks and names at the panels' present size: what of them takes room beside the panels."""
         for axis in log_axes:
-            box = axis.axes.bbox
-            log_ticks(axis, box.width / 45 if axis.axis_name == "x" else box.height / 25)
+            log_ticks(axis, axis.axes.bbox.width / 45 if axis.axis_name == "x" else axis.axes.bbox.height / 25)
         for text in texts:
             text.remove()
         texts[:] = [text for axes, named in side_names for text in _name_at_side(axes, named)]

@@ -82,8 +82,8 @@ class Calibration:
         light = rows @ self.uniformity @ columns.T
         smallest = float(self.uniformity.min()) / 2  # an extrapolated slope must not go below zero
         np.maximum(light, smallest, out=light)
-        shares: Float32Array = np.divide(light, light.max(), out=np.empty(light.shape, np.float32), casting="same_kind")
-        return shares
+        light /= light.max()
+        return light.astype(np.float32)
 
 
 def weights_of_grid(pixels: int, fields: int) -> FloatArray:

@@ -134,19 +134,16 @@ def utc_ns_of(text: str, option: str) -> int:
 
 @lru_cache(maxsize=1)
 def _table() -> _EarthTable:
-    """The IERS table of Astropy's package (finals2000A), with its predictions of a year.
+    """The IERS table of Astropy's package (finals2000A), with its predictions of a year; Bulletin B where it is given, else A.
 
-    Its columns as its `readme.finals2000A` numbers them: Bulletin B where it is given, otherwise Bulletin A. Astropy's own
-    reader takes 20 times as long.
+    Columns as its `readme.finals2000A` numbers them: Astropy's own reader takes 20 times as long.
     """
     from astropy_iers_data import IERS_A_FILE
 
+    a_columns, b_columns = ((58, 68), (18, 27), (37, 46)), ((154, 165), (134, 144), (144, 154))  # UT1-UTC and the pole
     with Path(IERS_A_FILE).open(encoding="ascii") as file:
-        every = ((line, line[154:165], line[134:144], line[144:154]) for line in file if line[58:68].strip())
-        rows = [
-            (line[7:15], *((ut1_b, x_b, y_b) if ut1_b.strip() else (line[58:68], line[18:27], line[37:46])))
-            for line, ut1_b, x_b, y_b in every
-        ]
+        lines = [(line, b_columns if line[154:165].strip() else a_columns) for line in file if line[58:68].strip()]
+    rows = [(line[7:15], *(line[begin:end] for begin, end in columns)) for line, columns in lines]
     mjd, ut1_utc_s, x_arcsec, y_arcsec = np.array(rows, dtype=np.float64).T
     ut1_tai_s = ut1_utc_s - _tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
     return _EarthTable(mjd, ut1_tai_s, np.radians(x_arcsec / 3600), np.radians(y_arcsec / 3600))

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -24,9 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
-    from matplotlib.text import Text
+    from matplotlib.text import Annotation
 
-Record = TypeVar("Record")
 SideNames = Sequence[tuple[str, tuple[float, float], str]]  # name, place in the data, colour
 Share = Literal["row", "col"]
 
@@ -99,13 +98,6 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
     write_csv(path, columns, [[getattr(record, name) for name in columns] for record in records])
 
 
-def read_records(path: Path, record: type[Record]) -> list[Record]:
-    """The rows of a table that `write_records` wrote, as dataclasses of texts, numbers and flags."""
-    convert = {name: "True".__eq__ if kind is bool else kind for name, kind in get_type_hints(record).items()}
-    with path.open(encoding="utf-8", newline="") as file:
-        return [record(**{name: convert[name](text) for name, text in row.items()}) for row in csv.DictReader(file)]
-
-
 @contextmanager
 def chart(path: Path, finding: str, panels: int = 1, columns: int = 1, **layout: Any) -> "Iterator[list[Axes]]":
     """Panels titled by their finding, laid out as `panels_of` says, and written when they are drawn.
@@ -148,32 +140,33 @@ def panels_of(
 
 
 def finish(figure: "Figure") -> None:
-    """Make labels, ticks and names at the side uniform, and lay the figure out: to know its panels' sizes, then for good."""
+    """Make labels, ticks and side names uniform, and lay the figure out until they want no other room beside their panels."""
     from matplotlib.ticker import LogLocator
 
     panels, side_names = figure.axes, _SIDE_NAMES.pop(figure, [])
     for axes in panels:
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_label_text(capital(axis.get_label_text()))
         axes.set_title(capital(axes.get_title(loc="left")))
-    log_axes = [
-        axis for axes in panels for axis in (axes.xaxis, axes.yaxis) if isinstance(axis.get_major_locator(), LogLocator)
-    ]
-    drafts = [text for axes, named in side_names for text in _name_at_side(axes, named, arrows=False)]
-    for axis in log_axes:
-        axis.set_ticks([], minor=True)
-    engine = figure.get_layout_engine()
-    if (side_names or log_axes) and engine is not None:
-        engine.execute(figure)
-    for text in drafts:
-        text.remove()
-    for axes, named in side_names:
-        _name_at_side(axes, named)
-    for axis in log_axes:
-        box = axis.axes.bbox
-        log_ticks(axis, box.width / 45 if axis.axis_name == "x" else box.height / 25)
-    if engine is not None:
-        engine.execute(figure)
+    every: list[Any] = [axis for axes in panels for axis in (axes.xaxis, axes.yaxis)]
+    for axis in every:
+        axis.set_label_text(capital(axis.get_label_text()))
+    log_axes = [axis for axis in every if isinstance(axis.get_major_locator(), LogLocator)]
+    engine, texts = figure.get_layout_engine(), list["Annotation"]()
+
+    def place() -> tuple[list[object], ...]:
+        """Ticks and names at the panels' present size: what of them takes room beside the panels."""
+        for axis in log_axes:
+            log_ticks(axis, axis.axes.bbox.width / 45 if axis.axis_name == "x" else axis.axes.bbox.height / 25)
+        for text in texts:
+            text.remove()
+        texts[:] = [text for axes, named in side_names for text in _name_at_side(axes, named)]
+        return [tuple(axis.get_ticklocs()) for axis in log_axes], [text.xyann[0] for text in texts]
+
+    room = place()
+    for _ in range(3):
+        if engine is not None:
+            engine.execute(figure)
+        if room == (room := place()):
+            break
     figure.set_layout_engine(None)  # each file that is written would repeat it, and draw twice
 
 
@@ -256,10 +249,10 @@ def _line_ends(axes: "Axes") -> Iterator[tuple[str, tuple[float, float], str]]:
             yield str(line.get_label()), place, str(line.get_color())
 
 
-def _name_at_side(axes: "Axes", named: SideNames, arrows: bool = True) -> "list[Text]":
+def _name_at_side(axes: "Axes", named: SideNames) -> "list[Annotation]":
     """The names of a panel, kept apart at its present height, with arrows to far points."""
     gap = 1.3 * SMALL_PT / 72 * axes.figure.dpi / axes.bbox.height
-    texts: list[Text] = []
+    texts: list[Annotation] = []
     at = {each: axes.transAxes.inverted().transform(axes.transData.transform(each[1])) for each in named or _line_ends(axes)}
     falling = sorted(at, key=lambda each: -at[each][1])
     for each, height in zip(falling, spread([float(at[one][1]) for one in falling], gap), strict=True):
@@ -275,7 +268,7 @@ def _name_at_side(axes: "Axes", named: SideNames, arrows: bool = True) -> "list[
                 va="center",
                 fontsize=SMALL_PT,
                 color=colour,
-                arrowprops=arrow if far and arrows else None,
+                arrowprops=arrow if far else None,
                 annotation_clip=False,
             )
         )

@@ -81,8 +81,9 @@ class Calibration:
         columns = weights_of_grid(width, self.uniformity.shape[1])
         light = rows @ self.uniformity @ columns.T
         smallest = float(self.uniformity.min()) / 2  # an extrapolated slope must not go below zero
-        light = np.maximum(light, smallest)
-        return np.asarray(light / light.max(), dtype=np.float32)
+        np.maximum(light, smallest, out=light)
+        light /= light.max()
+        return light.astype(np.float32)
 
 
 def weights_of_grid(pixels: int, fields: int) -> FloatArray:

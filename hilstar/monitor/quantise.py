@@ -349,7 +349,7 @@ class CodeTable:
         place, lower = (bits >> np.uint32(self.bin_shift)).astype(np.intp) - self.first_bin, bits & (none - 1)
         asked = (lower > 0) | (place == 0)  # the first code of a later bin counts a threshold at its very edge
         place, lower = place[asked], lower[asked]
-        if len(np.unique(place)) < len(place):
+        if (place[1:] == place[:-1]).any():
             return None
         words = np.full(len(self.first_code), none)
         words[place] = lower
@@ -370,10 +370,10 @@ def code_table(thresholds: Float32Array) -> CodeTable:
 
 
 def _table(thresholds: Float32Array, shift: int) -> CodeTable:
-    first_bin = int(thresholds[0].view(np.int32)) >> shift
-    last_bin = int(thresholds[-1].view(np.int32)) >> shift
-    edges = (np.arange(first_bin, last_bin + 1, dtype=np.int64) << shift).astype(np.int32).view(np.float32)
-    first_code = np.searchsorted(thresholds, edges, side="right").astype(np.uint32)
+    bits = thresholds.view(np.int32)
+    first_bin, last_bin = (int(end) >> shift for end in (bits[0], bits[-1]))
+    first_edge = ((bits + ((1 << shift) - 1)) >> shift) - first_bin  # the first bin that begins at or above each threshold
+    first_code = np.cumsum(np.bincount(first_edge)[: last_bin - first_bin + 1]).astype(np.uint32)
     first_code[0] = 0
     return CodeTable(thresholds, first_code, shift, first_bin)
 

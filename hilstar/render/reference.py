@@ -9,6 +9,7 @@ from hilstar.scene.sprites import Sprites
 
 RAYS_ACROSS = 5  # a pixel, along either axis: a limb is then within 0.02 px
 MAX_AT_ONCE_PX = 2**20  # pixels of sprites that are computed at once, which bounds memory
+RAYS_AT_ONCE = 2**14  # of a disc that are computed at once: few enough for a cache
 REACH_SIGMAS = 5  # reach of a disc's light beyond its rectangle
 
 
@@ -83,7 +84,8 @@ def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
         (np.arange((size + 2 * margin) * RAYS_ACROSS) + 0.5) / RAYS_ACROSS - 0.5 - margin + first
         for size, first in ((width, left), (height, top))
     )
-    sharp = np.stack([_rays(light, columns, y) for y in rows], axis=1)
+    at_once = max(1, RAYS_AT_ONCE // len(columns))
+    sharp = np.concatenate([_rays(light, columns, rows[k : k + at_once]) for k in range(0, len(rows), at_once)], axis=1)
     sigma = [RAYS_ACROSS * width_px for width_px in reversed(light.psf.width_px)]
     found = []
     for part in sharp:
@@ -93,15 +95,16 @@ def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
     return light.times * found[0], light.covers * found[1]
 
 
-def _rays(light: DiscLight, x_px: FloatArray, y_px: float) -> FloatArray:
-    """Light to a pixel, and cover (2, n), along the rays of a row of places (n,)."""
+def _rays(light: DiscLight, columns_px: FloatArray, rows_px: FloatArray) -> FloatArray:
+    """Light to a pixel, and cover (2, rows, columns), along the rays of places (columns,) in rows (rows,)."""
     camera = light.camera
-    u, v = camera.tangents(x_px, np.full_like(x_px, y_px))
+    x_px, y_px = (part.ravel() for part in np.meshgrid(columns_px, rows_px))
+    u, v = camera.tangents(x_px, y_px)
     seen = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
     if light.shear is not None:
-        late_s = light.shear.late_s(x_px, np.full_like(x_px, y_px))
+        late_s = light.shear.late_s(x_px, y_px)
         seen = seen + late_s[:, None] * np.cross(light.shear.rate_image_rad_s, seen)
     a, b, c, d = camera.slopes(seen[:, 0], seen[:, 1])
     sr = np.nan_to_num(1 / (a * d - b * c)) / np.linalg.norm(seen, axis=1) ** 3
     radiance, cover = light.disc.with_air(seen @ light.icrs_to_image)
-    return np.stack([radiance * sr, cover])
+    return np.stack([radiance * sr, cover]).reshape(2, len(rows_px), len(columns_px))

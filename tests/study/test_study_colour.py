@@ -6,6 +6,7 @@ import csv
 
 import pytest
 
+from hilstar.study import colour
 from hilstar.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS, run
 
 AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
@@ -14,7 +15,9 @@ AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("colour")
-    run(folder, quick=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(colour, "QUICK_ROUNDS", 1)  # no claim here is of a time
+        run(folder, quick=True)
 
     def rows(name):
         with (folder / f"{name}.csv").open() as file:

@@ -6,6 +6,7 @@ import csv
 
 import pytest
 
+from hilstar.study import economy
 from hilstar.study.economy import SCENES, run
 from hilstar.tracker.centroiders import FAMILY
 
@@ -13,7 +14,9 @@ from hilstar.tracker.centroiders import FAMILY
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("economy")
-    lines = run(folder, quick=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(economy, "QUICK_ROUNDS", 1)  # no claim here is of a time
+        lines = run(folder, quick=True)
     with (folder / "economy.csv").open() as file:
         return folder, lines, list(csv.DictReader(file))
 

@@ -304,7 +304,7 @@ def test_every_figure_is_drawn_and_found(study):
     for stem in STEMS:
         with Image.open(folder / f"{stem}.png") as image:
             pixels = np.asarray(image.convert("RGB"), dtype=int)
-        assert pixels.shape[1] > 800
+        assert pixels.shape[1] > 700
         coloured = pixels.max(axis=2) - pixels.min(axis=2) > 60
         assert coloured[pixels.shape[0] // 8 :].mean() > 0.002
         # A title cut off would touch the sides; the margins are white.

@@ -22,9 +22,13 @@ TOUCH_PX = 1.5  # boxes are whole pixels of a hinted font: this much is no overl
 PLAIN = {charts.INK, charts.MUTED, charts.GRID, charts.PAPER}  # of axes and of what a text beside it names
 
 
-def assert_legible(figure: Figure) -> None:
-    """No text overlaps another, leaves the canvas or is small; no curve leaves its axes or lies under a legend."""
-    figure.draw_without_rendering()
+def assert_legible(figure: Figure, *, drawn: bool = False) -> None:
+    """No text overlaps another, leaves the canvas or is small; no curve leaves its axes or lies under a legend.
+
+    `drawn`: at the figure's own resolution, so that its texts are where they belong.
+    """
+    if not drawn:
+        figure.draw_without_rendering()
     assert figure.get_suptitle(), "a chart has no finding"
     assert len(figure.get_suptitle().splitlines()) <= MAX_TITLE_LINES, figure.get_suptitle()
     texts = [(text, box(text)) for text in seen(figure)]

@@ -119,8 +119,8 @@ class Renderer(Backend):
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
         self._exact: dict[int, ExactQuantiser] = {}
         self._floor_encoder: Encoder | None = None
+        self._floor_levels: LevelTexture | None = None
         self._floor_key: tuple[object, float] = ((), 0.0)
-        self._floor_levels: Levels | None = None
         if not planes.panels:
             return
         panel, gain = planes.lit, planes.panels[0].gain()
@@ -184,20 +184,26 @@ class Renderer(Backend):
             if frame <= self._last_frame:
                 self.begin_anew()
             self._last_frame = frame
-            extended = sprites is not None and bool(sprites.extended)
-            self._by_numpy = self._by_star is not None and (not self._exact_passes or extended)
-            if not self._by_numpy:
+            passes, by_star = self._passes, self._by_star
+            if by_star is None or self._exact_passes:
                 sprites = as_maps(sprites, self.target)
-                extended = sprites is not None and bool(sprites.extended)
-                sprites = None if sprites is None else self._planes.packed(sprites)
-            units = None if self._by_numpy or extended else self._units
+            extended = sprites is not None and bool(sprites.extended)
+            # Stars are added to levels of extended light, by passes or by NumPy.
+            on_floor = extended and by_star is not None
+            units = None if extended and (not on_floor or passes is None or self._planes.apart) else self._units
             unit_e_per_s = None if units is None else units.unit_for(sprites)
-            passes = self._passes
+            self._by_numpy = by_star is not None and (not self._exact_passes or (on_floor and unit_e_per_s is None))
+            if sprites is not None and not self._by_numpy:
+                sprites = self._planes.packed(sprites)
             if passes is not None and unit_e_per_s is not None:
+                floor = None
+                if sprites is not None and on_floor and by_star is not None:
+                    with self._stage("extended"):
+                        floor = self._floor(sprites, by_star.floor_turn(frame))
                 # Levels star by star; the linear image is drawn only when it is read.
                 self._undrawn, self._levels_black = (sprites, True), False
                 with self._stage("erase"):
-                    passes.erase()
+                    passes.lay(floor)
                 if sprites is not None and len(sprites):
                     with self._stage("upload"):
                         passes.upload(sprites)
@@ -289,26 +295,27 @@ class Renderer(Backend):
         for one in self._exact_passes:
             if (left := one.left) is not None:
                 self._exact[one.plane].left, one.left = left, None
-        floor = None if sprites is None or not sprites.extended else self._floor(sprites, by_star.floor_turn(frame), levels)
+        floor = None
+        if sprites is not None and sprites.extended:
+            floor = self._floor(sprites, by_star.floor_turn(frame)).read()
         on = [None] * len(self._exact) if floor is None else np.atleast_3d(floor).transpose(2, 0, 1)
         self._exact_levels = target.by_plane(sprites, lambda k, light: self._exact[k].levels(light, on[k]))
         levels.write(self._exact_levels)
 
-    def _floor(self, sprites: Sprites, turn: float, levels: LevelTexture) -> Levels:
+    def _floor(self, sprites: Sprites, turn: float) -> LevelTexture:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
 
         The same lights and turn again give the same levels, which are kept.
         """
         key = sprites.lights or sprites.extended, turn
-        if key == self._floor_key and self._floor_levels is not None:
-            return self._floor_levels
-        if self._floor_encoder is None:
-            self._floor_encoder = Encoder(self._ctx, self._linear, levels, self._planes, DitherQuantiser)
-        self._erase()
-        self._draw_extended(sprites, self._sure(DitherQuantiser, None))
-        levels.fbo.clear()
-        self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions, self._tiles)
-        self._floor_key, self._floor_levels = key, Levels(levels.read().copy())
+        if self._floor_encoder is None or self._floor_levels is None:
+            self._floor_key, self._floor_levels = ((), 0.0), LevelTexture(self._ctx, self.target.resolution_px, self._planes)
+            self._floor_encoder = Encoder(self._ctx, self._linear, self._floor_levels, self._planes, DitherQuantiser)
+        if key != self._floor_key:
+            self._erase(levels=False)
+            self._draw_extended(sprites, self._sure(DitherQuantiser, None))
+            self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions, self._tiles, is_black=False)
+            self._floor_key = key
         return self._floor_levels
 
     def _sure(self, quantiser: type[PixelQuantiser], sprites: Sprites | None) -> Sure | None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import moderngl
 import numpy as np
@@ -20,11 +20,13 @@ from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, Target
 from hilstar.render.context import is_software
-from hilstar.render.disc_tiles import Tiles
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
+
+if TYPE_CHECKING:
+    from hilstar.render.disc_tiles import Tiles
 
 TABLE_WIDTH = 1024  # that of encode.frag
 _shader = cache(lambda name: resource_path("shaders", name).read_text())
@@ -473,7 +475,7 @@ class Encoder:
         covered_px: int,
         uniforms: Mapping[str, float],
         regions: Sequence[Rectangle] = (),
-        tiles: Tiles | None = None,
+        tiles: "Tiles | None" = None,
         *,
         is_black: bool = True,
     ) -> None:
@@ -513,7 +515,7 @@ class Encoder:
         for place, block in self._blocks.items():
             block.bind_to_uniform_block(place)
 
-    def _draw_tiles(self, tiles: Tiles, uniforms: Mapping[str, float]) -> None:
+    def _draw_tiles(self, tiles: "Tiles", uniforms: Mapping[str, float]) -> None:
         self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
         of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
         given = ((of_image, ()), (tiles.face_levels, ("TILE",)), (tiles.air_levels, ("TILE", "AIR")))

@@ -6,7 +6,7 @@ This room is the only user of moderngl.
 import zlib
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, partial
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import moderngl
 import numpy as np
@@ -18,7 +18,6 @@ from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
 from hilstar.render.context import Context, check_limits, computes_in_software, create_context
-from hilstar.render.disc_tiles import Sure, Tiles
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
     CUT_WINGS,
@@ -35,12 +34,14 @@ from hilstar.render.encoder import (
     sprites_array,
 )
 from hilstar.render.exact_pass import ExactPass
-from hilstar.render.extended import ExtendedLayer
 from hilstar.render.host_image import HostImage
-from hilstar.render.presenter import Presenter, changed_codes
 from hilstar.render.star_passes import LightUnits, StarPasses
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.sprites import Sprites
+
+if TYPE_CHECKING:
+    from hilstar.render.disc_tiles import Sure, Tiles
+    from hilstar.render.extended import ExtendedLayer
 
 FIRST_CAPACITY = 4096
 UNTIMED = nullcontext()
@@ -85,7 +86,6 @@ class Renderer(Backend):
         self._splat = splat_program(ctx, target.resolution_px, self._shares, planes)
         self._eraser = Eraser(ctx, target.resolution_px, planes, of_levels=False)
         self._level_eraser = Eraser(ctx, target.resolution_px, planes, of_levels=True)
-        self._extended = ExtendedLayer(ctx, target.resolution_px)
         self._regions: tuple[Rectangle, ...] = ()  # where extended light is on the images
         self._tiles: Tiles | None = None  # a disc whose levels need no linear image everywhere
         self._cut_sides = self._wider(target.sides)
@@ -235,6 +235,12 @@ class Renderer(Backend):
         """What draws linear images beside those of primaries."""
         return Renderer(Target(self.target.resolution_px, self.target.psf), self._ctx)
 
+    @cached_property
+    def _extended(self) -> "ExtendedLayer":
+        from hilstar.render.extended import ExtendedLayer  # no frame of stars alone needs it
+
+        return ExtendedLayer(self._ctx, self.target.resolution_px)
+
     def begin_anew(self) -> None:
         """See `Backend.begin_anew`."""
         self._last_frame = NO_FRAME
@@ -318,10 +324,12 @@ class Renderer(Backend):
             self._floor_key = key
         return self._floor_levels
 
-    def _sure(self, quantiser: type[PixelQuantiser], sprites: Sprites | None) -> Sure | None:
+    def _sure(self, quantiser: type[PixelQuantiser], sprites: Sprites | None) -> "Sure | None":
         """What a quantiser's levels need not know of a disc's light, where there is one plane."""
         if self._planes.apart or not self._planes.panels:
             return None
+        from hilstar.render.disc_tiles import Sure
+
         panel, (least, most) = self._planes.panels[0], self._gains
         white_e_per_s = panel.flux_at_white_e_per_s
         # The first step by the smallest threshold of a mask, at all of its turns
@@ -329,7 +337,7 @@ class Renderer(Backend):
         places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]
         return Sure(dark_e_per_s / most, white_e_per_s / least, places_px, self.footprint_px)
 
-    def _draw_extended(self, sprites: Sprites, sure: Sure | None = None) -> None:
+    def _draw_extended(self, sprites: Sprites, sure: "Sure | None" = None) -> None:
         """Add extended light to the linear image, that of each primary to its plane alone."""
         fbo, self._regions = self._linear_fbo, ()
         for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
@@ -339,7 +347,7 @@ class Renderer(Backend):
         fbo.color_mask = True, True, True, True
 
     def _draw_linear(
-        self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False, sure: Sure | None = None
+        self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False, sure: "Sure | None" = None
     ) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn, sprites = None, as_maps(sprites, self.target)
@@ -421,6 +429,8 @@ class Renderer(Backend):
 
     def show_on(self, view: ScreenView) -> None:
         """See `Backend.show_on`."""
+        from hilstar.render.presenter import Presenter
+
         self._screen, self._presenter = view, Presenter(self.codes_texture, view, apart=self._planes.apart)
         self.tables.append(self._presenter.table)
 
@@ -434,6 +444,8 @@ class Renderer(Backend):
 
     def changed_codes(self) -> str:
         """See `Backend.changed_codes`."""
+        from hilstar.render.presenter import changed_codes
+
         return changed_codes(self._ctx, self._screen.screen_px, self._screen.bits)
 
     def fault(self) -> str:

@@ -118,7 +118,8 @@ class StarPasses:
         self._footprint_px = planes.footprint_px
         gain = planes.panels[0].gain()
         self._gain = None if gain is None else ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
-        self._sums = ctx.buffer(np.zeros(math.prod(self._size_px) * len(planes.panels), dtype=np.int32))
+        self._sums = ctx.buffer(reserve=4 * math.prod(self._size_px) * len(planes.panels))
+        self._sums.clear()
         self._unit_e_per_s: list[float] = []  # units of the sums
         self.sprites = ctx.buffer(reserve=planes.dtype.itemsize, dynamic=True)
         self._drawn: int | None = None  # sprites that are in the buffer and on the images; None: it is not known

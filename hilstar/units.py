@@ -14,6 +14,7 @@ MAD_TO_SIGMA = 1.482602218505602  # from the median absolute deviation of a norm
 ERROR_OF_MEDIAN = math.sqrt(math.pi / 2)  # in those of the mean, for normal errors
 LIGHT_M_S = 299_792_458.0  # SI, exact
 LIGHT_KM_S = LIGHT_M_S / 1000.0
+MAX_SPEED_KM_S = 10_000.0  # of an observer: a thirtieth of that of light
 MAG_PER_RELATIVE = 2.5 / math.log(10)  # a small relative error of a flux, in magnitudes
 
 

@@ -2,7 +2,8 @@
 // Light to level, in each plane: the number of thresholds at or under the pixel's light. It comes after planes.glsl.
 // With STEPS no bin of the table holds more than one threshold, so the bin's own is the only one to ask, in a block of STEPS rows,
 // or for 0 in a texture (levels.glsl, which then comes last). Else the bin starts the count, which takes twice as long.
-// With RISES the thresholds are the edges of another quantiser, whose shader says whether a pixel gets the next level instead.
+// With RISES the thresholds are the edges of another quantiser, whose shader says by those about the light whether a pixel gets the
+// next level instead. They are in a block of EDGES rows where there is room.
 // With UNIFORMITY each pixel's light is first multiplied by its gain.
 // With IMAGES light is loaded from an image (OpenGL 4.2): on llvmpipe in two thirds of the time of a texture's texel.
 // With TILE light is that of tile.glsl, and no image's.
@@ -26,11 +27,17 @@ uniform usampler2D steps;             // in rows of TABLE_WIDTH
 #endif
 uint level_of(float light, int k);
 #else
-uniform sampler2D threshold_e_per_s;  // in rows of TABLE_WIDTH
 uniform usampler2D first_code;        // level of the smallest light of each bin, in rows of TABLE_WIDTH
 uniform ivec4 bins[PLANES];           // a plane's first bin, how many follow, bits of one, and its place
-uniform ivec2 thresholds[PLANES];     // a plane's first, and how many
 #endif
+#ifdef EDGES
+layout(std140) uniform Edges { vec4 edges[EDGES]; };
+#define THRESHOLD(k) edges[(k) >> 2][(k) & 3]
+#else
+uniform sampler2D threshold_e_per_s;  // in rows of TABLE_WIDTH
+#define THRESHOLD(k) texelFetch(threshold_e_per_s, place(k), 0).r
+#endif
+uniform ivec2 thresholds[PLANES];     // a plane's first, and how many
 #ifdef UNIFORMITY
 uniform sampler2D gain;
 #endif
@@ -54,19 +61,11 @@ ivec2 place(int index) {
 }
 
 #ifndef STEPS
-float threshold(int k) {
-    return texelFetch(threshold_e_per_s, place(k), 0).r;
-}
-
 uint level_of(float light, int plane) {
     ivec4 of = bins[plane];
     int first = thresholds[plane].x, white = thresholds[plane].y;
     int k = int(texelFetch(first_code, place(of.w + clamp((floatBitsToInt(light) >> of.z) - of.x, 0, of.y)), 0).r);
-    while (k < white && light >= threshold(first + k)) k++;
-#ifdef RISES
-    ivec2 pixel = ivec2(gl_FragCoord.xy);
-    if (k < white && rises(pixel, light, k == 0 ? 0.0 : threshold(first + k - 1), threshold(first + k))) k++;
-#endif
+    while (k < white && light >= THRESHOLD(first + k)) k++;
     return uint(k);
 }
 #endif
@@ -77,5 +76,13 @@ void main() {
 #ifdef UNIFORMITY
     light *= texelFetch(gain, pixel, 0).r;
 #endif
-    for (int k = 0; k < PLANES; k++) CODE(k) = level_of(light[k], k);
+    for (int k = 0; k < PLANES; k++) {
+        uint level = level_of(light[k], k);
+#ifdef RISES
+        int above = thresholds[k].x + int(level);
+        float low = level == 0u ? 0.0 : THRESHOLD(above - 1);
+        level += uint(int(level) < thresholds[k].y && rises(pixel, light[k], low, THRESHOLD(above)));
+#endif
+        CODE(k) = level;
+    }
 }

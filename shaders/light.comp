@@ -7,7 +7,8 @@
 // Defined before this text: LEVELS_FORMAT, FOOTPRINT. With KEEP the sums stay until the levels become black, for exact.comp and where
 // two stars may not share out the planes of a pixel; else they are set to 0 when they become levels. With ORDER stars are taken in an
 // order, first those whose pixels no other star lights: their light becomes levels without sums.
-// It comes after planes.glsl, shares.glsl and sums.glsl, and before levels.glsl.
+// With FLOOR levels are those of a pixel's stars and its floor's light together.
+// It comes after planes.glsl, shares.glsl, sums.glsl and with FLOOR floor.glsl, and before levels.glsl.
 
 layout(local_size_x = 32) in;
 
@@ -97,6 +98,9 @@ void main() {
                 float light = float(sum[k]) * unit_e_per_s[k];
 #ifdef UNIFORMITY
                 light *= texelFetch(gain, at, 0).r;
+#endif
+#ifdef FLOOR
+                light += FLOOR_LIGHT(at);
 #endif
                 shown[k] = level_of(light, k);
             }

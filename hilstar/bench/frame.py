@@ -21,7 +21,6 @@ from hilstar.bench.least_psf import Choice
 from hilstar.errors import InputError
 from hilstar.frame.bodies import BodyLayer, disc_stars
 from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
-from hilstar.frame.satellites import SatelliteLayer
 from hilstar.frame.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table
 from hilstar.frame.view import STILL, Canvas, Layer, View
 from hilstar.monitor.calibration import Calibration
@@ -246,6 +245,8 @@ class Bench:
 
     def discs(self, view: View) -> list[Disc]:
         """The bodies and satellites on the image that are drawn as discs, at rest: bodies nearest first, after satellites."""
+        from hilstar.frame.satellites import SatelliteLayer  # no other frame needs it
+
         found: list[Disc] = []
         for layer in reversed(self.layers):
             if isinstance(layer, SatelliteLayer):

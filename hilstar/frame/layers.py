@@ -6,7 +6,6 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from hilstar.frame.bodies import BodyLayer
-from hilstar.frame.satellites import SatelliteLayer
 from hilstar.frame.view import Canvas, Layer, View
 from hilstar.scene.exposure_motion import MIDDLE_S, smeared_sprites
 from hilstar.scene.frame_motion import swept_sprites
@@ -58,6 +57,8 @@ def sky_layers(
     if moving is not None and moving.names:
         layers.append(BodyLayer(moving, canvas))
     if moving is not None and moving.satellites is not None:
+        from hilstar.frame.satellites import SatelliteLayer
+
         layers.append(SatelliteLayer(moving, canvas, faintest_e_per_s))
     return tuple(layers)
 

@@ -349,7 +349,7 @@ class CodeTable:
         place, lower = (bits >> np.uint32(self.bin_shift)).astype(np.intp) - self.first_bin, bits & (none - 1)
         asked = (lower > 0) | (place == 0)  # the first code of a later bin counts a threshold at its very edge
         place, lower = place[asked], lower[asked]
-        if (place[1:] == place[:-1]).any():
+        if (place[1:] == place[:-1]).any():  # thresholds rise
             return None
         words = np.full(len(self.first_code), none)
         words[place] = lower

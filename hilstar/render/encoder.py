@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import moderngl
 import numpy as np
@@ -20,11 +20,13 @@ from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, Target
 from hilstar.render.context import is_software
-from hilstar.render.disc_tiles import Tiles
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
+
+if TYPE_CHECKING:
+    from hilstar.render.disc_tiles import Tiles
 
 TABLE_WIDTH = 1024  # that of encode.frag
 _shader = cache(lambda name: resource_path("shaders", name).read_text())
@@ -397,7 +399,7 @@ class Encoder:
         gain, rises = planes.panels[0].gain(), quantiser.shader
         defines = [*planes.defines, *["RISES"] * bool(rises), *["UNIFORMITY"] * (gain is not None)]
         edges = [quantiser.edges_e_per_s(panel) for panel in planes.panels]
-        table = None if rises else level_steps(edges)
+        table = level_steps(edges)
         steps = None if table is None else table_rows(table[0], ctx)
         defines += [] if table is None else [f"STEPS {0 if steps is None else len(steps)}"]
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
@@ -408,17 +410,22 @@ class Encoder:
         self._sprite_vao: moderngl.VertexArray | None = None
         self._white = planes.panels[0].response.white
         self._textures = {"linear_e_per_s": linear}
-        self._steps = None if steps is None else ctx.buffer(steps.tobytes())
+        thresholds, first = joined(edges)
+        counts = [(begin, len(one)) for begin, one in zip(first, edges, strict=True)]
+        rows = table_rows(thresholds, ctx) if rises else None
+        self._blocks = {place: ctx.buffer(one.tobytes()) for place, one in enumerate((steps, rows)) if one is not None}
+        if rows is not None:
+            self._defines = (*self._defines, f"EDGES {len(rows)}")
+        elif table is None or rises:
+            self._textures["threshold_e_per_s"] = self._texture(_rows(thresholds))
         if table is None:
             tables = [code_table(one) for one in edges]
-            thresholds, first = joined([one.threshold for one in tables])
             codes, begins = joined([one.first_code for one in tables])
-            self._textures |= {"threshold_e_per_s": self._texture(_rows(thresholds)), "first_code": self._texture(_rows(codes))}
+            self._textures["first_code"] = self._texture(_rows(codes))
             each = zip(tables, begins, strict=True)
             bins = [(one.first_bin, len(one.first_code) - 1, one.bin_shift, begin) for one, begin in each]
-            counts: list[Any] = [(begin, len(one)) for begin, one in zip(first, edges, strict=True)]
         else:
-            bins, counts = table[1], []
+            bins = table[1]
             self._textures |= {} if steps is not None else {"steps": self._texture(_rows(table[0]))}
         if gain is not None:
             self._textures["gain"] = self._texture(gain)
@@ -435,6 +442,8 @@ class Encoder:
             include = ("planes.glsl", *["tile.glsl"] * bool(of_tiles))
             program = self._built(vertex=vertex, defines=(*self._defines, *(of_tiles or self._of_image)), include=include)
             self._planes.set(program, bins=self._bins[0], thresholds=self._bins[1])
+            if "Edges" in program:
+                cast(moderngl.UniformBlock, program["Edges"]).binding = 1
             set_uniforms(program, {name: unit for unit, name in enumerate(self._textures)})
             self._programs[key] = program
         return self._programs[key]
@@ -450,7 +459,7 @@ class Encoder:
     def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
         """The tables by which light becomes levels."""
         textures = [texture for name, texture in self._textures.items() if name != "linear_e_per_s"]
-        return [*textures, *([] if self._steps is None else [self._steps])]
+        return [*textures, *self._blocks.values()]
 
     def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
         """Read the places and rates of sprites from a buffer."""
@@ -466,7 +475,7 @@ class Encoder:
         covered_px: int,
         uniforms: Mapping[str, float],
         regions: Sequence[Rectangle] = (),
-        tiles: Tiles | None = None,
+        tiles: "Tiles | None" = None,
         *,
         is_black: bool = True,
     ) -> None:
@@ -503,10 +512,10 @@ class Encoder:
             texture.use(unit)
         if self._linear_image is not None:
             self._linear_image.bind_to_image(0, read=True, write=False)
-        if self._steps is not None:
-            self._steps.bind_to_uniform_block(0)
+        for place, block in self._blocks.items():
+            block.bind_to_uniform_block(place)
 
-    def _draw_tiles(self, tiles: Tiles, uniforms: Mapping[str, float]) -> None:
+    def _draw_tiles(self, tiles: "Tiles", uniforms: Mapping[str, float]) -> None:
         self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
         of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
         given = ((of_image, ()), (tiles.face_levels, ("TILE",)), (tiles.air_levels, ("TILE", "AIR")))

@@ -25,7 +25,7 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
 OVERRATED = 1.0001  # rounding
-PARTS = tuple(f"{one}.glsl" for one in ("exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices"))
+PARTS = tuple(f"{one}.glsl" for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices"))
 LOCAL_SIZE = 32  # as in exact.comp
 TURNS_BINDING = 3
 FIRST_BINDING = 4  # first binding of a Memory's buffers
@@ -70,12 +70,12 @@ class ExactPass:
         self._step_e_per_s = float(light[1])
         self._turns = ctx.buffer(reserve=4, dynamic=True)
         self._quantiser, self._panel, self._balance = quantiser, panel, balance
-        self._programs: dict[tuple[bool, bool], moderngl.ComputeShader] = {}
+        self._programs: dict[tuple[bool, bool, bool], moderngl.ComputeShader] = {}
 
-    def _program(self, paths: bool, summed: bool) -> moderngl.ComputeShader:
-        """The program for stars or paths, whose light is summed or in the linear image; made when it is first asked for."""
-        if (paths, summed) in self._programs:
-            return self._programs[paths, summed]
+    def _program(self, paths: bool, summed: bool, floor: bool) -> moderngl.ComputeShader:
+        """The program for stars or paths, whose light is summed, on a `floor` of levels or not, or in the linear image."""
+        if (paths, summed, floor) in self._programs:
+            return self._programs[paths, summed, floor]
         order, panel, balance, together = self._pixels, self._panel, self._balance, self._together is not None and not paths
         defines = [f"NEAR {order.near}", f"LEVELS {self._format}", f"LINEAR {linear_format(self._planes)}"]
         defines += [
@@ -89,7 +89,12 @@ class ExactPass:
         defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.psf.width_px) < NARROW_PX)
         defines += self._shares.defines
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
-        defines += ["TEMPORAL"] * (self._memory is not None) + ["SUMS"] * summed + [*self._order.define, *self._light.define]
+        defines += (
+            ["TEMPORAL"] * (self._memory is not None)
+            + ["SUMS"] * summed
+            + [f"FLOOR {self._format}"] * floor
+            + [*self._order.define, *self._light.define]
+        )
         files = ("planes.glsl", *["sums.glsl"] * summed, *PARTS)
         program = build_compute(self._ctx, self._quantiser.shader, defines, files)
         self._shares.set(program)
@@ -114,7 +119,7 @@ class ExactPass:
             "last_light": weights.last_light,
         } | ({"gain": 0} if self._gain is not None else {})
         set_uniforms(program, values)
-        self._programs[paths, summed] = program
+        self._programs[paths, summed, floor] = program
         return program
 
     @property
@@ -135,7 +140,7 @@ class ExactPass:
     def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
         paths, ordered = sprites.per_star > 1, passes is not None and self._planes.apart
-        program = self._program(paths, passes is not None)
+        program = self._program(paths, passes is not None, passes is not None and passes.floor is not None)
         count, alone = len(sprites), passes.bind_order(TURNS_BINDING) if passes is not None and ordered else 0
         if paths or not ordered:
             turns = stretches_of(sprites.star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)

@@ -6,7 +6,7 @@ This room is the only user of moderngl.
 import zlib
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, partial
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import moderngl
 import numpy as np
@@ -18,7 +18,6 @@ from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
 from hilstar.render.context import Context, check_limits, computes_in_software, create_context
-from hilstar.render.disc_tiles import Sure, Tiles
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
     CUT_WINGS,
@@ -35,12 +34,14 @@ from hilstar.render.encoder import (
     sprites_array,
 )
 from hilstar.render.exact_pass import ExactPass
-from hilstar.render.extended import ExtendedLayer
 from hilstar.render.host_image import HostImage
-from hilstar.render.presenter import Presenter, changed_codes
 from hilstar.render.star_passes import LightUnits, StarPasses
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.sprites import Sprites
+
+if TYPE_CHECKING:
+    from hilstar.render.disc_tiles import Sure, Tiles
+    from hilstar.render.extended import ExtendedLayer
 
 FIRST_CAPACITY = 4096
 UNTIMED = nullcontext()
@@ -85,7 +86,6 @@ class Renderer(Backend):
         self._splat = splat_program(ctx, target.resolution_px, self._shares, planes)
         self._eraser = Eraser(ctx, target.resolution_px, planes, of_levels=False)
         self._level_eraser = Eraser(ctx, target.resolution_px, planes, of_levels=True)
-        self._extended = ExtendedLayer(ctx, target.resolution_px)
         self._regions: tuple[Rectangle, ...] = ()  # where extended light is on the images
         self._tiles: Tiles | None = None  # a disc whose levels need no linear image everywhere
         self._cut_sides = self._wider(target.sides)
@@ -119,8 +119,8 @@ class Renderer(Backend):
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
         self._exact: dict[int, ExactQuantiser] = {}
         self._floor_encoder: Encoder | None = None
+        self._floor_levels: LevelTexture | None = None
         self._floor_key: tuple[object, float] = ((), 0.0)
-        self._floor_levels: Levels | None = None
         if not planes.panels:
             return
         panel, gain = planes.lit, planes.panels[0].gain()
@@ -184,20 +184,26 @@ class Renderer(Backend):
             if frame <= self._last_frame:
                 self.begin_anew()
             self._last_frame = frame
-            extended = sprites is not None and bool(sprites.extended)
-            self._by_numpy = self._by_star is not None and (not self._exact_passes or extended)
-            if not self._by_numpy:
+            passes, by_star = self._passes, self._by_star
+            if by_star is None or self._exact_passes:
                 sprites = as_maps(sprites, self.target)
-                extended = sprites is not None and bool(sprites.extended)
-                sprites = None if sprites is None else self._planes.packed(sprites)
-            units = None if self._by_numpy or extended else self._units
+            extended = sprites is not None and bool(sprites.extended)
+            # Stars are added to levels of extended light, by passes or by NumPy.
+            on_floor = extended and by_star is not None
+            units = None if extended and (not on_floor or passes is None or self._planes.apart) else self._units
             unit_e_per_s = None if units is None else units.unit_for(sprites)
-            passes = self._passes
+            self._by_numpy = by_star is not None and (not self._exact_passes or (on_floor and unit_e_per_s is None))
+            if sprites is not None and not self._by_numpy:
+                sprites = self._planes.packed(sprites)
             if passes is not None and unit_e_per_s is not None:
+                floor = None
+                if sprites is not None and on_floor and by_star is not None:
+                    with self._stage("extended"):
+                        floor = self._floor(sprites, by_star.floor_turn(frame))
                 # Levels star by star; the linear image is drawn only when it is read.
                 self._undrawn, self._levels_black = (sprites, True), False
                 with self._stage("erase"):
-                    passes.erase()
+                    passes.lay(floor)
                 if sprites is not None and len(sprites):
                     with self._stage("upload"):
                         passes.upload(sprites)
@@ -228,6 +234,12 @@ class Renderer(Backend):
     def _white(self) -> "Renderer":
         """What draws linear images beside those of primaries."""
         return Renderer(Target(self.target.resolution_px, self.target.psf), self._ctx)
+
+    @cached_property
+    def _extended(self) -> "ExtendedLayer":
+        from hilstar.render.extended import ExtendedLayer  # no frame of stars alone needs it
+
+        return ExtendedLayer(self._ctx, self.target.resolution_px)
 
     def begin_anew(self) -> None:
         """See `Backend.begin_anew`."""
@@ -289,32 +301,35 @@ class Renderer(Backend):
         for one in self._exact_passes:
             if (left := one.left) is not None:
                 self._exact[one.plane].left, one.left = left, None
-        floor = None if sprites is None or not sprites.extended else self._floor(sprites, by_star.floor_turn(frame), levels)
+        floor = None
+        if sprites is not None and sprites.extended:
+            floor = self._floor(sprites, by_star.floor_turn(frame)).read()
         on = [None] * len(self._exact) if floor is None else np.atleast_3d(floor).transpose(2, 0, 1)
         self._exact_levels = target.by_plane(sprites, lambda k, light: self._exact[k].levels(light, on[k]))
         levels.write(self._exact_levels)
 
-    def _floor(self, sprites: Sprites, turn: float, levels: LevelTexture) -> Levels:
+    def _floor(self, sprites: Sprites, turn: float) -> LevelTexture:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
 
         The same lights and turn again give the same levels, which are kept.
         """
         key = sprites.lights or sprites.extended, turn
-        if key == self._floor_key and self._floor_levels is not None:
-            return self._floor_levels
-        if self._floor_encoder is None:
-            self._floor_encoder = Encoder(self._ctx, self._linear, levels, self._planes, DitherQuantiser)
-        self._erase()
-        self._draw_extended(sprites, self._sure(DitherQuantiser, None))
-        levels.fbo.clear()
-        self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions, self._tiles)
-        self._floor_key, self._floor_levels = key, Levels(levels.read().copy())
+        if self._floor_encoder is None or self._floor_levels is None:
+            self._floor_key, self._floor_levels = ((), 0.0), LevelTexture(self._ctx, self.target.resolution_px, self._planes)
+            self._floor_encoder = Encoder(self._ctx, self._linear, self._floor_levels, self._planes, DitherQuantiser)
+        if key != self._floor_key:
+            self._erase(levels=False)
+            self._draw_extended(sprites, self._sure(DitherQuantiser, None))
+            self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions, self._tiles, is_black=False)
+            self._floor_key = key
         return self._floor_levels
 
-    def _sure(self, quantiser: type[PixelQuantiser], sprites: Sprites | None) -> Sure | None:
+    def _sure(self, quantiser: type[PixelQuantiser], sprites: Sprites | None) -> "Sure | None":
         """What a quantiser's levels need not know of a disc's light, where there is one plane."""
         if self._planes.apart or not self._planes.panels:
             return None
+        from hilstar.render.disc_tiles import Sure
+
         panel, (least, most) = self._planes.panels[0], self._gains
         white_e_per_s = panel.flux_at_white_e_per_s
         # The first step by the smallest threshold of a mask, at all of its turns
@@ -322,7 +337,7 @@ class Renderer(Backend):
         places_px = np.empty((0, 2), dtype=np.intp) if sprites is None else sprites.data["pixel"]
         return Sure(dark_e_per_s / most, white_e_per_s / least, places_px, self.footprint_px)
 
-    def _draw_extended(self, sprites: Sprites, sure: Sure | None = None) -> None:
+    def _draw_extended(self, sprites: Sprites, sure: "Sure | None" = None) -> None:
         """Add extended light to the linear image, that of each primary to its plane alone."""
         fbo, self._regions = self._linear_fbo, ()
         for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
@@ -332,7 +347,7 @@ class Renderer(Backend):
         fbo.color_mask = True, True, True, True
 
     def _draw_linear(
-        self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False, sure: Sure | None = None
+        self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False, sure: "Sure | None" = None
     ) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn, sprites = None, as_maps(sprites, self.target)
@@ -414,6 +429,8 @@ class Renderer(Backend):
 
     def show_on(self, view: ScreenView) -> None:
         """See `Backend.show_on`."""
+        from hilstar.render.presenter import Presenter
+
         self._screen, self._presenter = view, Presenter(self.codes_texture, view, apart=self._planes.apart)
         self.tables.append(self._presenter.table)
 
@@ -427,6 +444,8 @@ class Renderer(Backend):
 
     def changed_codes(self) -> str:
         """See `Backend.changed_codes`."""
+        from hilstar.render.presenter import changed_codes
+
         return changed_codes(self._ctx, self._screen.screen_px, self._screen.bits)
 
     def fault(self) -> str:

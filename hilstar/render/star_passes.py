@@ -5,6 +5,7 @@ draws star by star, in a quarter of the time of rasterised sprites; a graphics c
 """
 
 import math
+from functools import partial
 
 import moderngl
 import numpy as np
@@ -19,7 +20,7 @@ from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 LOCAL_SIZE = 32  # as in light.comp
-STEPS_BINDING, ORDER_BINDING, SUMS_BINDING = 1, 2, 7
+STEPS_BINDING, ORDER_BINDING, LIGHT_BINDING, SUMS_BINDING = 1, 2, 2, 7
 MAX_SUM = 2**31 - 2**24  # what an int holds, less what a float32 that large is rounded by
 # Share of the first level's light. Where stars are so many and so bright that a unit would be more, their light is blended.
 MAX_UNIT = 1 / 64
@@ -106,7 +107,7 @@ class LightUnits:
 class StarPasses:
     """Draws sprites into pixels' sums and a LevelTexture; it lives in its renderer's context, which is current in every call.
 
-    With `exact` the sums stay for it to look at.
+    With `exact` the sums stay for it to look at. Where a frame has a `floor`, its stars' levels are added to those in light.
     """
 
     def __init__(self, levels: LevelTexture, planes: Planes, psf: Psf, shares: Shares, exact: bool, units: LightUnits) -> None:
@@ -117,7 +118,8 @@ class StarPasses:
         self._footprint_px = planes.footprint_px
         gain = planes.panels[0].gain()
         self._gain = None if gain is None else ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
-        self._sums = ctx.buffer(np.zeros(math.prod(self._size_px) * len(planes.panels), dtype=np.int32))
+        self._sums = ctx.buffer(reserve=4 * math.prod(self._size_px) * len(planes.panels))
+        self._sums.clear()
         self._unit_e_per_s: list[float] = []  # units of the sums
         self.sprites = ctx.buffer(reserve=planes.dtype.itemsize, dynamic=True)
         self._drawn: int | None = None  # sprites that are in the buffer and on the images; None: it is not known
@@ -128,16 +130,22 @@ class StarPasses:
         defines = [f"LEVELS_FORMAT {levels.format}", *planes.defines, *shares.defines, *["KEEP"] * keep]
         defines += ["UNIFORMITY"] * (gain is not None) + self._steps.define
         side, all_px = f"FOOTPRINT {units.side_px}", f"FOOTPRINT {self._footprint_px}"
-        files, defines = ("planes.glsl", "shares.glsl", "sums.glsl"), defines + ["ORDER"] * planes.apart
-        self._light, self._encode, self._black = self._programs = [
-            build_compute(ctx, "light.comp", [*part, *defines], files, ["levels.glsl"] * (part[0] == "LEVELS"))
-            for part in (["LIGHT", side], ["LEVELS", side], [all_px])
-        ]
-        self._least_reach = 0.5 * PixelOrder(psf).near_sigmas(PHASE_PX) ** 2 if exact else 0.0
-        for program in self._programs:
+        files, defines = ["planes.glsl", "shares.glsl", "sums.glsl"], defines + ["ORDER"] * planes.apart
+        self.floor: LevelTexture | None = None
+        light = planes.panels[0].light_e_per_s()
+        self._level_light = LookupTable(ctx, "LIGHT_ROWS", LIGHT_BINDING, np.append(light, light[-1]))
+
+        def built(*part: str) -> moderngl.ComputeShader:
+            more, last = ["floor.glsl"] * (len(part) > 2), ["levels.glsl"] * (part[0] == "LEVELS")
+            program = build_compute(ctx, "light.comp", [*part, *defines], files + more, last)
             program["resolution_px"], program["reach_px2"] = self._size_px, units.axes_px2
             planes.set(program, bins=table[1], most_e_per_s=units.most_e_per_s)
             shares.set(program)
+            return program
+
+        self._light, self._encode, self._black = self._programs = [built("LIGHT", side), built("LEVELS", side), built(all_px)]
+        self._encode_on_floor = partial(built, "LEVELS", side, f"FLOOR {levels.format}", *self._level_light.define)
+        self._least_reach = 0.5 * PixelOrder(psf).near_sigmas(PHASE_PX) ** 2 if exact else 0.0
         if exact:
             self._black["least_reach"] = self._least_reach
         self._order = ctx.buffer(reserve=4, dynamic=True)
@@ -146,7 +154,7 @@ class StarPasses:
     @property
     def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
         """The tables by which light becomes levels."""
-        return [self._steps.buffer, *([] if self._gain is None else [self._gain])]
+        return [self._steps.buffer, self._level_light.buffer, *([] if self._gain is None else [self._gain])]
 
     def forget(self, sums: bool) -> None:
         """The next `erase` makes all levels black: something else has drawn on them. With `sums`, those may be lost too."""
@@ -165,6 +173,18 @@ class StarPasses:
         else:
             self._run(self._black)
         self._drawn = 0
+
+    def lay(self, floor: LevelTexture | None) -> None:
+        """Take a frame's floor, which becomes its levels; None for black, which `erase` has drawn."""
+        if self.floor is not None and floor is None:
+            self.forget(sums=False)
+        self.erase()
+        self.floor = floor
+        if floor is not None:
+            self._ctx.copy_framebuffer(self._levels.fbo, floor.fbo)
+            floor.texture.bind_to_image(1, read=True, write=False)  # for all passes of the frame
+            if len(self._programs) == 3:
+                self._programs.append(self._encode_on_floor())
 
     def upload(self, sprites: Sprites) -> None:
         """Take the sprites that `add_light` and `encode` are about."""
@@ -203,7 +223,9 @@ class StarPasses:
         if self._gain is not None:
             self._gain.use(0)
         self._steps.bind()
-        self._run(self._encode)
+        if self.floor is not None:
+            self._level_light.bind()
+        self._run(self._encode if self.floor is None else self._programs[-1])
 
     def bind_order(self, binding: int) -> int:
         """Bind the order of stars, for another program; how many stand alone, first in it."""

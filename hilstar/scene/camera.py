@@ -195,14 +195,16 @@ class Camera:
         """As `project`, but beyond the lens on straight lines away from the image: a path may begin and end there."""
         if self.lens is None:
             return self.project(image_vectors)
-        z = image_vectors[:, 2]
-        near = _over(1.0, z)
-        u, v = image_vectors[:, 0] * near, image_vectors[:, 1] * near
-        limit = self.lens.max_tangent * WITHIN
+        near = _over(1.0, image_vectors[:, 2])
+        return self.places_outward_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
+
+    def places_outward_px(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `places_px`, but beyond the lens on straight lines away from the image."""
+        limit = np.inf if self.lens is None else self.lens.max_tangent * WITHIN
         beyond = np.flatnonzero(u * u + v * v > limit**2)
         if not len(beyond):
             return self.places_px(u, v)
-        times = np.hypot(u[beyond], v[beyond]) / limit
+        times, u, v = np.hypot(u[beyond], v[beyond]) / limit, u.copy(), v.copy()
         u[beyond] /= times
         v[beyond] /= times
         x_px, y_px = self.places_px(u, v)

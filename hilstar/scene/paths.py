@@ -23,6 +23,12 @@ MAX_NODES = 64  # on one path: leggauss is an eigenvalue problem, 1 ms for 64 no
 LIMIT_PX = 1e-3
 LIMIT_SHARE = 5e-4
 POINTS = (2, 3)
+# Through a lens one place, with slopes and curvature of the lens there, costs less than two exact ones and reaches farther.
+LENS_POINTS = (1, 3)
+TABLE_STEPS = 240  # across the wider side of a lens's table, which reaches BESIDE_TABLE of a side beyond the lens's box
+BESIDE_TABLE = 0.05
+TABLE_PX = LIMIT_PX / 2  # what a table may be off on the image
+WIDEST_TABLE = 2.5  # largest tangent: beyond it a path may begin behind the camera
 # Half a turn that 3 points draw through 350 mm and a strong lens with a field of degree 6: 0.29 deg, 28 deg/s at 60 Hz.
 MAX_HALF_TURN_RAD = 0.04
 NARROWER = 2**-0.25  # from one half turn that is tried to the next; the error falls with its power of the number of points
@@ -114,6 +120,22 @@ class Paths:
         x_px, y_px = self._places_px(self._seen[:, None], self._cross[:, None], self._along[:, None], seconds)
         return x_px.reshape(shape), y_px.reshape(shape)
 
+    def tangents_at(self, seconds: FloatArray, unit_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Tangents (2, n) of all stars at `seconds` (n,), their change in `unit_s` and half of the change of that."""
+        angle, turn = self.speed_rad_s * seconds, self.speed_rad_s * unit_s
+        cosine, sine = np.cos(angle), np.sin(angle)
+        across, faster = self._seen - self._along, self._cross * cosine
+        seen = across * cosine
+        seen -= self._cross * sine
+        faster += across * sine  # the axis times what is seen
+        bend = seen * (-turn * turn / 2)
+        seen += self._along
+        faster *= -turn
+        near = 1 / seen[2]
+        at = seen[:2] * near
+        first = (faster[:2] - at * faster[2]) * near
+        return at, first, (bend[:2] - at * bend[2] - first * faster[2]) * near
+
     def _places_px(
         self, seen: FloatArray, cross: FloatArray, along: FloatArray, seconds: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -180,7 +202,8 @@ def node_counts(length_sigma: FloatArray, per_sigma: float, at_rest: int, shorte
 class ShortPaths:
     """The paths of `exact` (n), each within `half_s` of its own `middle_s` (n,), through as many of its places as `points`.
 
-    These are at the roots of a Chebyshev polynomial. Off by at most LIMIT_PX or LIMIT_SHARE where `points_within` gave them.
+    These are at the roots of a Chebyshev polynomial; of 1, by a lens's table, slope and curvature are the path's too.
+    Off by at most LIMIT_PX or LIMIT_SHARE where `points_within` gave them.
     """
 
     def __init__(self, exact: Paths, middle_s: FloatArray, half_s: float, points: int) -> None:
@@ -188,6 +211,9 @@ class ShortPaths:
         self.speed_rad_s = exact.speed_rad_s
         self._count = len(exact)
         self._middle_s, self._half_s = middle_s, half_s
+        if points == 1:
+            self._terms = _lens_table(*_mapping(exact.camera)).along(*exact.tangents_at(middle_s, half_s))
+            return
         at = np.cos((np.arange(points) + 0.5) * (np.pi / points))
         places = np.stack(exact.through(_beyond(exact.camera)).all_places_px(middle_s + half_s * at[:, None]), axis=1)
         powers = np.linalg.inv(np.vander(at, increasing=True))
@@ -199,7 +225,7 @@ class ShortPaths:
     def places_px(self, star: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,)."""
         at = (seconds - self._middle_s[star]) / self._half_s
-        terms = self._terms[:, :, star]
+        terms = self._terms[:, :, star] if isinstance(star, slice) else self._terms.take(star, axis=2)
         places = terms[-1] * at
         for term in terms[-2:0:-1]:
             places += term
@@ -208,10 +234,69 @@ class ShortPaths:
         return places[0], places[1]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LensTable:
+    """A lens's places by tangents, of second degree about the nearest of the nodes of a grid over its box.
+
+    `terms` (6, 2, nodes): place, its changes a step along u and v, and its bends by uu / 2, uv and vv / 2. On the image places
+    are off by up to `off_px`.
+    """
+
+    first: FloatArray
+    steps: float  # a tangent
+    shape: tuple[int, int]  # along u and v
+    terms: FloatArray
+    off_px: float = 0.0
+
+    def along(self, at: FloatArray, by: FloatArray, bend: FloatArray) -> FloatArray:
+        """The terms (3, 2, n) of 1, t and t^2 of the pixels of tangents at + by t + bend t^2, each (2, n)."""
+        off = (at - self.first) * self.steps
+        node = np.rint(off)
+        for of_side, size in zip(node, self.shape, strict=True):
+            of_side.clip(0, size - 1, out=of_side)
+        off -= node
+        place, by_u, by_v, uu, uv, vv = self.terms.take((node[1] * self.shape[0] + node[0]).astype(np.intp), axis=2)
+        (u, v), (first_u, first_v), (bend_u, bend_v) = off, by * self.steps, bend * self.steps
+        steep_u, steep_v = uu * u, vv * v
+        place += u * (by_u + steep_u)
+        cross = uv * u
+        place += v * (by_v + cross + steep_v)
+        by_u += uv * v + 2 * steep_u
+        by_v += cross + 2 * steep_v
+        first = by_u * first_u + by_v * first_v
+        second = by_u * bend_u + by_v * bend_v + (uu * first_u + uv * first_v) * first_u + vv * (first_v * first_v)
+        return np.stack([place, first, second])
+
+
+def _mapping(camera: Camera) -> tuple[tuple[int, int], float, tuple[float, float], Lens | None]:
+    """What places depend on: the same of many cameras, by which tables are kept."""
+    return camera.resolution_px, camera.focal_length_px, camera.principal_point_px, camera.lens
+
+
+@lru_cache(maxsize=4)
+def _lens_table(size_px: tuple[int, int], focal_px: float, principal_px: tuple[float, float], lens: Lens) -> LensTable:
+    """The table of a bounded lens: its places at the grid's nodes, their slopes and bends by differences."""
+    camera = _beyond(Camera(size_px, focal_px, principal_px, np.eye(3), lens))
+    low, high = np.clip(np.array(lens.box).T, -lens.max_tangent, lens.max_tangent)
+    low, high = low - BESIDE_TABLE * (high - low), high + BESIDE_TABLE * (high - low)
+    step = float((high - low).max()) / TABLE_STEPS
+    across, down = (np.arange(-1, round(side / step) + 2) for side in high - low)  # one more node at each end
+    u, v = np.meshgrid(low[0] + step * across, low[1] + step * down)
+    at = np.stack(camera.places_outward_px(u.ravel(), v.ravel())).reshape(2, *u.shape)
+    middle, row, column = at[:, 1:-1, 1:-1], at[:, 1:-1], at[..., 1:-1]
+    left, right, above, below = row[..., :-2], row[..., 2:], column[:, :-2], column[:, 2:]
+    cross = (at[:, 2:, 2:] - at[:, 2:, :-2] - at[:, :-2, 2:] + at[:, :-2, :-2]) / 4
+    bends = (left + right) / 2 - middle, cross, (above + below) / 2 - middle
+    terms = np.stack([middle, (right - left) / 2, (below - above) / 2, *bends]).reshape(6, 2, -1)
+    table = LensTable(low[:, None], 1 / step, (len(across) - 2, len(down) - 2), terms)
+    between = np.stack([u.ravel(), v.ravel()]) + step / 2  # where a table of second degree is worst
+    found, exact = table.along(between, *np.zeros((2, 2, 1)))[0], np.stack(camera.places_outward_px(*between))
+    return replace(table, off_px=float(np.hypot(*(found - exact))[camera.contains_px(*exact)].max(initial=0.0)))
+
+
 def points_within(camera: Camera, half_turn_rad: float) -> int | None:
     """How many points keep paths within LIMIT_PX or LIMIT_SHARE, for a turn of twice that angle; None where no few do."""
-    mapping = camera.resolution_px, camera.focal_length_px, camera.principal_point_px, camera.lens
-    for points, longest_rad in zip(POINTS, _longest_half_turns_rad(*mapping), strict=True):
+    for points, longest_rad in _longest_half_turns_rad(*_mapping(camera)):
         if 0 < half_turn_rad <= longest_rad:
             return points
     return None
@@ -229,13 +314,16 @@ def bend_px(camera: Camera) -> float:
 
 @lru_cache(maxsize=16)
 def _longest_half_turns_rad(
-    resolution_px: tuple[int, int], focal_length_px: float, principal_point_px: tuple[float, float], lens: Lens | None
-) -> tuple[float, ...]:
-    """The longest half turn that each of POINTS can draw, tried on such a camera: 0 where even a short one is off."""
-    camera = Camera(resolution_px, focal_length_px, principal_point_px, np.eye(3), lens)
+    size_px: tuple[int, int], focal_px: float, principal_px: tuple[float, float], lens: Lens | None
+) -> tuple[tuple[int, float], ...]:
+    """Numbers of points, and the longest half turn that each can draw, tried on such a camera; 0 where none is short enough."""
+    camera = Camera(size_px, focal_px, principal_px, np.eye(3), lens)
     turns = [MAX_HALF_TURN_RAD * NARROWER**k for k in range(TRIES)]
-    firsts = [bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0) for points in POINTS]
-    return tuple([*turns, 0.0][first] for first in firsts)
+    few = POINTS
+    if lens is not None and lens.max_tangent < WIDEST_TABLE:
+        few = LENS_POINTS if _lens_table(size_px, focal_px, principal_px, lens).off_px <= TABLE_PX else POINTS
+    firsts = [bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0) for points in few]
+    return tuple((points, [*turns, 0.0][first]) for points, first in zip(few, firsts, strict=True))
 
 
 def _excess(camera: Camera, half_turn_rad: float, points: int) -> float:

@@ -137,7 +137,7 @@ class SiteAir:
         mag = self.dimming_mag[:, k, row] * (1 - part) + self.dimming_mag[:, k + 1, row] * part
         return np.asarray(flux_ratio(mag))
 
-    def twinkling(self, stars: Stars, utc_ns: int, exposure_s: float, rng: np.random.Generator) -> Stars:
+    def twinkling(self, stars: Stars, utc_ns: int, exposure_s: float, rng: "np.random.Generator") -> Stars:
         """Stars as they twinkle in an exposure, each by itself about its mean; bodies do not."""
         masses = air_mass(self.above(utc_ns).altitude_rad(stars.vectors))
         sigma = scintillation(self.aperture_mm, masses, self.height_m, exposure_s)

@@ -62,7 +62,7 @@ MAX_BV_TERM_MAG = 0.3
 # rates are wrong, and those of the K giants, fifty times as many to V = 7.5, are right.
 BV_KNOT_COUNT = 5
 MAX_BV_FIT_VI_MAG = 2.0
-BLOCK_STARS = 20_000  # evaluated at once: their splines' terms stay within a processor's cache
+BLOCK_STARS = 2_000  # evaluated at once: their splines' terms stay within a processor's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,13 +341,13 @@ def fit_table(bv_mag: FloatArray, vi_mag: FloatArray, electrons_per_s: FloatArra
 def natural_basis(colour_mag: FloatArray, knots_mag: FloatArray) -> FloatArray:
     """Basis of the natural cubic splines, shape (n, knots) (Hastie et al. 2009, eq. 5.4), colours held to the knots' range."""
     x = np.clip(colour_mag, knots_mag[0], knots_mag[-1])[:, None]
-    last = np.maximum(x - knots_mag[-1], 0) ** 3
-    d = (np.maximum(x - knots_mag[:-1], 0) ** 3 - last) / (knots_mag[-1] - knots_mag[:-1])
+    last, each = (np.maximum(x - knots, 0) for knots in (knots_mag[-1], knots_mag[:-1]))
+    d = (each * each * each - last * last * last) / (knots_mag[-1] - knots_mag[:-1])  # a power takes ten times as long
     return np.hstack([np.ones_like(x), x, d[:, :-1] - d[:, -1:]])
 
 
 def _knots_at_equal_shares(colour_mag: FloatArray, count: int) -> FloatArray:
-    return np.quantile(colour_mag, np.linspace(0, 1, count))
+    return np.interp(np.linspace(0, len(colour_mag) - 1, count), np.arange(len(colour_mag)), np.sort(colour_mag))
 
 
 def _knots(library: Library) -> Curve:

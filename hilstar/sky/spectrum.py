@@ -180,8 +180,8 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     """
     ranged = [curve.wavelength_nm for curve in curves if len(curve.wavelength_nm)]
     low, high = max(w[0] for w in ranged), min(w[-1] for w in ranged)
-    knots = np.unique(np.concatenate(ranged))
-    knots = knots[(knots >= low) & (knots <= high)]
+    knots = np.sort(np.concatenate(ranged))
+    knots = knots[(knots >= low) & (knots <= high) & (np.diff(knots, prepend=-np.inf) > 0)]
     if len(knots) < 2:
         raise InputError("the quantum efficiency and the transmission share no wavelength; check that both are in nm")
     pieces = np.maximum(1, np.ceil(np.diff(knots) / MAX_INTERVAL_NM)).astype(int)

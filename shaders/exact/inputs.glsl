@@ -9,19 +9,13 @@
 #endif
 
 layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // WORDS each, as in light.comp
-// A footprint's pixels by distance, for each phase, and the light of each level, white twice: in blocks where there is room for them,
-// which a CPU reads in half the time.
+// A footprint's pixels by distance, for each phase: in a block where there is room, as the light of levels in floor.glsl.
 #ifdef ORDER_ROWS
 layout(std140, binding = 1) uniform Order { uvec4 order_rows[ORDER_ROWS]; };
 #define ORDER_AT(k) order_rows[(k) >> 2][(k) & 3]
 #else
 layout(std430, binding = 1) readonly buffer Order { uint order[]; };
 #define ORDER_AT(k) order[k]
-#endif
-#ifdef LIGHT_ROWS
-layout(std140, binding = 2) uniform Light { vec4 light_rows[LIGHT_ROWS]; };
-#else
-layout(std430, binding = 2) readonly buffer Light { float light_e_per_s[]; };
 #endif
 #ifdef PATHS
 layout(std430, binding = 3) readonly buffer Stretches { ivec4 stretch[]; };   // its sprites: first, end; its path's: first, end
@@ -75,11 +69,3 @@ const float SAME_STEP = 1e-4;
 const float OFF = 0.6;  // of a step, where steps are equal: then one more pixel is turned
 
 const float MAX_CARRIED_STEPS = 8.0;
-
-float light_of(int level) {
-#ifdef LIGHT_ROWS
-    return light_rows[level >> 2][level & 3];
-#else
-    return light_e_per_s[level];
-#endif
-}

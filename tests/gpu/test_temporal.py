@@ -125,8 +125,9 @@ def test_paths_keep_their_light_over_the_frames():
     assert max(errors) < AIM_MAG
 
 
+@pytest.mark.usefixtures("each_way")
 def test_frames_with_extended_light_go_on_where_others_stopped():
-    """A map lights the image in every second frame, which NumPy draws: the light over all frames is right within a step."""
+    """A map lights the image in every second frame, by points drawn by NumPy: the light of all is right within a step."""
     panel = Panel(table_response(2, np.linspace(0, 1, 4)), WHITE)
     sprites = stars(*places(), 1.3 * WHITE / 3)
     none = replace(sprites, data=sprites.data[:0], star=sprites.star[:0], x_px=sprites.x_px[:0], y_px=sprites.y_px[:0])

@@ -48,7 +48,6 @@ Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
 MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
 STREAM_REASONS: tuple[Reason, ...] = ("rate", "source")
 REASONS = MESSAGE_REASONS + STREAM_REASONS
-MAX_SPEED_KM_S = 10_000.0  # speed of an observer: a thirtieth of that of light
 MIN_PLACE_KM, MAX_PLACE_KM = 6000.0, 1e7  # distance from the Earth's centre: the limits of an orbit file, too
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
 DELIMITER = b"\x00"

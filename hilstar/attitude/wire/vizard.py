@@ -32,7 +32,7 @@ from hilstar.errors import InputError, printable, shortened
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.rotation import angle_between_rad, conjugate, multiply, rate_between_rad_s
-from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.units import ARCSEC_PER_RAD, MAX_SPEED_KM_S, NS_PER_S
 
 SIM_UPDATE = b"SIM_UPDATE"
 MAX_UPDATE_BYTES = 1 << 22  # settings, models and maps of a large scenario go along with its spacecraft
@@ -181,9 +181,9 @@ class Follower:
             earth = next((body for body in update.bodies if body.name.lower() in EARTHS), VizBody())
             place_m, velocity_m_s = _against(place_m, earth.position_m), _against(velocity_m_s, earth.velocity_m_s)
         speed_m_s, far_km = math.hypot(*velocity_m_s), math.hypot(*place_m) / M_PER_KM
-        if len(velocity_m_s) != 3 or not speed_m_s <= wire.MAX_SPEED_KM_S * M_PER_KM:
+        if len(velocity_m_s) != 3 or not speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
             told = f"{speed_m_s:.3g} m/s" if velocity_m_s else "nothing"
-            advice = f"it is {wire.MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
+            advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
             return wire.Refusal("format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}")
         velocity = np.array(velocity_m_s) / M_PER_KM
         if self._taken == "velocity":

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from hilstar.attitude.wire.endpoint import ALLOW_FORM, AllowedSenders, UdpPlace, bound_place, parse_endpoint
-from hilstar.attitude.wire.nasa42 import spacecraft_number
 from hilstar.bench.config.values import NotNegative
 from hilstar.errors import InputError
 from hilstar.toml_tables import Table
@@ -145,6 +144,8 @@ def nasa42_road(settings: AttitudeSettings) -> tuple[int, AllowedSenders]:
     place, allowed = parse_endpoint(settings.address), AllowedSenders(settings.allow)
     if settings.bind is True and not allowed and not place.loopback:
         raise InputError(f"{settings.address} is open to other machines, and allow does not say which may send; {ALLOW_FORM}")
+    from hilstar.attitude.wire.nasa42 import spacecraft_number  # links and packets take 12 ms, which no other source needs here
+
     return spacecraft_number(settings.spacecraft), allowed
 
 

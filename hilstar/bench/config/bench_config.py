@@ -9,7 +9,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config import hardware
 from hilstar.bench.config.answers import AnswersSettings, check_answers
@@ -20,7 +19,7 @@ from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SiteSettings
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, Table, explained
-from hilstar.units import LIGHT_KM_S, NS_PER_S
+from hilstar.units import LIGHT_KM_S, MAX_SPEED_KM_S, NS_PER_S
 
 TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
 UNIX_JD, DAY_NS = 2_440_587.5, 86_400 * NS_PER_S

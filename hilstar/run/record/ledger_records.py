@@ -22,13 +22,14 @@ from hilstar.attitude.logs.mcap_log import (
     read_messages,
     read_metadata,
 )
-from hilstar.attitude.wire.packet import MAX_PLACE_KM, MAX_SPEED_KM_S, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
+from hilstar.attitude.wire.packet import MAX_PLACE_KM, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_read, printable
 from hilstar.reading import NOT_JSON, parse_toml
 from hilstar.run.pacer import Shown
+from hilstar.units import MAX_SPEED_KM_S
 
 FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/process", "/event", "/not_kept", "/fault"
 ANSWER_TOPIC = "/answer"

@@ -12,12 +12,30 @@ from tests.support.waiting import PATIENCE_S
 
 # What single commands, files and plots need, and no bench: each costs 15 to 250 ms.
 HEAVY = {"asyncio", "astropy", "matplotlib", "mcap", "rich", "scipy.special", "unittest"}
+# What no frame of stars alone needs: 3 to 12 ms each.
+OF_SOME_FRAMES = {
+    "hilstar.attitude.wire.packet",
+    "numpy.ma",
+    "numpy.random",
+    "hilstar.render.disc_tiles",
+    "hilstar.scene.trails",
+    "scipy",
+}
+FIRST_FRAME = """import sys, hilstar
+with hilstar.load(sys.argv[1]) as bench:
+    bench.draw((1.0, 0.0, 0.0, 0.0)).levels
+print(*sys.modules)"""
 
 
 def imported_by(module: str) -> set[str]:
     """The modules that a new process has after it imported one."""
-    program = f"import sys, {module}; print(*sys.modules)"
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S)
+    return modules_after(f"import sys, {module}; print(*sys.modules)")
+
+
+def modules_after(program: str, *words: str) -> set[str]:
+    """The modules that a program says."""
+    command = [sys.executable, "-c", program, *words]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE_S)
     return set(result.stdout.split())
 
 
@@ -27,7 +45,11 @@ def test_nothing_heavy_is_imported_before_it_is_used(module):
 
 
 def test_a_run_imports_before_its_first_frame_what_some_frames_need():
-    assert "scipy.special" in imported_by("hilstar.run.loop")
+    assert {"scipy.special", "hilstar.render.disc_tiles"} <= imported_by("hilstar.run.loop")
+
+
+def test_the_first_frame_of_stars_alone_imports_nothing_that_only_others_need():
+    assert not modules_after(FIRST_FRAME, "configs/demo.toml") & OF_SOME_FRAMES
 
 
 def test_a_run_begins_no_other_process_by_what_it_imports():

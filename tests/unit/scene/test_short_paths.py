@@ -12,7 +12,7 @@ from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene import frame_motion
 from hilstar.scene.camera import Lens, ResidualField, bounded
 from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
-from hilstar.scene.paths import LIMIT_PX, LIMIT_SHARE, Paths, ShortPaths, points_within
+from hilstar.scene.paths import LIMIT_PX, LIMIT_SHARE, TABLE_PX, Paths, ShortPaths, _lens_table, _mapping, points_within
 from hilstar.scene.psf import GaussianPsf
 from tests.support.stars import stars_at
 
@@ -27,11 +27,11 @@ SCREEN = (0.5 * (np.array(SIZE) - 1))[:, None]
 BETWEEN_THE_TRIED = 1.2
 
 
-def lens_camera(focal_mm: float):
+def lens_camera(focal_mm: float, degree: int = 6):
     """The lens of tests/benchmarks/bench_lens.py."""
     camera = monitor_camera(SIZE, 57.65, focal_mm, np.array([1.0, 0.0, 0.0, 0.0]))
-    x, y = np.random.default_rng(2).normal(0, 0.3, (2, 28))
-    field = ResidualField.of_terms(x, y, 6, SIZE)
+    x, y = np.random.default_rng(2).normal(0, 0.3, (2, (degree + 1) * (degree + 2) // 2))
+    field = ResidualField.of_terms(x, y, degree, SIZE)
     lens = Lens((0.6, -1.0, 2.0), (1e-3, -1e-3), (0.017, -0.01), field)
     return bounded(replace(camera, lens=lens), MARGIN_PX)
 
@@ -75,10 +75,25 @@ def test_a_place_is_off_by_no_more_than_the_limit_over_the_whole_screen(camera, 
     assert (off[seen] <= BETWEEN_THE_TRIED * np.maximum(LIMIT_PX, LIMIT_SHARE * length[np.nonzero(seen)[1]])).all()
 
 
-@pytest.mark.parametrize("points", [2, 3])
-def test_the_limit_is_where_it_fails(points):
+@pytest.mark.parametrize(
+    "camera", [CAMERAS["wide"], CAMERAS["narrow"], lens_camera(200.0, degree=10)], ids=["wide", "narrow", "wild"]
+)
+def test_a_table_of_a_lens_is_right_or_not_used(camera, rng):
+    """At 40 000 places, a half of them within 8 px of the image's border, where the field is steepest."""
+    size = np.array(SIZE)[:, None]
+    px = rng.uniform(-0.5, size - 0.5, (2, 40_000))
+    px[:, ::4] = np.where(px[:, ::4] < size / 2, rng.uniform(-0.5, 7.5), size - 0.5 - rng.uniform(0, 8))
+    px[0, 1::4] = rng.choice([-0.5, SIZE[0] - 0.5], 10_000)
+    table = _lens_table(*_mapping(camera))
+    found = table.along(np.stack(camera.tangents(*px)), *np.zeros((2, 2, 1)))[0]
+    off_px = np.hypot(*(found - px)).max()
+    assert 0.8 * table.off_px < off_px < 1.2 * table.off_px
+    assert (off_px < TABLE_PX) == (points_within(camera, 1e-6) == 1)
+
+
+@pytest.mark.parametrize(("points", "camera"), [(1, CAMERAS["narrow"]), (2, CAMERAS["pinhole"]), (3, CAMERAS["narrow"])])
+def test_the_limit_is_where_it_fails(points, camera):
     """A turn that is twice the longest for its points is off by more than it may be: the limit is no mere caution."""
-    camera = lens_camera(350.0)
     turns = np.geomspace(1e-5, 0.1, 400)
     longest = max(turn for turn in turns if (points_within(camera, turn) or 9) <= points)
     worst = 0.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 
 import pytest
-from PIL import Image
 
 from hilstar.frame.fault_kinds import KINDS
 from hilstar.study import faults
 from hilstar.study.faults import CASES, NOWHERE, QUANTISATIONS
+from tests.support.pictures import assert_drawn
 
 pytestmark = pytest.mark.study
 
@@ -46,5 +46,4 @@ def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(study):
 
 
 def test_the_chart_is_a_picture(study):
-    with Image.open(study[0] / "faults.png") as picture:
-        assert picture.size[0] > 800
+    assert_drawn(study[0] / "faults.png")

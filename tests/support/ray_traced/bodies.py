@@ -156,7 +156,7 @@ def _above(places: np.ndarray, body: Body) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(HEIGHT_ROUNDS):
         cos_u = 1 / np.sqrt(1 + tan_u**2)
         sin_u = tan_u * cos_u
-        tan_phi = (z + (a * a - c * c) / c * sin_u**3) / (rho - (a * a - c * c) / a * cos_u**3)
+        tan_phi = (z + (a * a - c * c) / c * sin_u**2 * sin_u) / (rho - (a * a - c * c) / a * cos_u**2 * cos_u)
         tan_u = tan_phi * c / a
     cos_phi = 1 / np.sqrt(1 + tan_phi**2)
     sin_phi = tan_phi * cos_phi

@@ -15,16 +15,16 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import patch
 
-import msgspec
 import numpy as np
 
-from hilstar.attitude.logs.mcap_log import RUN_METADATA, McapWriter, attitude_message
-from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.bench.build import open_bench
 from hilstar.charts import write_csv
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.run.record.ledger import TOPICS
+from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report import figures_of
 from hilstar.study.speed.benchmark import FRESH, RADEC_ROLL_DEG, own_bench_file, scene
@@ -37,7 +37,7 @@ STARS = (100, 1000, 10_000, 50_000, 200_000, 400_000, 1_000_000)
 SIZES = ((640, 480), (1024, 1024), FULL_HD, (3840, 2160), (7680, 4320))
 PACKETS_HZ, HOURS, WORKERS, CASES = (10, 100, 1000, 10_000), (1 / 60, 0.1, 0.5, 2.0), (1, 2), (20, 120)
 SECONDS, ROUNDS = 8.0, 15
-FRAME_HZ = 60
+FRAME_HZ, AXIS = 60, np.array([0.36, 0.48, 0.8])
 
 
 def spent(*command: str) -> tuple[str, float]:
@@ -77,26 +77,45 @@ def frame(width: int, height: int, stars: int) -> tuple[float, float]:
 def report(path: str) -> tuple[float, float]:
     """The processor time, ms, of reading a run's ledger, and the peak of memory, MB."""
     begin = time.process_time()
-    assert figures_of(Path(path)).last is not None
+    assert figures_of(Path(path)).counted["frames"]
     return (time.process_time() - begin) * 1e3, peak_mb()
 
 
+class StepLedger(Ledger):
+    """A ledger whose writer makes a pass when it is told to, not five times a second by the clock."""
+
+    def _run(self) -> None:
+        """Leave the passes to `turn`."""
+
+    def turn(self, last: bool = False) -> None:
+        """What the writer's thread does in one pass."""
+        self._turn(last)
+
+
 def write_ledger(path: Path, seconds: float) -> None:
-    """A ledger of FRAME_HZ frames and as many packets a second, in chunks as a run's."""
-    rng, encoder, origin_ns = np.random.default_rng(1), msgspec.json.Encoder(), 10**12
-    with path.open("wb") as file:
-        writer = McapWriter(file.fileno(), TOPICS, RUN_METADATA, {})
-        for k in range(round(seconds * FRAME_HZ)):
-            turn, swap_ns = 1e-4 * k, origin_ns + k * 10**9 // FRAME_HZ + int(rng.integers(0, 10**5))
-            q = np.array([np.cos(turn), np.sin(turn), 0.0, 0.0])
-            sample, at_ns = AttitudeSample(swap_ns, q, np.array([0.0, 0.0, 1e-3]), k), swap_ns - 8_000_000
-            writer.add("packet", at_ns, attitude_message(sample, at_ns, bytes(92)), k)
-            times = {"t_ns": swap_ns, "light_ns": swap_ns, "draw_ns": swap_ns - 5_000_000, "swap_ns": swap_ns}
-            known = FrameRecord(frame=k, **times, receive_ns=at_ns, age_ns=int(rng.integers(10**7)), q=tuple(q.tolist()))
-            writer.add("frame", swap_ns, encoder.encode(known), k)
+    """A run's ledger of FRAME_HZ frames and as many packets a second, as its recorder writes it, on a clock that is stepped."""
+    rng, count, now_ns = np.random.default_rng(1), round(seconds * FRAME_HZ), 10**12
+    clock = SimpleNamespace(monotonic=lambda: now_ns / 1e9, monotonic_ns=lambda: now_ns, time_ns=time.time_ns)
+    noise_ns = rng.integers(0, 10**5, (count, 2)).tolist()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        open_bench(own_bench_file(Path(folder) / "bench.toml", FULL_HD)) as bench,
+        patch("hilstar.run.record.ledger.time", clock),
+        StepLedger(path, bench) as ledger,
+    ):
+        for k, (late_ns, age_ns) in enumerate(noise_ns):
+            now_ns, turn = 10**12 + k * 10**9 // FRAME_HZ, 1e-4 * k
+            q, swap_ns, sent_ns = np.array([np.cos(turn), *np.sin(turn) * AXIS]), now_ns + late_ns, now_ns - 8_000_000 - age_ns
+            sample, at_ns = AttitudeSample(sent_ns, q, 2e-4 * FRAME_HZ * AXIS, k), sent_ns + 400_000
+            ledger.packet(at_ns, encode(sample), sample, None)
+            times = {"t_ns": now_ns, "light_ns": now_ns, "draw_ns": now_ns - 5_000_000, "swap_ns": swap_ns}
+            known = {"attitude_sequence": k, "attitude_t_ns": sent_ns, "receive_ns": at_ns, "prediction_ns": now_ns - sent_ns}
+            ledger.frame(
+                FrameRecord(frame=k, **times, **known, age_ns=now_ns - sent_ns, q=tuple(q.tolist()), stars_drawn=160 + k % 9)
+            )
             if k % (FRAME_HZ // 5) == 0:
-                writer.flush()
-        writer.finish()
+                ledger.turn()
+        ledger.turn(last=True)
 
 
 def served(rate_hz: int) -> tuple[float, float]:
@@ -168,6 +187,8 @@ def main() -> None:
             print(json.dumps(frame(*map(int, values))))
         case ["report", path]:
             print(json.dumps(report(path)))
+        case ["ledger", path, hours]:
+            write_ledger(Path(path), 3600 * float(hours))
         case []:
             results = ROOT / "results"
             tracker, _ = tracker_rows(ROUNDS, 30.0)

@@ -31,7 +31,7 @@ from mcap import records as kinds
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import RecordLengthLimitExceeded
 from mcap.opcode import Opcode
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import Writer
 from zstandard import ZstdCompressor
 from zstandard import ZstdDecompressor as Zstd
@@ -123,8 +123,13 @@ def read_chunks(path: Path, *, tell: bool = True) -> Iterator[tuple[Topics, Mess
                 told = dict(topics)
             elif isinstance(record, kinds.Message) and record.channel_id in topics:
                 yield told, [(record.channel_id, record.data)]
-    unfinished = unfinished_part(path) if tell else None
-    if unfinished is not None:
+    if tell:
+        tell_no_end(path)
+
+
+def tell_no_end(path: Path) -> None:
+    """Log a line of the first of a run's files that lacks its end. Raises InputError."""
+    if (unfinished := unfinished_part(path)) is not None:
         log.warning("%s %s", unfinished, NO_END)
 
 
@@ -214,8 +219,9 @@ class _Reader(StreamReader):
     """
 
     def __init__(self, file: IO[bytes], size: int) -> None:
-        super().__init__(self, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
+        super().__init__(self, emit_chunks=True, record_size_limit=size)  # type: ignore[arg-type]
         self._file, self._size, self.place = file, size, 0
+        self._crcs = (0, 0, 0)  # CRC-32 of the file up to two reads ago, to one, and to here
 
     def read(self, length: int) -> bytes:
         """At most `length` bytes, for the library. Raises TooLargeError for a record over MAX_RECORD_BYTES."""
@@ -224,6 +230,7 @@ class _Reader(StreamReader):
             raise TooLargeError(f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read")
         data = self._file.read(min(length, left))
         self.place += len(data)
+        self._crcs = (*self._crcs[1:], zlib.crc32(data, self._crcs[-1]))
         return data
 
     def all(self) -> Iterator[kinds.McapRecord]:
@@ -257,11 +264,15 @@ class _Reader(StreamReader):
                 elif opcode != MESSAGE_INDEX:
                     break
                 at = end
-            self._stream._crc = zlib.crc32(memoryview(piece)[:at], self._stream.checksum())
+            self._crcs = (*self._crcs[1:], zlib.crc32(memoryview(piece)[:at], self._crcs[-1]))
             self.place = self._file.seek(begin + at)
 
     def _read_record(self, opcode: int, length: int) -> kinds.McapRecord | None:
-        return None if opcode == MESSAGE_INDEX else super()._read_record(opcode, length)
+        before = self._crcs[0]  # the opcode and the length were read since
+        record = None if opcode == MESSAGE_INDEX else super()._read_record(opcode, length)
+        if isinstance(record, kinds.DataEnd) and record.data_section_crc not in {0, before}:
+            raise CRCValidationError(record.data_section_crc, before, record)
+        return record
 
 
 def _is_finished(file: IO[bytes]) -> bool:

@@ -272,6 +272,8 @@ def _packets(run: RunFigures) -> dict[str, Any]:
     begin_s, rates_hz = run.packet_times.rates_hz(run.first_swap_ns)
     accepted, refused = (_numbers(rates_hz[:, kind], MS_DIGITS) for kind in range(2))
     width_s = run.packet_times.width_ns / NS_PER_S
+    if len(begin_s) and begin_s[-1] + width_s > run.duration_s:
+        accepted[-1] = None  # the run ended before this bin did
     return {"t_s": _numbers(begin_s, S_DIGITS), "width_s": width_s, "accepted_hz": accepted, "refused_hz": refused}
 
 

@@ -163,7 +163,7 @@ def leave(code: int) -> NoReturn:
     """End the process without asking Python's own end, which takes every module apart (20 ms) and waits for threads.
 
     After a signal, or where a thread still waits for something, nothing else is asked either: a thread may be in the middle of
-    writing. A profiler, and a stdout that cannot be written, get Python's own end.
+    writing. A profiler gets Python's own end.
     """
     for number in ENDING:
         with contextlib.suppress(ValueError):  # not the main thread
@@ -172,12 +172,10 @@ def leave(code: int) -> NoReturn:
     own = {"hilstar-signals", "hilstar-stderr"}
     others = [thread for thread in threading.enumerate() if thread.name not in own]
     if _ending.signal is None and len(others) == 1:
-        try:
-            sys.stdout.flush()
-        except (OSError, ValueError):
-            sys.exit(code)
         if sys.getprofile() is not None:
             sys.exit(code)
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
         atexit._run_exitfuncs()
     os._exit(code)
 

@@ -33,7 +33,6 @@ RADIUS_POWER = 0.77
 STAR_SIGMA = 8.0  # a box sum this many sigmas above the background is a star
 PIXEL_GREY = 0.7  # the brightest grey of a pixel that no disc covers
 MAX_CARD = 60  # characters of text on a card of FITS
-PNG_BITS = 16
 
 
 def exposure_picture(dn: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
@@ -123,8 +122,9 @@ def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
 
 
 class TrackerPictures:
-    """A PNG for each attitude, drawn in the bench's GL context and freed with the bench.
+    """A greyscale PNG of 16 bits for each attitude, drawn in the bench's GL context and freed with the bench.
 
+    Its leading bits are the DN's, so that a reader that keeps 8 of them still sees a picture; sBIT says how many they are.
     The exposure is centred on the attitude; stars smear where the attitude has a rate. Noise is full, and that of the n-th
     picture of a run is always the same. `now` says which faults of a scenario are on.
     """
@@ -142,7 +142,8 @@ class TrackerPictures:
         view = self._simulator.view(sample.q_icrs_to_cam, rate, sample.t_ns, sample.velocity_km_s, sample.place_km)
         exposure = self._simulator.expose(view, self._noise.rng(self._count), self._faults(view))
         self._count += 1
-        return dn_png(exposure.dn, self._simulator.config.tracker.detector.bits)
+        bits = self._simulator.config.tracker.detector.bits
+        return png_of(np.left_shift(exposure.dn, 16 - bits, dtype=np.uint16), bits)
 
     def _faults(self, view: View) -> FaultyExposure | None:
         """The exposure with the faults of the display's frame; where that stands still, at the attitude at which it does."""
@@ -153,11 +154,3 @@ class TrackerPictures:
             stood = self._stood
             view = replace(view, q_icrs_to_cam=stood.q_icrs_to_cam, rate_cam_rad_s=STILL, t_ns=stood.t_ns)
         return FaultyExposure(self._view, (ExposurePiece(view, now),)) if now else None
-
-
-def dn_png(dn: npt.NDArray[np.uint16], bits: int) -> bytes:
-    """DN (height, width) of so many bits as a greyscale PNG of 16, which its sBIT says: DN = value >> (16 - bits).
-
-    The leading bits are the DN's, so that a reader that keeps 8 of them still sees a picture.
-    """
-    return png_of(np.left_shift(dn, PNG_BITS - bits, dtype=np.uint16), bits)

@@ -24,6 +24,7 @@ from hilstar.cli.options import with_values
 from tests.docs.pages import Block, blocks_of, differs
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.forks import Started
+from tests.support.readme import plain_pytest
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -133,7 +134,9 @@ def hilstar(words: list[str]) -> str:
 def other_program(words: list[str]) -> str:
     """What another program prints; `python` is this one."""
     command = [sys.executable, *words[1:]] if words[0] == "python" else words
-    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=PATIENCE_S).stdout
+    return subprocess.run(
+        command, stdout=subprocess.PIPE, text=True, check=True, timeout=PATIENCE_S, env=plain_pytest(Path())
+    ).stdout
 
 
 @contextlib.contextmanager

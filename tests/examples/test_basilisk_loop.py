@@ -11,24 +11,24 @@ import pytest
 from tests.examples.support import copied
 from tests.support.waiting import PATIENCE_S
 
-# 12 s of real time: 3 arcmin with a bandwidth of 0.6 rad/s have decayed to some arcsec by the last quarter; what is
-# left is the tracker's noise, 0.1 arcsec and 1.2 about the boresight, through the controller. Measured 0.3 to 1.8, and 3, with
+# 9 s of real time: 72 arcsec with a bandwidth of 0.6 rad/s have decayed to some arcsec by the last quarter; what is
+# left is the tracker's noise, 0.1 arcsec and 1.2 about the boresight, through the controller. Measured 0.3 to 3.6, and 3, with
 # half of the answers on a machine with eight times the work of its cores.
 ACROSS_ARCSEC, ABOUT_ARCSEC = 10.0, 40.0
 # The loop is closed in real time: a machine that loses answers, or is late with them, flies another loop, of which nothing is
 # stated.
-MIN_ANSWERS, MAX_AGE_MS = 112, 250.0
+MIN_ANSWERS, MAX_AGE_MS = 76, 250.0
 
 
 def test_a_slew_settles_by_nothing_but_the_trackers_answers(tmp_path):
-    command = [sys.executable, "basilisk_loop.py", "0.05", "12"]
+    command = [sys.executable, "basilisk_loop.py", "0.02", "9"]
     folder = copied(tmp_path)
     result = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S + 60, check=False)
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
     assert found["answers"] > 0
     if found["answers"] < MIN_ANSWERS or found["answer_age_ms"] > MAX_AGE_MS:
-        pytest.skip(f"a busy machine: {found['answers']} answers of 120, {found['answer_age_ms']:.0f} ms old in the middle")
+        pytest.skip(f"a busy machine: {found['answers']} answers of 90, {found['answer_age_ms']:.0f} ms old in the middle")
     assert found["pointing_rms_arcsec"]["x"] < ACROSS_ARCSEC
     assert found["pointing_rms_arcsec"]["y"] < ACROSS_ARCSEC
     assert found["pointing_rms_arcsec"]["about_boresight"] < ABOUT_ARCSEC

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from tests.examples.support import commands, copied, section
-from tests.support.commands import run_hilstar_here
-from tests.support.waiting import PATIENCE_S
+from tests.support.commands import run_hilstar_here, run_started
+from tests.support.readme import plain_pytest
 
 
 def test_it_passes_on_the_same_sky_and_fails_on_another(tmp_path, monkeypatch):
@@ -32,7 +31,7 @@ def test_it_passes_on_the_same_sky_and_fails_on_another(tmp_path, monkeypatch):
 
     options = ["--import-mode=importlib", "-p", "no:cacheprovider", "-rA"]
     command = [sys.executable, *test[1:], "wrong/test_sky.py", *options]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    result = run_started(command, env=plain_pytest(folder))
     assert result.returncode == pytest.ExitCode.TESTS_FAILED, result.stdout
     outcomes = {name: outcome for outcome, name in re.findall(r"(?m)^(PASSED|FAILED) (\S+)::", result.stdout)}
     assert outcomes == {"test_sky.py": "PASSED", "wrong/test_sky.py": "FAILED"}

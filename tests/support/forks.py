@@ -41,6 +41,7 @@ LATER = {
     "campaign": ("hilstar.campaign.results", "hilstar.campaign.requirements_page", "hilstar.campaign.bench_run"),
     "first-light": ("hilstar.calibrate.first_light.session", "scipy.optimize"),
     "frame": ("astropy.io.fits",),
+    "pytest": ("pytest", "hilstar.testing", "astropy.io.fits"),
     "scheduler": ("distributed.cli.dask_scheduler",),
     "simulate": ("astropy.io.fits", "astropy.table", "hilstar.twin.batch"),
     "worker": ("distributed.cli.dask_worker", "hilstar.campaign.pool"),
@@ -149,7 +150,7 @@ def main(made: socket.socket) -> None:
         if not data:
             return
         request = json.loads(data)
-        if modules := later.pop("".join(request["words"][3:4]), ()):
+        if modules := [module for word in request["words"][2:4] for module in later.pop(word, ())]:
             for module in modules:
                 importlib.import_module(module)
             settle()

@@ -101,6 +101,17 @@ def serving(tmp_path: Path, port: int, *options: str, attitude: str = "", monito
         yield process
 
 
+def children_of(process: int) -> list[int]:
+    """The processes that a process's main thread has started, and that run."""
+    return list(map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split()))
+
+
+def workers_of(process: subprocess.Popen[str]) -> list[int]:
+    """The workers of a command's pool, which a fork server of its own starts."""
+    servers = (child for child in children_of(process.pid) if b"forkserver" in Path(f"/proc/{child}/cmdline").read_bytes())
+    return [worker for server in servers for worker in children_of(server)]
+
+
 def summary_of(process: subprocess.Popen[str], timeout: float = PATIENCE_S, code: int = 0) -> dict:
     """What it prints at its end, with that exit code."""
     out, err = process.communicate(timeout=timeout)

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ import pytest
 from tests.support.campaigns import read_columns, write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.forks import Started
+from tests.support.servers import workers_of
 from tests.support.waiting import PATIENCE_S, wait_for
 
 # Slow enough to be killed in its middle; its answer, and the images that it fails over, are those of the pixels alone.
@@ -46,12 +46,6 @@ def rows_so_far(folder: Path) -> int:
     return sum(path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl"))
 
 
-def workers_of(process: subprocess.Popen[str]) -> Iterator[int]:
-    for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
-        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
-            yield int(child)
-
-
 def runs(pid: int) -> bool:
     """Whether a process is there, and no zombie that waits for its new parent."""
     try:
@@ -78,11 +72,11 @@ def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
     wait_for(lambda: rows_so_far(folder) > after_stop + 1)
     second = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=folder)
     assert_refused(second, 2, "another campaign is running")
-    victims = list(workers_of(killed))
+    victims = workers_of(killed)
     os.kill(victims[0], signal.SIGKILL)
     after_kill = rows_so_far(folder)
     wait_for(lambda: rows_so_far(folder) > after_kill + 2)
-    left = list(workers_of(killed))
+    left = workers_of(killed)
     assert victims[0] not in left
     os.kill(killed.pid, signal.SIGKILL)
     killed.communicate()

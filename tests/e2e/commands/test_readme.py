@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 
 from tests.support.benches import ROOT, attitude_table
-from tests.support.commands import run_hilstar, run_hilstar_here
+from tests.support.commands import run_hilstar, run_hilstar_here, run_started
 from tests.support.forks import Started
-from tests.support.readme import README, blocks
+from tests.support.readme import README, blocks, plain_pytest
 from tests.support.senders import free_port
 
 
@@ -47,9 +47,8 @@ def test_the_user_s_regression_test_passes(tmp_path):
     (tmp_path / "bench.toml").write_text(blocks("toml")[0])
     (tmp_path / "test_mine.py").write_text(blocks("python")[1])
     assert blocks("python")[1].strip().count("\n") + 1 <= 9
-    result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "test_mine.py"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", "pytest", "-q", "test_mine.py"]
+    result = run_started(command, tmp_path, env=plain_pytest(tmp_path))
     assert result.returncode == 0, result.stdout
 
 

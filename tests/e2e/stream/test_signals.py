@@ -22,6 +22,7 @@ from tests.support.benches import LIVE_BENCH, attitude_table
 from tests.support.commands import has_handlers
 from tests.support.forks import Started
 from tests.support.senders import free_port, packet, publisher
+from tests.support.servers import workers_of
 from tests.support.waiting import PATIENCE_S, CoreWaits, repeating, wait_for
 
 WITHIN_S = 1.0
@@ -329,8 +330,8 @@ def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
         context.term()
 
 
-def ctrl_c_is_blocked(worker: Path) -> bool:
-    (line,) = (line for line in (worker / "status").read_text().splitlines() if line.startswith("SigBlk"))
+def ctrl_c_is_blocked(worker: int) -> bool:
+    (line,) = (line for line in Path(f"/proc/{worker}/status").read_text().splitlines() if line.startswith("SigBlk"))
     return bool(int(line.split()[1], 16) & 1 << signal.SIGINT - 1)
 
 
@@ -342,9 +343,7 @@ def test_a_pool_of_workers_ends_with_its_command(tmp_path, small_bench_file):
     for number in (signal.SIGTERM, signal.SIGKILL):
         with running(program("simulate", small_bench_file, "--log", log, "-o", out / str(number))) as process:
             wait_for(lambda number=number: list((out / str(number)).glob("*.fits")))
-            children = map(Path("/proc").joinpath, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split())
-            workers = [child for child in children if b"spawn_main" in (child / "cmdline").read_bytes()]
-            assert workers and all(map(ctrl_c_is_blocked, workers))
+            assert workers_of(process) and all(map(ctrl_c_is_blocked, workers_of(process)))
             code, _, err = ends(process, number)
         assert code == (128 + number if number == signal.SIGTERM else -number)
         assert "Traceback" not in err

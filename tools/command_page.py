@@ -14,7 +14,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from typer import Typer
 from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
 
-from hilstar.cli.app import app
+from hilstar.cli.app import application
 from hilstar.errors import InputError, MachineError
 
 MAX_BOUND = 1e6  # a larger limit only keeps arithmetic within its types; nobody meets it
@@ -72,10 +72,10 @@ class Parameter:
 
 def page() -> str:
     """The page: the commands in the panels of `hilstar --help`."""
-    parts, panels = [HEAD], dict.fromkeys(panel for panel, _, _ in commands_of(app))
+    parts, panels = [HEAD], dict.fromkeys(panel for panel, _, _ in commands_of(application()))
     for title in panels:
         parts.append(f"## {title}\n")
-        parts += [section(name, command) for panel, name, command in commands_of(app) if panel == title]
+        parts += [section(name, command) for panel, name, command in commands_of(application()) if panel == title]
     return "\n".join(parts)
 
 

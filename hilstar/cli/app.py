@@ -1,7 +1,5 @@
 """The table of commands, grouped as `hilstar --help` shows them."""
 
-import copy
-import sys
 from functools import cache
 from importlib import import_module
 from typing import Annotated, Any
@@ -61,39 +59,6 @@ class Commands(TyperGroup):
             raise EarlyEnd(error) from error
 
 
-class Application(typer.Typer):
-    """The commands of `hilstar`. Only the one that is called is built, and once: all of them take 40 ms, a third of a start."""
-
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Run a command line, by default this process' own. Raises EarlyEnd."""
-        words = arguments[0] if arguments else sys.argv[1:]
-        names = [each.name for each in self.registered_commands] + [each.name for each in self.registered_groups]
-        return built(self, words[0] if words and words[0] in names else None)(*arguments, **named)
-
-    def with_one(self, name: str | None) -> "Application":
-        """The application with only the command or group of this name; whole without a name."""
-        if name is None:
-            return self
-        one = copy.copy(self)
-        one.registered_commands = [each for each in self.registered_commands if each.name == name]
-        one.registered_groups = [each for each in self.registered_groups if each.name == name]
-        return one
-
-
-@cache
-def built(application: Application, name: str | None) -> Any:
-    """What typer makes of an application to run one of its commands, or any of them."""
-    return typer.main.get_command(application.with_one(name))
-
-
-app = Application(
-    cls=Commands,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",  # "rich" would swallow a table's name, as in [answers]
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
-
 def print_version(wanted: bool) -> None:
     """Print the version and exit, if `wanted`."""
     if wanted:
@@ -101,7 +66,6 @@ def print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def hilstar(
     _: Annotated[bool, Option("--version", callback=print_version, is_eager=True, help="Print the version and quit.")] = False,
 ) -> None:
@@ -111,14 +75,44 @@ def hilstar(
 def add(to: typer.Typer, file: str, name: str, panel: str | None = None) -> None:
     """Add the command of a function `name` in a file of this folder."""
     function = getattr(import_module(f"hilstar.cli.{file}"), name)
-    to.command(name.strip("_").replace("_", "-"), rich_help_panel=panel)(function)
+    to.command(public(name), rich_help_panel=panel)(function)
 
 
-for panel, names in COMMANDS.items():
-    for name in names:
-        add(app, name, name, panel)
-for group, (panel, words, names) in GROUPS.items():
-    members = typer.Typer(help=words)
-    for name in names:
-        add(members, group, name)
-    app.add_typer(members, name=group, rich_help_panel=panel)
+def public(name: str) -> str:
+    """A function's name as a command's."""
+    return name.strip("_").replace("_", "-")
+
+
+@cache
+def application(only: str | None = None) -> typer.Typer:
+    """The commands of `hilstar`, or `only` the command or group of a name: each imports its file, and all take 50 ms."""
+    app = typer.Typer(
+        cls=Commands,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="markdown",  # "rich" would swallow a table's name, as in [answers]
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.callback()(hilstar)
+    for panel, names in COMMANDS.items():
+        for name in names:
+            if only in (None, public(name)):
+                add(app, name, name, panel)
+    for group, (panel, words, names) in GROUPS.items():
+        if only in (None, group):
+            members = typer.Typer(help=words)
+            for name in names:
+                add(members, group, name)
+            app.add_typer(members, name=group, rich_help_panel=panel)
+    return app
+
+
+@cache
+def built(only: str | None) -> Any:
+    """What typer makes of an application."""
+    return typer.main.get_command(application(only))
+
+
+def run(words: list[str]) -> Any:
+    """Run a command line. Raises EarlyEnd, and what typer and the command raise."""
+    names = {public(name) for names in COMMANDS.values() for name in names} | GROUPS.keys()
+    return built(words[0] if words and words[0] in names else None)(words, standalone_mode=False)

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from hilstar.cli.app import EarlyEnd, app
+from hilstar.cli.app import EarlyEnd, run
 from hilstar.cli.options import with_values
 from hilstar.console.terminal import fail
 from hilstar.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
@@ -49,7 +49,7 @@ def run_command(words: list[str]) -> int:
 def _run(words: list[str]) -> int:
     """The exit code of a command. Raises SystemExit where it is refused."""
     try:
-        code = int(app(words, standalone_mode=False) or 0)
+        code = int(run(words) or 0)
         sys.stdout.flush()
         if code == INTERRUPTED:  # typer turns Ctrl-C into this code, and says nothing
             fail("stopped", interrupts.exit_code())

@@ -34,7 +34,6 @@ def frame(
     from hilstar.bench.bench_file import at_moment, read_bench_file
     from hilstar.bench.build import open_bench
     from hilstar.bench.cameras import fields_of_view
-    from hilstar.bench.fault_views import faults_at
     from hilstar.frame.truth import clipped_in
 
     q = options.parse_attitude("frame", radec, quaternion)
@@ -53,7 +52,11 @@ def frame(
     with open_bench(file) as bench:
         if explain:
             explain_bench(bench, t_ns)
-        effects = None if wrong is None else faults_at(bench, wrong, t_ns or 0)
+        effects = None
+        if wrong is not None:
+            from hilstar.bench.fault_views import faults_at  # takes 20 ms, with the random numbers of its light
+
+            effects = faults_at(bench, wrong, t_ns or 0)
         shot = bench.frame(q, t_ns=t_ns, faults=effects)
         if output is not None:
             files.write_frame_fits(output, bench, shot)

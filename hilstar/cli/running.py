@@ -225,9 +225,11 @@ def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: 
 
 def optional_scenario(path: Path | None) -> "Scenario | None":
     """The scenario of `--scenario`, None without one. Raises InputError."""
+    if path is None:
+        return None
     from hilstar.bench.scenario import read_scenario
 
-    return None if path is None else read_scenario(path)
+    return read_scenario(path)
 
 
 @contextmanager

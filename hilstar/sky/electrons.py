@@ -341,13 +341,16 @@ def fit_table(bv_mag: FloatArray, vi_mag: FloatArray, electrons_per_s: FloatArra
 def natural_basis(colour_mag: FloatArray, knots_mag: FloatArray) -> FloatArray:
     """Basis of the natural cubic splines, shape (n, knots) (Hastie et al. 2009, eq. 5.4), colours held to the knots' range."""
     x = np.clip(colour_mag, knots_mag[0], knots_mag[-1])[:, None]
-    last, each = (np.maximum(x - knots, 0) for knots in (knots_mag[-1], knots_mag[:-1]))
-    d = (each * each * each - last * last * last) / (knots_mag[-1] - knots_mag[:-1])  # a power takes ten times as long
+    last = np.maximum(x - knots_mag[-1], 0) ** 3
+    d = (np.maximum(x - knots_mag[:-1], 0) ** 3 - last) / (knots_mag[-1] - knots_mag[:-1])
     return np.hstack([np.ones_like(x), x, d[:, :-1] - d[:, -1:]])
 
 
 def _knots_at_equal_shares(colour_mag: FloatArray, count: int) -> FloatArray:
-    return np.interp(np.linspace(0, len(colour_mag) - 1, count), np.arange(len(colour_mag)), np.sort(colour_mag))
+    """Quantiles, bit for bit NumPy's, whose own import `numpy.ma`: that takes 10 ms."""
+    whole, part = np.divmod(np.linspace(0, 1, count) * (len(colour_mag) - 1), 1)
+    low, high = np.sort(colour_mag)[[whole.astype(np.intp), np.ceil(whole + part).astype(np.intp)]]
+    return np.asarray(np.where(part < 0.5, low + (high - low) * part, high - (high - low) * (1 - part)))
 
 
 def _knots(library: Library) -> Curve:

@@ -19,7 +19,7 @@ import pytest
 from hilstar.bench.config import read_config
 from hilstar.bench.scenario import parse_scenario
 from hilstar.campaign.plan import parse_plan
-from hilstar.cli.app import app
+from hilstar.cli.app import run
 from hilstar.cli.options import with_values
 from tests.docs.pages import Block, blocks_of, differs
 from tests.support.benches import ROOT, SMALL_BENCH
@@ -126,7 +126,7 @@ def type_in(block: Block, port: str) -> None:
 def hilstar(words: list[str]) -> str:
     """What a hilstar command prints; it is run in this process, which saves a start of half a second."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        code = app(with_values(words), standalone_mode=False)
+        code = run(with_values(words))
     assert not code, f"exit code {code}: hilstar {' '.join(words)}"
     return printed.getvalue()
 

@@ -16,7 +16,7 @@ import pytest
 
 import hilstar
 from hilstar.attitude.logs.log_file import READABLE
-from hilstar.cli import app
+from hilstar.cli.app import run
 from hilstar.errors import HilstarError, InputError, one_line
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.commands import assert_refused, bounded_by, run_hilstar_here
@@ -42,7 +42,7 @@ def bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def refusal(*words: str) -> str:
     """The line with which a command refuses, in this process."""
     with pytest.raises(HilstarError) as error:
-        app([*map(str, words)], standalone_mode=False)
+        run([*map(str, words)])
     assert error.value.exit_code == 2
     line = one_line(str(error.value))
     assert len(line) <= 1000

@@ -9,7 +9,7 @@ import pytest
 from typer import Typer
 
 import hilstar
-from hilstar.cli.app import app
+from hilstar.cli.app import application, run
 from tests.support.benches import ROOT
 
 
@@ -23,7 +23,7 @@ def lines_of(group: Typer) -> Iterator[list[str]]:
             yield [str(inner.name), *words]
 
 
-LINES = list(lines_of(app))
+LINES = list(lines_of(application()))
 
 
 def test_there_are_commands_and_groups():
@@ -35,14 +35,14 @@ def test_there_are_commands_and_groups():
 @pytest.mark.parametrize("words", LINES, ids=" ".join)
 @pytest.mark.parametrize("flag", ["-h", "--help"])
 def test_help_is_there(words, flag, capsys):
-    assert not app([*words, flag], standalone_mode=False)
+    assert not run([*words, flag])
     usage = next(line for line in capsys.readouterr().out.splitlines() if "Usage:" in line)
     typed = usage.partition(" [OPTIONS]")[0].split()
     assert typed[len(typed) - len(words) :] == words
 
 
 def test_the_version_is_the_package_s(capsys):
-    assert not app(["--version"], standalone_mode=False)
+    assert not run(["--version"])
     assert capsys.readouterr().out == f"hilstar {hilstar.__version__}\n"
 
 
@@ -54,5 +54,5 @@ def test_the_version_stands_in_one_place():
 
 def test_help_shows_the_name_of_a_table(capsys):
     """Rich takes [word] for markup, and shows nothing of it."""
-    assert not app(["answers", "--help"], standalone_mode=False)
+    assert not run(["answers", "--help"])
     assert "by [answers]" in capsys.readouterr().out

@@ -35,7 +35,7 @@ from hilstar.render.encoder import (
 )
 from hilstar.render.exact_pass import ExactPass
 from hilstar.render.host_image import HostImage
-from hilstar.render.star_passes import LightUnits, StarPasses
+from hilstar.render.star_passes import ApartPasses, LightUnits, StarPasses
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.sprites import Sprites
 
@@ -156,7 +156,11 @@ class Renderer(Backend):
         target, planes = self.target, self._planes
         units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
         if computes_in_software(self._ctx):  # a graphics card is left idle by a star a lane
-            self._passes = StarPasses(levels, planes, target.psf, self._shares, self._by_star is not None, units)
+            if planes.apart:
+                psf = target.psf if self._by_star is not None else None
+                self._passes = ApartPasses(levels, planes, self._shares, units, psf)
+            else:
+                self._passes = StarPasses(levels, planes, self._shares, units)
             return
         self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, planes, in_units=True)
         planes.set(self._unit_splat, most_e_per_s=units.most_e_per_s)
@@ -214,7 +218,7 @@ class Renderer(Backend):
                 self._choose(sprites, passes)
                 return
             if passes is not None:
-                passes.forget(sums=False)
+                passes.forget()
             if self._by_numpy:
                 self._draw_by_numpy(sprites, frame)
                 self._undrawn = (sprites, False)
@@ -412,7 +416,7 @@ class Renderer(Backend):
         """The levels of the last draw, R8UI or R16UI, for whom its `ctx` is current; TypeError without a response."""
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no levels")
-        return self._levels.texture
+        return self._levels.upload()
 
     def linear(self) -> Float32Array:
         """See `Backend.linear`."""
@@ -436,6 +440,8 @@ class Renderer(Backend):
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
         """See `Backend.present`."""
+        with self._ctx:
+            _ = self.codes_texture  # with the last levels
         self._presenter.present(overlay, patch_code, marker)
 
     def take_back_buffer(self) -> None:
@@ -469,7 +475,7 @@ class Renderer(Backend):
         self._floor_encoder, self._floor_levels = None, None
         with self._ctx:
             if self._passes is not None:
-                self._passes.forget(sums=True)
+                self._passes.forget()
             self._extended.forget()
         self.begin_anew()
 

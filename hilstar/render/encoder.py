@@ -318,11 +318,8 @@ class LevelTexture:
         width, height = resolution_px
         kind, self._components = level_dtype(planes.panels[0].response), planes.texel
         shape = height, width, planes.texel
-        self.memory: moderngl.Buffer | None = None  # that of `image`, where this GL computes in it
-        if computes_in_software(ctx):
-            self.image, self.memory = pinned(ctx, shape, kind)
-        else:
-            self.image = np.zeros(shape, dtype=kind)
+        made: tuple[npt.NDArray[Any], moderngl.Buffer | None] = np.zeros(shape, dtype=kind), None
+        self.image, self.memory = pinned(ctx, shape, kind) if computes_in_software(ctx) else made
         self._levels = Levels(self.image[..., : len(planes.panels)] if planes.apart else self.image[..., 0])
         self._dtype = f"u{self.image.itemsize}"
         bits = 8 * self.image.itemsize

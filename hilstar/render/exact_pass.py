@@ -128,7 +128,6 @@ class ExactPass:
         """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
         paths = sprites.per_star > 1
         program = self._program(paths, passes is not None, passes is not None and passes.floor is not None)
-        count = len(sprites)
         if passes is None:
             self._linear.bind_to_image(1, read=True, write=False)
         else:
@@ -137,7 +136,7 @@ class ExactPass:
             turns = stretches_of(sprites.star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
             write(self._turns, turns.astype(np.int32))
             self._turns.bind_to_storage_buffer(TURNS_BINDING)
-            count = len(turns)
+        count = len(turns) if paths else len(sprites)
         if self._memory is not None and paths:
             self._memory.bind(sprites.star[turns[:, 0]], turns[:, 0] != turns[:, 2])
         elif self._memory is not None:

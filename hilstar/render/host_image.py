@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import IntArray
-from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software, pinned
+from hilstar.render.context import MAX_ROUNDS, pinned
 from hilstar.render.encoder import Shares, build_compute
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
@@ -49,12 +49,6 @@ class HostImage:
         self._program = build_compute(ctx, "linear.comp", named, ["shares.glsl"])
         shares.set(self._program)
         self._program["resolution_px"] = resolution_px
-
-    @staticmethod
-    def runs_on(ctx: moderngl.Context, resolution_px: tuple[int, int]) -> bool:
-        """Whether this GL is a processor's, has what this needs, and takes an image so large."""
-        width, height = resolution_px
-        return computes_in_software(ctx) and 4 * width * height <= MAX_WRITTEN_BYTES
 
     def _reserved(self) -> moderngl.Buffer:
         return self._ctx.buffer(reserve=2 * self._capacity * SPRITE_DTYPE.itemsize, dynamic=True)

@@ -17,7 +17,7 @@ from hilstar.monitor.quantise import MASK_TURNS, DitherQuantiser, PixelQuantiser
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
-from hilstar.render.context import Context, check_limits, computes_in_software, create_context
+from hilstar.render.context import MAX_WRITTEN_BYTES, Context, check_limits, computes_in_software, create_context
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
     CUT_WINGS,
@@ -94,7 +94,8 @@ class Renderer(Backend):
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
         self._linear_image = np.empty((height, width), dtype=np.float32)
-        on_host = self.ON_HOST and target.response is None and HostImage.runs_on(ctx, target.resolution_px)
+        fits = 4 * width * height <= MAX_WRITTEN_BYTES
+        on_host = self.ON_HOST and target.response is None and fits and computes_in_software(ctx)
         self._host = HostImage(ctx, target.resolution_px, self._shares) if on_host else None
         self._on_host = False  # where the last draw is
 
@@ -156,11 +157,8 @@ class Renderer(Backend):
         target, planes = self.target, self._planes
         units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
         if computes_in_software(self._ctx):  # a graphics card is left idle by a star a lane
-            if planes.apart:
-                psf = target.psf if self._by_star is not None else None
-                self._passes = ApartPasses(levels, planes, self._shares, units, psf)
-            else:
-                self._passes = StarPasses(levels, planes, self._shares, units)
+            made, psf = ApartPasses if planes.apart else StarPasses, target.psf if self._by_star is not None else None
+            self._passes = made(levels, planes, self._shares, units, psf)
             return
         self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, planes, in_units=True)
         planes.set(self._unit_splat, most_e_per_s=units.most_e_per_s)

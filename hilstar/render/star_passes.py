@@ -98,11 +98,8 @@ class LightUnits:
 
         Of one that stands `alone` no pixel beyond it is lit.
         """
-        if alone:
-            return self._share_bound * sprites.per_star / self.lit_e_per_s
-        width, height = self._size_px
-        wings = self.wings * (DENSER_WINGS if len(sprites) * self._footprint_px**2 > width * height else 1)
-        return self._share_bound * sprites.per_star * wings / self.lit_e_per_s
+        denser = DENSER_WINGS if len(sprites) * self._footprint_px**2 > math.prod(self._size_px) else 1
+        return self._share_bound * sprites.per_star * (1.0 if alone else self.wings * denser) / self.lit_e_per_s
 
 
 class StarPasses:
@@ -113,7 +110,7 @@ class StarPasses:
     `floor`, its stars' levels are added to those in light.
     """
 
-    def __init__(self, levels: LevelTexture, planes: Planes, shares: Shares, units: LightUnits) -> None:
+    def __init__(self, levels: LevelTexture, planes: Planes, shares: Shares, units: LightUnits, exact_psf: Psf | None) -> None:
         ctx = self._ctx = levels.texture.ctx
         self._levels, self._planes, self._units, self._shares = levels, planes, units, shares
         width, height = self._size_px = levels.texture.size
@@ -123,7 +120,7 @@ class StarPasses:
         sums, self._sums = pinned(ctx, (height, width * len(planes.panels)), np.int32)
         self._unit_e_per_s: list[float] = []  # units of the sums
         self.sprites = ctx.buffer(reserve=planes.dtype.itemsize, dynamic=True)
-        self._drawn: int | None = None  # sprites that are in the buffer and on the images; None: it is not known
+        self._drawn = 0  # sprites in the buffer
         side_px = min(self._footprint_px, width, height)
         self._square = np.add.outer(width * np.arange(side_px), np.arange(side_px)).ravel()
         self._images = sums, levels.image.reshape(height, -1)
@@ -146,25 +143,18 @@ class StarPasses:
         return program
 
     def forget(self) -> None:
-        """The next `erase` makes all levels and sums black: something else has drawn on them, or they may be lost."""
-        self._drawn, self._corner, self._levels.in_memory = None, None, False
-
-    def erase(self) -> None:
-        """Make black what the last frame drew."""
-        self._levels.in_memory = True
-        for image, squares in zip(self._images, self._squares, strict=True):
-            if self._corner is None:
-                image.fill(0)
-            else:
-                squares[self._corner[0], image.shape[1] // self._size_px[0] * self._corner[1]] = 0
-        self._drawn, self._corner = 0, NOWHERE
+        """The next `lay` makes all levels and sums black: something else has drawn on them, or they may be lost."""
+        self._corner, self._levels.in_memory = None, False
 
     def lay(self, floor: LevelTexture | None) -> None:
-        """Take a frame's floor, which becomes its levels; None for black."""
-        if floor is None and self.floor is not None:
-            self.forget()
-        self.erase()
-        self.floor = floor
+        """Make black what the last frame drew, and take a frame's floor, which becomes its levels; None for black."""
+        corner = None if floor is None and self.floor is not None else self._corner
+        self.floor, self._levels.in_memory, self._corner = floor, True, NOWHERE
+        for image, squares in zip(self._images, self._squares, strict=True):
+            if corner is None:
+                image.fill(0)
+            else:
+                squares[corner[0], image.shape[1] // self._size_px[0] * corner[1]] = 0
         if floor is not None:
             self._levels.image[..., 0] = floor.read()
             floor.texture.bind_to_image(1, read=True, write=False)  # for all passes of the frame
@@ -184,7 +174,6 @@ class StarPasses:
         """Add the light of the sprites to their pixels' sums, which are of these units."""
         self._unit_e_per_s = unit_e_per_s
         self._run(self._programs[0], self._alone)
-        self._ctx.finish()  # before NumPy looks at the sums
 
     def encode(self) -> None:
         """Make levels of the sums under the sprites, the nearest."""
@@ -210,13 +199,14 @@ class StarPasses:
                 buffer.bind_to_storage_buffer(binding)
 
     def _run(self, program: moderngl.ComputeShader, without: int = 0) -> None:
-        if not self._drawn or self._drawn == without:
+        if self._drawn == without:
             return
         self.bind(program)
         program["count"] = self._drawn
         self._shares.bind()
         program.run(-(-(self._drawn - without) // LOCAL_SIZE))
         self._ctx.memory_barrier()
+        self._ctx.finish()  # before NumPy looks at the sums
 
 
 class ApartPasses(StarPasses):
@@ -226,7 +216,7 @@ class ApartPasses(StarPasses):
     """
 
     def __init__(self, levels: LevelTexture, planes: Planes, shares: Shares, units: LightUnits, exact_psf: Psf | None) -> None:
-        super().__init__(levels, planes, shares, units)
+        super().__init__(levels, planes, shares, units, exact_psf)
         table, gain = level_steps(edges_of(planes)), self._gain
         if table is None:
             raise ValueError("several thresholds in a bin; ask `LightUnits.takes` first")
@@ -261,7 +251,6 @@ class ApartPasses(StarPasses):
             self._gains.use(0)
         self._steps.bind()
         self._run(self._programs[1])
-        self._ctx.finish()
 
     def bind(self, program: moderngl.ComputeShader) -> None:
         """Let another program look at the sums, and take the stars in their order."""
@@ -289,8 +278,6 @@ def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
 
 def crowded_at(x_px: FloatArray, y_px: FloatArray, reach_px: FloatArray) -> BoolArray:
     """Whether the circle of a star, `reach_px` (n,) about it, meets another's, (n,): sought in strips of the image."""
-    if not len(x_px):
-        return np.zeros(0, dtype=np.bool_)
     low, high = y_px.min(), y_px.max()
     most_px = 2 * float(reach_px.max())  # by which two stars may be apart
     strip, long = np.floor(x_px / max(most_px, STRIP_PX)), high - low + 2 * most_px

@@ -5,7 +5,7 @@
 // gives more than half of its light, so no pixel is written by two stars.
 // With TEMPORAL a star begins with the errors that it left in the frame before (hilstar/monitor/temporal.py).
 // With TOGETHER it begins with what it left in the planes that were chosen before.
-// Defined before this text: LEVELS and LINEAR, formats; PLANE; KEPT (8 or 4); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
+// Defined before this text: LEVELS_FORMAT and LINEAR; LEVEL_BITS and TEXEL; PLANE; KEPT (8 or 4); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
 // FIRST, its first pixel relative to the star's own; and exact/inputs.glsl, exact/stars.glsl, exact/pixels.glsl, exact/choices.glsl.
 // On a CPU memory reads cost most: a pixel's place is one word, read once, and images are read faster than textures. A branch costs
 // both its sides there, because eight stars run in one vector: no decision depends on a pixel's number, and loops end with the star.
@@ -72,21 +72,13 @@ Choice turn_one(Near near, Choice best) {
     return best;
 }
 
-#ifdef APART
-#define SHOWN(at) uvec4 shown = imageLoad(levels, at);
-#else
-#define SHOWN(at) uvec4 shown = uvec4(0u);
-#endif
-
 // Write only the pixels whose level is not the nearest one.
 void store(Near near, BITS up) {
 #define STORE(BITS_OF, FROM) \
     for (uint turned = up BITS_OF ^ near.rounded_up BITS_OF; turned != 0u; turned &= turned - 1u) { \
         int k = findLSB(turned) + FROM; \
-        ivec2 at = near.star.pixel + offset_of(PLACE(k)); \
-        SHOWN(at) \
-        shown[PLANE] = (step_of[k] >> 16) + uint(has_bit(up, k)); \
-        imageStore(levels, at, shown); }
+        bool rises = has_bit(up, k); \
+        turn_level(near.star.pixel + offset_of(PLACE(k)), rises, int(step_of[k] >> 16) + int(rises)); }
 #if NEAR <= 32
     STORE(, 0)
 #else
@@ -153,7 +145,9 @@ void leave(int i, Sums sums) {
 void main() {
     int i = int(gl_GlobalInvocationID.x);
     if (i >= count) return;
+#ifdef APART
     is_alone = i < alone;
+#endif
 #ifndef PATHS
     i = turn[i];
 #endif

@@ -15,7 +15,7 @@ float light_of(int level) {
 }
 
 #ifdef FLOOR
-layout(FLOOR, binding = 1) readonly uniform uimage2D floor_levels;
+layout(LEVELS_FORMAT, binding = 1) readonly uniform uimage2D floor_levels;
 #define FLOOR_LIGHT(at) + light_of(int(imageLoad(floor_levels, at).r))
 #else
 #define FLOOR_LIGHT(at)

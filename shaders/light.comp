@@ -1,25 +1,23 @@
 #version 430 core
 // Draws a frame's stars, one per lane, each within the ellipse that it lights. With LIGHT a star adds its light to the sums of its
-// pixels; with LEVELS the sums become the nearest levels; with neither the levels become black again.
-// On llvmpipe this takes a quarter of the time of rasterised and blended points (hilstar/render/star_passes.py). Most of it is stores:
-// the planes of an image are beside each other in sums and levels.
+// pixels; of primaries, with LEVELS the sums become the nearest levels.
+// On llvmpipe this takes a quarter of the time of rasterised and blended points (hilstar/render/star_passes.py). Three quarters of
+// it are the sums' memory, lane by lane: the planes of an image are beside each other in sums and levels, TEXEL of LEVEL_BITS.
 // splat.frag repeats this arithmetic operation by operation, so that points make the same levels.
-// Defined before this text: LEVELS_FORMAT, FOOTPRINT. With KEEP the sums stay until the levels become black, for exact.comp and where
-// two stars may not share out the planes of a pixel; else they are set to 0 when they become levels. With ORDER stars are taken in an
-// order, first those whose pixels no other star lights: their light becomes levels without sums.
-// With FLOOR levels are those of a pixel's stars and its floor's light together.
-// It comes after planes.glsl, shares.glsl, sums.glsl and with FLOOR floor.glsl, and before levels.glsl.
+// Defined before this text: FOOTPRINT, TEXEL, LEVEL_BITS. Primaries' stars (APART) are taken in an order, first those whose pixels no
+// other star lights: their light becomes levels without sums.
+// It comes after planes.glsl, shares.glsl and sums.glsl, and before levels.glsl.
 
 layout(local_size_x = 32) in;
 
 layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };  // WORDS each, as SPRITE_DTYPE, and each plane's light
-#ifdef ORDER
+#ifdef APART
 layout(std430, binding = 2) readonly buffer Order { int order[]; };
 uniform int alone;
 uniform float reach_of_alone_per_e;  // beyond it no pixel is lit
 #endif
-layout(LEVELS_FORMAT, binding = 0) writeonly uniform uimage2D levels;
 #ifdef LEVELS
+layout(std430, binding = 8) buffer Levels { uint level_words[]; };
 #ifdef STEPS
 layout(std140, binding = 1) uniform Steps { uvec4 steps[STEPS]; };
 #define STEP(bin) steps[(bin) >> 2][(bin) & 3]
@@ -38,7 +36,6 @@ uniform ivec2 resolution_px;
 uniform float most_e_per_s[PLANES];  // maximum light of one star in one pixel: more is white in any case
 uniform float reach_per_e;   // a star lights an ellipse: the logarithm of this times its rate, times these squares of its axes
 uniform vec2 reach_px2;
-uniform float least_reach;   // minimum of that logarithm
 uniform vec2 margin_px;      // as in star.vert
 
 const float LEAST_PX = 1e-6;
@@ -50,24 +47,22 @@ const int FIRST = -((FOOTPRINT - 1) / 2);
 
 void main() {
     int i = int(gl_GlobalInvocationID.x);
-#if defined(ORDER) && defined(LIGHT)
+#if defined(APART) && defined(LIGHT)
     i += alone;
 #endif
     if (i >= count) return;
     float reached_per_e = reach_per_e;
-#ifdef ORDER
+#ifdef APART
     bool is_alone = i < alone;
     if (is_alone) reached_per_e = reach_of_alone_per_e;
     i = order[i];
-#else
-    const bool is_alone = false;
 #endif
     ivec2 pixel = ivec2(sprite[WORDS * i], sprite[WORDS * i + 1]);
     vec2 fraction = vec2(intBitsToFloat(sprite[WORDS * i + 2]), intBitsToFloat(sprite[WORDS * i + 3]));
     float e_per_s = intBitsToFloat(sprite[WORDS * i + 4]);
     float of_plane[PLANES];
     for (int k = 0; k < PLANES; k++) of_plane[k] = intBitsToFloat(sprite[WORDS * i + WORDS - PLANES + k]);
-    vec2 reach_px = sqrt(max(log(reached_per_e * e_per_s), least_reach) * reach_px2);
+    vec2 reach_px = sqrt(max(log(reached_per_e * e_per_s), 0.0) * reach_px2);
     vec2 all_px = reach_px + margin_px;  // in any plane
     int first_x = max(FIRST, -pixel.x), end_x = min(FIRST + FOOTPRINT, resolution_px.x - pixel.x);
     int y = max(max(FIRST, -pixel.y), int(ceil(fraction.y - all_px.y)));
@@ -79,37 +74,30 @@ void main() {
         for (int x = max(first_x, int(ceil(fraction.x - wide))); x < end; x++) {
             ivec2 at = pixel + ivec2(x, y);
             int here = PLANES * (at.y * resolution_px.x + at.x);
-#if defined(LIGHT)
+#ifdef LIGHT
             for (int k = 0; k < PLANES; k++) atomicAdd(sums[here + k], UNITS(k));
-#elif defined(LEVELS)
+#else
             int sum[PLANES];
-#ifdef KEEP
             if (is_alone) {
                 for (int k = 0; k < PLANES; k++) sum[k] = UNITS(k);
             } else {
                 for (int k = 0; k < PLANES; k++) sum[k] = sums[here + k];
             }
-#else
-            sum[0] = atomicExchange(sums[here], 0);  // there is one plane
-            if (sum[0] == 0) continue;  // shared with another star, and already done
-#endif
             uvec4 shown = uvec4(0u);
             for (int k = 0; k < PLANES; k++) {
                 float light = float(sum[k]) * unit_e_per_s[k];
 #ifdef UNIFORMITY
                 light *= texelFetch(gain, at, 0).r;
 #endif
-#ifdef FLOOR
-                light += FLOOR_LIGHT(at);
-#endif
                 shown[k] = level_of(light, k);
             }
-            imageStore(levels, at, shown);
+            int pixel_of_levels = at.y * resolution_px.x + at.x;
+#if LEVEL_BITS == 8
+            level_words[pixel_of_levels] = shown.x | shown.y << 8 | shown.z << 16;
 #else
-#ifdef KEEP
-            for (int k = 0; k < PLANES && !is_alone; k++) sums[here + k] = 0;
+            level_words[2 * pixel_of_levels] = shown.x | shown.y << 16;
+            level_words[2 * pixel_of_levels + 1] = shown.z;
 #endif
-            imageStore(levels, at, uvec4(0u));
 #endif
         }
     }

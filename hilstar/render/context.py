@@ -2,10 +2,14 @@
 
 import contextlib
 import ctypes
+import math
+import mmap
 from dataclasses import dataclass
 from typing import Any
 
 import moderngl
+import numpy as np
+import numpy.typing as npt
 from glcontext import egl
 
 from hilstar.errors import InputError, MachineError, did_you_mean
@@ -20,6 +24,8 @@ SOFTWARE = ("llvmpipe", "softpipe")
 # llvmpipe's limits: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
 MAX_WRITTEN_BYTES, MAX_ROUNDS = 2**27, 60_000
 MAX_GPUS = 32
+PINNED_MEMORY = "GL_AMD_pinned_memory"
+EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA  # constants of that extension and of OpenGL
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,13 +123,29 @@ def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprin
 
 
 def computes_in_software(ctx: moderngl.Context) -> bool:
-    """Whether this GL is a processor's and has compute shaders; a graphics card rasterises points in its stride."""
-    return bool(ctx.version_code >= COMPUTE_VERSION) and is_software(ctx)
+    """Whether this GL is a processor's, with compute shaders in the process's own memory; cards rasterise in their stride."""
+    return bool(ctx.version_code >= COMPUTE_VERSION) and is_software(ctx) and PINNED_MEMORY in ctx.extensions
 
 
 def is_software(ctx: moderngl.Context) -> bool:
     """Whether a processor draws, and no graphics card."""
     return str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
+
+
+def pinned(ctx: moderngl.Context, shape: tuple[int, ...], dtype: npt.DTypeLike) -> tuple[npt.NDArray[Any], moderngl.Buffer]:
+    """A black array in whole pages, which it keeps for as long as somebody holds it, and a buffer of the same memory."""
+    count, size = math.prod(shape), -(-math.prod(shape) * np.dtype(dtype).itemsize // 4) * 4  # whole words, too
+    pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    values = np.frombuffer(pages, dtype, count).reshape(shape)
+    find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
+    find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    bind = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_uint)(find(b"glBindBuffer"))
+    specify = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p, ctypes.c_uint)(find(b"glBufferData"))
+    buffer = ctx.buffer(reserve=size)
+    bind(EXTERNAL_VIRTUAL_MEMORY_BUFFER, buffer.glo)
+    specify(EXTERNAL_VIRTUAL_MEMORY_BUFFER, size, values.ctypes.data, DYNAMIC_COPY)
+    bind(EXTERNAL_VIRTUAL_MEMORY_BUFFER, 0)
+    return values, buffer
 
 
 def leave_contexts() -> None:

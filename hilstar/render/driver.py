@@ -68,11 +68,6 @@ class Driver:
         address = load(name) if name else 0
         self._reset: Any = ctypes.PYFUNCTYPE(ctypes.c_uint)(address) if address else None
 
-    @property
-    def tells_resets(self) -> bool:
-        """Whether the driver has a reset status to ask for."""
-        return self._reset is not None
-
     def wait(self) -> None:
         """Wait until the GPU has done all that was asked of it. Raises GpuError where it does not within 10 s."""
         fence = self._fence(GL_SYNC_GPU_COMMANDS_COMPLETE, 0)

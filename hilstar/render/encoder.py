@@ -19,7 +19,7 @@ from hilstar.monitor.quantise import Panel, PixelQuantiser, code_table, level_dt
 from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, Target
-from hilstar.render.context import is_software
+from hilstar.render.context import computes_in_software, is_software, pinned
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import Psf
@@ -317,22 +317,34 @@ class LevelTexture:
     def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int], planes: Planes) -> None:
         width, height = resolution_px
         kind, self._components = level_dtype(planes.panels[0].response), planes.texel
-        self._image = np.zeros((height, width, planes.texel), dtype=kind)
-        self._levels = Levels(self._image[..., : len(planes.panels)] if planes.apart else self._image[..., 0])
-        self._dtype = f"u{self._image.itemsize}"
-        self.format = f"{'rgba' if planes.apart else 'r'}{8 * self._image.itemsize}ui"
+        shape = height, width, planes.texel
+        made: tuple[npt.NDArray[Any], moderngl.Buffer | None] = np.zeros(shape, dtype=kind), None
+        self.image, self.memory = pinned(ctx, shape, kind) if computes_in_software(ctx) else made
+        self._levels = Levels(self.image[..., : len(planes.panels)] if planes.apart else self.image[..., 0])
+        self._dtype = f"u{self.image.itemsize}"
+        bits = 8 * self.image.itemsize
+        self.defines = f"LEVELS_FORMAT {'rgba' if planes.apart else 'r'}{bits}ui", f"LEVEL_BITS {bits}", f"TEXEL {planes.texel}"
         self.texture = ctx.texture(resolution_px, planes.texel, dtype=self._dtype)
         self.fbo = ctx.framebuffer([self.texture])
         self.fbo.clear()
+        self.in_memory = False  # whether the last levels are in the array alone
 
     def write(self, levels: Levels) -> None:
         """Upload levels."""
         self._levels[...] = levels
-        self.texture.write(self._image, alignment=1)
+        self.texture.write(self.image, alignment=1)
+
+    def upload(self) -> moderngl.Texture:
+        """The texture, with what was made in the array."""
+        if self.in_memory:
+            self.texture.write(self.image, alignment=1)
+            self.in_memory = False
+        return self.texture
 
     def read(self) -> Levels:
-        """The levels (height, width), or of primaries (height, width, 3); the next call overwrites the same array."""
-        self.fbo.read_into(self._image, components=self._components, dtype=self._dtype, alignment=1)
+        """The levels (height, width), or of primaries (height, width, 3); the next frame overwrites the same array."""
+        if not self.in_memory:
+            self.fbo.read_into(self.image, components=self._components, dtype=self._dtype, alignment=1)
         return self._levels
 
 

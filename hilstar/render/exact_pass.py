@@ -17,7 +17,7 @@ from hilstar.monitor.footprints import LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.render.backend import Target, Turn
 from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, linear_format, set_uniforms, write
-from hilstar.render.star_passes import StarPasses, turns_of
+from hilstar.render.star_passes import TURNS_BINDING, StarPasses, turns_of
 from hilstar.scene.psf import PIXEL_VARIANCE
 from hilstar.scene.sprites import Sprites
 
@@ -27,7 +27,6 @@ NARROW_PX = 0.75
 OVERRATED = 1.0001  # rounding
 PARTS = tuple(f"{one}.glsl" for one in ("floor", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices"))
 LOCAL_SIZE = 32  # as in exact.comp
-TURNS_BINDING = 3
 FIRST_BINDING = 4  # first binding of a Memory's buffers
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
 SUMS_BYTES = 4 * SUMS
@@ -56,9 +55,8 @@ class ExactPass:
         self.plane, self._makes_up, self._kept = turn
         panel = planes.panels[self.plane]
         self._planes, self._together = planes, left
-        self._format = levels.format
         balance = Balance(target.psf, target.seen, quantiser.weights)
-        self._linear, self._levels = linear, levels.texture
+        self._linear, self._levels, self._level_defines = linear, levels.texture, levels.defines
         self._pixels = PixelOrder(balance.psf)
         self._shares = shares
         light = panel.light_e_per_s()
@@ -77,24 +75,13 @@ class ExactPass:
         if (paths, summed, floor) in self._programs:
             return self._programs[paths, summed, floor]
         order, panel, balance, together = self._pixels, self._panel, self._balance, self._together is not None and not paths
-        defines = [f"NEAR {order.near}", f"LEVELS {self._format}", f"LINEAR {linear_format(self._planes)}"]
-        defines += [
-            f"PLANE {self.plane}",
-            f"KEPT {self._kept}",
-            *["MAKES_UP"] * any(self._makes_up),
-            *["LEAVES"] * (self._kept == KEPT_BEFORE),
-            *self._planes.defines,
-            *["TOGETHER"] * together,
-        ]
-        defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.psf.width_px) < NARROW_PX)
-        defines += self._shares.defines
-        defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
-        defines += (
-            ["TEMPORAL"] * (self._memory is not None)
-            + ["SUMS"] * summed
-            + [f"FLOOR {self._format}"] * floor
-            + [*self._order.define, *self._light.define]
-        )
+        defines = [f"NEAR {order.near}", *self._level_defines, f"LINEAR {linear_format(self._planes)}"]
+        defines += [f"PLANE {self.plane}", f"KEPT {self._kept}", *self._planes.defines, *self._shares.defines]
+        defines += [f"SIZE {order.size}", f"FIRST ({order.first})", *self._order.define, *self._light.define]
+        narrow, uneven = min(balance.psf.width_px) < NARROW_PX, self._gain is not None
+        whether = {"MAKES_UP": any(self._makes_up), "LEAVES": self._kept == KEPT_BEFORE, "TOGETHER": together, "NARROW": narrow}
+        whether |= {"PATHS": paths, "UNIFORMITY": uneven, "TEMPORAL": self._memory is not None, "SUMS": summed, "FLOOR": floor}
+        defines += [name for name, is_so in whether.items() if is_so]
         files = ("planes.glsl", *["sums.glsl"] * summed, *PARTS)
         program = build_compute(self._ctx, self._quantiser.shader, defines, files)
         self._shares.set(program)
@@ -139,14 +126,17 @@ class ExactPass:
 
     def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
-        paths, ordered = sprites.per_star > 1, passes is not None and self._planes.apart
+        paths = sprites.per_star > 1
         program = self._program(paths, passes is not None, passes is not None and passes.floor is not None)
-        count, alone = len(sprites), passes.bind_order(TURNS_BINDING) if passes is not None and ordered else 0
-        if paths or not ordered:
+        if passes is None:
+            self._linear.bind_to_image(1, read=True, write=False)
+        else:
+            passes.bind(program)
+        if paths or passes is None or not self._planes.apart:  # else `passes` have an order
             turns = stretches_of(sprites.star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
             write(self._turns, turns.astype(np.int32))
             self._turns.bind_to_storage_buffer(TURNS_BINDING)
-            count = len(turns)
+        count = len(turns) if paths else len(sprites)
         if self._memory is not None and paths:
             self._memory.bind(sprites.star[turns[:, 0]], turns[:, 0] != turns[:, 2])
         elif self._memory is not None:
@@ -161,15 +151,11 @@ class ExactPass:
         if self._gain is not None:
             self._gain.use(0)
         self._levels.bind_to_image(0, read=True, write=True)
-        if passes is None:
-            self._linear.bind_to_image(1, read=True, write=False)
-        else:
-            passes.bind_sums(program)
         program["count"] = count
-        if "alone" in program:
-            program["alone"] = alone
         program.run(-(-count // LOCAL_SIZE))
         self._ctx.memory_barrier()
+        if passes is not None:
+            self._ctx.finish()  # before NumPy looks at the levels
 
 
 class Memory:

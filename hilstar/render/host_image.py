@@ -3,8 +3,6 @@
 On llvmpipe this takes a third of the time of sprites that are rasterised into a texture, which is then read.
 """
 
-import ctypes
-import mmap
 from typing import cast
 
 import moderngl
@@ -12,13 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import IntArray
-from hilstar.render.backend import EGL_LIBRARY
-from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
+from hilstar.render.context import MAX_ROUNDS, pinned
 from hilstar.render.encoder import Shares, build_compute
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
-PINNED_MEMORY = "GL_AMD_pinned_memory"
-EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA  # constants of that extension and of OpenGL
 BANDS = 16  # bands of rows, each drawn by one thread at a time; an even number
 FEW_PX = 12_800  # sprites' pixels that one thread draws before more threads would have begun
 FIRST_CAPACITY = 1024  # sprites
@@ -41,10 +36,7 @@ class HostImage:
         self._shares = shares
         footprint_px = shares.footprint_px
         width, height = resolution_px
-        # Whole pages, which the array keeps for as long as somebody holds it.
-        pages = mmap.mmap(-1, 4 * width * height, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        self.image = np.frombuffer(pages, dtype=np.float32).reshape(height, width)
-        self._light = _pinned(ctx, self.image.ctypes.data, self.image.nbytes)
+        self.image, self._light = pinned(ctx, (height, width), np.float32)
         self.image.flags.writeable = False
         self._capacity = FIRST_CAPACITY  # sprites that fit into half of the buffer
         self._half = 0  # the half with the last frame's
@@ -57,13 +49,6 @@ class HostImage:
         self._program = build_compute(ctx, "linear.comp", named, ["shares.glsl"])
         shares.set(self._program)
         self._program["resolution_px"] = resolution_px
-
-    @staticmethod
-    def runs_on(ctx: moderngl.Context, resolution_px: tuple[int, int]) -> bool:
-        """Whether this GL is a processor's, has what this needs, and takes an image so large."""
-        width, height = resolution_px
-        has = computes_in_software(ctx) and PINNED_MEMORY in ctx.extensions
-        return has and 4 * width * height <= MAX_WRITTEN_BYTES
 
     def _reserved(self) -> moderngl.Buffer:
         return self._ctx.buffer(reserve=2 * self._capacity * SPRITE_DTYPE.itemsize, dynamic=True)
@@ -128,16 +113,3 @@ class HostImage:
             program.run(bands)
             self._ctx.memory_barrier()
         self._ctx.finish()  # before somebody reads the image
-
-
-def _pinned(ctx: moderngl.Context, address: int, size: int) -> moderngl.Buffer:
-    """A buffer whose memory is the process's own at an address, which must stay for as long as the context does."""
-    find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
-    find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
-    bind = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_uint)(find(b"glBindBuffer"))
-    specify = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p, ctypes.c_uint)(find(b"glBufferData"))
-    buffer = ctx.buffer(reserve=size)
-    bind(EXTERNAL_VIRTUAL_MEMORY_BUFFER, buffer.glo)
-    specify(EXTERNAL_VIRTUAL_MEMORY_BUFFER, size, address, DYNAMIC_COPY)
-    bind(EXTERNAL_VIRTUAL_MEMORY_BUFFER, 0)
-    return buffer

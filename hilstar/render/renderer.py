@@ -17,7 +17,7 @@ from hilstar.monitor.quantise import MASK_TURNS, DitherQuantiser, PixelQuantiser
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.monitor.response import Levels
 from hilstar.render.backend import NO_FRAME, Backend, ScreenView, SpriteSide, SpriteSides, Target, as_maps
-from hilstar.render.context import Context, check_limits, computes_in_software, create_context
+from hilstar.render.context import MAX_WRITTEN_BYTES, Context, check_limits, computes_in_software, create_context
 from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
     CUT_WINGS,
@@ -35,7 +35,7 @@ from hilstar.render.encoder import (
 )
 from hilstar.render.exact_pass import ExactPass
 from hilstar.render.host_image import HostImage
-from hilstar.render.star_passes import LightUnits, StarPasses
+from hilstar.render.star_passes import ApartPasses, LightUnits, StarPasses
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.sprites import Sprites
 
@@ -94,7 +94,8 @@ class Renderer(Backend):
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
         self._linear_image = np.empty((height, width), dtype=np.float32)
-        on_host = self.ON_HOST and target.response is None and HostImage.runs_on(ctx, target.resolution_px)
+        fits = 4 * width * height <= MAX_WRITTEN_BYTES
+        on_host = self.ON_HOST and target.response is None and fits and computes_in_software(ctx)
         self._host = HostImage(ctx, target.resolution_px, self._shares) if on_host else None
         self._on_host = False  # where the last draw is
 
@@ -156,7 +157,8 @@ class Renderer(Backend):
         target, planes = self.target, self._planes
         units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
         if computes_in_software(self._ctx):  # a graphics card is left idle by a star a lane
-            self._passes = StarPasses(levels, planes, target.psf, self._shares, self._by_star is not None, units)
+            made, psf = ApartPasses if planes.apart else StarPasses, target.psf if self._by_star is not None else None
+            self._passes = made(levels, planes, self._shares, units, psf)
             return
         self._unit_splat = splat_program(self._ctx, target.resolution_px, self._shares, planes, in_units=True)
         planes.set(self._unit_splat, most_e_per_s=units.most_e_per_s)
@@ -214,7 +216,7 @@ class Renderer(Backend):
                 self._choose(sprites, passes)
                 return
             if passes is not None:
-                passes.forget(sums=False)
+                passes.forget()
             if self._by_numpy:
                 self._draw_by_numpy(sprites, frame)
                 self._undrawn = (sprites, False)
@@ -412,7 +414,7 @@ class Renderer(Backend):
         """The levels of the last draw, R8UI or R16UI, for whom its `ctx` is current; TypeError without a response."""
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no levels")
-        return self._levels.texture
+        return self._levels.upload()
 
     def linear(self) -> Float32Array:
         """See `Backend.linear`."""
@@ -436,6 +438,8 @@ class Renderer(Backend):
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
         """See `Backend.present`."""
+        with self._ctx:
+            _ = self.codes_texture  # with the last levels
         self._presenter.present(overlay, patch_code, marker)
 
     def take_back_buffer(self) -> None:
@@ -469,7 +473,7 @@ class Renderer(Backend):
         self._floor_encoder, self._floor_levels = None, None
         with self._ctx:
             if self._passes is not None:
-                self._passes.forget(sums=True)
+                self._passes.forget()
             self._extended.forget()
         self.begin_anew()
 

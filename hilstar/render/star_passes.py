@@ -5,22 +5,23 @@ draws star by star, in a quarter of the time of rasterised sprites; a graphics c
 """
 
 import math
-from functools import partial
+from collections.abc import Sequence
 
 import moderngl
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from hilstar.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.monitor.footprints import PixelOrder
-from hilstar.monitor.quantise import RoundQuantiser
+from hilstar.monitor.quantise import RoundQuantiser, ThresholdCounter
 from hilstar.render.backend import SpriteSides
-from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES
-from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, level_steps, write
+from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, pinned
+from hilstar.render.encoder import LevelTexture, LookupTable, Planes, Shares, build_compute, level_steps, set_uniforms, write
 from hilstar.scene.psf import Psf
 from hilstar.scene.sprites import Sprites
 
 LOCAL_SIZE = 32  # as in light.comp
-STEPS_BINDING, ORDER_BINDING, LIGHT_BINDING, SUMS_BINDING = 1, 2, 2, 7
+STEPS_BINDING, ORDER_BINDING, TURNS_BINDING, SUMS_BINDING, LEVELS_BINDING = 1, 2, 3, 7, 8
 MAX_SUM = 2**31 - 2**24  # what an int holds, less what a float32 that large is rounded by
 # Share of the first level's light. Where stars are so many and so bright that a unit would be more, their light is blended.
 MAX_UNIT = 1 / 64
@@ -31,9 +32,9 @@ WINGS, DENSER_WINGS = 128, 8
 # A square that is large enough at its worst phase, and in its corners, leaves out as little as an ellipse with so many times
 # the wings: with 4, streaks at 10 deg/s were off by 1.4 arcsec rms and 0.004 mag, by squares 0.6 and 0.001.
 SQUARE_WINGS = 16
-# Share of the image: where footprints cover more, a clear of levels and sums is faster (llvmpipe, 1080p and 4K).
-MAX_ERASED = 0.1
-MAX_ERASED_KEPT = 0.1  # with the sums, and all pixels among which `exact` chooses
+# Share of the image: where footprints cover more, all of it is made black and looked through faster (llvmpipe, 1080p and 4K).
+MAX_GATHERED = 0.1
+NOWHERE = (np.empty(0, dtype=np.intp),) * 2
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
 RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # runs of stars are sorted by light; runs times half octaves fill 16 bits
 STRIP_PX = 64.0
@@ -97,108 +98,141 @@ class LightUnits:
 
         Of one that stands `alone` no pixel beyond it is lit.
         """
-        if alone:
-            return self._share_bound * sprites.per_star / self.lit_e_per_s
-        width, height = self._size_px
-        wings = self.wings * (DENSER_WINGS if len(sprites) * self._footprint_px**2 > width * height else 1)
-        return self._share_bound * sprites.per_star * wings / self.lit_e_per_s
+        denser = DENSER_WINGS if len(sprites) * self._footprint_px**2 > math.prod(self._size_px) else 1
+        return self._share_bound * sprites.per_star * (1.0 if alone else self.wings * denser) / self.lit_e_per_s
 
 
 class StarPasses:
     """Draws sprites into pixels' sums and a LevelTexture; it lives in its renderer's context, which is current in every call.
 
-    With `exact` the sums stay for it to look at. Where a frame has a `floor`, its stars' levels are added to those in light.
+    A compute shader adds up the light of one plane in NumPy's own memory. NumPy makes levels of the sums that light a pixel, of
+    10 000 stars in a third of the time of another pass over stars. The sums stay for `exact` to look at. Where a frame has a
+    `floor`, its stars' levels are added to those in light.
     """
 
-    def __init__(self, levels: LevelTexture, planes: Planes, psf: Psf, shares: Shares, exact: bool, units: LightUnits) -> None:
+    def __init__(self, levels: LevelTexture, planes: Planes, shares: Shares, units: LightUnits, exact_psf: Psf | None) -> None:
         ctx = self._ctx = levels.texture.ctx
-        keep = self._keep = exact or planes.apart
         self._levels, self._planes, self._units, self._shares = levels, planes, units, shares
-        self._size_px = levels.texture.size
-        self._footprint_px = planes.footprint_px
-        gain = planes.panels[0].gain()
-        self._gain = None if gain is None else ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
-        self._sums = ctx.buffer(reserve=4 * math.prod(self._size_px) * len(planes.panels))
-        self._sums.clear()
+        width, height = self._size_px = levels.texture.size
+        self._footprint_px, self._gain, (edges, *_) = planes.footprint_px, planes.panels[0].gain(), edges_of(planes)
+        self._counter = ThresholdCounter(edges)
+        self._dark_e_per_s = float(edges[0]) / (1.0 if self._gain is None else float(self._gain.max())) * (1 - 1e-6)
+        sums, self._sums = pinned(ctx, (height, width * len(planes.panels)), np.int32)
         self._unit_e_per_s: list[float] = []  # units of the sums
         self.sprites = ctx.buffer(reserve=planes.dtype.itemsize, dynamic=True)
-        self._drawn: int | None = None  # sprites that are in the buffer and on the images; None: it is not known
-        table = level_steps(edges_of(planes))
-        if table is None:
-            raise ValueError("several thresholds in a bin; ask `LightUnits.takes` first")
-        self._steps = LookupTable(ctx, "STEPS", STEPS_BINDING, table[0])
-        defines = [f"LEVELS_FORMAT {levels.format}", *planes.defines, *shares.defines, *["KEEP"] * keep]
-        defines += ["UNIFORMITY"] * (gain is not None) + self._steps.define
-        side, all_px = f"FOOTPRINT {units.side_px}", f"FOOTPRINT {self._footprint_px}"
-        files, defines = ["planes.glsl", "shares.glsl", "sums.glsl"], defines + ["ORDER"] * planes.apart
+        self._drawn = 0  # sprites in the buffer
+        side_px = min(self._footprint_px, width, height)
+        self._square = np.add.outer(width * np.arange(side_px), np.arange(side_px)).ravel()
+        self._images = sums, levels.image.reshape(height, -1)
+        wide = [image.shape[1] // width * side_px for image in self._images]
+        self._squares = [sliding_window_view(image, (side_px, wide[k]), writeable=True) for k, image in enumerate(self._images)]
+        self._corner: tuple[IntArray, IntArray] | None = None  # row and column of the squares about sprites; None: anywhere
+        self._alone = 0  # how many stars need no sums, the first in an order
+        self._programs = [self._program("LIGHT", f"FOOTPRINT {units.side_px}")]
+        self.tables: list[moderngl.Texture | moderngl.Buffer] = []  # by which light becomes levels, on the GPU
         self.floor: LevelTexture | None = None
-        light = planes.panels[0].light_e_per_s()
-        self._level_light = LookupTable(ctx, "LIGHT_ROWS", LIGHT_BINDING, np.append(light, light[-1]))
+        self._level_light = planes.panels[0].light_e_per_s()
 
-        def built(*part: str) -> moderngl.ComputeShader:
-            more, last = ["floor.glsl"] * (len(part) > 2), ["levels.glsl"] * (part[0] == "LEVELS")
-            program = build_compute(ctx, "light.comp", [*part, *defines], files + more, last)
-            program["resolution_px"], program["reach_px2"] = self._size_px, units.axes_px2
-            planes.set(program, bins=table[1], most_e_per_s=units.most_e_per_s)
-            shares.set(program)
-            return program
+    def _program(self, *defines: str, last: Sequence[str] = ()) -> moderngl.ComputeShader:
+        """A program of light.comp."""
+        defines = (*defines, *self._levels.defines, *self._planes.defines, *self._shares.defines)
+        program = build_compute(self._ctx, "light.comp", defines, ("planes.glsl", "shares.glsl", "sums.glsl"), last)
+        program["resolution_px"], program["reach_px2"] = self._size_px, self._units.axes_px2
+        self._planes.set(program, most_e_per_s=self._units.most_e_per_s)
+        self._shares.set(program)
+        return program
 
-        self._light, self._encode, self._black = self._programs = [built("LIGHT", side), built("LEVELS", side), built(all_px)]
-        self._encode_on_floor = partial(built, "LEVELS", side, f"FLOOR {levels.format}", *self._level_light.define)
-        self._least_reach = 0.5 * PixelOrder(psf).near_sigmas(PHASE_PX) ** 2 if exact else 0.0
-        if exact:
-            self._black["least_reach"] = self._least_reach
-        self._order = ctx.buffer(reserve=4, dynamic=True)
-        self._alone = 0  # how many stars stand alone, the first in the order
-
-    @property
-    def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
-        """The tables by which light becomes levels."""
-        return [self._steps.buffer, self._level_light.buffer, *([] if self._gain is None else [self._gain])]
-
-    def forget(self, sums: bool) -> None:
-        """The next `erase` makes all levels black: something else has drawn on them. With `sums`, those may be lost too."""
-        self._drawn = None
-        if sums:
-            self._sums.clear()
-
-    def erase(self) -> None:
-        """Make black what the last frame drew."""
-        most_px = (MAX_ERASED_KEPT if self._keep else MAX_ERASED) * self._size_px[0] * self._size_px[1]
-        if self._drawn is None or self._drawn * self._footprint_px**2 > most_px:
-            if self._keep:
-                self._sums.clear()
-            self._levels.fbo.use()
-            self._levels.fbo.clear()
-        else:
-            self._run(self._black)
-        self._drawn = 0
+    def forget(self) -> None:
+        """The next `lay` makes all levels and sums black: something else has drawn on them, or they may be lost."""
+        self._corner, self._levels.in_memory = None, False
 
     def lay(self, floor: LevelTexture | None) -> None:
-        """Take a frame's floor, which becomes its levels; None for black, which `erase` has drawn."""
-        if self.floor is not None and floor is None:
-            self.forget(sums=False)
-        self.erase()
-        self.floor = floor
+        """Make black what the last frame drew, and take a frame's floor, which becomes its levels; None for black."""
+        corner = None if floor is None and self.floor is not None else self._corner
+        self.floor, self._levels.in_memory, self._corner = floor, True, NOWHERE
+        for image, squares in zip(self._images, self._squares, strict=True):
+            if corner is None:
+                image.fill(0)
+            else:
+                squares[corner[0], image.shape[1] // self._size_px[0] * corner[1]] = 0
         if floor is not None:
-            self._ctx.copy_framebuffer(self._levels.fbo, floor.fbo)
+            self._levels.image[..., 0] = floor.read()
             floor.texture.bind_to_image(1, read=True, write=False)  # for all passes of the frame
-            if len(self._programs) == 3:
-                self._programs.append(self._encode_on_floor())
 
     def upload(self, sprites: Sprites) -> None:
         """Take the sprites that `add_light` and `encode` are about."""
         write(self.sprites, sprites.data)
         self._drawn = len(sprites)
-        reach_per_e = self._units.reach_per_e(sprites)
         for program in self._programs:
-            program["reach_per_e"] = reach_per_e
-        if self._planes.apart:
-            self._order_stars(sprites, reach_per_e)
+            program["reach_per_e"] = self._units.reach_per_e(sprites)
+        (width, height), side_px, self._corner = self._size_px, self._footprint_px, None
+        if len(sprites) * side_px**2 <= MAX_GATHERED * width * height and side_px <= min(width, height):
+            x, y = np.clip(sprites.data["pixel"] - (side_px - 1) // 2, 0, (width - side_px, height - side_px)).T
+            self._corner = y, x
 
-    def _order_stars(self, sprites: Sprites, reach_per_e: float) -> None:
-        """Those that stand alone come first, stars of alike light one after another."""
-        rates = np.ascontiguousarray(sprites.data["electrons_per_s"])
+    def add_light(self, unit_e_per_s: list[float]) -> None:
+        """Add the light of the sprites to their pixels' sums, which are of these units."""
+        self._unit_e_per_s = unit_e_per_s
+        self._run(self._programs[0], self._alone)
+
+    def encode(self) -> None:
+        """Make levels of the sums under the sprites, the nearest."""
+        sums = (self._images[0] if self._corner is None else self._squares[0][self._corner]).ravel()
+        least = 1 if self.floor is not None else int(self._dark_e_per_s / self._unit_e_per_s[0])
+        places = lit = np.flatnonzero(sums >= least)
+        if self._corner is not None:
+            star, at = np.divmod(lit, len(self._square))
+            places = (self._corner[0] * self._size_px[0] + self._corner[1])[star] + self._square[at]
+        light = sums[lit].astype(np.float32) * np.float32(self._unit_e_per_s[0])
+        if self._gain is not None:
+            light *= self._gain.ravel()[places]
+        levels = self._levels.image.reshape(-1)
+        if self.floor is not None:
+            light += self._level_light[levels[places]]
+        levels[places] = self._counter.count(light)
+
+    def bind(self, program: moderngl.ComputeShader) -> None:
+        """Let another program look at the sums (see shaders/sums.glsl) and change levels."""
+        self._planes.set(program, unit_e_per_s=self._unit_e_per_s)
+        for binding, buffer in ((0, self.sprites), (SUMS_BINDING, self._sums), (LEVELS_BINDING, self._levels.memory)):
+            if buffer is not None:
+                buffer.bind_to_storage_buffer(binding)
+
+    def _run(self, program: moderngl.ComputeShader, without: int = 0) -> None:
+        if self._drawn == without:
+            return
+        self.bind(program)
+        program["count"] = self._drawn
+        self._shares.bind()
+        program.run(-(-(self._drawn - without) // LOCAL_SIZE))
+        self._ctx.memory_barrier()
+        self._ctx.finish()  # before NumPy looks at the sums
+
+
+class ApartPasses(StarPasses):
+    """The same for the planes of primaries: the shader makes the levels, those of stars that stand alone without sums.
+
+    There each pixel's three levels lie beside each other, which NumPy would look for three times.
+    """
+
+    def __init__(self, levels: LevelTexture, planes: Planes, shares: Shares, units: LightUnits, exact_psf: Psf | None) -> None:
+        super().__init__(levels, planes, shares, units, exact_psf)
+        table, gain = level_steps(edges_of(planes)), self._gain
+        if table is None:
+            raise ValueError("several thresholds in a bin; ask `LightUnits.takes` first")
+        self._steps = LookupTable(self._ctx, "STEPS", STEPS_BINDING, table[0])
+        self._gains = None if gain is None else self._ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
+        of_levels = ("LEVELS", f"FOOTPRINT {units.side_px}", *self._steps.define, *["UNIFORMITY"] * (gain is not None))
+        self._programs.append(self._program(*of_levels, last=["levels.glsl"]))
+        planes.set(self._programs[1], bins=table[1])
+        self._least_reach = 0.0 if exact_psf is None else 0.5 * PixelOrder(exact_psf).near_sigmas(PHASE_PX) ** 2
+        self._order = self._ctx.buffer(reserve=4, dynamic=True)
+        self.tables += [self._steps.buffer, *([] if self._gains is None else [self._gains])]
+
+    def upload(self, sprites: Sprites) -> None:
+        """Take the sprites that `add_light` and `encode` are about: those alone come first, alike light one after another."""
+        super().upload(sprites)
+        reach_per_e, rates = self._units.reach_per_e(sprites), np.ascontiguousarray(sprites.data["electrons_per_s"])
         crowded = np.ones(len(sprites), dtype=np.bool_)
         if sprites.per_star == 1 and len(sprites) * self._footprint_px**2 < math.prod(self._size_px):  # else few do
             squares = np.maximum(np.log(np.maximum(reach_per_e * rates, 1e-30)), self._least_reach) * max(self._units.axes_px2)
@@ -211,44 +245,22 @@ class StarPasses:
         for program in self._programs:
             program["alone"], program["reach_of_alone_per_e"] = self._alone, self._units.reach_per_e(sprites, alone=True)
 
-    def add_light(self, unit_e_per_s: list[float]) -> None:
-        """Add the light of the sprites to their pixels' sums, which are of these units."""
-        self._unit_e_per_s = unit_e_per_s
-        for program in self._programs:
-            self._planes.set(program, unit_e_per_s=unit_e_per_s)
-        self._run(self._light, self._alone)
-
     def encode(self) -> None:
         """Make levels of the sums under the sprites, the nearest."""
-        if self._gain is not None:
-            self._gain.use(0)
+        if self._gains is not None:
+            self._gains.use(0)
         self._steps.bind()
-        if self.floor is not None:
-            self._level_light.bind()
-        self._run(self._encode if self.floor is None else self._programs[-1])
+        self._run(self._programs[1])
 
-    def bind_order(self, binding: int) -> int:
-        """Bind the order of stars, for another program; how many stand alone, first in it."""
-        self._order.bind_to_storage_buffer(binding)
-        return self._alone
-
-    def bind_sums(self, program: moderngl.ComputeShader) -> None:
-        """Let another program look at the sums (see shaders/sums.glsl)."""
-        self._planes.set(program, unit_e_per_s=self._unit_e_per_s)
-        self._sums.bind_to_storage_buffer(SUMS_BINDING)
+    def bind(self, program: moderngl.ComputeShader) -> None:
+        """Let another program look at the sums, and take the stars in their order."""
+        super().bind(program)
+        self._order.bind_to_storage_buffer(TURNS_BINDING)
+        set_uniforms(program, {"alone": self._alone})
 
     def _run(self, program: moderngl.ComputeShader, without: int = 0) -> None:
-        if not self._drawn or self._drawn == without:
-            return
-        program["count"] = self._drawn
-        if self._planes.apart:
-            self._order.bind_to_storage_buffer(ORDER_BINDING)
-        self._shares.bind()
-        self.sprites.bind_to_storage_buffer(0)
-        self._sums.bind_to_storage_buffer(SUMS_BINDING)
-        self._levels.texture.bind_to_image(0, read=False, write=True)
-        program.run(-(-(self._drawn - without) // LOCAL_SIZE))
-        self._ctx.memory_barrier()
+        self._order.bind_to_storage_buffer(ORDER_BINDING)
+        super()._run(program, without)
 
 
 def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
@@ -266,8 +278,6 @@ def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:
 
 def crowded_at(x_px: FloatArray, y_px: FloatArray, reach_px: FloatArray) -> BoolArray:
     """Whether the circle of a star, `reach_px` (n,) about it, meets another's, (n,): sought in strips of the image."""
-    if not len(x_px):
-        return np.zeros(0, dtype=np.bool_)
     low, high = y_px.min(), y_px.max()
     most_px = 2 * float(reach_px.max())  # by which two stars may be apart
     strip, long = np.floor(x_px / max(most_px, STRIP_PX)), high - low + 2 * most_px

@@ -34,8 +34,10 @@ layout(std430, binding = 6) writeonly buffer Left { float left_sums[]; };
 layout(std430, binding = 6) buffer Left { float left_sums[]; };               // ten for each plane of a star
 uniform float makes_up[PLANES];  // for how much of what each plane left the star makes up here, in steps of both
 #endif
-layout(LEVELS, binding = 0) uniform uimage2D levels;
-#ifndef SUMS
+#ifdef SUMS
+layout(std430, binding = 8) buffer Levels { uint level_words[]; };            // TEXEL of LEVEL_BITS for a pixel
+#else
+layout(LEVELS_FORMAT, binding = 0) uniform uimage2D levels;
 layout(LINEAR, binding = 1) readonly uniform image2D linear_e_per_s;
 #endif
 #ifdef UNIFORMITY
@@ -43,7 +45,7 @@ uniform sampler2D gain;
 #endif
 
 uniform int count;
-uniform int alone;     // stars whose pixels no other star lights, the first in their order: there are no sums of them
+uniform int alone;     // of primaries, stars whose pixels no other star lights, the first in their order: there are no sums of them
 uniform int footprint;  // pixels in all
 uniform float reach_px2, reach_per_e; // how many of them are chosen: as PixelOrder.reach in footprints.py
 uniform int fewest;

@@ -64,7 +64,7 @@ void look_at(inout Near near, int k) {
     if (asked < 0.0) return;
     float factor = output_of(at) / light_of(1);
     asked = min(asked / output_of(at) FLOOR_LIGHT(at), light_of(white));
-    int level = int(imageLoad(levels, at)[PLANE]);
+    int level = level_at(at);
     bool above = light_of(level) > asked;
     if (above) near.rounded_up |= bit_of(k);
     level -= int(above);
@@ -112,7 +112,7 @@ vec3 error_beyond(Near near, vec3 error) {
         float asked = asked_of(at, own);
         if (asked < 0.0) continue;
         float factor = output_of(at);
-        error += (light_of(int(imageLoad(levels, at)[PLANE])) - min(asked / factor FLOOR_LIGHT(at), light_of(white))) * factor / light_of(1) * arm;
+        error += (light_of(level_at(at)) - min(asked / factor FLOOR_LIGHT(at), light_of(white))) * factor / light_of(1) * arm;
     }
     // What lies further out stays dark.
     return error - (whole_of(near.star) - seen) / light_of(1);

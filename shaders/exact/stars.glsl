@@ -52,6 +52,35 @@ vec3 whole_of(Star star) {
 }
 #endif
 
+// A pixel's level, and its change to the next one: no two stars change the same pixel.
+#ifdef SUMS
+const uint BITS_OF_LEVEL = uint(LEVEL_BITS), IN_WORD = 32u / BITS_OF_LEVEL;
+
+uint level_place(ivec2 at) {
+    return uint(TEXEL * (at.y * resolution_px.x + at.x) + PLANE);
+}
+
+int level_at(ivec2 at) {
+    uint place = level_place(at);
+    return int(level_words[place / IN_WORD] >> place % IN_WORD * BITS_OF_LEVEL & (1u << BITS_OF_LEVEL) - 1u);
+}
+
+void turn_level(ivec2 at, bool rises, int level) {
+    uint place = level_place(at), step = 1u << place % IN_WORD * BITS_OF_LEVEL;
+    atomicAdd(level_words[place / IN_WORD], rises ? step : 0u - step);
+}
+#else
+int level_at(ivec2 at) {
+    return int(imageLoad(levels, at)[PLANE]);
+}
+
+void turn_level(ivec2 at, bool rises, int level) {
+    uvec4 shown = PLANES == 1 ? uvec4(0u) : imageLoad(levels, at);
+    shown[PLANE] = uint(level);
+    imageStore(levels, at, shown);
+}
+#endif
+
 const uint NO_STEP = 0xffffffffu;
 
 float output_of(ivec2 at) {
@@ -118,7 +147,11 @@ float path_light_at(vec2 offset) {
 }
 #endif
 
+#ifdef APART
 bool is_alone;
+#else
+const bool is_alone = false;
+#endif
 
 // The light that a pixel should show, e-/s, negative where it is not this star's; `own` is what the star gives.
 float asked_of(ivec2 at, float own) {

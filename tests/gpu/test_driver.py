@@ -43,7 +43,7 @@ def test_a_gl_error_is_told_once_and_by_its_name(context):
 
 
 def test_the_reset_status_is_asked_for(context):
-    assert Driver(context).tells_resets
+    assert Driver(context)._reset is not None
 
 
 SIZE, SIGMA, WHITE = (96, 64), (0.85, 0.85), 1e6

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.render import host_image
+from hilstar.render import context, host_image
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.render.variants import SplatVariant, VariantRenderer
@@ -132,7 +132,7 @@ def test_renderers_that_come_and_go_leave_no_memory_behind(rng):
 
 
 def test_an_older_opengl_rasterises(monkeypatch, rng):
-    monkeypatch.setattr(host_image, "PINNED_MEMORY", "GL_NO_such_extension")
+    monkeypatch.setattr(context, "PINNED_MEMORY", "GL_NO_such_extension")
     with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         assert gl._host is None
         gl.draw(sprites_at(np.array([[50.0, 40.0]]), np.array([1e6]), gl.footprint_px))

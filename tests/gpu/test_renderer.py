@@ -190,7 +190,7 @@ def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
             fresh.draw(None)
             fresh._last_count = None  # all of its images is cleared
             if fresh._passes is not None:
-                fresh._passes.forget(sums=False)
+                fresh._passes.forget()
             fresh.draw(sprites)
             assert np.array_equal(gl.levels(), fresh.levels())
             if read:

@@ -32,17 +32,23 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
-    """An image size, px, and a number of stars in view."""
+class ImageSize:
+    """An image size, px."""
 
     width: int
     height: int
-    stars: int
 
     @property
     def size(self) -> Size:
         """Width and height, px."""
         return self.width, self.height
+
+
+@dataclass(frozen=True, slots=True)
+class Cell(ImageSize):
+    """An image size and a number of stars in view."""
+
+    stars: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,19 +95,12 @@ class Skipped:
 
 
 @dataclass(frozen=True, slots=True)
-class ProcessStart:
+class ProcessStart(ImageSize):
     """Times of import and first frame in a process of its own, and its peak memory."""
 
-    width: int
-    height: int
     import_ms: float
     first_frame_ms: float
     memory_mb: float
-
-    @property
-    def size(self) -> Size:
-        """Width and height, px."""
-        return self.width, self.height
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,13 +168,12 @@ def lines(result: Result) -> Iterator[str]:
 
 def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
     own = {row.kind: row.ms.median for row in rows if row.method == "hilstar"}
-    if rows:
-        yield f"the virtual tracker, {_words(rows[0].size)}, {rows[0].stars} stars, ms of the processor (median)"
     for row in rows:
+        if row is rows[0]:
+            yield f"the virtual tracker, {_words(row.size)}, {row.stars} stars, ms of the processor (median)"
         beside = "" if row.method == "hilstar" else f"   {row.ms.median / own[row.kind]:.2f} of hilstar's"
         yield f"  {row.kind.replace('_', ' '):12}{row.method:11}{row.ms.median:8.1f}{beside}"
-    if rows:
-        yield ""
+    yield from [""] * bool(rows)
 
 
 def _notes(result: Result) -> Iterator[str]:

@@ -414,7 +414,8 @@ class Renderer(Backend):
         """The levels of the last draw, R8UI or R16UI, for whom its `ctx` is current; TypeError without a response."""
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no levels")
-        return self._levels.upload()
+        with self._ctx:
+            return self._levels.upload()
 
     def linear(self) -> Float32Array:
         """See `Backend.linear`."""
@@ -438,8 +439,7 @@ class Renderer(Backend):
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
         """See `Backend.present`."""
-        with self._ctx:
-            _ = self.codes_texture  # with the last levels
+        _ = self.codes_texture  # with the last levels
         self._presenter.present(overlay, patch_code, marker)
 
     def take_back_buffer(self) -> None:

@@ -248,7 +248,7 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
     data, about = io.BytesIO(), io.BytesIO()
     png.Writer(width, height, bitdepth=8 * image.itemsize, greyscale=image.ndim == 2, compression=1).write_packed(data, rows)
     if meant_bits is not None:
-        png.write_chunk(about, b"sBIT", bytes([meant_bits]))
+        png.write_chunk(about, b"sBIT", bytes([meant_bits] * (1 if image.ndim == 2 else 3)))
     whole = data.getvalue()
     return whole[:AFTER_HEADER] + about.getvalue() + whole[AFTER_HEADER:]
 

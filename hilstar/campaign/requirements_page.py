@@ -44,15 +44,19 @@ def write_requirements(plan: Plan, path: Path, table: Path, file: BenchFile) -> 
         ("program", f"hilstar {__version__}"),
         *([("certificate", f"{certificate.line}; {off_by(certificate)}")] if certificate else []),
     ]
+    counts = [(verdict, sum(each.verdict == verdict for each in found)) for verdict in (MET, NOT_MET, NOT_SHOWN)]
+    each_count = ", ".join(f"{count} {verdict}" for verdict, count in counts if count)
     page = [
-        f"<p>{_badge(verdict_of(found))} {escaped(_sentence(found))}</p>",
+        f"<p>{_badge(verdict_of(found))} {escaped(f'Of {len(found)} requirements {each_count}.')}</p>",
         table_of(about),
         "<h2>Verdicts</h2>",
         table_of(
             [
                 (
                     *(each.require.words, f"{100 * each.require.confidence:g} %", each.value, each.bound, each.cases),
-                    *(Markup(_badge(each.verdict)), _remark(each), each.method),
+                    Markup(_badge(each.verdict)),
+                    f"about {each.more} more cases" if each.verdict == NOT_SHOWN and each.more else "",
+                    each.method,
                 )
                 for each in found
             ],
@@ -92,15 +96,6 @@ def verdict_of(found: list[RequirementVerdict]) -> str:
     """The verdict of all together: the worst."""
     verdicts = {each.verdict for each in found}
     return NOT_MET if NOT_MET in verdicts else NOT_SHOWN if NOT_SHOWN in verdicts else MET
-
-
-def _sentence(found: list[RequirementVerdict]) -> str:
-    counts = [(verdict, sum(each.verdict == verdict for each in found)) for verdict in (MET, NOT_MET, NOT_SHOWN)]
-    return f"Of {len(found)} requirements {', '.join(f'{count} {verdict}' for verdict, count in counts if count)}."
-
-
-def _remark(each: RequirementVerdict) -> str:
-    return f"about {each.more} more cases" if each.verdict == NOT_SHOWN and each.more else ""
 
 
 def _badge(verdict: str) -> str:

@@ -97,12 +97,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
     # The main thread may be in the middle of a wait for it and hold the event's lock, which a handler in it cannot take.
     with contextlib.suppress(RuntimeError):  # no thread to be had: the watchers end it
-        _thread.start_new_thread(_stop, (*_ending.stops,))
-
-
-def _stop(*stops: threading.Event) -> None:
-    for stop in stops:
-        stop.set()
+        _thread.start_new_thread(lambda *stops: [stop.set() for stop in stops], (*_ending.stops,))
 
 
 def is_command() -> bool:

@@ -235,7 +235,9 @@ def _within(rows: list[MagnitudeRow]) -> dict[str, float | None]:
 
 def write_report(directory: Path, found: LightBudget) -> None:
     """budget.csv, and its chart as budget.png and budget.svg. Raises InputError where one cannot be written."""
-    rows = [_flat(row) for row in found.rows]
+    rows = [asdict(row) for row in found.rows]
+    for row in rows:  # each kind of centroider has a column of its own
+        row.update({f"axis_rms_px_{kind}": value for kind, value in row.pop("axis_rms_px").items()})
     write_csv(directory / "budget.csv", list(rows[0]), [["" if v is None else v for v in row.values()] for row in rows])
     reach = found.within[f"{FLUX_LIMITS_MAG[1]:g}_mag"]
     finding = f"{found.bits} bits, {found.method}: from V = {found.clips_v_mag:.1f}, where stars clip, within "
@@ -266,12 +268,6 @@ def write_report(directory: Path, found: LightBudget) -> None:
             for edge in (found.clips_v_mag, found.nothing_v_mag):
                 axis.axvline(edge, color=MUTED, linewidth=1)
             label_ends(axis)
-
-
-def _flat(row: MagnitudeRow) -> dict[str, float | None]:
-    """A row's columns: each kind of centroider has its own."""
-    values = asdict(row)
-    return values | {f"axis_rms_px_{kind}": value for kind, value in values.pop("axis_rms_px").items()}
 
 
 def budget_lines(found: LightBudget) -> list[str]:

@@ -14,6 +14,7 @@ import time
 import numpy as np
 import pytest
 
+from hilstar import charts
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.cameras import bench_camera
 from hilstar.calibrate.first_light.photometry import response_error_mag
@@ -107,7 +108,10 @@ def steps_of(result):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = plant(tmp_path_factory.mktemp("light"), flip_x=True)
-    before = virtually(folder, *NONE)
+    with pytest.MonkeyPatch.context() as patched:  # of this page nothing is looked at
+        patched.setattr(charts, "finish", lambda figure: None)
+        patched.setattr(charts, "svg", lambda figure: "<svg></svg>")
+        before = virtually(folder, *NONE)
     assert before.returncode == 1, before.stderr
     result = virtually(folder, *FEW)
     assert result.returncode == 0, result.stderr

@@ -93,6 +93,7 @@ def test_a_formula_s_shares_of_white_are_said_to_be_assumed(tmp_path):
         assert len(told.stderr.splitlines()) == assumed
 
 
+@pytest.mark.usefixtures("without_charts")
 def test_budget_has_every_centroider_and_takes_the_bench_s_own(tmp_path, small_bench_file):
     fit = of_json("budget", small_bench_file, "-o", tmp_path / "out")
     assert fit["centroider"] == "fit"

@@ -44,6 +44,11 @@ def test_nothing_heavy_is_imported_before_it_is_used(module):
     assert not imported_by(module) & HEAVY
 
 
+def test_the_process_that_reads_a_link_imports_no_numpy():
+    """That is half of what its start would cost."""
+    assert "numpy" not in imported_by("hilstar.attitude.wire.apart_child, hilstar.attitude.wire.zmq_links")
+
+
 def test_a_run_imports_before_its_first_frame_what_some_frames_need():
     assert {"scipy.special", "hilstar.render.disc_tiles"} <= imported_by("hilstar.run.loop")
 

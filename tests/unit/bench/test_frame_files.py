@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import png
 import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from hilstar.bench.frame_files import PREVIEW_BLUR_PX, PREVIEW_POWER, PREVIEW_RADIUS_PX, write_preview_png
+from hilstar.bench.frame_files import PREVIEW_BLUR_PX, PREVIEW_POWER, PREVIEW_RADIUS_PX, png_of, write_preview_png
 
 
 def preview_by_filters(codes):
@@ -34,3 +35,13 @@ def test_a_preview_has_a_disc_for_each_lit_pixel_to_the_edges(tmp_path, lit):
 def test_a_preview_of_a_dark_frame_is_dark(tmp_path):
     write_preview_png(tmp_path / "preview.png", np.zeros((20, 30), np.uint8))
     assert not np.asarray(Image.open(tmp_path / "preview.png")).any()
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (4, 7, 3)])
+@pytest.mark.parametrize(("kind", "meant"), [(np.uint8, None), (np.uint16, 12)])
+def test_a_png_has_the_values_that_another_reader_finds(rng, shape, kind, meant):
+    """pypng, which reads colours of 16 bits too; the image is a view whose rows are not in memory's order."""
+    image = rng.integers(0, np.iinfo(kind).max, shape[1::-1] + shape[2:], kind).swapaxes(0, 1)
+    width, height, rows, told = png.Reader(bytes=png_of(image, meant)).read()
+    assert np.array_equal(np.vstack([*rows]).reshape(shape), image)
+    assert (width, height, told["bitdepth"]) == (*shape[1::-1], 8 * np.dtype(kind).itemsize)

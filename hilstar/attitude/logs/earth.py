@@ -134,13 +134,10 @@ def utc_ns_of(text: str, option: str) -> int:
 
 @lru_cache(maxsize=1)
 def _table() -> _EarthTable:
-    """The IERS table of Astropy's package (finals2000A), with its predictions of a year; Bulletin B where it is given, else A.
-
-    Columns as its `readme.finals2000A` numbers them: Astropy's own reader takes 20 times as long.
-    """
+    """The IERS table of Astropy's package (finals2000A) and its year of predictions, in a twentieth of Astropy's own time."""
     from astropy_iers_data import IERS_A_FILE
 
-    a_columns, b_columns = ((58, 68), (18, 27), (37, 46)), ((154, 165), (134, 144), (144, 154))  # UT1-UTC and the pole
+    a_columns, b_columns = ((58, 68), (18, 27), (37, 46)), ((154, 165), (134, 144), (144, 154))  # UT1, pole
     with Path(IERS_A_FILE).open(encoding="ascii") as file:
         lines = [(line, b_columns if line[154:165].strip() else a_columns) for line in file if line[58:68].strip()]
     rows = [(line[7:15], *(line[begin:end] for begin, end in columns)) for line, columns in lines]

@@ -161,3 +161,16 @@ def test_the_largest_sprites_are_whole(sigma):
         found, light, panel = gl.levels().copy(), gl.linear(), gl.target.panel()
     assert np.count_nonzero(found != round_levels(light, panel)) <= 3
     assert np.count_nonzero(found) > 1000
+
+
+@pytest.mark.parametrize("quantisation", ["round", "exact"])
+def test_the_texture_that_a_window_shows_has_the_levels_in_memory(quantisation, rng):
+    """Whatever context is current, and where an image's bytes fill no whole words."""
+    size = (37, 29)
+    with Renderer(Target(size, GaussianPsf(SIGMA), PANELS["srgb8"], WHITE, quantisation=quantisation)) as gl:
+        for count in (40, 400, 30):
+            gl.draw(stars(count, rng, size, (4, 6)))
+            levels, texture = gl.levels().copy(), gl.codes_texture
+            with gl.context:
+                shown = np.frombuffer(texture.read(alignment=1), dtype=np.uint8).reshape(size[::-1])
+            assert levels.any() and np.array_equal(shown, levels) and np.array_equal(gl.levels(), levels)

@@ -33,20 +33,17 @@ POOL_BYTES, WORKERS = 50_000_000, 2
 TIMES = {"late": -1, "draw": -1, "age": 1, "prediction": 1, "packet": -1}
 COUNTS, MARKS = ("missed_before", "stars_drawn", "clipped", "below_step"), ("stale", "capped", "operator", "hidden")
 VALUES = (*TIMES, *COUNTS, *MARKS, "blank", "w", "x", "y", "z")
-TIME_FIELDS = ("predicted_swap_ns", "draw_ns", "age_ns", "prediction_ns", "receive_ns")
-FIELDS = ("swap_ns", "t_ns", *TIME_FIELDS, *COUNTS, *MARKS, "q")
+FIELDS = ("swap_ns", "t_ns", "predicted_swap_ns", "draw_ns", "age_ns", "prediction_ns", "receive_ns", *COUNTS, *MARKS, "q")
 ACCEPTED, REFUSED = range(2)
 FRAME, PACKET, OTHER = 1, 2, 4  # bits of what a record is
-NO_Q = (np.nan,) * 4
 Integers = npt.NDArray[np.int64]
 
 
 class Columns(NamedTuple):
     """Records in their order; `kinds` (n,) has the bits of each, `record` gives one of them.
 
-    Of frames there are `swap_ns` and `t_ns` (frames,) and `values` (VALUES, frames), of packets `packets` (2, packets):
-    receive_ns, and ACCEPTED or REFUSED. `others` are all other records, and among them packets refused or without a time, and
-    each frame that has other faults than the one before it.
+    Of frames there are `swap_ns`, `t_ns` and `values` (VALUES, frames), of packets receive_ns and ACCEPTED or REFUSED. `others`
+    are all other records, and among them packets refused or without a time, and frames of other faults than the one before.
     """
 
     kinds: npt.NDArray[np.uint8]
@@ -93,9 +90,9 @@ def columns_of(records: list[RunRecord]) -> Columns:
         else:
             row[:] = list(map(bool, column)) if name in MARKS else _integers(column)
     values[-5] = [each is None for each in q] if None in q else False
-    values[-4:] = np.fromiter(chain.from_iterable([each or NO_Q for each in q]), np.float64).reshape(-1, 4).T
-    packets = np.array([times_ns, marks], np.int64)
-    return Columns(np.frombuffer(kinds, np.uint8), swap, _integers(t_ns), values, packets, others, records.__getitem__)
+    values[-4:] = np.fromiter(chain.from_iterable([each or (np.nan,) * 4 for each in q]), np.float64).reshape(-1, 4).T
+    what, packets = np.frombuffer(kinds, np.uint8), np.array([times_ns, marks], np.int64)
+    return Columns(what, swap, _integers(t_ns), values, packets, others, records.__getitem__)
 
 
 def _integers(values: Any) -> Integers:
@@ -104,14 +101,19 @@ def _integers(values: Any) -> Integers:
 
 def blocks_of(path: Path) -> Iterator[Columns]:
     """The records of a ledger, BLOCK at once. Raises InputError for a file that is no ledger or is damaged."""
-    large = len(os.sched_getaffinity(0)) > 1 and sum(part.stat().st_size for part in parts_of(path)) >= POOL_BYTES
     rest: list[RunMessage] = []
     with telling_faults(path):
         blocks = _blocks(path, rest)
-        yield from _decoded_beside(blocks) if large else map(_checked_columns, map(decoded, blocks))
+        yield from _decoded_beside(blocks) if _pays(path) else map(_checked_columns, map(decoded, blocks))
         records = decoded(rest)
         tell_no_end(path)
         yield _checked_columns(records)
+
+
+def _pays(path: Path) -> bool:
+    """Whether processes beside this one take less time: for a large ledger, and while a core is idle, for blocks wait often."""
+    running = int(Path("/proc/loadavg").read_text().split()[3].split("/")[0])  # this one included
+    return running < len(os.sched_getaffinity(0)) and sum(part.stat().st_size for part in parts_of(path)) >= POOL_BYTES
 
 
 def _blocks(path: Path, rest: list[RunMessage]) -> Iterator[list[RunMessage]]:

@@ -184,8 +184,7 @@ class Keyframes:
             if worth[place] > self._best.get(why, (0, 0))[0]:
                 self._best[why] = int(worth[place]), begin + place
         kept = {*self._even.rows[:, 0].tolist(), *(number for _, number in self._best.values()), self._count - 1}
-        records = {number: block.record(places[number - begin]) for number in kept if number >= begin}
-        self._records = {number: self._records[number] for number in kept if number < begin} | records
+        self._records = {n: block.record(places[n - begin]) if n >= begin else self._records[n] for n in kept}
 
     @property
     def last(self) -> FrameRecord | None:

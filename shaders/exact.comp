@@ -77,8 +77,7 @@ void store(Near near, BITS up) {
 #define STORE(BITS_OF, FROM) \
     for (uint turned = up BITS_OF ^ near.rounded_up BITS_OF; turned != 0u; turned &= turned - 1u) { \
         int k = findLSB(turned) + FROM; \
-        bool rises = has_bit(up, k); \
-        turn_level(near.star.pixel + offset_of(PLACE(k)), rises, int(step_of[k] >> 16) + int(rises)); }
+        show_level(near.star.pixel + offset_of(PLACE(k)), int(step_of[k] >> 16) + int(has_bit(up, k))); }
 #if NEAR <= 32
     STORE(, 0)
 #else

@@ -52,7 +52,7 @@ vec3 whole_of(Star star) {
 }
 #endif
 
-// A pixel's level, and its change to the next one: no two stars change the same pixel.
+// A pixel's level, and its change to another. Two stars change the same pixel only where both their sprites end before it.
 #ifdef SUMS
 const uint BITS_OF_LEVEL = uint(LEVEL_BITS), IN_WORD = 32u / BITS_OF_LEVEL;
 
@@ -65,16 +65,17 @@ int level_at(ivec2 at) {
     return int(level_words[place / IN_WORD] >> place % IN_WORD * BITS_OF_LEVEL & (1u << BITS_OF_LEVEL) - 1u);
 }
 
-void turn_level(ivec2 at, bool rises, int level) {
-    uint place = level_place(at), step = 1u << place % IN_WORD * BITS_OF_LEVEL;
-    atomicAdd(level_words[place / IN_WORD], rises ? step : 0u - step);
+void show_level(ivec2 at, int level) {
+    uint place = level_place(at), shift = place % IN_WORD * BITS_OF_LEVEL;
+    atomicAnd(level_words[place / IN_WORD], ~(((1u << BITS_OF_LEVEL) - 1u) << shift));
+    atomicOr(level_words[place / IN_WORD], uint(level) << shift);
 }
 #else
 int level_at(ivec2 at) {
     return int(imageLoad(levels, at)[PLANE]);
 }
 
-void turn_level(ivec2 at, bool rises, int level) {
+void show_level(ivec2 at, int level) {
     uvec4 shown = PLANES == 1 ? uvec4(0u) : imageLoad(levels, at);
     shown[PLANE] = uint(level);
     imageStore(levels, at, shown);

@@ -35,6 +35,7 @@ SLEW_LOG = "slew.jsonl"
 WAYPOINTS_DEG = ((84.057, -1.2, 0.0), (101.287, -16.716, 25.0), (114.825, 5.225, -10.0))
 # To and fro about the first of them, as a tracker at work: degrees, and the seconds of a turn, of RA, declination and roll.
 SCAN = ((2.0, 67.0), (2.0, 47.0), (10.0, 91.0))
+LEAST_SLEW_S = 5.0  # 40 deg/s at most; a shorter run ends within the slew. Receivers refuse 60 deg/s
 SETTLE_FRACTION = 0.15  # share of each leg, at rest at its end
 JITTER_ARCSEC = (1.5, 1.5, 6.0)  # 1 sigma about cam x, y, z: a good wheel-controlled satellite
 JITTER_SECONDS = 0.4  # its correlation time
@@ -57,7 +58,7 @@ def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
     points = [from_radec_roll_deg(*waypoint) for waypoint in WAYPOINTS_DEG]
 
     def slew(t_s: float) -> FloatArray:
-        progress = min(t_s / duration_s, 1.0) * (len(points) - 1)
+        progress = min(t_s / max(duration_s, LEAST_SLEW_S), 1.0) * (len(points) - 1)
         leg = min(int(progress), len(points) - 2)
         s = min((progress - leg) / (1 - SETTLE_FRACTION), 1.0)
         return slerp(points[leg], points[leg + 1], s**3 * (10 - 15 * s + 6 * s * s))

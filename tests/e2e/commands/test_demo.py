@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
+from hilstar.bench.config.attitude import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.run import demo
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
@@ -22,7 +25,7 @@ SECONDS = 1.5
 # The planted field-of-view error has amplitudes of 2.8 arcsec. A display that misses a frame at 0.3 deg/s is 18 arcsec
 # behind, and on a busy machine that is most of the bias's error.
 LOOP_BIAS_ARCSEC = 60.0
-SLOW_START_S = 2 * SECONDS  # longer than the slew of a demo of SECONDS, which a sender that began before would have ended
+SLOW_START_S = 0.5  # a sender that began before would have sent 50 attitudes
 
 
 def run_demo(folder, *options):
@@ -58,6 +61,12 @@ def test_the_sender_begins_once_a_frame_is_drawn_however_long_that_takes(tmp_pat
     assert summary["frames"] + summary["missed_frames"] == round(SECONDS * 60)
     assert summary["stars_drawn"]["mean"] > 50  # no blank frame of the lead-in is among them
     assert len({path.read_bytes() for path in (tmp_path / "demo").glob("*_codes.png")}) == 4
+
+
+@pytest.mark.parametrize("seconds", [0.5, 2.0, 10.0])
+def test_a_short_demo_too_turns_no_faster_than_a_receiver_takes(seconds):
+    samples = demo.slew_samples(seconds, np.random.default_rng(1))
+    assert max(math.hypot(*sample.rate_cam_rad_s) for sample in samples) < math.radians(AttitudeSettings().max_rate_deg_s)
 
 
 def test_a_sky_that_stood_still_is_said_last_and_is_no_success(tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ from hilstar.notices import Notices
 from hilstar.run.faults import read_recording
 from hilstar.run.pacer import Shown
 from hilstar.run.record.ledger_records import EventRecord, codes_ms_of, config_of, wrong_in_frame
-from hilstar.run.record.report import METRICS, SUMS, RunFigures, RunReport, figures_of, summarise, table_rows
+from hilstar.run.record.report import COUNTS, METRICS, RunFigures, RunReport, figures_of, summarise, table_rows
 from hilstar.run.replay import played_again, replay
 from hilstar.run.serve import Outlet
 from hilstar.units import NS_PER_S
@@ -133,7 +133,7 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
 
 def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> list[dict[str, Any]]:
     recording = read_recording(ledger, run.faults)
-    frames = run.keyframes.chosen()
+    frames = run.keyframes.chosen(run.last)
     # Where a fault froze the sky, the picture is an earlier frame's.
     frozen = {number for number, fault in recording.faults.items() if isinstance(fault, Freeze)}
     chosen = [(record, why) for record, why in frames if not (frozen & set(record.faults) or wrong_in_frame(record))]
@@ -259,7 +259,7 @@ def _numbers(values: FloatArray, digits: int) -> list[float | None]:
 
 def _spans(run: RunFigures) -> dict[str, Any]:
     told: dict[str, Any] = {"t_s": _numbers(run.spans.begin, S_DIGITS), "frames": run.spans.length}
-    for number, name in enumerate((*METRICS, *SUMS)):
+    for number, name in enumerate((*METRICS, *COUNTS)):
         low, high, total = run.spans.column(number)
         if name in {"missed", "stale", "blank"}:
             told[name] = _numbers(total, 0)

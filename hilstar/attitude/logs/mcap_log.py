@@ -123,13 +123,8 @@ def read_chunks(path: Path, *, tell: bool = True) -> Iterator[tuple[Topics, Mess
                 told = dict(topics)
             elif isinstance(record, kinds.Message) and record.channel_id in topics:
                 yield told, [(record.channel_id, record.data)]
-    if tell:
-        tell_no_end(path)
-
-
-def tell_no_end(path: Path) -> None:
-    """Log a line of the first of a run's files that lacks its end. Raises InputError."""
-    if (unfinished := unfinished_part(path)) is not None:
+    unfinished = unfinished_part(path) if tell else None
+    if unfinished is not None:
         log.warning("%s %s", unfinished, NO_END)
 
 

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from hilstar.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
-from hilstar.run.record.ledger_columns import BLOCK, columns_of
 from hilstar.run.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
-from hilstar.run.record.report import MAX_EVENTS, RunFigures, SpanTable, TimeBins, summarise
+from hilstar.run.record.report import BLOCK, MAX_EVENTS, RunFigures, SpanTable, TimeBins, summarise
 from tests.support.run_page import run_data_of
 
 PERIOD_NS = 16_666_667
@@ -34,10 +33,10 @@ def run() -> RunFigures:
     for begin in range(0, FRAMES, BLOCK):
         block = range(begin, min(begin + BLOCK, FRAMES))
         late = {31_415: {"age_ns": 900_000_000, "stale": True, "missed_before": 3}}
-        figures.add(columns_of([frame(k, **late.get(k, {})) for k in block]))
-        figures.add(columns_of([PacketForm(True, None, 10**12 + k * PERIOD_NS) for k in block]))
-    refused = CountRecord(host_ns=10**12 + 500 * 10**9, kind="packet", reason="crc", count=77)
-    figures.add(columns_of([refused, EventRecord(host_ns=10**12 + 90 * 10**9, kind="mark", detail="<b>cover off</b>")]))
+        figures.add(*(frame(k, **late.get(k, {})) for k in block))
+        figures.add(*(PacketForm(True, None, 10**12 + k * PERIOD_NS) for k in block))
+    figures.add(CountRecord(host_ns=10**12 + 500 * 10**9, kind="packet", reason="crc", count=77))
+    figures.add(EventRecord(host_ns=10**12 + 90 * 10**9, kind="mark", detail="<b>cover off</b>"))
     return figures
 
 
@@ -90,7 +89,7 @@ def test_the_verdict_names_everything_that_was_wrong():
     for k, more in enumerate(
         [{}, {"stale": True}, {"q": None, "stale": True}, {"missed_before": 2, "missed": 2}, {"hidden": "covered", "missed": 2}]
     ):
-        figures.add(columns_of([frame(k, **more)]))
+        figures.add(frame(k, **more))
     told = verdict(summarise(figures), figures.counted["late"])
     assert not told["ok"]
     assert told["reasons"] == [
@@ -103,7 +102,7 @@ def test_the_verdict_names_everything_that_was_wrong():
         told["headline"] == "Sky was not right throughout" and told["share"] == "28.5 %"
     )  # 2 of 5 frames and 2 periods without one
     well = RunFigures({})
-    well.add(columns_of([frame(0)]))
+    well.add(frame(0))
     assert verdict(summarise(well), 0)["ok"]
 
 
@@ -137,9 +136,9 @@ def test_bins_keep_every_count_whatever_the_times():
 
 def test_of_a_flood_of_events_the_first_and_the_last_are_told():
     figures = RunFigures({})
-    figures.add(columns_of([frame(0)]))
+    figures.add(frame(0))
     for k in range(3 * MAX_EVENTS):
-        figures.add(columns_of([EventRecord(host_ns=k, kind="stale", detail="x" * 10_000)]))
+        figures.add(EventRecord(host_ns=k, kind="stale", detail="x" * 10_000))
     told = run_data("run.mcap", figures, summarise(figures))
     assert len(told["events"]) == 2 * MAX_EVENTS and told["events_total"] == 3 * MAX_EVENTS
     assert max(len(event["line"]) for event in told["events"]) <= 400

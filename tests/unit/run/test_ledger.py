@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import multiprocessing
 import os
 import resource
 import shutil
@@ -25,7 +24,6 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
 from hilstar.cli.options import parse_split
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.run.record import ledger_columns
 from hilstar.run.record.ledger import (
     MAX_WAITING_BYTES,
     Ledger,
@@ -34,7 +32,6 @@ from hilstar.run.record.ledger import (
     QueueEntry,
     SplitLimits,
 )
-from hilstar.run.record.ledger_columns import columns_of
 from hilstar.run.record.ledger_records import FAULT_TOPIC, FaultRecord, FrameRecord, drawable_frames
 from hilstar.run.record.report import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
@@ -313,38 +310,17 @@ def test_a_report_of_absurd_times_is_a_report(tmp_path):
 def test_a_report_s_memory_does_not_grow_with_the_run():
     figures, known = RunFigures({}), {"light_ns": 1, "draw_ns": 0, "q": (1.0, 0.0, 0.0, 0.0)}
     for begin in range(0, 140_000, 7000):
-        frames = (
-            FrameRecord(frame=k, t_ns=k, swap_ns=16_666_667 * k, missed_before=int(k == 70_000), **known)
-            for k in range(begin, begin + 7000)
+        figures.add(
+            *(
+                FrameRecord(frame=k, t_ns=k, swap_ns=16_666_667 * k, missed_before=int(k == 70_000), **known)
+                for k in range(begin, begin + 7000)
+            )
         )
-        figures.add(columns_of(list(frames)))
     assert figures.counted["frames"] == 140_000
     assert len(figures.samples.rows) <= 1 << 16 and figures.samples.stride == 4
     assert figures.spreads["interval"].percentile(50) == pytest.approx(16.667, rel=2e-3)
     begin, (_, _, lost) = figures.spans.begin, figures.spans.column(6)
     assert begin[lost > 0] == pytest.approx(70_000 / 60, abs=1.1)
-
-
-def test_a_large_ledger_is_decoded_beside_with_the_same_figures_and_the_same_lines(tmp_path, bench, monkeypatch):
-    monkeypatch.setattr(ledger_columns, "BLOCK", 500)
-    with Ledger(tmp_path / "run.mcap", bench) as ledger:
-        keep(ledger, 0, 3000)
-    data = (tmp_path / "run.mcap").read_bytes()
-    middle = len(data) // 2
-    (tmp_path / "damaged.mcap").write_bytes(data[:middle] + bytes(9) + data[middle + 9 :])
-
-    def told(name):
-        try:
-            figures = figures_of(tmp_path / name)
-            return summarise(figures), figures.keyframes.chosen()
-        except InputError as error:
-            return str(error)
-
-    whole, damaged = told("run.mcap"), told("damaged.mcap")
-    assert whole[0].frames == 3000 and "damaged before byte" in damaged
-    monkeypatch.setattr(ledger_columns, "_pays", lambda _: True)
-    assert (told("run.mcap"), told("damaged.mcap")) == (whole, damaged)
-    assert not multiprocessing.active_children()
 
 
 def test_refused_packets_are_counted_by_reason(tmp_path, bench):

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any, get_type_hints
 
-from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, TEAL, chart, read_records, value_bars
+from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, TEAL, chart, value_bars
 from hilstar.study import codes, colour, timing
 from hilstar.study.sweep import Figure, Trial, Trials
 from hilstar.study.tradeoff import run as tradeoff
@@ -102,7 +103,7 @@ def draw_tracker(rows: list[dict[str, str]]) -> None:
     own = {row["kind"]: float(row["median_ms"]) for row in rows if row["method"] == "hilstar"}
     finding = f"The virtual tracker takes {own['exposure']:.0f} ms for an exposure, {own['case']:.0f} ms for a campaign's case"
     note = (
-        "Medians of processor time, ms, in turn, beside other work. 1024 x 1024 px of the demo's tracker, all noise; peers have"
+        "Medians of processor time, ms, in turn. 1024 x 1024 px of the demo's tracker, all noise; peers have"
         " hilstar's expected image or DN. verify: one field. First frame: a process from exec to its end, 1920 x 1080."
     )
     with chart(DOCS / "tracker_speed.svg", finding, note=note, height_inch=3.6) as (axes,):
@@ -113,6 +114,13 @@ def rows_of(name: str) -> list[dict[str, str]]:
     """The rows of a CSV file here."""
     with (HERE / name).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def read_records(path: Path, record: type[Any]) -> list[Any]:
+    """The rows of a study's table as its dataclasses of texts, numbers and flags."""
+    convert = {name: "True".__eq__ if kind is bool else kind for name, kind in get_type_hints(record).items()}
+    with path.open(encoding="utf-8", newline="") as file:
+        return [record(**{name: convert[name](text) for name, text in row.items()}) for row in csv.DictReader(file)]
 
 
 if __name__ == "__main__":

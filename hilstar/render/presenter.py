@@ -50,6 +50,7 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             texture = level_texture(context, levels)
             Presenter(texture, ScreenView(screen_px, screen_px, bits, triples=part)).present()
             read = context.screen.read(viewport=(0, 0, width, height), components=3, dtype="f4")
+            _ = context.error  # moderngl asks for an attachment, which a window's back buffer has not, and reads on
             texture.release()
         drawn = np.rint(np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1])
         differ = (drawn != part[levels]).any(axis=-1)

@@ -50,7 +50,10 @@ def asleep_ns(clock):
             do_harm()
     return round(slept_s * 1e9) if looks > 1 else 0
 
-build.open_bench, HostClock.asleep_ns = open_bench, asleep_ns
+HostClock.asleep_ns = asleep_ns
+for module in list(sys.modules.values()):  # whoever has imported it already, too
+    if getattr(module, "open_bench", None) is opened:
+        module.open_bench = open_bench
 sys.exit(run_command(sys.argv[4:]))
 """
 LOG_S = 4
@@ -119,3 +122,4 @@ def test_a_window_s_own_table_that_changed_in_sleep_ends_the_run(tmp_path):
     with xvfb(tmp_path) as screen:
         ran, ledger = planted(tmp_path, "table", 60.0, table=-1, how="--windowed", env=screen.env)
     assert_ended_early(ran, ledger, tmp_path, "memory was lost in sleep, 1 of the tables")
+    assert "before the first frame" not in ran.stderr  # the window's own check of its codes leaves no error

@@ -7,7 +7,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkServerProcess
 
 END_S = 2.0
-AHEAD = 4  # tasks for each worker that are begun before the answer to the first of them is taken
 ONE_THREAD = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Work = Callable[..., Any]
@@ -85,34 +84,6 @@ class ProcessPool(Closing):
             if worker.link in ready or worker.process.sentinel in ready:
                 yield self._news(worker)
 
-    def answers(self, workers: int, tasks: Iterable[tuple[Any, ...]], lost: type[Exception]) -> Iterator[tuple[Any, Any]]:
-        """Tasks in their order, each with the answer of one of so many new workers; a few are begun before it is wanted.
-
-        Raises a worker's exception, `lost` for a worker that died, and last one of `tasks`.
-        """
-        for _ in range(workers):
-            self.start()
-        following, done, begun, wanted = iter(tasks), dict[int, Any](), 0, 0
-        task, failure = _next(following)
-        while task is not None or wanted < begun:
-            for worker in self.workers:
-                if task is not None and begun < wanted + AHEAD * workers and worker.ready and worker.task is None:
-                    worker.give((begun, task), *task)
-                    begun += 1
-                    task, failure = _next(following)
-            for worker, news, said in self.heard():
-                if news in {"error", "died"}:
-                    died = lost(f"a process of the pool ended with code {said}; is there enough memory?")
-                    raise said if news == "error" else died
-                if news == "answer":
-                    (number, answered), worker.task = worker.task, None
-                    done[number] = answered, said
-            while wanted in done:
-                yield done.pop(wanted)
-                wanted += 1
-        if failure is not None:
-            raise failure
-
     def _news(self, worker: WorkerProcess) -> News:
         with contextlib.suppress(EOFError, OSError):
             if worker.link.poll():  # an answer of one that has died since is still heard
@@ -142,13 +113,6 @@ class ProcessPool(Closing):
             worker.process.terminate()
         for worker in list(self.workers):
             self._remove(worker)
-
-
-def _next(tasks: Iterator[Any]) -> tuple[Any, Exception | None]:
-    try:
-        return next(tasks, None), None
-    except Exception as error:  # raised after the answers to the tasks before
-        return None, error
 
 
 @contextmanager

@@ -323,6 +323,9 @@ class Renderer(Backend):
             self._erase(levels=False)
             self._draw_extended(sprites, self._sure(DitherQuantiser, None))
             self._floor_encoder.draw(0, 1, 0, {"shift": turn}, self._regions, self._tiles, is_black=False)
+            self._floor_levels.in_memory = False
+            self._floor_levels.read()
+            self._floor_levels.in_memory = True  # read back once, for all frames that keep it
             self._floor_key = key
         return self._floor_levels
 

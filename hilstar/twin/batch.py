@@ -99,10 +99,24 @@ def simulate_views(
         pieces: list[tuple[ExposurePiece, ...]] = [()] * len(views) if faults is None else faults.pieces(first, views)
     make_directory(directory)
     scenario = None if faults is None else faults.scenario
-    tasks = ((number, view, cuts) for number, (view, cuts) in enumerate(zip(views, pieces, strict=True)))
+    tasks = iter(enumerate(zip(views, pieces, strict=True)))
     with ProcessPool(_start_exposing, (file, noise, directory, scenario), (Exception,)) as pool:
-        for done, _ in enumerate(pool.answers(min(len(views), len(os.sched_getaffinity(0))), tasks, MachineError), start=1):
-            on_done(done)
+        for _ in range(min(len(views), len(os.sched_getaffinity(0)))):
+            pool.start()
+        done = 0
+        while done < len(views):
+            for worker, news, said in pool.heard():
+                if news == "error":
+                    raise said
+                if news == "died":
+                    raise MachineError(f"a process of the pool ended with code {said}; is there enough memory?")
+                if news == "answer":
+                    done += 1
+                    on_done(done)
+                task = next(tasks, None)
+                if task is not None:
+                    number, (view, cuts) = task
+                    worker.give(number, number, view, cuts)
 
 
 def _start_exposing(

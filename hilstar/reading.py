@@ -92,6 +92,12 @@ def exists(path: Path) -> bool:
         return False
 
 
+def by_number(path: Path) -> list[str | int]:
+    """A key that sorts files by name as people number them: NAME_9 before NAME_10."""
+    parts = re.split(r"(\d+)", path.name)
+    return [int(part) if part.isdigit() else part for part in parts]
+
+
 def open_regular(path: Path, advice: str, limit_bytes: int | None = None) -> IO[bytes]:
     """A regular file, open for reading. `advice` is what to give instead, such as "give the path of a bench file".
 

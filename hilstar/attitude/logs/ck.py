@@ -28,6 +28,7 @@ from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated
 from hilstar.attitude.wire.packet import checked_sample
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.errors import InputError
+from hilstar.reading import by_number
 
 BESIDE = (".tls", ".tsc", ".tf")  # leap seconds, clocks and frames, as NAIF ends their names
 MAX_BESIDE = 30
@@ -37,14 +38,27 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def _kernels_beside(path: Path) -> list[Path]:
-    """The leap second, clock and frame kernels in the CK's folder, in that order and by name: a later version counts."""
+    """The leap second, clock and frame kernels in the CK's folder, in that order and by name: a later version counts.
+
+    Versions are numbers: clock_10 comes after clock_9.
+    """
     try:
-        files = sorted(file for file in path.resolve().parent.iterdir() if file.suffix.lower() in BESIDE and file.is_file())
+        files = [file for file in path.resolve().parent.iterdir() if file.suffix.lower() in BESIDE and file.is_file()]
     except OSError as error:
         raise InputError(f"{path}: its folder cannot be searched for kernels ({error.strerror}); give --kernel FILE") from error
     if len(files) > MAX_BESIDE:
         raise InputError(f"{path}: {len(files)} kernels lie beside it; name those that it needs: --kernel FILE")
-    return sorted(files, key=lambda file: BESIDE.index(file.suffix.lower()))
+    return sorted(files, key=lambda file: (BESIDE.index(file.suffix.lower()), by_number(file)))
+
+
+def _beside_line(kernels: list[Path]) -> str:
+    """The kernels from beside the CK in their order, and which of several of one kind counts."""
+    names = ", ".join(kernel.name for kernel in kernels) or "none"
+    last_of_kind = {kernel.suffix.lower(): kernel.name for kernel in kernels}
+    kinds = [kernel.suffix.lower() for kernel in kernels]
+    counting = [last_of_kind[kind] for kind in BESIDE if kinds.count(kind) > 1]
+    of_several = f"; where they differ, the last counts ({', '.join(counting)})" if counting else ""
+    return f"kernels from beside the CK: {names}{of_several}; --kernel names others"
 
 
 def read_ck(path: Path, stated: Stated) -> LogReading:
@@ -55,8 +69,7 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
     kernels, told = list(stated.kernels), []
     if not kernels:
         kernels = _kernels_beside(path)
-        names = ", ".join(kernel.name for kernel in kernels) or "none"
-        told.append(("kernels", f"kernels from beside the CK: {names}; --kernel names others"))
+        told.append(("kernels", _beside_line(kernels)))
     arrays, said = _asked(path, kernels, stated.body)
     if said["step_s"] is not None:
         error = f"{said['error_rad'] * MAS_PER_RAD:.2g} mas"

@@ -3,8 +3,8 @@
 A request is one JSON object on stdin: `path`, `kernels` and `body`. The answer is an NPZ file on stdout: the arrays of
 `_Sampled`, and `said`, JSON text with the rest, or with `error` alone. Times are spacecraft clock ticks throughout.
 
-1. Summaries, times, counts and quaternions are checked here before SPICE evaluates a segment. SPICE trusts them, and would
-   follow a damaged list of records forever.
+1. SPICE reads the file: its list of segments (`daf...`), what they cover (`ckcov`) and their attitudes (`ckgp`). What SPICE
+   trusts is checked before: a list of segments that never ends, counts, and quaternions that are not unit.
 2. Of two segments at one time, SPICE takes the later one.
 3. Segments with attitudes at given times (types 1 and 3) are read at those times.
 4. Types 2, 4, 5 and 6 are functions of time. They are read at even steps, halved until the interpolation between them is
@@ -15,15 +15,16 @@ A request is one JSON object on stdin: `path`, `kernels` and `body`. The answer 
 import io
 import json
 import math
-import os
-import struct
+import shutil
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,15 +39,15 @@ from hilstar.reading import HEAD_BYTES, open_regular
 from hilstar.rotation import angle_between_rad, from_matrix, rate_between_rad_s
 from hilstar.units import NS_PER_S
 
-RECORD_BYTES, WORD_BYTES = 1024, 8
-ORDERS = {b"LTL-IEEE": "<", b"BIG-IEEE": ">"}
+WORD_BYTES = 8
+MAX_SUMMARY_WORDS = 125  # SPICE's own limit of a summary
 MAX_SUMMARIES = 100_000
 MAX_TEXT_BYTES, MAX_BINARY_BYTES = 50_000_000, 4_000_000_000
 MAX_NAMED = 1000  # kernels of one meta-kernel
 ADVICE = "give a SPICE kernel (.tls, .tsc, .tf, .tm, ...)"
 CK_DOUBLES, CK_INTEGERS = 2, 6
+QUATERNION_WORDS, RATE_WORDS, TYPE_2_WORDS = 4, 3, 8
 DIRECTORY = 100  # every hundredth time stands in a directory too
-QUATERNION_WORDS, RATE_WORDS = 4, 3
 TYPE_5_WORDS = {0: 8, 1: 4, 2: 14, 3: 7}  # words in a packet, by subtype
 TYPES = range(1, 7)
 Span = tuple[float, float]
@@ -68,85 +69,8 @@ MAX_NAMED_BODIES = 12
 CK_CLASS = 3  # SPICE's class of frames whose attitude is in CKs
 
 
-class _Summary(NamedTuple):
-    """One array of a DAF: the summary's doubles and integers, of which the last two are the first and last word (from 1)."""
-
-    doubles: tuple[float, ...]
-    integers: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class _Daf:
-    """A DAF whose list of summaries is whole, and whose arrays lie within the file."""
-
-    path: Path
-    order: str
-    summaries: list[_Summary]
-
-    def words(self, summary: _Summary) -> FloatArray:
-        first, last = summary.integers[-2:]
-        with open_regular(self.path, "give a SPICE kernel") as file:
-            file.seek((first - 1) * WORD_BYTES)
-            raw = file.read((last - first + 1) * WORD_BYTES)
-        if len(raw) != (last - first + 1) * WORD_BYTES:
-            raise InputError(f"{self.path}: was cut while it was read; copy it whole")
-        return np.frombuffer(raw, self.order + "f8").astype(np.float64)
-
-
-def _read_daf(path: Path, limit_bytes: int) -> _Daf:
-    """The summaries of a DAF, in the file's order. Raises InputError for a file that is not one, or is damaged."""
-    with open_regular(path, "give a SPICE kernel", limit_bytes) as file:
-        size_words = os.fstat(file.fileno()).st_size // WORD_BYTES
-        head = file.read(RECORD_BYTES)
-        order = ORDERS.get(head[88:96])
-        if len(head) < RECORD_BYTES:
-            raise InputError(f"{path}: has {len(head)} bytes, less than a DAF's first record; is it cut off?")
-        if not head.startswith(b"DAF/") or order is None:
-            format_text = head[88:96].decode("ascii", "replace").strip() or "missing"
-            raise InputError(f"{path}: is no DAF in IEEE form (its form is {shortened(format_text)}); convert it by tobin")
-        doubles, integers = struct.unpack(order + "2i", head[8:16])
-        if not (0 <= doubles <= 124 and 2 <= integers <= 250 and doubles + (integers + 1) // 2 <= 125):
-            raise InputError(f"{path}: is a damaged DAF: its summaries have {doubles} doubles and {integers} integers")
-        layout = struct.Struct(f"{order}{doubles}d{integers}i")
-        summaries: list[_Summary] = []
-        for raw in _raw_summaries(path, file, struct.unpack(order + "2i", head[76:84]), order, layout.size):
-            numbers = layout.unpack_from(raw)
-            begin, end = numbers[-2:]
-            if not RECORD_BYTES // WORD_BYTES < begin <= end <= size_words:
-                raise _damaged(path, f"an array has the words {begin} to {end} of {size_words}")
-            summaries.append(_Summary(numbers[:doubles], numbers[doubles:]))
-            if len(summaries) > MAX_SUMMARIES:
-                raise InputError(f"{path}: has more than {MAX_SUMMARIES} segments; split it into several")
-    return _Daf(path, order, summaries)
-
-
-def _raw_summaries(path: Path, file: IO[bytes], ends: tuple[int, int], order: str, size: int) -> Iterator[bytes]:
-    """The bytes of each summary, from a list of records that each name the next and the previous one."""
-    (record, last), previous, words = ends, 0, -(-size // WORD_BYTES)
-    records = os.fstat(file.fileno()).st_size // RECORD_BYTES
-    seen: set[int] = set()
-    while record:
-        if record in seen or not 1 < record <= records:
-            raise _damaged(path, f"its list of summaries leads to record {record}")
-        seen.add(record)
-        file.seek((record - 1) * RECORD_BYTES)
-        raw = file.read(RECORD_BYTES)
-        following, before, count = struct.unpack(order + "3d", raw[:24])
-        if before != previous or not 0 <= count <= 125 // words or not (0 <= following < 2**31 and following.is_integer()):
-            raise _damaged(path, f"summary record {record} is not one of its list")
-        yield from (raw[(3 + k * words) * WORD_BYTES :] for k in range(int(count)))
-        record, previous = int(following), record
-    if previous != last:
-        raise _damaged(path, f"its list of summaries ends at record {previous}, not {last}")
-
-
-def _damaged(path: Path, what: str) -> InputError:
-    return InputError(f"{path}: is a damaged DAF: {what}; is it cut off?")
-
-
-@dataclass(frozen=True, slots=True)
-class _CkSegment:
-    """A segment's descriptor; `number` counts from 1 in the file, and a higher one has priority. Ticks."""
+class Segment(NamedTuple):
+    """One segment of a CK by its summary: ticks of the clock, ids, its type, and its first and last word in the file."""
 
     number: int
     start: float
@@ -155,118 +79,162 @@ class _CkSegment:
     reference: int
     kind: int
     has_rate: bool
-    summary: _Summary
+    first_word: int
+    last_word: int
 
 
-@dataclass(frozen=True, slots=True)
-class Coverage:
-    """The intervals (n, 2) that a segment covers, and the times (n,) of its attitudes where it has some, both increasing."""
+class Coverage(NamedTuple):
+    """The intervals (n, 2) that a segment covers, and the times (n,) of its attitudes if it has some, both increasing."""
 
     intervals: FloatArray
     epochs: FloatArray
 
 
-def _read_segments(path: Path, limit_bytes: int) -> tuple[_Daf, list[_CkSegment]]:
-    """The segments of a CK in the file's order. Raises InputError for a file that is damaged or another type of segment."""
-    daf = _read_daf(path, limit_bytes)
+@contextmanager
+def _opened(spice: Any, path: Path) -> Iterator[int]:
+    """A DAF as SPICE opens it. Raises InputError for what is no regular file.
+
+    An error leaves it open, for this process then ends; closing what SPICE has closed would hide what it said.
+    """
+    open_regular(path, ADVICE).close()
+    handle = spice.dafopr(str(path))
+    yield handle
+    spice.dafcls(handle)
+
+
+def _summaries(spice: Any, path: Path, handle: int) -> Iterator[tuple[FloatArray, list[int]]]:
+    """The doubles and integers of each summary of a DAF, in the file's order. Raises InputError for a list without an end.
+
+    SPICE follows a damaged list for ever, also where it only looks for an attitude. So the list is walked, and
+    counted, before anything is looked for.
+    """
+    doubles, integers = spice.dafhsf(handle)
+    spice.dafbfs(handle)
+    count = 0
+    while spice.daffna():
+        count += 1
+        if count > MAX_SUMMARIES:
+            raise InputError(f"{path}: has more than {MAX_SUMMARIES} segments; split it, or copy it again if it is damaged")
+        summary_doubles, summary_integers = spice.dafus(spice.dafgs(MAX_SUMMARY_WORDS), doubles, integers)
+        yield summary_doubles, [int(number) for number in summary_integers]
+
+
+def read_segments(spice: Any, path: Path, handle: int) -> list[Segment]:
+    """The segments of a CK in the file's order. Raises InputError for another file and another type of segment."""
+    if tuple(spice.dafhsf(handle)) != (CK_DOUBLES, CK_INTEGERS):
+        raise InputError(f"{path}: is another kind of DAF than a CK")
+    size_words = path.stat().st_size // WORD_BYTES
     segments = []
-    for number, summary in enumerate(daf.summaries, start=1):
-        if (len(summary.doubles), len(summary.integers)) != (CK_DOUBLES, CK_INTEGERS):
-            raise InputError(f"{path}: is another kind of DAF than a CK")
-        body, reference, kind, has_rate = summary.integers[:4]
-        start, stop = summary.doubles
+    for number, (ticks, integers) in enumerate(_summaries(spice, path, handle), start=1):
+        body, reference, kind, has_rate, first_word, last_word = integers
+        start, stop = float(ticks[0]), float(ticks[1])
         if not (math.isfinite(start) and math.isfinite(stop) and 0 <= start <= stop):
             raise InputError(f"{path}: segment {number} spans the ticks {start:g} to {stop:g}; is the file damaged?")
         if kind not in TYPES:
             raise InputError(f"{path}: segment {number} is of type {kind}; types 1 to 6 are read")
-        segments.append(_CkSegment(number, start, stop, body, reference, kind, has_rate != 0, summary))
+        if not 0 < first_word <= last_word <= size_words:
+            place = f"the words {first_word} to {last_word} of {size_words}"
+            raise InputError(f"{path}: segment {number} has {place}; is the file cut off?")
+        segments.append(Segment(number, start, stop, body, reference, kind, has_rate != 0, first_word, last_word))
     if not segments:
         raise InputError(f"{path}: contains no segment; is the file cut off?")
-    return daf, segments
+    return segments
 
 
-def _coverage(daf: _Daf, segment: _CkSegment) -> Coverage | None:
-    """What a segment covers; None for types 4 and 6, whose intervals SPICE tells (`ckcov`). Raises InputError.
+def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray:
+    """The times (n,) at which a segment of type 1 or 3 has attitudes; none for the other types.
 
-    A quaternion that is not unit is refused here: of one that is all zeros SPICE would make an attitude.
+    Raises InputError for a quaternion that is not unit: of one that is all zeros SPICE would make an attitude. Types 1,
+    2, 3 and 5 begin with their packets, whose first words are the quaternion; in all but type 2 their times follow.
+    SPICE has no other way to them. Packets of types 4 and 6 are polynomials, which it checks itself.
     """
     if segment.kind in {4, 6}:
-        return None
-    words = daf.words(segment.summary)
-    read = _type_2(words) if segment.kind == 2 else _epochs(words, segment)
-    where = f"{daf.path}: segment {segment.number}"
-    if read is None:
-        raise InputError(f"{where}: its counts or directory do not fit its {len(words)} words; is the file damaged?")
-    intervals, epochs, q = read
-    times = (intervals.ravel(), epochs)
-    if not all(np.isfinite(each).all() for each in times) or (np.diff(epochs) <= 0).any() or (np.diff(times[0]) < 0).any():
-        raise InputError(f"{where}: its times do not increase; is the file damaged?")
-    norm = np.sqrt((q * q).sum(axis=1))
-    bad = np.flatnonzero(~(np.abs(norm - 1.0) <= NORM_TOLERANCE))
+        return np.empty(0)
+    words = np.asarray(spice.dafgda(handle, segment.first_word, segment.last_word), dtype=np.float64)
+    where = f"{path}: segment {segment.number}"
+    count, packet_words = _packets(words, segment)
+    if count < 1 or packet_words < QUATERNION_WORDS or (packet_words + 1) * count > len(words):
+        raise InputError(f"{where}: its counts do not fit its {len(words)} words; is the file damaged?")
+    quaternions = words[: packet_words * count].reshape(count, packet_words)[:, :QUATERNION_WORDS]
+    norms = np.sqrt((quaternions * quaternions).sum(axis=1))
+    bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
     if len(bad):
-        raise InputError(f"{where}: the norm of its quaternion {bad[0] + 1} is {norm[bad[0]]:.6g}; it must be 1")
-    within = np.clip(intervals, segment.start, segment.stop)
-    return Coverage(within[(within[:, 1] > within[:, 0]) | (intervals[:, 1] == intervals[:, 0])], epochs)
+        raise InputError(f"{where}: the norm of its quaternion {bad[0] + 1} is {norms[bad[0]]:.6g}; it must be 1")
+    if segment.kind in SMOOTH:
+        return np.empty(0)
+    epochs = words[packet_words * count : (packet_words + 1) * count]
+    if not np.isfinite(epochs).all() or (np.diff(epochs) <= 0).any():
+        raise InputError(f"{where}: its times do not increase; is the file damaged?")
+    # SPICE searches by a directory: the hundredth time (type 3), or the mean of it and the next (type 1).
+    directory = words[(packet_words + 1) * count :][: (count - 1) // DIRECTORY]
+    hundredth, following = epochs[DIRECTORY - 1 : -1 : DIRECTORY], epochs[DIRECTORY::DIRECTORY]
+    if not ((hundredth <= directory) & (directory <= following)).all():
+        raise InputError(f"{where}: its directory is not that of its times; is the file damaged?")
+    return epochs
 
 
-Read = tuple[FloatArray, FloatArray, FloatArray]  # intervals (n, 2), times (n,) and quaternions (n, 4)
+def _packets(words: FloatArray, segment: Segment) -> tuple[int, int]:
+    """How many packets a segment of type 1, 2, 3 or 5 has, and the words of each; 0 and 0 where that cannot be told."""
+    if segment.kind == 2:  # it states no count: packets of 8 words, two times each, and a directory of every hundredth
+        return -(-(100 * len(words) + 1) // 1001), TYPE_2_WORDS
+    trailer_words = {1: 1, 3: 2, 5: 5}[segment.kind]
+    if len(words) < trailer_words or not np.isfinite(words[-trailer_words:]).all():
+        return 0, 0
+    count = int(words[-1])
+    if segment.kind == 5:
+        return count, TYPE_5_WORDS.get(int(words[-4]), 0)
+    return count, QUATERNION_WORDS + RATE_WORDS * segment.has_rate
 
 
-def _type_2(words: FloatArray) -> Read | None:
-    """N packets of 8 words, N starts, N stops, a directory of (N - 1) // 100."""
-    count = -(-(DIRECTORY * len(words) + 1) // (10 * DIRECTORY + 1))
-    if count < 1 or 10 * count + (count - 1) // DIRECTORY != len(words):
-        return None
-    starts, stops = words[8 * count : 10 * count].reshape(2, count)
-    if not _is_directory(words[10 * count :], starts):
-        return None
-    return np.column_stack((starts, stops)), np.empty(0), words[: 8 * count].reshape(count, 8)[:, :QUATERNION_WORDS]
+def _coverages(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Coverage]:
+    """What each of these segments of one structure covers."""
+    with _opened(spice, path) as handle:
+        epochs = [_epochs(spice, path, handle, segment) for segment in segments]
+    intervals = _intervals(spice, path, segments)
+    coverages = []
+    for segment, own_epochs, own_intervals in zip(segments, epochs, intervals, strict=True):
+        # SPICE counts each instance of type 1 as an interval of its own; hilstar goes on from one to the next.
+        spans = own_epochs[[0, -1]].reshape(1, 2) if segment.kind == 1 else own_intervals
+        if not np.isfinite(spans).all() or (np.diff(spans.ravel()) < 0).any():
+            raise InputError(f"{path}: segment {segment.number}: its intervals do not increase; is the file damaged?")
+        within = np.clip(spans, segment.start, segment.stop)
+        is_covered = (within[:, 1] > within[:, 0]) | (spans[:, 1] == spans[:, 0])
+        coverages.append(Coverage(within[is_covered], own_epochs))
+    return coverages
 
 
-def _epochs(words: FloatArray, segment: _CkSegment) -> Read | None:
-    """Types 1, 3 and 5: packets, their times, a directory; 3 and 5 also the starts of intervals, a directory and counts."""
-    counts = _counts(words, segment)
-    if counts is None:
-        return None
-    packet, count, starts_count = counts
-    q = words[: packet * count].reshape(count, packet)[:, :QUATERNION_WORDS]
-    epochs, rest = words[packet * count : packet * count + count], words[packet * count + count :]
-    directory, rest = np.split(rest, [(count - 1) // DIRECTORY])
-    starts, starts_directory = rest[:starts_count], rest[starts_count : starts_count + max(starts_count - 1, 0) // DIRECTORY]
-    if not (_is_directory(directory, epochs) and _is_directory(starts_directory, starts)):
-        return None
-    if segment.kind == 1:
-        return epochs[[0, -1]].reshape(1, 2), epochs, q
-    first = np.searchsorted(epochs, starts)
-    if first[0] != 0 or (np.diff(first) < 1).any() or first[-1] >= count:
-        return None
-    return np.column_stack((starts, epochs[np.append(first[1:], count) - 1])), epochs, q
+def _intervals(spice: Any, path: Path, segments: Sequence[Segment]) -> list[FloatArray]:
+    """The intervals (n, 2) that each segment covers, by SPICE.
+
+    SPICE tells the coverage of a structure, all its segments together, and which of two that overlap has a gap is lost
+    in that. So each segment becomes a structure of its own, in a copy of the file.
+    """
+    if len(segments) == 1:
+        return [_covered(spice, path, segments[0].body, segments[0])]
+    numbers = {segment.number for segment in segments}
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "apart.bc"
+        shutil.copyfile(path, copy)
+        handle = spice.dafopw(str(copy))
+        for number, (ticks, integers) in enumerate(_summaries(spice, copy, handle), start=1):
+            body = number if number in numbers else 0
+            spice.dafrs(spice.dafps(CK_DOUBLES, CK_INTEGERS, ticks, [body, *integers[1:]]))
+        spice.dafcls(handle)
+        return [_covered(spice, copy, segment.number, segment) for segment in segments]
 
 
-def _counts(words: FloatArray, segment: _CkSegment) -> tuple[int, int, int] | None:
-    """Words of a packet, packets and intervals, from the end of the segment; None where they do not fit its size."""
-    trailer = {1: 1, 3: 2, 5: 5}[segment.kind]
-    if len(words) < trailer or not np.isfinite(words[-trailer:]).all():
-        return None
-    count, starts_count = int(words[-1]), 0 if segment.kind == 1 else int(words[-2])
-    packet = TYPE_5_WORDS.get(int(words[-4]), 0) if segment.kind == 5 else QUATERNION_WORDS + RATE_WORDS * segment.has_rate
-    if count < 1 or packet == 0 or (segment.kind != 1 and not 1 <= starts_count <= count):
-        return None
-    directories = (count - 1) // DIRECTORY + max(starts_count - 1, 0) // DIRECTORY
-    whole = packet * count + count + starts_count + directories + trailer == len(words)
-    return (packet, count, starts_count) if whole else None
-
-
-def _is_directory(directory: FloatArray, times: FloatArray) -> bool:
-    """Whether a directory has every hundredth time: SPICE would search past the packets by another."""
-    return bool((directory == times[DIRECTORY - 1 :: DIRECTORY][: len(directory)]).all())
+def _covered(spice: Any, path: Path, body: int, segment: Segment) -> FloatArray:
+    # No type takes fewer than two words of a segment for each interval's two bounds.
+    cell = spice.cell_double(segment.last_word - segment.first_word + 3)
+    window = spice.ckcov(str(path), body, False, "INTERVAL", 0.0, "SCLK", cell)
+    return np.array(list(window), dtype=np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
     """Ticks from `start` to `stop` of a segment; `epochs` (n,) are the times strictly within at which it holds attitudes."""
 
-    segment: _CkSegment
+    segment: Segment
     start: float
     stop: float
     epochs: FloatArray
@@ -287,7 +255,7 @@ class _Piece:
         return np.concatenate([*inner, ticks[-1:]])
 
 
-def _pieces_of(covered: list[tuple[_CkSegment, Coverage]]) -> list[_Piece]:
+def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
     """The pieces of the segments of one structure, in order of time; segments come in the file's order."""
     owners = [(segment, cover.epochs, *span) for segment, cover in covered for span in cover.intervals.tolist()]
     if not owners:
@@ -301,7 +269,7 @@ def _pieces_of(covered: list[tuple[_CkSegment, Coverage]]) -> list[_Piece]:
         if start == stop:
             owner_of_point[cells.start] = index
     begins = np.flatnonzero(np.diff(owner_of_cell, prepend=-1))
-    ends = np.append(begins[1:], len(bounds) - 1)
+    ends = np.append(begins[1:], len(bounds) - 1)[: len(begins)]  # none begins where a CK has instants alone
     spans = [(owner_of_cell[k], k, end) for k, end in zip(begins.tolist(), ends.tolist(), strict=True) if owner_of_cell[k] >= 0]
     for k in np.flatnonzero(owner_of_point >= 0).tolist():
         if owner_of_cell[k] < 0 and (k == 0 or owner_of_cell[k - 1] < 0):
@@ -508,7 +476,10 @@ def _checked(spice: Any, kernel: Path, meta: Path | None = None) -> list[Path]:
     if meta is not None and head.startswith(b"KPL/MK"):
         raise InputError(f"{meta}: names another meta-kernel, {kernel}; name its kernels instead")
     if head.startswith(b"DAF/"):
-        _read_daf(kernel, MAX_BINARY_BYTES)
+        open_regular(kernel, ADVICE, MAX_BINARY_BYTES).close()
+        with _opened(spice, kernel) as handle:
+            for _ in _summaries(spice, kernel, handle):
+                pass
         return [kernel]
     if head.startswith((b"DAFETF", b"DASETF")):
         raise InputError(f"{kernel}: is a transfer file; convert it by tobin")
@@ -557,13 +528,15 @@ def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sample
     """The attitudes of the CK's structure, with its name and the frames that its segments refer to. Raises InputError."""
     import spiceypy
 
-    daf, segments = _read_segments(path, MAX_CK_BYTES)
+    open_regular(path, ADVICE, MAX_CK_BYTES).close()
     try:
         with spiceypy.no_found_check():
+            with _opened(spiceypy, path) as handle:
+                segments = read_segments(spiceypy, path, handle)
             load(spiceypy, path, kernels)
             body = _body(spiceypy, path, segments, stated)
             own = [segment for segment in segments if segment.body == body]
-            pieces = _pieces_of(list(zip(own, _coverages(spiceypy, daf, own), strict=True)))
+            pieces = _pieces_of(list(zip(own, _coverages(spiceypy, path, own), strict=True)))
             if not pieces:
                 raise InputError(f"{path}: its segments of {body} cover no time")
             structure = _Structure(path, spiceypy, body, all(segment.has_rate for segment in own))
@@ -573,23 +546,7 @@ def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sample
         raise InputError(f"{path}: {_in_words(error)}") from error
 
 
-def _coverages(spice: Any, daf: _Daf, segments: list[_CkSegment]) -> list[Coverage]:
-    """What each segment covers; SPICE tells the intervals of types 4 and 6."""
-    found = [_coverage(daf, segment) for segment in segments]
-    if None not in found:
-        return [each for each in found if each is not None]
-    words = sum(segment.summary.integers[-1] - segment.summary.integers[-2] for segment in segments)
-    window = spice.ckcov(str(daf.path), segments[0].body, False, "INTERVAL", 0.0, "SCLK", spice.cell_double(words + 2))
-    intervals = np.array(list(window), dtype=np.float64).reshape(-1, 2)
-    result = []
-    for segment, each in zip(segments, found, strict=True):
-        within = np.clip(intervals, segment.start, segment.stop)
-        touched = (intervals[:, 0] <= segment.stop) & (intervals[:, 1] >= segment.start)
-        result.append(Coverage(within[touched], np.empty(0)) if each is None else each)
-    return result
-
-
-def _body(spice: Any, path: Path, segments: list[_CkSegment], stated: str | None) -> int:
+def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -> int:
     """The id of the structure: the only one, or what the user states by a number, a frame's name or a body's."""
     bodies = sorted({segment.body for segment in segments})
     named = ", ".join(_name(spice, body) for body in bodies[:MAX_NAMED_BODIES]) + (", ..." * (len(bodies) > MAX_NAMED_BODIES))

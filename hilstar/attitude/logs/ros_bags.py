@@ -27,7 +27,17 @@ from mcap.records import Message as McapMessage
 from hilstar.attitude.logs.mcap_log import ROS_ENCODINGS, records_of, unpacked
 from hilstar.errors import InputError, shortened
 from hilstar.files import temporary_folder
-from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, open_regular, read_text, refuse_kind, size_text
+from hilstar.reading import (
+    HEAD_BYTES,
+    MCAP_MAGIC,
+    ROSBAG_MAGIC,
+    SQLITE_MAGIC,
+    by_number,
+    open_regular,
+    read_text,
+    refuse_kind,
+    size_text,
+)
 from hilstar.units import NS_PER_S
 
 BAG_ADVICE = "give a bag of ROS 1 (.bag) or ROS 2 (.db3, .mcap, or the bag's directory)"
@@ -355,7 +365,7 @@ def _files_of(path: Path, told: list[tuple[str, str]]) -> list[Path]:
     if not metadata.is_file():
         told.append(("log-cut", f"{path} has no {METADATA} (its recorder was killed?); all of its bag files are read"))
         files = [file for file in path.iterdir() if FILE_NAME.fullmatch(file.name)]  # NAME_2 comes before NAME_10
-        return sorted(files, key=lambda file: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", file.name)])
+        return sorted(files, key=by_number)
     # relative_file_paths, one to a line or in brackets, as ROS 2 writes them; a YAML reader's time has no bound.
     found = FILE_LIST.search(read_text(metadata, "give a bag of ROS 2", MAX_METADATA_BYTES))
     if found is None:

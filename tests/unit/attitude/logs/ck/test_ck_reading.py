@@ -204,6 +204,63 @@ def test_a_long_pause_that_an_interval_covers_is_no_gap(folder, motion):
     assert not found.breaks.any()
 
 
+def test_a_gap_of_the_later_segment_is_filled_by_the_earlier_one(folder, motion):
+    other = ck.Motion(np.random.default_rng(5))
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES, rates=False)
+        ck.write_segment(handle, 3, other, np.array([1.0, 1.5, 3.0, 3.5]), starts=[1.0, 3.0])
+    found, _ = read(folder / "a.bc")
+    between = [q for second, q in zip(seconds_of(found), found.q, strict=True) if 1.6 < second < 2.9]
+    assert len(between) == 5  # the earlier segment's own times: 1.75 to 2.75 s
+    assert angle_between_rad(between[2], motion.quaternion(2.25)) < READ_BACK_RAD
+    assert found.gaps_s == []
+
+
+@pytest.mark.parametrize(("kind", "count"), [(1, 101), (1, 250), (3, 101), (5, 101)])
+def test_a_segment_with_a_directory_is_read(folder, motion, kind, count):
+    """From 101 records on a segment has a directory, which each type makes in its own way."""
+    times = np.arange(count) * 0.25
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, kind, motion, times)
+    found, _ = read(folder / "a.bc")
+    assert seconds_of(found)[[0, -1]] == pytest.approx(times[[0, -1]], abs=1e-6)
+    assert angle_between_rad(found.q[-1], motion.quaternion(float(times[-1]))) < READ_BACK_RAD
+
+
+def test_functions_of_time_with_a_directory_are_read(folder, motion):
+    starts_s = [0.5 * k for k in range(101)]
+    steps = [(start_s, start_s + 0.4, motion.turn(start_s), [0.0, 0.0, 0.1]) for start_s in starts_s]
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_type_2(handle, steps)
+    found, _ = read(folder / "a.bc")
+    assert len(found.gaps_s) == 100
+
+
+@pytest.mark.parametrize(("kind", "count"), [(1, 1), (3, 3), (5, 8)])
+def test_single_instants_are_read_and_held(folder, motion, kind, count):
+    """A CK that forbids interpolation begins an interval with each record."""
+    times = np.arange(count) * 1.0
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, kind, motion, times, starts=times)
+    found, _ = read(folder / "a.bc")
+    assert seconds_of(found) == pytest.approx(times, abs=1e-6)
+    assert found.breaks[1:].all()
+    for second, q in zip(times.tolist(), found.q, strict=True):
+        assert angle_between_rad(q, motion.quaternion(second)) < READ_BACK_RAD
+
+
+def test_of_numbered_kernels_beside_the_ck_the_last_by_number_counts(folder, motion):
+    (folder / "clock.tsc").unlink()
+    for number, start_s in ((9, ck.START_S), (10, ck.START_S + 60.0)):
+        (folder / f"clock_{number}.tsc").write_text(ck.clock_kernel(start_s=start_s))
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES)
+    log = open_log(folder / "a.bc")
+    assert log.samples[0].t_ns == J2000_NS + round(ck.START_S + 60.0) * NS_PER_S
+    line = "kernels from beside the CK: leap.tls, clock_9.tsc, clock_10.tsc; where they differ, the last counts (clock_10.tsc)"
+    assert ("kernels", f"{line}; --kernel names others") in log.told
+
+
 # The whole way: another process, the kernels beside the file, the mounting, names
 
 

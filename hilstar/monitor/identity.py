@@ -12,7 +12,20 @@ from hilstar.toml_tables import Table
 
 TABLE = "monitor_identity"  # in a calibration or geometry file
 STRAIGHT = "straight"
-NO_SERIALS = frozenset({0, 1, 0x01010101, 0xFFFFFFFF})  # what makers write who number nothing
+# What makers write who number nothing: 0, 1, or a number of one byte repeated (0x01010101, 0x20202020), which is told
+# apart from a count by its size; digits in a row; words, with or without digits behind them.
+NO_SERIALS = frozenset({0, 1})
+DIGITS_IN_A_ROW = ("01234567890", "12345678901234567890", "9876543210")
+MIN_IN_A_ROW = 4  # characters: fewer are a count
+SERIAL_BYTES = 4  # of the number in an EDID's head
+NO_SERIAL_WORDS = frozenset(
+    {
+        *("na", "none", "null", "nil", "no", "unknown", "undefined", "default", "empty", "blank", "tbd"),
+        *("serial", "serialno", "serialnumber", "sn", "number", "monitor", "display"),
+        *("demo", "demoset", "sample", "test", "dummy", "tobefilledbyoem"),
+        *("notavailable", "notapplicable", "notspecified", "notset"),
+    }
+)
 MAX_WEEK = 54  # 0: not stated; 255: the year is the model's (VESA E-EDID 1.4, 3.4.4)
 SHOWN_DIGITS = 20  # a SHA-256 in a line; names and modes are shorter
 
@@ -76,15 +89,38 @@ def edid_identity(edid: bytes) -> MonitorIdentity:
         return known
     # pyedid 1.0.3 reads these two numbers the wrong way round.
     product, number = (int.from_bytes(edid[a:b], "little") for a, b in ((10, 12), (12, 16)))
-    serial = _plain(found.serial) if isinstance(found.serial, str) else ""
+    text_serial = _plain(found.serial) if isinstance(found.serial, str) else ""
     return msgspec.structs.replace(
         known,
         maker=found.manufacturer_pnp_id,
         model=_plain(found.name or "") or f"{product:04x}",
-        serial=serial if serial.strip("0 ") else "" if number in NO_SERIALS else str(number),
+        serial=_stated_serial(text_serial) or _stated_serial(str(number)),
         week=found.week if 0 < found.week <= MAX_WEEK else None,
         year=found.year,
     )
+
+
+def _stated_serial(text: str) -> str:
+    """The serial number that a text holds; "" where it is a placeholder, which each monitor of its kind has."""
+    plain = "".join(character for character in text.casefold() if character.isalnum())
+    number_text, base = (plain[2:], 16) if plain.startswith("0x") else (plain, 10)
+    try:
+        is_placeholder = _is_no_serial(int(number_text, base))
+    except ValueError:
+        letters = "".join(character for character in plain if not character.isdigit())
+        is_placeholder = not plain or letters in NO_SERIAL_WORDS
+    if len(plain) >= MIN_IN_A_ROW:
+        is_one_character = len(set(plain)) == 1
+        is_row = any(plain in row for row in DIGITS_IN_A_ROW)
+        is_placeholder = is_placeholder or is_one_character or is_row
+    return "" if is_placeholder else text
+
+
+def _is_no_serial(number: int) -> bool:
+    """Whether a number is what makers write who number nothing."""
+    size_bytes = (number.bit_length() + 7) // 8
+    repeated = number.to_bytes(size_bytes, "little")
+    return number in NO_SERIALS or (size_bytes == SERIAL_BYTES and len(set(repeated)) == 1)
 
 
 def _plain(text: str) -> str:

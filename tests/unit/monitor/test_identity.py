@@ -104,6 +104,44 @@ def test_what_differs_is_said_with_both_values(changed, words):
     assert read_back(now) == now
 
 
+PLACEHOLDERS = (
+    "0000000000001", "0x00000000", "0x01010101", "16843009", "N/A", "n/a", "serial", "Serial Number", "demoset-1", "123456789",
+    "1234567890", "0123456789", "987654321", "0x88888888", "2290649224", "0x20202020", "XXXXXXXX", "11111111", "none", "-",
+)  # fmt: skip
+SERIALS = ("F00BAR", "CN0ABC1234", "7", "16843010", "0x01010102", "1234567891234", "AH1234567", "NA4711X", "L3CMTF012345")
+
+
+def with_serial_text(text):
+    """A real EDID whose number is 0 and whose last descriptor, that of its serial number, holds this text."""
+    block = bytearray(real()[0].block)
+    block[12:16] = bytes(4)
+    block[108:126] = b"\0\0\0\xff\0" + f"{text}\n".encode()[:13].ljust(13)
+    block[127] = -sum(block[:127]) % 256
+    return bytes(block)
+
+
+@pytest.mark.parametrize("text", PLACEHOLDERS)
+def test_a_placeholder_is_no_serial_number(text):
+    identity = edid_identity(with_serial_text(text))
+    assert identity.serial == ""
+    assert "has no serial number" in identity.doubt
+
+
+@pytest.mark.parametrize("text", SERIALS)
+def test_a_serial_number_is_kept_as_it_stands(text):
+    identity = edid_identity(with_serial_text(text))
+    assert identity.serial == text
+    assert not identity.doubt
+
+
+def test_a_number_of_one_byte_repeated_is_no_serial_number():
+    for number in (0x88888888, 0x20202020, 0x01010101, 1, 0, 0xFFFFFFFF):
+        block = bytearray(with_serial_text("N/A"))
+        block[12:16] = number.to_bytes(4, "little")
+        block[127] = -sum(block[:127]) % 256
+        assert edid_identity(bytes(block)).serial == ""
+
+
 def test_a_monitor_without_a_serial_number_is_doubted():
     assert not THIS.doubt and THIS.name() == "DEL U2412M, serial F00BAR, on DP-1 at 1920x1200@59.95"
     numberless = msgspec.structs.replace(THIS, serial="")

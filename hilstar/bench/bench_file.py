@@ -6,8 +6,8 @@ A file may also name several bench files, one for each head of an attitude deter
     [attitude]
     endpoint = "tcp://127.0.0.1:5560"
 
-The source's attitude is the body's; each head's `[tracker] q_body_to_cam` makes it its camera's. `[attitude]` holds for all
-heads, in place of their own.
+The source's attitude is the body's, whatever its `convention` is otherwise; each head's `[tracker] q_body_to_cam` makes it its
+camera's. `[attitude]` holds for all heads, in place of their own.
 """
 
 import hashlib
@@ -189,7 +189,19 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
 
 def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:
     file = read_bench_file(head)
-    return changed_file(file, parse_toml(head, file.text) | {"attitude": attitude})
+    file = changed_file(file, parse_toml(head, file.text) | {"attitude": attitude})
+    source = file.config.attitude
+    if source.convention.frame == "body":
+        return file
+    stated = attitude.get("convention")
+    if isinstance(stated, dict) and "frame" in stated:
+        raise InputError(
+            f'{head}: [attitude] convention = {{ frame = "cam" }}: several heads have one source, the attitude of the body;'
+            ' write frame = "body", or leave it out'
+        )
+    convention = msgspec.structs.replace(source.convention, frame="body")
+    config = msgspec.structs.replace(file.config, attitude=msgspec.structs.replace(source, convention=convention))
+    return replace(file, config=config)
 
 
 def as_head(head: Path, heads: Path) -> BenchFile:

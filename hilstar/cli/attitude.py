@@ -60,7 +60,7 @@ def attitude(
     mounted = Mounting(first.config.tracker.q_body_to_cam) if mounting is None else options.parse_mounting(mounting)
     if live:
         sample, conventions, held = _live(first, at, wait)
-        for _, line in mounted.told if conventions.of_body else ():
+        for _, line in conventions.mounting_notices(mounted):
             say(line)
     else:
         stated = Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, options.parse_place(place))

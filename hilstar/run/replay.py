@@ -13,7 +13,7 @@ from msgspec.structs import replace as replaced
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.logs.entries import Stated, log_joins
-from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
+from hilstar.attitude.logs.log_file import NOTHING_STATED, check_stated, log_timeline, open_log
 from hilstar.attitude.logs.mcap_log import holds_ros, is_mcap, read_attitudes
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import rate_refusal
@@ -139,6 +139,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     a step that gives no frame.
     """
     factor = wanted.speed
+    check_stated(log, stated)
     if is_mcap(log) and not holds_ros(log):
         frames = drawable_frames(log, math.radians(config.attitude.max_rate_deg_s))
         first = last = next(frames, None)

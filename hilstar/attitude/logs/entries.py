@@ -26,7 +26,7 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.rate_check import cause_in
 from hilstar.attitude.clock.timeline import Join
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
-from hilstar.attitude.wire.source import Conventions, Mounting
+from hilstar.attitude.wire.source import Convention, Conventions, Mounting
 from hilstar.rotation import conjugate, multiply
 from hilstar.units import NS_PER_S
 
@@ -43,6 +43,19 @@ LOOKED_AT = 2000  # samples, for the cause of rates that do not fit
 NO_GAPS: frozenset[int] = frozenset()
 
 
+# The statements, and the option of a command by which each is made.
+OPTIONS = {
+    "mounting": "--mounting",
+    "kernels": "--kernel",
+    "topic": "--topic",
+    "body": "--body",
+    "reference": "--reference",
+    "epoch_utc": "--epoch-utc",
+    "place": "--place",
+    "convention": "--convention",
+}
+
+
 class LogEntry(NamedTuple):
     """`where` is a line (":12"), an epoch or a count, as it follows the file's name in a message."""
 
@@ -55,7 +68,8 @@ class Stated:
     """What the user states of a log, where the file itself does not say it; None where nothing is stated.
 
     `kernels` are SPICE kernels; `topic` and `body` choose one of several; `reference` names the frame that attitudes refer to;
-    `epoch_utc` is the UTC of the log's time zero; `place` is latitude and longitude in degrees and height in metres (WGS84).
+    `epoch_utc` is the UTC of the log's time zero; `place` is latitude and longitude in degrees and height in metres (WGS84);
+    `convention` is that of the quaternions of CSV, JSON lines and MCAP, `convention_by` who states it.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -65,6 +79,20 @@ class Stated:
     reference: str | None = None
     epoch_utc: str | None = None
     place: tuple[float, float, float] | None = None
+    convention: Convention | None = None
+    convention_by: str = "--convention"
+
+    def __iter__(self) -> Iterator[tuple[str, str]]:
+        """The field of each statement that the user makes, and how it is written; a bench file's mounting is none."""
+        for name, option in OPTIONS.items():
+            if name == "mounting":
+                stated = self.mounting.by_option
+            elif name == "convention":
+                stated, option = self.convention is not None, self.convention_by
+            else:
+                stated = getattr(self, name) not in (None, ())
+            if stated:
+                yield name, option
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,7 +92,7 @@ def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
     from hilstar.attitude.wire.packet import AttitudeSample
 
     log = open_log(path, stated)
-    joins = log_joins(log.samples)
+    joins = log_joins(log.samples, log.told)
     for _, line in [*log.told, *joins.told]:
         say(line)
     t_ns = time_in_log(path, log.samples, at)

@@ -7,6 +7,7 @@ from typer import Argument, Option
 
 from hilstar.cli import options, running
 from hilstar.console.run_status import RunSource, RunStatus, on_terminal
+from hilstar.console.terminal import say
 from hilstar.files import MCAP, check_directory, check_ending
 from hilstar.notices import Notices
 
@@ -69,6 +70,8 @@ def replay(
         running.optional_answers(bench, notices, kept, screen) as answers,
         running.optional_frames(frames, bench, screen) as watched,
     ):
+        if play.span:
+            say(play.span)
         running.say_of_light(bench)
         if explain:
             running.explain_bench(bench, of_source=play.conventions.lines(stated.mounting))

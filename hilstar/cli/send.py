@@ -109,7 +109,7 @@ def wanted_samples(
         return spin_samples(options.parse_spin(spin), rate or 100.0, options.parse_radec(radec or "84.057,-1.2,0")), math.inf
     read = open_log(log or Path(), statements.stated())
     recorded = read.samples
-    for _, line in [*read.told, *log_joins(recorded).told]:
+    for _, line in [*read.told, *log_joins(recorded, read.told).told]:
         say(line)
     return log_samples(recorded, rate), len(recorded) if rate is None else math.inf
 

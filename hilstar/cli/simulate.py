@@ -114,7 +114,7 @@ def simulate_log(
     read = open_log(log, statements.stated(config))
     samples = read.samples
     file = dated(file, read.conventions.scale, samples[0].t_ns)
-    for _, line in [*read.told, *log_joins(samples).told]:
+    for _, line in [*read.told, *log_joins(samples, read.told).told]:
         say(line)
     max_rate_rad_s = math.radians(config.attitude.max_rate_deg_s)
     views = log_views(samples, frames, config.tracker.exposure_s, max_rate_rad_s)

@@ -25,6 +25,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.rate_check import cause_in
 from hilstar.attitude.clock.timeline import Join
+from hilstar.attitude.logs.log_times import TIMES
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import Convention, Conventions, Mounting
 from hilstar.rotation import conjugate, multiply
@@ -187,8 +188,8 @@ class LogJoins:
         return lines
 
 
-def log_joins(samples: Sequence[AttitudeSample]) -> LogJoins:
-    """How the samples of a log join; their times must increase."""
+def log_joins(samples: Sequence[AttitudeSample], told: Iterable[tuple[str, str]] = ()) -> LogJoins:
+    """How the samples of a log join; their times must increase. `told` are notices that may explain rates that do not fit."""
     if len(samples) < 2:
         return LogJoins()
     t_ns = np.array([sample.t_ns for sample in samples], dtype=object)
@@ -200,7 +201,7 @@ def log_joins(samples: Sequence[AttitudeSample]) -> LogJoins:
     held = gap & ~fits & ~broken
     misfit = known & ~fits & ~broken & ~gap
     cause = ""
-    if misfit.any():  # what is probably wrong with the rates from the first one on that does not fit
+    if misfit.any() and TIMES not in dict(told):  # what is probably wrong from the first rate on that does not fit
         first = int(misfit.argmax())
         found = cause_in([sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None])
         cause = "" if found is None else found.text

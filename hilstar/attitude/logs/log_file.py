@@ -35,6 +35,7 @@ from hilstar.attitude.logs.entries import (
     Stated,
     log_joins,
 )
+from hilstar.attitude.logs.log_times import time_notices
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, checked_sample, decode
 from hilstar.attitude.wire.source import HILSTARS, PACKETS, Convention, Conventions, components, packet_conventions
 from hilstar.errors import InputError, MachineError
@@ -83,6 +84,8 @@ def _read_csv(lines: Iterable[str], scalar: Literal["first", "last"]) -> Iterato
     missing = [name for name in needed if name not in header]
     if missing:
         detail = f"column {missing[0]} is missing; the header must have {','.join(needed)}"
+        if missing[0] == "t_s" and "t_ns" in header:
+            detail = f"column t_ns: a CSV has its times in seconds; divide by 1e9, and write {','.join(needed)}"
         yield LogEntry(f":{reader.line_num}", Refusal("format", detail))
         return
     places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
@@ -180,7 +183,10 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
     if not samples:
         _refuse_other_topics(path)
         raise InputError(f"{path}: contains no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
-    return AttitudeLog(samples, conventions, [*reading.told, *conventions.mounting_notices(mounting)])
+    told = [*reading.told, *conventions.mounting_notices(mounting)]
+    if conventions.of_packets:  # other formats say themselves what their times are
+        told += time_notices(samples, conventions.time_unit)
+    return AttitudeLog(samples, conventions, told)
 
 
 def _refuse_other_topics(path: Path) -> None:
@@ -403,7 +409,8 @@ def _open_json_lines(path: Path, stated: Stated) -> Iterator[LogReading]:
 def _open_csv(path: Path, stated: Stated) -> Iterator[LogReading]:
     scalar = (stated.convention or HILSTARS).scalar
     with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        yield _of_packets(path, _read_csv(lines, scalar), "CSV", stated)
+        reading = _of_packets(path, _read_csv(lines, scalar), "CSV", stated)
+        yield replace(reading, conventions=replace(reading.conventions, time_unit="s"))
 
 
 def _is_bag(beginning: LogHead) -> bool:

@@ -12,11 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from hilstar.attitude.wire.packet import AttitudeSample, Event
 from hilstar.toml_tables import Table
 
-if TYPE_CHECKING:  # NumPy takes 70 ms, and a process that only stamps packets needs none
+if TYPE_CHECKING:  # NumPy takes 70 ms, and a process that only stamps packets needs none; a bench file needs no packets
     from hilstar.arrays import FloatArray
+    from hilstar.attitude.wire.packet import AttitudeSample, Event
 
 Components = tuple[float, float, float, float]
 IDENTITY: Components = (1.0, 0.0, 0.0, 0.0)
@@ -35,10 +35,10 @@ UNUSED = (
 class Convention(Table, frozen=True):
     """What a quaternion turns into what, and the order of its components (see [conventions](attitude-in.md#conventions))."""
 
-    #: Where the scalar stands among the four numbers: w, x, y, z or x, y, z, w.
+    #: Where the scalar stands among the four numbers. `"first"`: w, x, y, z. `"last"`: x, y, z, w.
     scalar: Literal["first", "last"] = "first"
-    #: `"icrs_to_cam"`: it turns ICRS components into those of the frame. `"cam_to_icrs"`: the other way round. For
-    #: `frame = "body"` read body for cam.
+    #: `"icrs_to_cam"`: it turns ICRS components into the frame's (with `frame = "body"`: the body's). `"cam_to_icrs"`: the
+    #: other way round.
     direction: Literal["icrs_to_cam", "cam_to_icrs"] = "icrs_to_cam"
     #: Whose attitude it is. `"cam"`: the camera's. `"body"`: the spacecraft's, which `[tracker] q_body_to_cam` makes the
     #: camera's; rates are then the body's, too.
@@ -129,7 +129,7 @@ class Conventions:
     `turns` says from which frame to which; `scalar` the order of the components; `time` the scale and the zero of its times;
     `of_body` whether `[tracker] q_body_to_cam` applies; `written` gives an attitude in the source's own words; `scale` is the
     time scale (UTC, TAI, TT, TDB, GPS) whose ns since 1970-01-01T00:00:00 its times are, in days of 86400 s; None for others.
-    `of_packets`: a `Convention` says what its quaternions are, and its times are plain numbers.
+    `of_packets`: a `Convention` says what its quaternions are, and its times are plain numbers (of `time_unit` in a log).
     """
 
     source: str
@@ -140,6 +140,7 @@ class Conventions:
     written: Callable[[FloatArray], str]
     scale: str | None = None
     of_packets: bool = False
+    time_unit: str = "ns"
 
     def mounting_notices(self, mounting: Mounting) -> list[tuple[str, str]]:
         """What the user must know of the mounting: that nobody stated one, or that one is stated and not used."""
@@ -201,6 +202,7 @@ class SentAttitudes:
         """A decoder whose samples are the camera's; `decode` itself where they are already, which costs nothing."""
         if self._mounting is None and self.convention.is_hilstars:
             return decode
+        from hilstar.attitude.wire.packet import AttitudeSample
 
         def decoded(message: bytes) -> Event:
             event = decode(message)

@@ -3,14 +3,16 @@
 from dataclasses import dataclass, replace
 from itertools import product
 
+import msgspec
 import numpy as np
 
 from hilstar.answers.answer import Answer
-from hilstar.answers.formats import CHECKSUMS, AnswerDecoder, Conventions, RefusedAnswer
+from hilstar.answers.formats import CHECKSUMS, AnswerDecoder, RefusedAnswer
 from hilstar.arrays import FloatArray
-from hilstar.bench.config.answers import Convention, field_format
+from hilstar.attitude.wire.source import Convention, Mounting, SentAttitudes
+from hilstar.bench.config.answers import field_format
 from hilstar.errors import printable, shortened
-from hilstar.rotation import angle_between_rad, conjugate, multiply, normalise, to_radec_roll_deg
+from hilstar.rotation import angle_between_rad, to_radec_roll_deg
 from hilstar.units import ARCSEC_PER_RAD
 
 MAX_SHOWN_BYTES = 96
@@ -44,15 +46,15 @@ def _angle(off_rad: float) -> str:
 
 def under_conventions(answer: Answer, decoder: AnswerDecoder, shown: FloatArray | None) -> list[UnderConvention]:
     """A valid answer under each convention, the matching one marked; `shown` is q_icrs_to_cam of what is shown."""
-    mounted = decoder.conventions.q_body_to_cam
+    mounted = decoder.q_body_to_cam
     if answer.q_icrs_to_cam is None:
         return []
-    sent = _as_sent(answer.q_icrs_to_cam, decoder.conventions)
+    sent = decoder.sent.as_sent(answer.q_icrs_to_cam)
     frames = ("cam", "body") if mounted is not None else ("cam",)
     found = []
     for scalar, direction, frame in product(("first", "last"), ("icrs_to_cam", "cam_to_icrs"), frames):
         convention = Convention(scalar=scalar, direction=direction, frame=frame)  # type: ignore[arg-type]
-        q = Conventions(convention, mounted).q_icrs_to_cam(sent)
+        q = SentAttitudes(convention, Mounting(mounted)).q_icrs_to_cam(sent)
         found.append(UnderConvention(convention, q, None if shown is None else angle_between_rad(q, shown)))
     if shown is None:
         return found
@@ -60,15 +62,6 @@ def under_conventions(answer: Answer, decoder: AnswerDecoder, shown: FloatArray 
     off, next_off = nearest.off_rad or 0.0, min((other.off_rad or 0.0 for other in others), default=np.pi)
     certain = off < NEAR_RAD and next_off > APART * off
     return [replace(each, matches=certain and each is nearest) for each in found]
-
-
-def _as_sent(q_icrs_to_cam: FloatArray, conventions: Conventions) -> FloatArray:
-    q, convention = q_icrs_to_cam, conventions.convention
-    if convention.frame == "body" and conventions.q_body_to_cam is not None:
-        q = multiply(conjugate(normalise(np.array(conventions.q_body_to_cam))), q)
-    if convention.direction == "cam_to_icrs":
-        q = conjugate(q)
-    return np.roll(q, -1) if convention.scalar == "last" else q
 
 
 def hex_line(raw: bytes) -> str:
@@ -114,8 +107,8 @@ def lines_of(found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: Float
     if matching is not None:
         found_as, form = matching.convention, decoder.settings.format
         scalar = "first" if form == "frame" else found_as.scalar
-        written = f'{{ scalar = "{scalar}", direction = "{found_as.direction}", frame = "{found_as.frame}" }}'
-        own = found_as == decoder.conventions.convention
+        written = msgspec.structs.replace(found_as, scalar=scalar)
+        own = found_as == decoder.sent.convention
         lines.append("  the bench file's convention matches" if own else f"  write [answers] convention = {written}")
         if form == "frame" and found_as.scalar == "last":
             lines.append("  and name its four fields qx, qy, qz, qw in the order in which they now are qw, qx, qy, qz")

@@ -23,17 +23,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 from cobs import cobs
 
 from hilstar.answers.answer import Answer, ReportedStar
-from hilstar.arrays import FloatArray
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import INT64, AnswerPacket, Refusal, checked_sample, decode
-from hilstar.attitude.wire.source import Components
-from hilstar.bench.config.answers import MAX_FRAME_BYTES, AnswersSettings, Convention, FrameField, FrameLength, field_format
+from hilstar.attitude.wire.source import Components, Mounting, SentAttitudes
+from hilstar.bench.config.answers import MAX_FRAME_BYTES, AnswersSettings, FrameField, FrameLength, field_format
 from hilstar.errors import InputError, one_line, printable, shortened
-from hilstar.rotation import conjugate, multiply, normalise, to_matrix
 from hilstar.units import NS_PER_S
 
 MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
@@ -79,40 +76,21 @@ class JsonAnswer(msgspec.Struct, frozen=True):
     centroids: list[list[float | None]] = []
 
 
-@dataclass(frozen=True, slots=True)
-class Conventions:
-    """A bench file's convention, with the camera's place in the body: what a tracker said, as an answer of hilstar's."""
-
-    convention: Convention
-    q_body_to_cam: Components | None = None
-
-    def q_icrs_to_cam(self, q: FloatArray) -> FloatArray:
-        """The camera's attitude of a tracker's unit quaternion (4,) in the order that it was sent."""
-        if self.convention.scalar == "last":
-            q = np.roll(q, 1)
-        if self.convention.direction == "cam_to_icrs":
-            q = conjugate(q)
-        if self.convention.frame == "body" and self.q_body_to_cam is not None:
-            q = multiply(normalise(np.array(self.q_body_to_cam)), q)
-        return q
-
-    def answer(self, host_ns: int, raw: bytes, said: JsonAnswer) -> Answer | RefusedAnswer:
-        """The answer, or why the numbers are none."""
-        t_ns = said.t_ns
-        if t_ns is not None and t_ns not in INT64:
-            return RefusedAnswer("time", f"t_ns {t_ns} does not fit 64 bits", raw)
-        mode = "" if said.mode is None else printable(shortened(said.mode, MAX_MODE_CHARACTERS))[:MAX_MODE_CHARACTERS]
-        stars = said.stars if said.stars is not None and 0 <= said.stars <= MAX_STARS else None
-        plain = Answer(host_ns, raw, t_ns, None, None, said.valid, mode, stars, said.rms_arcsec, _reported(said.centroids))
-        if said.q is None or not said.valid:  # without an attitude its numbers may be anything
-            return replace(plain, valid=False) if said.q is None else plain
-        checked = checked_sample(0, said.q, said.rate)
-        if isinstance(checked, Refusal):
-            return RefusedAnswer(checked.reason, checked.detail, raw)
-        rate = checked.rate_cam_rad_s
-        if rate is not None and self.convention.frame == "body" and self.q_body_to_cam is not None:
-            rate = to_matrix(normalise(np.array(self.q_body_to_cam))) @ rate
-        return replace(plain, q_icrs_to_cam=self.q_icrs_to_cam(checked.q_icrs_to_cam), rate_cam_rad_s=rate)
+def answer_of(sent: SentAttitudes, host_ns: int, raw: bytes, said: JsonAnswer) -> Answer | RefusedAnswer:
+    """The answer that a tracker's numbers are, or why they are none; `sent` says what its quaternions mean."""
+    t_ns = said.t_ns
+    if t_ns is not None and t_ns not in INT64:
+        return RefusedAnswer("time", f"t_ns {t_ns} does not fit 64 bits", raw)
+    mode = "" if said.mode is None else printable(shortened(said.mode, MAX_MODE_CHARACTERS))[:MAX_MODE_CHARACTERS]
+    stars = said.stars if said.stars is not None and 0 <= said.stars <= MAX_STARS else None
+    plain = Answer(host_ns, raw, t_ns, None, None, said.valid, mode, stars, said.rms_arcsec, _reported(said.centroids))
+    if said.q is None or not said.valid:  # without an attitude its numbers may be anything
+        return replace(plain, valid=False) if said.q is None else plain
+    checked = checked_sample(0, said.q, said.rate)
+    if isinstance(checked, Refusal):
+        return RefusedAnswer(checked.reason, checked.detail, raw)
+    camera = sent.sample(checked)
+    return replace(plain, q_icrs_to_cam=camera.q_icrs_to_cam, rate_cam_rad_s=camera.rate_cam_rad_s)
 
 
 def _reported(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
@@ -361,10 +339,8 @@ class AnswerDecoder:
     def __init__(
         self, settings: AnswersSettings, q_body_to_cam: Components | None, messages: bool, folder: Path | None = None
     ) -> None:
-        convention = settings.convention
-        if settings.format == "frame":  # whose fields say by their names which of them is the scalar
-            convention = msgspec.structs.replace(convention, scalar="first")
-        self.settings, self.conventions = settings, Conventions(convention, q_body_to_cam)
+        self.settings, self.q_body_to_cam = settings, q_body_to_cam
+        self.sent = SentAttitudes(settings.convention, Mounting(q_body_to_cam))
         self._messages, self._last_ns = messages, 0
         self.frames = FrameDecoder(settings)
         self._function = _load(settings.format, folder) if settings.format.startswith("python:") else None
@@ -407,7 +383,7 @@ class AnswerDecoder:
         return {"cobs": b"\0", "slip": SLIP_END}.get(self.settings.framing or "", b"")
 
     def _answer(self, host_ns: int, said: JsonAnswer | RefusedAnswer, raw: bytes) -> Answer | RefusedAnswer:
-        return said if isinstance(said, RefusedAnswer) else self.conventions.answer(host_ns, raw, said)
+        return said if isinstance(said, RefusedAnswer) else answer_of(self.sent, host_ns, raw, said)
 
     def _said(self, body: bytes) -> Iterable[JsonAnswer | RefusedAnswer]:
         if self._function is not None:

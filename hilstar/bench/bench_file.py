@@ -6,8 +6,8 @@ A file may also name several bench files, one for each head of an attitude deter
     [attitude]
     endpoint = "tcp://127.0.0.1:5560"
 
-The source's attitude is the body's; each head's `[tracker] q_body_to_cam` makes it its camera's. `[attitude]` holds for all
-heads, in place of their own.
+The source's attitude is the body's, whatever its `convention` is otherwise; each head's `[tracker] q_body_to_cam` makes it its
+camera's. `[attitude]` holds for all heads, in place of their own.
 """
 
 import hashlib
@@ -17,10 +17,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from hilstar.attitude.wire.source import HILSTARS, Mounting
 from hilstar.bench.config import GAUSSIAN, GEOCENTRE, SOURCE, AttitudeSettings, BenchConfig, config_of, parse_config
 from hilstar.bench.config.bench_config import HEADS, UNIX, today, with_dates
 from hilstar.errors import InputError, did_you_mean, shortened
@@ -29,6 +30,9 @@ from hilstar.monitor.calibration import BUILT_IN
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
 from hilstar.sky.spectrum import BUILT_IN_CURVES
 from hilstar.sky.star_table import file_sha256
+
+if TYPE_CHECKING:
+    from hilstar.attitude.logs.entries import Stated
 
 MAX_NAMED_BYTES = 100_000_000
 MIN_HEADS, MAX_HEADS = 2, 8
@@ -92,6 +96,14 @@ def with_codes_ms(file: BenchFile, codes_ms: tuple[float, float] | None) -> Benc
 def at_moment(file: BenchFile, t_ns: int | None) -> BenchFile:
     """The file for a moment that a person names: its stars are those of that day where t_ns counts from 1970."""
     return file if t_ns is None or file.config.sky.epoch_utc != UNIX else dated(file, None, t_ns)
+
+
+def stated_in(config: BenchConfig) -> "Stated":
+    """What a bench file states of a log that is read with it: the mounting and, if it is not hilstar's, the convention."""
+    from hilstar.attitude.logs.entries import Stated
+
+    convention = None if config.attitude.convention == HILSTARS else config.attitude.convention
+    return Stated(Mounting(config.tracker.q_body_to_cam), convention=convention, convention_by="[attitude] convention")
 
 
 def _sha256(config: BenchConfig, folder: Path) -> str:
@@ -189,7 +201,19 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
 
 def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:
     file = read_bench_file(head)
-    return changed_file(file, parse_toml(head, file.text) | {"attitude": attitude})
+    file = changed_file(file, parse_toml(head, file.text) | {"attitude": attitude})
+    source = file.config.attitude
+    if source.convention.frame == "body":
+        return file
+    stated = attitude.get("convention")
+    if isinstance(stated, dict) and "frame" in stated:
+        raise InputError(
+            f'{head}: [attitude] convention = {{ frame = "cam" }}: several heads have one source, the attitude of the body;'
+            ' write frame = "body", or leave it out'
+        )
+    convention = msgspec.structs.replace(source.convention, frame="body")
+    config = msgspec.structs.replace(file.config, attitude=msgspec.structs.replace(source, convention=convention))
+    return replace(file, config=config)
 
 
 def as_head(head: Path, heads: Path) -> BenchFile:

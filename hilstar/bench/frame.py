@@ -21,7 +21,7 @@ from hilstar.bench.least_psf import Choice
 from hilstar.errors import InputError
 from hilstar.frame.bodies import BodyLayer, disc_stars
 from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
-from hilstar.frame.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table
+from hilstar.frame.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table, with_errors
 from hilstar.frame.view import STILL, Canvas, Layer, View
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap, star_losses_mag
@@ -50,25 +50,32 @@ MOST = 0.5  # a pixel is a disc's if more than this share of its light is the di
 NAMED_STARS = 5
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Frame:
     """One frame: what each monitor pixel should cause, the codes that ask for it, and the stars behind it.
 
     `light` is float32 (channels, height, width), electrons per second, and `linear` (height, width) all channels together;
     `levels`, uint8 or uint16 (height, width), are indices into the response's table; `codes` are the code values, the same
     array or with bit stealing (height, width, 3). Where the primaries are driven apart, levels and codes are one array
-    (height, width, 3). `truth` is a structured array of TRUTH_DTYPE, a row for each star whose
+    (height, width, 3). `rows` is a structured array of TRUTH_DTYPE, a row for each star whose
     sprite touches the monitor, and `star` (n,) the places of the same stars in the bench's, negative for light that a fault
-    adds. `t_ns` is the moment for which bodies were placed.
+    adds. `t_ns` is the moment for which bodies were placed. `truth` is `rows` with the errors of the stars, which `errors`
+    reads when they are first asked for.
     """
 
     q_icrs_to_cam: FloatArray
     light: Float32Array
     levels: Levels
     codes: Codes
-    truth: npt.NDArray[np.void]
+    rows: npt.NDArray[np.void]
     star: IntArray
     t_ns: int | None = None
+    errors: Callable[[npt.NDArray[np.void]], npt.NDArray[np.void]] = lambda rows: rows
+
+    @cached_property
+    def truth(self) -> npt.NDArray[np.void]:
+        """The truth table of the frame, as `hilstar frame --truth` writes it: TRUTH_DTYPE, brightest first."""
+        return self.errors(self.rows)
 
     @property
     def linear(self) -> Float32Array:
@@ -322,14 +329,18 @@ class Bench:
             drive = self.colours.drive(self.colours.shares_of(self.stars, star))
         truth["drawn"] = truth["electrons_per_s"] * drive >= self.faintest_shown_e_per_s
         order = np.argsort(truth["v_mag"], kind="stable")
-        return Frame(view.q_icrs_to_cam, light, levels, self.code_values(levels), truth[order], star[order], t_ns)
+        codes = self.code_values(levels)
+        return Frame(view.q_icrs_to_cam, light, levels, codes, truth[order], star[order], t_ns, self._with_errors)
+
+    def _with_errors(self, rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+        return with_errors(rows, self.stars.catalog, self.config.sky.epoch_jyear)
 
     def losses_mag(self, frame: Frame, faults: FaultLayer | None = None) -> dict[int | str, float]:
         """For each clipped star of a frame (by HIP number, or a body's name), how many magnitudes too faint it is.
 
         That is summed over its own pixels. `faults` are those of the frame.
         """
-        clipped = clipped_in(frame.truth)
+        clipped = clipped_in(frame.rows)
         if not clipped:
             return {}
         view = self.view(frame.q_icrs_to_cam, None, frame.t_ns)

@@ -21,7 +21,6 @@ from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.bench.certificate import certificate_number
 from hilstar.bench.frame import Bench, Frame
 from hilstar.files import as_text, whole_file, written
-from hilstar.frame.truth import with_errors
 from hilstar.monitor.response import Codes
 from hilstar.rotation import to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
@@ -167,7 +166,7 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     header = sky_header(bench.file.sha256, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera)
     header["BUNIT"] = ("electron/s", "each pixel's share of the tracker's electrons")
     header["WHITE"] = (bench.flux_at_white_e_per_s, "[electron/s] one pixel at the white code")
-    header["NSTARS"] = (len(frame.truth), "stars in view")
+    header["NSTARS"] = (len(frame.rows), "stars in view")
     header["CALNAME"] = (bench.calibration.name, "monitor calibration")
     header["CALSHA"] = bench.calibration.sha256
     if number := certificate_number(bench.file):
@@ -210,14 +209,9 @@ def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, c
     return header
 
 
-def write_truth_csv(path: Path, frame: Frame, bench: Bench | None = None) -> None:
-    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0, an unknown figure is nan.
-
-    The errors of its stars are those that the catalogue of its `bench` has.
-    """
+def write_truth_csv(path: Path, frame: Frame) -> None:
+    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0, an unknown figure is nan."""
     truth = frame.truth
-    if bench is not None:
-        truth = with_errors(truth, bench.stars.catalog, bench.config.sky.epoch_jyear)
     with whole_file(path) as whole, as_text(whole) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(truth.dtype.names or ())

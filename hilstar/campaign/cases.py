@@ -12,10 +12,8 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import log_timeline, open_log
-from hilstar.attitude.wire.source import Mounting
-from hilstar.bench.bench_file import BenchFile, dated
+from hilstar.bench.bench_file import BenchFile, dated, stated_in
 from hilstar.bench.scenario import Scenario, read_scenario
 from hilstar.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
 from hilstar.campaign.solvers import CentroidErrors, SolverAnswer
@@ -194,7 +192,7 @@ def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
 
 
 def _read_log(path: Path, file: BenchFile) -> _Log:
-    read = open_log(path, Stated(Mounting(file.config.tracker.q_body_to_cam)))
+    read = open_log(path, stated_in(file.config))
     max_rate_rad_s = math.radians(file.config.attitude.max_rate_deg_s)
     timeline = log_timeline(read.samples, Policy(0, NS_PER_S, max_rate_rad_s))
     return _Log(timeline, (read.samples[0].t_ns, read.samples[-1].t_ns), read.conventions.scale)

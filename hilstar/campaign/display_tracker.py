@@ -11,6 +11,7 @@ from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import before_detector, tracker_camera
 from hilstar.bench.config import GAUSSIAN, BenchConfig
 from hilstar.frame.layers import Sources, light_of, sky_layers
+from hilstar.frame.truth import with_errors
 from hilstar.frame.view import View
 from hilstar.monitor.quantise import primary_lights
 from hilstar.rotation import propagate
@@ -93,7 +94,7 @@ class DisplayTracker:
         light = light_of(self.canvas, sky_layers(self.canvas, Sources(self._bench.moving), paths=False), stars, view)
         truth = exposure_truth(self.canvas, view, stars, light, mean_e)
         truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
-        return Exposure(view, dn, mean_e, truth)
+        return Exposure(view, dn, mean_e, with_errors(truth, stars.catalog, self.config.sky.epoch_jyear))
 
     def _light_e_per_s(self, view: View) -> FloatArray:
         """The mean light (primaries, H, W) of the display over the exposure."""

@@ -72,7 +72,7 @@ def reference_stars(file: BenchFile) -> list[ReferenceStar]:
 
 
 def _of_field(bench: Bench, frame: Frame, number: int, geometry: BenchGeometry) -> list[ReferenceStar]:
-    truth, sigma = frame.truth, max(bench.psf.width_px)
+    truth, sigma = frame.rows, max(bench.psf.width_px)
     vectors = bench.stars.directions(frame.star) @ to_matrix(frame.q_icrs_to_cam).T
     x, y = truth["x_px"].astype(np.float64), truth["y_px"].astype(np.float64)
     places = np.nan_to_num(np.stack([x, y], axis=1), nan=-1e6)

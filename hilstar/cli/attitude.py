@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SHOWN_STARS = 3
 
 
+@options.log_statements
 def attitude(
     source: Annotated[
         Path, Argument(metavar="INPUT", help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
@@ -35,39 +36,35 @@ def attitude(
         Path | None, Option(metavar="BENCH.toml", help="Whose tracker, mounting and sky to use; by default the demo's tracker.")
     ] = None,
     wait: Annotated[float, Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)] = 10.0,
-    kernel: options.KernelFiles = None,
-    topic: options.TopicName = None,
-    body: options.BodyName = None,
-    reference: options.ReferenceName = None,
-    epoch_utc: options.EpochUtc = None,
-    place: options.PlaceText = None,
-    mounting: options.MountingText = None,
+    statements: options.LogStatements = options.NOTHING_STATED,
     explain: Annotated[
         bool, Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
     ] = False,
     as_json: options.Json = False,
 ) -> None:
     """Say where a log or a live stream points: quaternion, RA, Dec, roll, and the brightest stars in view."""
-    from hilstar.attitude.logs.entries import Stated
-    from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
 
     live = source.suffix.lower() == ".toml"
     first = read_bench_file(source if live else bench or resource_path("configs", "demo.toml"))
     file = read_bench_file(bench) if live and bench is not None else first
-    if live and mounting is not None:
-        raise InputError(f"--mounting {mounting}: write it into {source} as [tracker] q_body_to_cam")
-    mounted = Mounting(first.config.tracker.q_body_to_cam) if mounting is None else options.parse_mounting(mounting)
+    if live:
+        written = "write it into"
+        if statements.mounting is not None:
+            raise InputError(f"--mounting {statements.mounting}: {written} {source} as [tracker] q_body_to_cam")
+        if statements.convention is not None:
+            raise InputError(f"--convention {statements.convention}: {written} {source} as [attitude] convention")
+        statements.refuse(f"it is for a log, and {source} names a live stream; leave it out")
+    stated = statements.stated(first.config)
     if live:
         sample, conventions, held = _live(first, at, wait)
-        for _, line in mounted.told if conventions.of_body else ():
+        for _, line in conventions.mounting_notices(stated.mounting):
             say(line)
     else:
-        stated = Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, options.parse_place(place))
         sample, conventions, held = _of_log(source, at, stated)
     file = dated(file, conventions.scale, sample.t_ns)
     told = {"source": conventions.source, "held": held, **_pointing(sample, file)}
-    meaning = conventions.lines(mounted)
+    meaning = conventions.lines(stated.mounting)
     print_found(as_json, told | {"conventions": meaning}, [*(meaning if explain else ()), *_lines(told)])
 
 
@@ -95,7 +92,7 @@ def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
     from hilstar.attitude.wire.packet import AttitudeSample
 
     log = open_log(path, stated)
-    joins = log_joins(log.samples)
+    joins = log_joins(log.samples, log.told)
     for _, line in [*log.told, *joins.told]:
         say(line)
     t_ns = time_in_log(path, log.samples, at)

@@ -10,24 +10,17 @@ from hilstar.cli import options
 from hilstar.console.terminal import say
 
 
+@options.log_statements
 def convert(
     log: Annotated[Path, Argument(metavar="LOG", help=options.LOG_HELP)],
     output: Annotated[Path, Argument(metavar="OUT", help=".csv, .jsonl, .aem, .xml or .mcap.")],
-    kernel: options.KernelFiles = None,
-    topic: options.TopicName = None,
-    body: options.BodyName = None,
-    reference: options.ReferenceName = None,
-    epoch_utc: options.EpochUtc = None,
-    place: options.PlaceText = None,
-    mounting: options.MountingText = None,
+    statements: options.LogStatements = options.NOTHING_STATED,
 ) -> None:
     """Convert an attitude log to another format."""
-    from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.logs.log_file import open_log, write_log
 
     options.check_files([log], [output])
-    mounted, at = options.parse_mounting(mounting), options.parse_place(place)
-    read = open_log(log, Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, at))
+    read = open_log(log, statements.stated())
     for _, line in read.told:
         say(line)
     write_log(output, read.samples, read.conventions.scale)

@@ -61,19 +61,19 @@ def frame(
         if output is not None:
             files.write_frame_fits(output, bench, shot)
         if truth is not None:
-            files.write_truth_csv(truth, shot, bench)
+            files.write_truth_csv(truth, shot)
         if codes is not None:
             files.write_codes_png(codes, shot.codes, bench.config.monitor.bits)
         if preview is not None:
             files.write_preview_png(preview, shot.levels)
-        clipped = clipped_in(shot.truth)
+        clipped = clipped_in(shot.rows)
         summary: dict[str, Any] = {
-            "stars": len(shot.truth),
+            "stars": len(shot.rows),
             "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
             "flux_at_white_e_per_s": bench.flux_at_white_e_per_s,
             "clipped": clipped,
             "clipped_mag": bench.losses_mag(shot, effects),
-            "left_out": left_out(shot.truth),
+            "left_out": left_out(shot.rows),
             "calibration": {"name": bench.calibration.name, "sha256": bench.calibration.sha256},
             "faults": [] if effects is None else [one.fault.name for one in effects.now],
             "written": [str(path) for path in targets],
@@ -86,7 +86,7 @@ def frame(
         names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
     if summary["faults"]:
         names += f", faults: {', '.join(summary['faults'])}"
-    print_found(as_json, summary, [f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}", fields.line()])
+    print_found(as_json, summary, [f"{len(shot.rows)} stars{names}; wrote {', '.join(summary['written'])}", fields.line()])
     say_units(fields)  # after the refusals: a failing command prints one line
 
 

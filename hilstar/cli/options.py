@@ -3,12 +3,14 @@
 A parser takes a text and returns a value. Each refusal shows the form to write.
 """
 
+import inspect
 import math
 import re
-from collections.abc import Iterable
-from functools import partial
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
+from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from typer import Argument, Option
 
@@ -18,6 +20,7 @@ from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
     from hilstar.arrays import FloatArray
+    from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench import bench_file
     from hilstar.bench.config import BenchConfig
@@ -40,6 +43,7 @@ RunFile = Annotated[Path, Argument(metavar="RUN.mcap", help="The ledger of serve
 ScenarioFile = Annotated[
     Path | None, Option("--scenario", metavar="FILE.toml", help="Faults on request: what is wrong in the sky, and when.")
 ]
+# What a user states of a log (see `LogStatements`).
 unsaid = partial(Option, rich_help_panel="What the log itself does not say")
 KernelFiles = Annotated[list[Path] | None, unsaid("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.")]
 TopicName = Annotated[str | None, unsaid("--topic", metavar="NAME", help="The topic, where a bag has several.")]
@@ -51,6 +55,9 @@ PLACE_HELP = "Where the vehicle is: degrees and metres, WGS84."
 PlaceText = Annotated[str | None, unsaid("--place", metavar="LAT,LON,HEIGHT", help=PLACE_HELP)]
 MOUNTING_HELP = "q_body_to_cam, for a log of the body's attitude."
 MountingText = Annotated[str | None, unsaid("--mounting", metavar="W,X,Y,Z", help=MOUNTING_HELP)]
+CONVENTION_METAVAR = "scalar=last,direction=cam_to_icrs,frame=body"
+CONVENTION_HELP = "What the quaternions of a CSV, JSON lines or an MCAP are, in place of [attitude] convention."
+ConventionText = Annotated[str | None, unsaid("--convention", metavar=CONVENTION_METAVAR, help=CONVENTION_HELP)]
 MAX_SEED = 2**63 - 1  # largest number in a FITS header
 LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, MCAP (a ledger), a SPICE CK, a ROS bag or a PX4 ULog."
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -181,17 +188,105 @@ def parse_place(text: str | None) -> tuple[float, float, float] | None:
     return latitude_deg, longitude_deg, height_m
 
 
-def parse_mounting(text: str | None) -> "Mounting":
+def parse_mounting(text: str) -> "Mounting":
     """The mounting of `--mounting`. Raises InputError."""
     from hilstar.attitude.wire.protocol import NORM_TOLERANCE
     from hilstar.attitude.wire.source import Mounting
 
-    if text is None:
-        return Mounting()
     w, x, y, z = parse_numbers(text, 4, "--mounting", "W,X,Y,Z")
     if abs(math.hypot(w, x, y, z) - 1) > NORM_TOLERANCE:
         raise InputError(f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion W,X,Y,Z")
-    return Mounting((w, x, y, z))
+    return Mounting((w, x, y, z), by_option=True)
+
+
+def parse_convention(text: str) -> dict[str, str]:
+    """The keys of `[attitude] convention` that "scalar=last,frame=body" names, and their values. Raises InputError."""
+    from typing import get_args, get_type_hints
+
+    from hilstar.attitude.wire.source import Convention
+
+    choices = {name: get_args(hint) for name, hint in get_type_hints(Convention).items()}
+    named: dict[str, str] = {}
+    for part in text.split(","):
+        key, equals, value = (word.strip() for word in part.partition("="))
+        if key not in choices or not equals or key in named:
+            raise InputError(f"--convention {text}: write {CONVENTION_METAVAR}, each key once, or some of them")
+        if value not in choices[key]:
+            raise InputError(f"--convention {text}: {key} is {' or '.join(choices[key])}; write {CONVENTION_METAVAR}")
+        named[key] = value
+    return named
+
+
+@dataclass(frozen=True, slots=True)
+class LogStatements:
+    """What the command line states of a log, as it was typed; `log_statements` gives a command an option for each."""
+
+    kernel: KernelFiles = None
+    topic: TopicName = None
+    body: BodyName = None
+    reference: ReferenceName = None
+    epoch_utc: EpochUtc = None
+    place: PlaceText = None
+    mounting: MountingText = None
+    convention: ConventionText = None
+
+    def stated(self, config: "BenchConfig | None" = None) -> "Stated":
+        """The same for a log's reader, in place of what the bench file states. Raises InputError, also for contradictions."""
+        from hilstar.attitude.logs.entries import Stated
+        from hilstar.attitude.wire.source import Convention
+        from hilstar.bench.bench_file import stated_in
+
+        own = Stated() if config is None else stated_in(config)
+        place = parse_place(self.place)
+        found = replace(own, topic=self.topic, body=self.body, reference=self.reference, epoch_utc=self.epoch_utc, place=place)
+        found = replace(found, kernels=tuple(self.kernel or ()))
+        if self.mounting is not None:
+            found = replace(found, mounting=parse_mounting(self.mounting))
+        if self.convention is not None:
+            named = parse_convention(self.convention)
+            if self.mounting is not None and named.get("frame") == "cam":
+                raise InputError(
+                    f"--mounting {self.mounting}: --convention {self.convention} says that the attitudes are the camera's;"
+                    " write frame=body, or leave out --mounting"
+                )
+            found = replace(found, convention=Convention(**named), convention_by="--convention")  # type: ignore[arg-type]
+        return found
+
+    def refuse(self, why: str) -> None:
+        """Refuse (InputError) each statement where there is no log."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None:
+                shown = value[0] if isinstance(value, list) else value
+                raise InputError(f"--{field.name.replace('_', '-')} {shown}: {why}")
+
+
+NOTHING_STATED = LogStatements()
+
+
+def log_statements(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `LogStatements`, in the place of its argument `statements`."""
+
+    @wraps(command)
+    def with_statements(**arguments: Any) -> None:
+        stated = {field.name: arguments.pop(field.name) for field in fields(LogStatements)}
+        command(**arguments, statements=LogStatements(**stated))
+
+    kinds = get_type_hints(LogStatements, include_extras=True)
+    own = inspect.signature(command)
+    parameters: list[inspect.Parameter] = []
+    for parameter in own.parameters.values():
+        if parameter.name != "statements":
+            parameters.append(parameter)
+            continue
+        parameters += [
+            inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kinds[field.name])
+            for field in fields(LogStatements)
+        ]
+    parameters.sort(key=lambda parameter: parameter.kind)
+    with_statements.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    with_statements.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {"return": None}
+    return with_statements
 
 
 def parse_diode(text: str) -> tuple[str, int]:

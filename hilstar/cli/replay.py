@@ -7,10 +7,12 @@ from typer import Argument, Option
 
 from hilstar.cli import options, running
 from hilstar.console.run_status import RunSource, RunStatus, on_terminal
+from hilstar.console.terminal import say
 from hilstar.files import MCAP, check_directory, check_ending
 from hilstar.notices import Notices
 
 
+@options.log_statements
 def replay(
     bench_file: options.BenchFile,
     log: Annotated[Path, Argument(metavar="LOG", help=options.LOG_HELP)],
@@ -20,12 +22,7 @@ def replay(
     start: Annotated[float | None, Option(metavar="S", help="Start this many seconds after the first sample.")] = None,
     stop: Annotated[float | None, Option(metavar="S", help="Stop this many seconds after the first sample.")] = None,
     step: Annotated[float | None, Option(metavar="S", help="Time step of the log between frames, in seconds.")] = None,
-    kernel: options.KernelFiles = None,
-    topic: options.TopicName = None,
-    body: options.BodyName = None,
-    reference: options.ReferenceName = None,
-    epoch_utc: options.EpochUtc = None,
-    place: options.PlaceText = None,
+    statements: options.LogStatements = options.NOTHING_STATED,
     headless: options.Headless = False,
     output: Annotated[
         Path | None, Option("-o", "--output", metavar="DIR", help="Directory for a PNG of each frame, and frames.csv.")
@@ -45,8 +42,6 @@ def replay(
     as_json: options.Json = False,
 ) -> None:
     """Show an attitude log on the monitor."""
-    from hilstar.attitude.logs.entries import Stated
-    from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file, with_codes_ms
     from hilstar.console.publisher import RunDescription
     from hilstar.run.replay import FrameImages, Wanted, plan_play
@@ -61,8 +56,7 @@ def replay(
     options.check_files([log, scenario], [None if output is None else output / "frames.csv"], file, ledger, overwrite)
     split = options.parse_split(ledger_split)
     notices = Notices()
-    mounting = Mounting(file.config.tracker.q_body_to_cam)
-    stated = Stated(mounting, tuple(kernel or ()), topic, body, reference, epoch_utc, options.parse_place(place))
+    stated = statements.stated(file.config)
     play = plan_play(log, Wanted(options.parse_speed(speed), start, stop, step), file.config, stated)
     file = with_codes_ms(dated(file, play.conventions.scale, play.first_ns), play.codes_ms)
     with (
@@ -76,9 +70,11 @@ def replay(
         running.optional_answers(bench, notices, kept, screen) as answers,
         running.optional_frames(frames, bench, screen) as watched,
     ):
+        if play.span:
+            say(play.span)
         running.say_of_light(bench)
         if explain:
-            running.explain_bench(bench, of_source=play.conventions.lines(mounting))
+            running.explain_bench(bench, of_source=play.conventions.lines(stated.mounting))
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
         told = RunSource(f"replaying {log}", renderer, refresh_hz, play.frame_count, running.forced_on(screen))
         status = RunStatus(told, kept)

@@ -22,6 +22,7 @@ Share = Annotated[str, Option(metavar="[SHARE]", help="Fraction of the packets, 
 KeyFile = Annotated[Path | None, Option(metavar="FILE", help="From `hilstar keys`.")]
 
 
+@options.log_statements
 def send(
     log: Annotated[Path | None, Argument(metavar="[LOG]", help=options.LOG_HELP)] = None,
     spin: Annotated[str | None, Option(metavar="AXIS,DEG_PER_S", help="A constant rotation instead of a log.")] = None,
@@ -48,7 +49,7 @@ def send(
     allowed_clients: Annotated[
         Path | None, Option(metavar="DIR", help="Directory of the public keys that may connect.")
     ] = None,
-    mounting: options.MountingText = None,
+    statements: options.LogStatements = options.NOTHING_STATED,
     as_json: options.Json = False,
 ) -> None:
     """Send a log or a constant rotation over ZeroMQ, UDP or a serial line, with the faults of a bad cable on request."""
@@ -63,7 +64,7 @@ def send(
     lost, corrupted, reordered = (options.parse_share(text, option) for option, text in named)
     if lost + corrupted + reordered > 1:
         raise InputError("send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller fractions")
-    samples, total = wanted_samples(log, spin, rate, radec, mounting)
+    samples, total = wanted_samples(log, spin, rate, radec, statements)
     if duration is not None:
         samples = takewhile(lambda sample: sample.t_ns < duration * NS_PER_S, samples)
     stop = threading.Event()
@@ -92,10 +93,10 @@ def in_time(advance: Callable[[int], None]) -> Callable[[int], None]:
 
 
 def wanted_samples(
-    log: Path | None, spin: str | None, rate: float | None, radec: str | None, mounting: str | None
+    log: Path | None, spin: str | None, rate: float | None, radec: str | None, statements: options.LogStatements
 ) -> tuple[Any, float]:
     """The samples to send, and their number (infinite if unknown)."""
-    from hilstar.attitude.logs.entries import Stated, log_joins
+    from hilstar.attitude.logs.entries import log_joins
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.run.send_log import log_samples, spin_samples
 
@@ -104,10 +105,11 @@ def wanted_samples(
     if rate is not None and not 1e-3 <= rate <= 10_000:
         raise InputError(f"--rate {rate:g}: write packets per second, 0.001 to 10000")
     if spin is not None:
+        statements.refuse("it is for a LOG, and --spin sends none; leave it out")
         return spin_samples(options.parse_spin(spin), rate or 100.0, options.parse_radec(radec or "84.057,-1.2,0")), math.inf
-    read = open_log(log or Path(), Stated(options.parse_mounting(mounting)))
+    read = open_log(log or Path(), statements.stated())
     recorded = read.samples
-    for _, line in [*read.told, *log_joins(recorded).told]:
+    for _, line in [*read.told, *log_joins(recorded, read.told).told]:
         say(line)
     return log_samples(recorded, rate), len(recorded) if rate is None else math.inf
 

@@ -89,13 +89,14 @@ def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, 
 
 def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
     """A head's link to the process that has the source, with which it ends; `fed_by` is that one's endpoint and process id."""
-    from hilstar.attitude.wire.source import PACKETS, Mounting
+    from hilstar.attitude.wire.source import Mounting, SentAttitudes
     from hilstar.attitude.wire.zmq_links import FedDecoder, ZmqReceiver
 
     endpoint, _, parent = fed_by.rpartition(",")
     end_with_parent(int(parent))
-    conventions = replace(PACKETS, source="the source of several heads", of_body=True)
-    decoder = FedDecoder(Mounting(file.config.tracker.q_body_to_cam), conventions)
+    sent = SentAttitudes(file.config.attitude.convention, Mounting(file.config.tracker.q_body_to_cam))
+    decoder = FedDecoder(sent)
+    decoder.conventions = replace(decoder.conventions, source="the source of several heads")
     return ZmqReceiver(endpoint, notices=notices, decoder=decoder)
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hilstar.twin.simulator import FrameNoise
 
 
+@options.log_statements
 def simulate(
     bench_file: options.BenchFile,
     radec: options.RadecText = None,
@@ -30,6 +31,7 @@ def simulate(
     frames: Annotated[
         int | None, Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1)
     ] = None,
+    statements: options.LogStatements = options.NOTHING_STATED,
     seed: Annotated[int, Option(help="Seed of the frame's noise.", min=0, max=options.MAX_SEED)] = 0,
     noise: Annotated[Literal["full", "none"], Option(help="The detector's full noise, or none.")] = "full",
     output: Annotated[Path | None, Option("-o", "--output", metavar="OUT.fits", help="The image in DN, uint16.")] = None,
@@ -50,8 +52,9 @@ def simulate(
         if output is None or radec or quaternion or rate or png or dn_png or at is not None:
             raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png or --dn-png")
         check_directory("-o", output)
-        simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output, scenario)
+        simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output, scenario, statements)
         return
+    statements.refuse("it is for --log LOG, and there is none; leave it out")
     targets = [path for path in (output, png, dn_png) if path is not None]
     if not targets:
         raise InputError("simulate: no output was asked for; add -o OUT.fits, --png OUT.png or --dn-png OUT.png")
@@ -91,22 +94,27 @@ def simulate(
 
 
 def simulate_log(
-    bench_file: Path, log: Path, frames: int | None, noise: "FrameNoise", output: Path, scenario: Path | None
+    bench_file: Path,
+    log: Path,
+    frames: int | None,
+    noise: "FrameNoise",
+    output: Path,
+    scenario: Path | None,
+    statements: options.LogStatements,
 ) -> None:
     """The virtual tracker along a log."""
-    from hilstar.attitude.logs.entries import Stated, log_joins
+    from hilstar.attitude.logs.entries import log_joins
     from hilstar.attitude.logs.log_file import open_log
-    from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
     from hilstar.twin.batch import LogFaults, log_views, simulate_views
 
     wrong = optional_scenario(scenario)
     file = read_bench_file(bench_file)
     config = file.config
-    read = open_log(log, Stated(Mounting(config.tracker.q_body_to_cam)))
+    read = open_log(log, statements.stated(config))
     samples = read.samples
     file = dated(file, read.conventions.scale, samples[0].t_ns)
-    for _, line in [*read.told, *log_joins(samples).told]:
+    for _, line in [*read.told, *log_joins(samples, read.told).told]:
         say(line)
     max_rate_rad_s = math.radians(config.attitude.max_rate_deg_s)
     views = log_views(samples, frames, config.tracker.exposure_s, max_rate_rad_s)

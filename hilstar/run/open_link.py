@@ -2,6 +2,7 @@
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from hilstar.attitude.wire.keys import CurveKeys
@@ -9,10 +10,10 @@ from hilstar.attitude.wire.links import LockstepLink, StreamLink
 from hilstar.attitude.wire.nasa42 import MessageReader, Nasa42Link, Nasa42Lockstep
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeReply, TimeRequest
 from hilstar.attitude.wire.serial_link import SerialApart, SerialLink
-from hilstar.attitude.wire.source import Mounting
+from hilstar.attitude.wire.source import Mounting, SentAttitudes
 from hilstar.attitude.wire.udp import UdpLink
 from hilstar.attitude.wire.vizard import DifferenceRates, Follower, StateUse, VizardLive, vizard_broadcast
-from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqLockstep, ZmqReceiver
+from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqApart, ZmqLockstep, ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
 from hilstar.bench.config.attitude import FaultSettings, nasa42_road, udp_road
 from hilstar.bench.config.bench_config import from_source
@@ -37,18 +38,23 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None,
     lock, and a thread of a process that draws reads a packet some milliseconds late.
     """
     settings = config.attitude
+    sent = SentAttitudes(settings.convention, Mounting(config.tracker.q_body_to_cam))
     if settings.source == "serial":
-        return (SerialApart if apart else SerialLink)(str(settings.port), settings.baud, notices)
+        return (SerialApart if apart else SerialLink)(str(settings.port), settings.baud, notices, sent=sent)
     if settings.source in {"udp", "scpi"}:
-        return UdpLink(*udp_road(settings), notices)
+        link = UdpLink(*udp_road(settings), notices, sent=sent)
+        if settings.source == "scpi":  # hilstar's own process sends the packets: nobody else has a convention
+            link.conventions = replace(link.conventions, source="SCPI", of_packets=False)
+        return link
     if settings.source == "vizard":
         return _open_vizard(config, notices, apart=apart)
     if settings.source == "42":
         return _open_42(config, notices)
     keys = link_keys(settings, folder)
     if settings.lockstep:
-        return ZmqLockstep(settings.address, bind=settings.bind is not False, keys=keys, notices=notices)
-    receiver = ZmqReceiver(settings.address, bind=settings.bind is True, keys=keys, notices=notices)
+        return ZmqLockstep(settings.address, bind=settings.bind is not False, keys=keys, notices=notices, sent=sent)
+    decoder = PacketDecoder(sent)
+    receiver = ZmqReceiver(settings.address, bind=settings.bind is True, keys=keys, notices=notices, decoder=decoder)
     return ZmqApart(receiver, notices) if apart else receiver
 
 

@@ -13,7 +13,8 @@ from msgspec.structs import replace as replaced
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.logs.entries import Stated, log_joins
-from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
+from hilstar.attitude.logs.log_file import NOTHING_STATED, check_stated, log_timeline, open_log
+from hilstar.attitude.logs.log_times import span_line
 from hilstar.attitude.logs.mcap_log import holds_ros, is_mcap, read_attitudes
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import rate_refusal
@@ -88,9 +89,9 @@ class Play:
 
     `first_ns` is the time of the first frame, and `zero_ns` that from which a scenario counts its seconds: the log's first
     sample, or the run's first frame. `moving` says whether stars are drawn along their paths; None: as the bench file says.
-    `told` are events to report before it begins. Only an earlier run has faults in its `recording`, and a
-    renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same renderer draws the same codes from
-    them bit for bit; another draws them within `DrawnBy.other_codes`.
+    `told` are events to report before it begins, `span` says how long a log is, and its step. Only an earlier run has faults
+    in its `recording`, and a renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same renderer
+    draws the same codes from them bit for bit; another draws them within `DrawnBy.other_codes`.
     """
 
     frame: Callable[[int], PlayedFrame]
@@ -101,6 +102,7 @@ class Play:
     zero_ns: int
     moving: bool | None = None
     told: Sequence[tuple[str, str]] = ()
+    span: str = ""
     conventions: Conventions = PACKETS
     recording: Recording = NO_RECORDING
     drawn_by: DrawnBy | None = None
@@ -139,6 +141,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     a step that gives no frame.
     """
     factor = wanted.speed
+    check_stated(log, stated)
     if is_mcap(log) and not holds_ros(log):
         frames = drawable_frames(log, math.radians(config.attitude.max_rate_deg_s))
         first = last = next(frames, None)
@@ -162,7 +165,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     if count > MAX_FRAMES:
         raise InputError(f"{log}: gives {count:.3g} frames; write a longer --step, or --start and --stop")
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
-    joins = log_joins(samples)
+    joins = log_joins(samples, read.told)
     timeline = log_timeline(samples, policy_of(config.attitude), joins)
 
     def frame(slot: int) -> PlayedFrame:
@@ -170,7 +173,8 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
         return PlayedFrame(slot, t_ns, timeline.at(t_ns))
 
     play = Play(frame, int(count) + 1, len(timeline), not math.isinf(factor), first_ns, samples[0].t_ns)
-    return replace(play, told=[*read.told, *joins.told], conventions=read.conventions)
+    told = [*read.told, *joins.told]
+    return replace(play, told=told, conventions=read.conventions, span=span_line(samples))
 
 
 def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) -> Play:

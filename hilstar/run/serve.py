@@ -109,9 +109,8 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
     loop = outlet.loop(bench, sink)
-    if link.conventions.of_body:
-        for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
-            outlet.notices.tell(kind, line)
+    for kind, line in link.conventions.mounting_notices(Mounting(bench.config.tracker.q_body_to_cam)):
+        outlet.notices.tell(kind, line)
     with stop_on_signal(loop.stop), loop.watch:
         if link.steps:
             bench.warm_up()

@@ -19,7 +19,6 @@ from hilstar.bench.frame_files import png_of, sky_header, write_fits
 from hilstar.bench.scenario import NO_SCENARIO, Scenario
 from hilstar.files import written
 from hilstar.frame.fault_kinds import Drop, Freeze, Now
-from hilstar.frame.truth import with_errors
 from hilstar.frame.view import STILL, View
 from hilstar.scene.camera import Camera
 from hilstar.sky.stars import Stars
@@ -103,8 +102,7 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
     if exposure.faults:
         header["FAULTS"] = ", ".join(exposure.faults)[:MAX_CARD]
     header["NSTARS"] = (len(exposure.truth), "stars in view")
-    truth = with_errors(exposure.truth, simulator.stars.catalog, epoch_jyear)
-    hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(truth, name="TRUTH")])
+    hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
     write_fits(path, hdus)
 
 

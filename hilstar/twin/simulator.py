@@ -28,7 +28,7 @@ from hilstar.frame.fault_kinds import CosmicRays, Now
 from hilstar.frame.fault_light import FaultView
 from hilstar.frame.faults import FaultLayer
 from hilstar.frame.layers import light_of, seen_in, sky_layers
-from hilstar.frame.truth import TRUTH_DTYPE, added_truth, truth_table, with_channels
+from hilstar.frame.truth import TRUTH_DTYPE, added_truth, truth_table, with_channels, with_errors
 from hilstar.frame.view import STILL, Canvas, View
 from hilstar.optics.glass_psf import GlassPsf
 from hilstar.process.closing import Closing
@@ -202,6 +202,7 @@ class Simulator(Closing):
         if self.glass is not None:  # a measured PSF may be negative somewhere
             np.maximum(mean_e, 0.0, out=mean_e)
         dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e, self.glass)
+        truth = with_errors(truth, stars.catalog, self.config.sky.epoch_jyear)
         if faults is None:
             return Exposure(view, dn, mean_e, truth, light.capped)
         added, by_bv = _exposed(faults.added_truth()), stars.colours_by_bv

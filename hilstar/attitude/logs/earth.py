@@ -30,7 +30,7 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns
 from hilstar.attitude.logs.entries import LogEntry, Stated
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
 from hilstar.rotation import frame_turns, from_matrix, multiply, normalise, rotate
 from hilstar.units import NS_PER_S
 
@@ -236,9 +236,16 @@ class Reference(NamedTuple):
 def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> Reference:
     """The reference of that kind, once all is stated that it needs; `first_ns` is the log's first time.
 
-    Raises InputError where a level frame has no place, or its times are no dates and their zero is not stated, or is twice.
+    Raises InputError where a level frame has no place, or its times are no dates and their zero is not stated, or is twice;
+    and where a place or a zero is stated of the ICRS, which needs none.
     """
     if kind == "icrs":
+        for option, value in (("--place", stated.place), ("--epoch-utc", stated.epoch_utc)):
+            if value is not None:
+                raise InputError(
+                    f"{path}: {option} is for attitudes that refer to a level frame (--reference enu or ned), and these refer"
+                    f" to {AXES[kind]}; leave it out"
+                )
         return Reference(kind)
     if stated.place is None:
         raise InputError(f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place LAT,LON,HEIGHT")
@@ -252,6 +259,26 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
             )
         utc_ns = utc_ns_of(stated.epoch_utc, "--epoch-utc")
     return Reference(kind, stated.place[:2], utc_ns)
+
+
+def reference_kind(path: Path, stated: Stated, told: list[tuple[str, str]]) -> Kind:
+    """What the axes of a log's reference are by `--reference` alone, the log itself naming no frame; the ICRS without one.
+
+    Raises InputError for a name that does not say what its axes are.
+    """
+    if stated.reference is None:
+        return "icrs"
+    kind = KINDS.get(stated.reference.lower())
+    if kind is None:
+        raise InputError(f"{path}: --reference {shortened(stated.reference)}: the log names no frame; write icrs, enu or ned")
+    if stated.reference.lower() in LOOSE:
+        told.append(("reference", loosely_icrs(stated.reference)))
+    return kind
+
+
+def loosely_icrs(frame: str) -> str:
+    """What to tell the user of a frame that simulators call inertial."""
+    return f"the frame {frame!r} is taken as the ICRS; a frame of date is 0.4 deg off by now"
 
 
 def to_icrs(entries: Iterable[LogEntry], reference: Reference, gyro: bool, told: list[tuple[str, str]]) -> Iterator[LogEntry]:

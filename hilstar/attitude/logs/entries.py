@@ -25,8 +25,9 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.rate_check import cause_in
 from hilstar.attitude.clock.timeline import Join
+from hilstar.attitude.logs.log_times import TIMES
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
-from hilstar.attitude.wire.source import Conventions, Mounting
+from hilstar.attitude.wire.source import Convention, Conventions, Mounting
 from hilstar.rotation import conjugate, multiply
 from hilstar.units import NS_PER_S
 
@@ -43,6 +44,19 @@ LOOKED_AT = 2000  # samples, for the cause of rates that do not fit
 NO_GAPS: frozenset[int] = frozenset()
 
 
+# The statements, and the option of a command by which each is made.
+OPTIONS = {
+    "mounting": "--mounting",
+    "kernels": "--kernel",
+    "topic": "--topic",
+    "body": "--body",
+    "reference": "--reference",
+    "epoch_utc": "--epoch-utc",
+    "place": "--place",
+    "convention": "--convention",
+}
+
+
 class LogEntry(NamedTuple):
     """`where` is a line (":12"), an epoch or a count, as it follows the file's name in a message."""
 
@@ -55,7 +69,8 @@ class Stated:
     """What the user states of a log, where the file itself does not say it; None where nothing is stated.
 
     `kernels` are SPICE kernels; `topic` and `body` choose one of several; `reference` names the frame that attitudes refer to;
-    `epoch_utc` is the UTC of the log's time zero; `place` is latitude and longitude in degrees and height in metres (WGS84).
+    `epoch_utc` is the UTC of the log's time zero; `place` is latitude and longitude in degrees and height in metres (WGS84);
+    `convention` is that of the quaternions of CSV, JSON lines and MCAP, `convention_by` who states it.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -65,6 +80,20 @@ class Stated:
     reference: str | None = None
     epoch_utc: str | None = None
     place: tuple[float, float, float] | None = None
+    convention: Convention | None = None
+    convention_by: str = "--convention"
+
+    def __iter__(self) -> Iterator[tuple[str, str]]:
+        """The field of each statement that the user makes, and how it is written; a bench file's mounting is none."""
+        for name, option in OPTIONS.items():
+            if name == "mounting":
+                stated = self.mounting.by_option
+            elif name == "convention":
+                stated, option = self.convention is not None, self.convention_by
+            else:
+                stated = getattr(self, name) not in (None, ())
+            if stated:
+                yield name, option
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +188,8 @@ class LogJoins:
         return lines
 
 
-def log_joins(samples: Sequence[AttitudeSample]) -> LogJoins:
-    """How the samples of a log join; their times must increase."""
+def log_joins(samples: Sequence[AttitudeSample], told: Iterable[tuple[str, str]] = ()) -> LogJoins:
+    """How the samples of a log join; their times must increase. `told` are notices that may explain rates that do not fit."""
     if len(samples) < 2:
         return LogJoins()
     t_ns = np.array([sample.t_ns for sample in samples], dtype=object)
@@ -172,7 +201,7 @@ def log_joins(samples: Sequence[AttitudeSample]) -> LogJoins:
     held = gap & ~fits & ~broken
     misfit = known & ~fits & ~broken & ~gap
     cause = ""
-    if misfit.any():  # what is probably wrong with the rates from the first one on that does not fit
+    if misfit.any() and TIMES not in dict(told):  # what is probably wrong from the first rate on that does not fit
         first = int(misfit.argmax())
         found = cause_in([sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None])
         cause = "" if found is None else found.text

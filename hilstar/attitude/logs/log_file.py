@@ -2,24 +2,32 @@
 
 CSV and JSON lines are read and written here. CSV columns, in any order: `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s),
 `sequence` and `discontinuity`. A JSON line is the wire's JSON form of an attitude. The other formats have a module each.
+
+What a user states of a log is used or refused:
+1. Each format of FORMATS declares the statements that its reader uses. Any other is refused by name, before the file is read.
+2. A statement that a format uses, but not for this file, is refused by the reader (`stated_reference` for a place) or, for a
+   mounting where the attitudes are the camera's own, by `open_log`.
 """
 
 import contextlib
 import csv
 import importlib.util
-from collections.abc import Iterable, Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING, Literal, NamedTuple
 
 import msgspec
+from msgspec import structs
 
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
 from hilstar.attitude.logs.entries import (
     MAX_QUOTED_CHARACTERS,
     MAX_SAMPLES,
+    OPTIONS,
     AttitudeLog,
     LogEntry,
     LogJoins,
@@ -27,8 +35,9 @@ from hilstar.attitude.logs.entries import (
     Stated,
     log_joins,
 )
+from hilstar.attitude.logs.log_times import time_notices
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, checked_sample, decode
-from hilstar.attitude.wire.source import PACKETS
+from hilstar.attitude.wire.source import HILSTARS, PACKETS, Convention, Conventions, components, packet_conventions
 from hilstar.errors import InputError, MachineError
 from hilstar.files import whole_file
 from hilstar.reading import (
@@ -42,7 +51,12 @@ from hilstar.reading import (
     open_regular,
     read_text,
 )
+from hilstar.rotation import conjugate, multiply
 from hilstar.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from hilstar.arrays import FloatArray
+    from hilstar.attitude.logs.earth import Reference
 
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
 RATE_COLUMNS = ("rx", "ry", "rz")
@@ -59,7 +73,8 @@ SECONDS_FORM = "write seconds after its first sample"
 TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 
 
-def _read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
+def _read_csv(lines: Iterable[str], scalar: Literal["first", "last"]) -> Iterator[LogEntry]:
+    """The attitudes of a CSV, each quaternion as it was sent: with the scalar last, its columns count as x, y, z, w in turn."""
     reader = csv.reader(lines)
     rows = (row for row in reader if row and not row[0].startswith("#"))
     header = [name.strip() for name in next(rows, [])]
@@ -69,16 +84,21 @@ def _read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
     missing = [name for name in needed if name not in header]
     if missing:
         detail = f"column {missing[0]} is missing; the header must have {','.join(needed)}"
+        if missing[0] == "t_s" and "t_ns" in header:
+            detail = f"column t_ns: a CSV has its times in seconds; divide by 1e9, and write {','.join(needed)}"
         yield LogEntry(f":{reader.line_num}", Refusal("format", detail))
         return
     places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
+    numbers: tuple[str, ...] = CSV_COLUMNS[1:]
+    if scalar == "last":  # whatever the columns are called: a table that says so by its names needs no statement
+        numbers = tuple(sorted(numbers, key=lambda name: places[name]))
     wanted = f"write finite numbers for {','.join(CSV_COLUMNS)}"
     if len(places) > len(CSV_COLUMNS):
         wanted += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
     for row in rows:
         try:
             cells = {name: row[place].strip() for name, place in places.items()}
-            q = tuple(float(cells[name]) for name in CSV_COLUMNS[1:])
+            q = tuple(float(cells[name]) for name in numbers)
             turning = [cells.get(name, "") for name in RATE_COLUMNS]
             rate = tuple(map(float, turning)) if any(turning) else None
             sequence = int(cells.get("sequence") or 0)
@@ -145,14 +165,17 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
     samples: list[AttitudeSample] = []
     try:
         with _open_log(path, stated) as reading:
-            of_body = reading.conventions.of_body
+            conventions, mounting = reading.conventions, stated.mounting
+            if mounting.by_option and not conventions.of_body:
+                own = f"{path}: --mounting: its attitudes are the camera's own ({conventions.source})"
+                raise InputError(f"{own}; leave it out")
             for where, event in reading.entries:
                 if isinstance(event, Refusal):
                     raise InputError(f"{path}{where}: {event.detail}")
                 if samples and event.t_ns <= samples[-1].t_ns:
                     times = f"t_ns {event.t_ns} after {samples[-1].t_ns}"
                     raise InputError(f"{path}{where}: time does not increase ({times}); {reading.advice}")
-                samples.append(stated.mounting.sample(event) if of_body else event)
+                samples.append(mounting.sample(event) if conventions.of_body else event)
                 if len(samples) > MAX_SAMPLES:
                     raise InputError(f"{path}{where}: more than {MAX_SAMPLES} attitudes; split the log into several")
     except (OSError, csv.Error) as error:
@@ -160,7 +183,10 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
     if not samples:
         _refuse_other_topics(path)
         raise InputError(f"{path}: contains no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
-    return AttitudeLog(samples, reading.conventions, [*reading.told, *(stated.mounting.told if of_body else [])])
+    told = [*reading.told, *conventions.mounting_notices(mounting)]
+    if conventions.of_packets:  # other formats say themselves what their times are
+        told += time_notices(samples, conventions.time_unit)
+    return AttitudeLog(samples, conventions, told)
 
 
 def _refuse_other_topics(path: Path) -> None:
@@ -210,83 +236,227 @@ def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins 
     return timeline
 
 
-@contextlib.contextmanager
-def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
-    """The reading of a file, by what it holds. A format's reader, and its library, are imported where a log needs them."""
+class LogHead(NamedTuple):
+    """The beginning of a log: its first bytes, none of a directory."""
+
+    path: Path
+    head: bytes
+
+    @property
+    def word(self) -> str:
+        """The first word of a text's first line that is no comment; "" where there is none."""
+        with open_lines(self.path, READABLE, MAX_LOG_BYTES) as lines:
+            firsts = (line.split(maxsplit=1)[0] for line in lines if line.strip())
+            return next((first for first in firsts if first != "COMMENT" and not first.startswith("#")), "")
+
+
+Opened = contextlib.AbstractContextManager[LogReading]
+
+
+class LogFormat(NamedTuple):
+    """A format: its name in a message, the statements (fields of `Stated`) that its reader uses, how it is told and opened."""
+
+    name: str
+    uses: frozenset[str]
+    begins: Callable[[LogHead], bool]
+    open: Callable[[Path, Stated], Opened]
+
+
+def check_stated(path: Path, stated: Stated) -> LogFormat:
+    """The format of a log. Raises InputError for a statement that the format does not use, and for a file that is no log."""
     head = b""
     if not path.is_dir():
         with open_regular(path, READABLE) as file:
             head = file.read(HEAD_BYTES)
-    if _is_bag(path, head):
-        _require("rosbags", "ros", f"{path}: a ROS bag")
-        from hilstar.attitude.logs.ros import read_ros
-        from hilstar.attitude.logs.ros_bags import open_bag
-
-        with open_bag(path) as bag:
-            yield read_ros(bag, stated)
-    elif head.startswith(ULOG_MAGIC):
-        _require("pyulog", "px4", f"{path}: a ULog of PX4")
-        from hilstar.attitude.logs.px4 import read_ulog
-
-        yield read_ulog(path, stated)
-    elif head.startswith(CK_MAGIC):
-        _require("spiceypy", "spice", f"{path}: a SPICE CK")
-        from hilstar.attitude.logs.ck import read_ck
-
-        yield read_ck(path, stated)
-    elif head.startswith(MCAP_MAGIC):
-        from hilstar.attitude.logs.mcap_log import read_attitudes
-
-        entries = (LogEntry(f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
-        yield LogReading(entries, replace(PACKETS, source="MCAP"), "the sender restarted here; give a log of one run")
-    else:
-        with _open_text(path) as reading:
-            yield reading
+    beginning = LogHead(path, head)
+    found = next(each for each in FORMATS if each.begins(beginning))
+    for name, written in stated:
+        if name in found.uses or (found.name == LEDGER and written != OPTIONS[name]):
+            continue  # what a run's bench file says of its packets, its ledger has already done
+        own = " has a convention of its own" if name == "convention" else " does not use it"
+        raise InputError(f"{path}: {written}: {found.name}{own}; leave it out")
+    return found
 
 
-def _is_bag(path: Path, head: bytes) -> bool:
-    if head.startswith(MCAP_MAGIC):
+@contextlib.contextmanager
+def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
+    """The reading of a file, by what it holds. A format's reader, and its library, are imported where a log needs them."""
+    with check_stated(path, stated).open(path, stated) as reading:
+        yield reading
+
+
+def _of_packets(
+    path: Path, entries: Iterator[LogEntry], source: str, stated: Stated, advice: str = "sort the log by time"
+) -> LogReading:
+    """The reading of entries that have the numbers of a packet, as they were sent: their convention, then their reference.
+
+    Rates are with respect to the reference, in the frame's own components.
+    """
+    convention = HILSTARS if stated.convention is None else stated.convention
+    by = [] if stated.convention is None else [stated.convention_by]
+    if stated.mounting.by_option:  # which says that the attitudes are the body's
+        convention, by = structs.replace(convention, frame="body"), [*by, OPTIONS["mounting"]]
+    told: list[tuple[str, str]] = []
+    if convention != HILSTARS:
+        told.append(("log-convention", f"read with convention = {convention} ({', '.join(by)})"))
+    if not convention.is_hilstars:
+        entries = _by_convention(entries, convention)
+    conventions = packet_conventions(convention, source)
+    if stated.reference is None and stated.place is None and stated.epoch_utc is None:
+        return LogReading(entries, conventions, advice, told)
+    from hilstar.attitude.logs.earth import reference_kind, stated_reference, to_icrs  # 30 ms
+
+    kind = reference_kind(path, stated, told)
+    first = next(entries, None)
+    sample = None if first is None else first.event
+    if first is None or not isinstance(sample, AttitudeSample):  # which is refused when it is read
+        return LogReading([] if first is None else [first], conventions, advice, told)
+    reference = stated_reference(path, kind, stated, sample.t_ns)
+    turned = to_icrs(itertools.chain([first], entries), reference, False, told)
+    return LogReading(turned, _referred(conventions, convention, reference, sample.t_ns), advice, told)
+
+
+def _by_convention(entries: Iterable[LogEntry], convention: Convention) -> Iterator[LogEntry]:
+    for entry in entries:
+        event = entry.event
+        yield LogEntry(entry.where, convention.sample(event)) if isinstance(event, AttitudeSample) else entry
+
+
+def _referred(conventions: Conventions, convention: Convention, reference: "Reference", first_ns: int) -> Conventions:
+    """The conventions of a log whose attitudes refer to a reference; the self-check is for its first time."""
+    if reference.kind == "icrs":
+        return conventions
+
+    def written(q_icrs_to_frame: "FloatArray") -> str:
+        q = multiply(q_icrs_to_frame, conjugate(reference.q_icrs_to_reference([first_ns])[0]))
+        return f"q = {components(convention.as_sent(q))} at {first_ns / NS_PER_S:.9f} s"
+
+    turns = packet_conventions(convention, reference="reference").turns
+    return replace(conventions, turns=f"{turns}; the reference is {reference.words}", written=written)
+
+
+@contextlib.contextmanager
+def _open_ros(path: Path, stated: Stated) -> Iterator[LogReading]:
+    _require("rosbags", "ros", f"{path}: a ROS bag")
+    from hilstar.attitude.logs.ros import read_ros
+    from hilstar.attitude.logs.ros_bags import open_bag
+
+    with open_bag(path) as bag:
+        yield read_ros(bag, stated)
+
+
+@contextlib.contextmanager
+def _open_ulog(path: Path, stated: Stated) -> Iterator[LogReading]:
+    _require("pyulog", "px4", f"{path}: a ULog of PX4")
+    from hilstar.attitude.logs.px4 import read_ulog
+
+    yield read_ulog(path, stated)
+
+
+@contextlib.contextmanager
+def _open_ck(path: Path, stated: Stated) -> Iterator[LogReading]:
+    _require("spiceypy", "spice", f"{path}: a SPICE CK")
+    from hilstar.attitude.logs.ck import read_ck
+
+    yield read_ck(path, stated)
+
+
+@contextlib.contextmanager
+def _open_ledger(path: Path, stated: Stated) -> Iterator[LogReading]:
+    """A run's attitudes as it showed them: its convention and its mounting are in them already."""
+    yield LogReading(_mcap_entries(path), replace(PACKETS, source="MCAP", of_packets=False), RESTARTED)
+
+
+@contextlib.contextmanager
+def _open_mcap(path: Path, stated: Stated) -> Iterator[LogReading]:
+    yield _of_packets(path, _mcap_entries(path), "MCAP", stated, RESTARTED)
+
+
+def _mcap_entries(path: Path) -> Iterator[LogEntry]:
+    from hilstar.attitude.logs.mcap_log import read_attitudes
+
+    for number, sample in enumerate(read_attitudes(path), start=1):
+        yield LogEntry(f", attitude {number}", sample)
+
+
+@contextlib.contextmanager
+def _open_aem(path: Path, stated: Stated) -> Iterator[LogReading]:
+    from hilstar.attitude.logs.aem import read_aem
+    from hilstar.attitude.logs.earth import q_icrs_to_date
+
+    text = read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_AEM_BYTES)
+    try:
+        reading = read_aem(text, q_icrs_to_date)
+    except AemFaultError as fault:
+        raise InputError(f"{path}{fault.where}: {fault}") from fault
+    yield reading
+
+
+@contextlib.contextmanager
+def _open_other_ccsds(path: Path, stated: Stated) -> Iterator[LogReading]:
+    word = LogHead(path, b"").word[:MAX_QUOTED_CHARACTERS]
+    raise InputError(f"{path}: starts with {word}; of the CCSDS messages, only CCSDS_AEM_VERS is read")
+    yield
+
+
+@contextlib.contextmanager
+def _open_json_lines(path: Path, stated: Stated) -> Iterator[LogReading]:
+    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
+        yield _of_packets(path, _read_json_lines(lines), "JSON lines", stated)
+
+
+@contextlib.contextmanager
+def _open_csv(path: Path, stated: Stated) -> Iterator[LogReading]:
+    scalar = (stated.convention or HILSTARS).scalar
+    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
+        reading = _of_packets(path, _read_csv(lines, scalar), "CSV", stated)
+        yield replace(reading, conventions=replace(reading.conventions, time_unit="s"))
+
+
+def _is_bag(beginning: LogHead) -> bool:
+    if beginning.head.startswith(MCAP_MAGIC):
         from hilstar.attitude.logs.mcap_log import holds_ros
 
-        return holds_ros(path)
-    if path.is_dir():
+        return holds_ros(beginning.path)
+    if beginning.path.is_dir():
         from hilstar.attitude.logs.ros_bags import is_bag_directory
 
-        return is_bag_directory(path)
-    return head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))
+        return is_bag_directory(beginning.path)
+    return beginning.head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))
+
+
+def _is_ledger(beginning: LogHead) -> bool:
+    from hilstar.attitude.logs.mcap_log import begins_as_ledger
+
+    return beginning.head.startswith(MCAP_MAGIC) and begins_as_ledger(beginning.path)
+
+
+LEDGER = "the ledger of a run"
+RESTARTED = "the sender restarted here; give a log of one run"
+LEVEL = frozenset({"reference", "place", "epoch_utc"})
+LIKE_PACKETS = LEVEL | {"mounting", "convention"}
+# The first that a file begins like is its format; what is none of the others is read as CSV.
+FORMATS = (
+    LogFormat("a ROS bag", LEVEL | {"mounting", "topic", "body"}, _is_bag, _open_ros),
+    LogFormat("a ULog of PX4", LEVEL | {"mounting", "topic"}, lambda log: log.head.startswith(ULOG_MAGIC), _open_ulog),
+    LogFormat("a SPICE CK", frozenset({"mounting", "kernels", "body"}), lambda log: log.head.startswith(CK_MAGIC), _open_ck),
+    LogFormat(LEDGER, frozenset(), _is_ledger, _open_ledger),
+    LogFormat("MCAP", LIKE_PACKETS, lambda log: log.head.startswith(MCAP_MAGIC), _open_mcap),
+    LogFormat(
+        "a CCSDS AEM",
+        frozenset({"mounting"}),
+        lambda log: log.word.startswith(("<", "CCSDS_AEM_VERS")),
+        _open_aem,
+    ),
+    LogFormat("a CCSDS message", frozenset(), lambda log: log.word.startswith("CCSDS_"), _open_other_ccsds),
+    LogFormat("JSON lines", LIKE_PACKETS, lambda log: log.word.startswith("{"), _open_json_lines),
+    LogFormat("CSV", LIKE_PACKETS, lambda log: True, _open_csv),
+)
 
 
 def _require(library: str, extra: str, what: str) -> None:
     if importlib.util.find_spec(library) is None:
         raise MachineError(f"{what}; reading it needs {library}: pip install 'hilstar[{extra}]'")
-
-
-@contextlib.contextmanager
-def _open_text(path: Path) -> Iterator[LogReading]:
-    """The reading of a text, told by the first word of its first line that is no comment."""
-    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        firsts = (line.split(maxsplit=1)[0] for line in lines if line.strip())
-        word = next((first for first in firsts if first != "COMMENT" and not first.startswith("#")), "")
-    if word.startswith(("<", "CCSDS_AEM_VERS")):
-        from hilstar.attitude.logs.aem import read_aem
-        from hilstar.attitude.logs.earth import q_icrs_to_date
-
-        text = read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_AEM_BYTES)
-        try:
-            reading = read_aem(text, q_icrs_to_date)
-        except AemFaultError as fault:
-            raise InputError(f"{path}{fault.where}: {fault}") from fault
-        yield reading
-        return
-    if word.startswith("CCSDS_"):
-        raise InputError(
-            f"{path}: starts with {word[:MAX_QUOTED_CHARACTERS]}; of the CCSDS messages, only CCSDS_AEM_VERS is read"
-        )
-    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        if word.startswith("{"):
-            yield LogReading(_read_json_lines(lines), replace(PACKETS, source="JSON lines"))
-        else:
-            yield LogReading(_read_csv(lines), replace(PACKETS, source="CSV"))
 
 
 def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None) -> int:

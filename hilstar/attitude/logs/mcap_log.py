@@ -21,6 +21,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Any, NamedTuple, Self
@@ -151,6 +152,12 @@ def topics_of(path: Path) -> list[str]:
 def read_metadata(path: Path, name: str) -> dict[str, str]:
     """The first metadata of that name, {} where there is none. Raises InputError for damage."""
     return next((dict(r.metadata) for r in records_of(path) if isinstance(r, kinds.Metadata) and r.name == name), {})
+
+
+def begins_as_ledger(path: Path) -> bool:
+    """Whether a file has the head of a run's ledger, which stands before its topics. Raises InputError for damage before it."""
+    heads = takewhile(lambda record: isinstance(record, kinds.Header | kinds.Metadata), records_of(path))
+    return any(isinstance(head, kinds.Metadata) and head.name == RUN_METADATA for head in heads)
 
 
 def is_mcap(path: Path) -> bool:

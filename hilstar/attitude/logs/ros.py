@@ -30,7 +30,17 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.earth import AXES, EXACT, FIRST_DATE_NS, KINDS, Kind, Reference, stated_reference, to_icrs
+from hilstar.attitude.logs.earth import (
+    AXES,
+    EXACT,
+    FIRST_DATE_NS,
+    KINDS,
+    Kind,
+    Reference,
+    loosely_icrs,
+    stated_reference,
+    to_icrs,
+)
 from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated, in_order
 from hilstar.attitude.logs.ros_bags import Bag, BagTopic, Encoding
 from hilstar.attitude.wire.packet import Refusal, checked_sample
@@ -333,7 +343,7 @@ def _kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told
         if own is None:
             raise InputError(f"{refers if frame else f'{path}: {why}'}; {STATE}")
         if (frame or "").lower() not in EXACT and own == "icrs":
-            told.append(("reference", f"the frame {frame!r} is taken as the ICRS; a frame of date is 0.4 deg off by now"))
+            told.append(("reference", loosely_icrs(str(frame))))
         return own
     if own is None:
         called = f"the frame {frame!r}" if frame else "the reference"

@@ -14,6 +14,7 @@ from serial.tools import list_ports
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.links import Arrival, RawMessage, StreamLink
+from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
@@ -71,8 +72,17 @@ class SerialLink(StreamLink):
     two_way = True
     verb = "reading"
 
-    def __init__(self, port: str, baud: int, notices: Notices | None = None, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        notices: Notices | None = None,
+        clock: HostClock = HOST_CLOCK,
+        *,
+        sent: SentAttitudes = AS_SENT,
+    ) -> None:
         super().__init__(notices, clock)
+        self.conventions, self._decode = sent.conventions, sent.decoder(wire.decode_frame)
         self.endpoint = f"serial:{port}@{baud}"
         self._port, self._baud = port, baud
         self._reopened = 0
@@ -109,7 +119,7 @@ class SerialLink(StreamLink):
             for k, body in enumerate(bodies, 1):  # frames before the chunk's last were there earlier, and waited for it
                 waiting.append(chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies)))
         taken = self._gate.newest(waiting, wire.frame_declares_discontinuity)
-        return [Arrival(each.host_ns, wire.decode_frame(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
+        return [Arrival(each.host_ns, self._decode(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
         if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
@@ -203,8 +213,16 @@ class SerialApart(SerialLink):
     stamped = True
     _given: serial.Serial | None = None  # the device that the process reads
 
-    def __init__(self, port: str, baud: int, notices: Notices | None = None, clock: HostClock = HOST_CLOCK) -> None:
-        super().__init__(port, baud, notices, clock)
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        notices: Notices | None = None,
+        clock: HostClock = HOST_CLOCK,
+        *,
+        sent: SentAttitudes = AS_SENT,
+    ) -> None:
+        super().__init__(port, baud, notices, clock, sent=sent)
         self._reader = ReaderProcess(self._notices, clock=clock)
 
     def await_ready(self) -> None:

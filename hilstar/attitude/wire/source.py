@@ -1,15 +1,22 @@
-"""What a source of attitudes means by its numbers, and how the attitude of a body becomes that of the camera."""
+"""What a source of attitudes means by its numbers, and how they become the attitude of the camera.
+
+Two steps, in this order, each of which may be the identity:
+1. The convention: a quaternion as it was sent becomes the Hamilton one, scalar first, that turns ICRS components into those of
+   the sender's frame. Rates are of that frame with respect to the ICRS, in its own components, whatever the convention.
+2. The mounting: an attitude and a rate of the body become the camera's.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.toml_tables import Table
 
-if TYPE_CHECKING:  # NumPy takes 70 ms, and a process that only stamps packets needs none
+if TYPE_CHECKING:  # NumPy takes 70 ms, and a process that only stamps packets needs none; a bench file needs no packets
     from hilstar.arrays import FloatArray
+    from hilstar.attitude.wire.packet import AttitudeSample, Event
 
 Components = tuple[float, float, float, float]
 IDENTITY: Components = (1.0, 0.0, 0.0, 0.0)
@@ -19,27 +26,80 @@ UNSTATED = (
     "the source holds the body's attitude, and the tracker's axes are taken as the body's; "
     "write [tracker] q_body_to_cam (without a bench file: --mounting W,X,Y,Z)"
 )
+UNUSED = (
+    "[tracker] q_body_to_cam does not turn these attitudes: they are taken as the camera's; if they are the body's, write "
+    '[attitude] convention = { frame = "body" }'
+)
+
+
+class Convention(Table, frozen=True):
+    """What a quaternion turns into what, and the order of its components (see [conventions](attitude-in.md#conventions))."""
+
+    #: Where the scalar stands among the four numbers. `"first"`: w, x, y, z. `"last"`: x, y, z, w.
+    scalar: Literal["first", "last"] = "first"
+    #: `"icrs_to_cam"`: it turns ICRS components into the frame's (with `frame = "body"`: the body's). `"cam_to_icrs"`: the
+    #: other way round.
+    direction: Literal["icrs_to_cam", "cam_to_icrs"] = "icrs_to_cam"
+    #: Whose attitude it is. `"cam"`: the camera's. `"body"`: the spacecraft's, which `[tracker] q_body_to_cam` makes the
+    #: camera's; rates are then the body's, too.
+    frame: Literal["cam", "body"] = "cam"
+
+    @property
+    def is_hilstars(self) -> bool:
+        """Whether a quaternion is sent as hilstar has it, of whichever frame."""
+        return self.scalar == "first" and self.direction == "icrs_to_cam"
+
+    def q_icrs_to_frame(self, sent: FloatArray) -> FloatArray:
+        """The Hamilton quaternion (4,), scalar first, of a unit quaternion (4,) in the order in which it was sent."""
+        import numpy as np
+
+        from hilstar.rotation import conjugate
+
+        q = sent if self.scalar == "first" else np.roll(sent, 1)
+        return conjugate(q) if self.direction == "cam_to_icrs" else q
+
+    def as_sent(self, q_icrs_to_frame: FloatArray) -> FloatArray:
+        """What a sender of this convention sends for an attitude (4,) of its frame."""
+        import numpy as np
+
+        from hilstar.rotation import conjugate
+
+        q = conjugate(q_icrs_to_frame) if self.direction == "cam_to_icrs" else q_icrs_to_frame
+        return q if self.scalar == "first" else np.roll(q, -1)
+
+    def sample(self, sent: AttitudeSample) -> AttitudeSample:
+        """The sample with its quaternion from ICRS to its frame; its rate is what it was."""
+        return sent if self.is_hilstars else replace(sent, q_icrs_to_cam=self.q_icrs_to_frame(sent.q_icrs_to_cam))
+
+    def __str__(self) -> str:
+        """As a bench file has it."""
+        return f'{{ scalar = "{self.scalar}", direction = "{self.direction}", frame = "{self.frame}" }}'
+
+
+HILSTARS = Convention()
 
 
 class Mounting:
     """How the camera sits in the body: `q_body_to_cam`, which turns body components into camera components.
 
-    None where nobody has said: the camera's axes are then taken as the body's, and `told` says so.
+    None where nobody has said: the camera's axes are then taken as the body's, and `told` says so. `by_option`: the command
+    line says it (`--mounting`), which is refused where the source is not the body's.
     """
 
-    def __init__(self, q_body_to_cam: Components | None = None) -> None:
+    def __init__(self, q_body_to_cam: Components | None = None, *, by_option: bool = False) -> None:
         import numpy as np
 
         from hilstar.rotation import normalise, to_matrix
 
         self.q_body_to_cam = normalise(np.array(q_body_to_cam or IDENTITY, dtype=np.float64))
         self.told = [] if q_body_to_cam else [("mounting", UNSTATED)]
+        self.by_option = by_option
         self._matrix = to_matrix(self.q_body_to_cam)
-        self._plain = q_body_to_cam in {None, IDENTITY}
+        self.is_identity = q_body_to_cam in {None, IDENTITY}
 
     def sample(self, body: AttitudeSample) -> AttitudeSample:
         """The camera's attitude and motion of a sample that holds the body's: q_icrs_to_body, rate in body components."""
-        if self._plain:
+        if self.is_identity:
             return body
         from hilstar.rotation import multiply
 
@@ -47,9 +107,13 @@ class Mounting:
         return replace(
             body,
             q_icrs_to_cam=multiply(self.q_body_to_cam, body.q_icrs_to_cam),
-            rate_cam_rad_s=None if rate is None else self._matrix @ rate,
-            acceleration_cam_rad_s2=None if acceleration is None else self._matrix @ acceleration,
+            rate_cam_rad_s=None if rate is None else self.in_cam(rate),
+            acceleration_cam_rad_s2=None if acceleration is None else self.in_cam(acceleration),
         )
+
+    def in_cam(self, in_body: FloatArray) -> FloatArray:
+        """Camera components (3,) of a vector in body components (3,)."""
+        return self._matrix @ in_body
 
     def q_icrs_to_body(self, q_icrs_to_cam: FloatArray) -> FloatArray:
         """The body's attitude of the camera's."""
@@ -65,6 +129,7 @@ class Conventions:
     `turns` says from which frame to which; `scalar` the order of the components; `time` the scale and the zero of its times;
     `of_body` whether `[tracker] q_body_to_cam` applies; `written` gives an attitude in the source's own words; `scale` is the
     time scale (UTC, TAI, TT, TDB, GPS) whose ns since 1970-01-01T00:00:00 its times are, in days of 86400 s; None for others.
+    `of_packets`: a `Convention` says what its quaternions are, and its times are plain numbers (of `time_unit` in a log).
     """
 
     source: str
@@ -74,6 +139,14 @@ class Conventions:
     of_body: bool
     written: Callable[[FloatArray], str]
     scale: str | None = None
+    of_packets: bool = False
+    time_unit: str = "ns"
+
+    def mounting_notices(self, mounting: Mounting) -> list[tuple[str, str]]:
+        """What the user must know of the mounting: that nobody stated one, or that one is stated and not used."""
+        if self.of_body:
+            return mounting.told
+        return [("mounting", UNUSED)] if self.of_packets and not mounting.is_identity else []
 
     def lines(self, mounting: Mounting) -> list[str]:
         """The conventions, and the self-check, for a person."""
@@ -97,11 +170,66 @@ def components(q: FloatArray) -> str:
     return "(" + ", ".join(f"{c:.7f}" for c in q) + ")"
 
 
-PACKETS = Conventions(
-    "hilstar's packets and logs",
-    "q_icrs_to_cam turns ICRS components into camera components",
-    "scalar first (w, x, y, z), Hamilton",
-    "the sender's own clock, of any zero",
-    of_body=False,
-    written=lambda q: f"q = {components(q)}",
-)
+class SentAttitudes:
+    """The way from what a sender sends to the camera's attitude: its convention, then the mounting where that is the body's.
+
+    Links hand it their decoders, so that whoever reads a link sees the camera's attitudes, and the bytes as they came.
+    """
+
+    def __init__(self, convention: Convention = HILSTARS, mounting: Mounting | None = None) -> None:
+        self.convention, self.conventions = convention, packet_conventions(convention)
+        turns = convention.frame == "body" and mounting is not None and not mounting.is_identity
+        self._mounting = mounting if turns else None
+
+    def q_icrs_to_cam(self, sent: FloatArray) -> FloatArray:
+        """The camera's attitude of a unit quaternion (4,) in the order in which it was sent."""
+        from hilstar.rotation import multiply
+
+        q = self.convention.q_icrs_to_frame(sent)
+        return q if self._mounting is None else multiply(self._mounting.q_body_to_cam, q)
+
+    def as_sent(self, q_icrs_to_cam: FloatArray) -> FloatArray:
+        """What the sender sends for an attitude (4,) of the camera."""
+        q = q_icrs_to_cam if self._mounting is None else self._mounting.q_icrs_to_body(q_icrs_to_cam)
+        return self.convention.as_sent(q)
+
+    def sample(self, sent: AttitudeSample) -> AttitudeSample:
+        """The camera's attitude and motion of a sample as it was sent."""
+        sample = self.convention.sample(sent)
+        return sample if self._mounting is None else self._mounting.sample(sample)
+
+    def decoder(self, decode: Callable[[bytes], Event]) -> Callable[[bytes], Event]:
+        """A decoder whose samples are the camera's; `decode` itself where they are already, which costs nothing."""
+        if self._mounting is None and self.convention.is_hilstars:
+            return decode
+        from hilstar.attitude.wire.packet import AttitudeSample
+
+        def decoded(message: bytes) -> Event:
+            event = decode(message)
+            return self.sample(event) if isinstance(event, AttitudeSample) else event
+
+        return decoded
+
+
+def packet_conventions(
+    convention: Convention, source: str = "hilstar's packets and logs", reference: str = "ICRS"
+) -> Conventions:
+    """The conventions of packets, JSON and the logs that are written like them; `reference` is what attitudes refer to."""
+    frames = [f"{reference} components", "body components" if convention.frame == "body" else "camera components"]
+    names = ["icrs" if reference == "ICRS" else "reference", convention.frame]
+    if convention.direction == "cam_to_icrs":
+        frames, names = frames[::-1], names[::-1]
+    order = "(w, x, y, z)" if convention.scalar == "first" else "(x, y, z, w)"
+    return Conventions(
+        source,
+        f"q_{names[0]}_to_{names[1]} turns {frames[0]} into {frames[1]}",
+        f"scalar {convention.scalar} {order}, Hamilton",
+        "the sender's own clock, of any zero",
+        of_body=convention.frame == "body",
+        written=lambda q: f"q = {components(convention.as_sent(q))}",
+        of_packets=True,
+    )
+
+
+PACKETS = packet_conventions(HILSTARS)
+AS_SENT = SentAttitudes()

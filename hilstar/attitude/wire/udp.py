@@ -23,6 +23,7 @@ from typing import Any
 from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
 from hilstar.attitude.wire.links import PAUSE_S, Arrival, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, declares_discontinuity, decode, encode
+from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
@@ -236,9 +237,16 @@ class UdpLink(StreamLink):
     verb = "bound to"
 
     def __init__(
-        self, place: UdpPlace, allowed: AllowedSenders, notices: Notices | None = None, clock: HostClock = HOST_CLOCK
+        self,
+        place: UdpPlace,
+        allowed: AllowedSenders,
+        notices: Notices | None = None,
+        clock: HostClock = HOST_CLOCK,
+        *,
+        sent: SentAttitudes = AS_SENT,
     ) -> None:
         super().__init__(notices, clock)
+        self.conventions, self._decode = sent.conventions, sent.decoder(decode)
         self._allowed, self._credit = allowed, Credit()
         self._strangers = self._dropped = self._looked_ns = 0
         self._filtered = False
@@ -267,7 +275,7 @@ class UdpLink(StreamLink):
         for host_ns, (data,), _, _, sender in admitted:
             peer = sender or ()
             self._credit.earn(peer, len(data))
-            arrivals.append(Arrival(host_ns, decode(data), data, back=partial(self._answer, peer)))
+            arrivals.append(Arrival(host_ns, self._decode(data), data, back=partial(self._answer, peer)))
         return arrivals
 
     def _look(self, strangers: int) -> None:

@@ -347,6 +347,7 @@ class BroadcastDecoder(PacketDecoder):
     """What SIM_UPDATE messages mean; the very first ones are held back for a moment."""
 
     def __init__(self, follower: Follower, clock: HostClock = HOST_CLOCK) -> None:
+        super().__init__()
         self._follower, self.conventions, self._clock = follower, follower.conventions, clock
         self._opening = Opening()
 

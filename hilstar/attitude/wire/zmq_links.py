@@ -14,7 +14,7 @@ from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import OpenStream, ReaderProcess
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival, LockstepLink, RawMessage, StreamLink
-from hilstar.attitude.wire.source import PACKETS, Conventions, Mounting
+from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, SocketOptions, ZmqSocket
 from hilstar.notices import Notices
 from hilstar.process.closing import Closing
@@ -32,8 +32,10 @@ STAMP = struct.Struct("<q")  # host time of arrival, ns: one clock for all proce
 class PacketDecoder:
     """Says what the messages of a free stream mean: packets or JSON, of which only the last part counts."""
 
-    conventions = PACKETS
     stamped = False  # whether messages carry their own times of arrival
+
+    def __init__(self, sent: SentAttitudes = AS_SENT) -> None:
+        self.conventions, self.decode = sent.conventions, sent.decoder(wire.decode)
 
     def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[wire.Event]]:
         """What messages say."""
@@ -41,7 +43,7 @@ class PacketDecoder:
 
     def _arrival(self, message: RawMessage) -> Arrival[wire.Event]:
         raw = message.parts[-1]
-        return Arrival(message.host_ns, wire.decode(raw), raw, message.waited_ns)
+        return Arrival(message.host_ns, self.decode(raw), raw, message.waited_ns)
 
 
 PACKET_DECODER = PacketDecoder()
@@ -198,7 +200,8 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
 
     _json = False  # whether the last request was
 
-    def __init__(self, endpoint: str, **options: Unpack[SocketOptions]) -> None:
+    def __init__(self, endpoint: str, *, sent: SentAttitudes = AS_SENT, **options: Unpack[SocketOptions]) -> None:
+        self.conventions, self._decode = sent.conventions, sent.decoder(wire.decode)
         options.setdefault("bind", True)
         super().__init__(zmq.REP, endpoint, **options)
 
@@ -210,7 +213,7 @@ class ZmqLockstep(ZmqSocket, LockstepLink):
         message = self._take() if self._waits(timeout_ms) else None
         if message is None:
             return None
-        host_ns, event = self._clock.now_ns(), wire.decode(message)
+        host_ns, event = self._clock.now_ns(), self._decode(message)
         if isinstance(event, wire.TimeRequest):
             self._answer(wire.encode(wire.TimeReply(event.sequence, event.t1_ns, host_ns, self._clock.now_ns())))
             return None
@@ -261,17 +264,9 @@ class FedDecoder(PacketDecoder):
 
     stamped = True
 
-    def __init__(self, mounting: Mounting, conventions: Conventions) -> None:
-        self._mounting = mounting
-        self.conventions = conventions
-
     def _arrival(self, message: RawMessage) -> Arrival[wire.Event]:
         if len(message.parts) != 2 or len(message.parts[0]) != STAMP.size:
             return super()._arrival(message)
         (came_ns,) = STAMP.unpack(message.parts[0])
         raw = message.parts[1]
-        event = wire.decode(raw)
-        if not isinstance(event, wire.AttitudeSample):
-            return Arrival(came_ns, event, raw)
-        camera = self._mounting.sample(event)
-        return Arrival(came_ns, camera, wire.encode(camera))
+        return Arrival(came_ns, self.decode(raw), raw)

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from hilstar.attitude.wire.endpoint import ALLOW_FORM, AllowedSenders, UdpPlace, bound_place
+from hilstar.attitude.wire.source import HILSTARS, Convention
 from hilstar.bench.config.values import NotNegative, Positive, Signed
 from hilstar.errors import InputError, shortened
 from hilstar.toml_tables import Table
@@ -21,17 +22,6 @@ PLACE_FORM = 'write "HOST:PORT", such as "127.0.0.1:7000"'
 TYPES = "u8, i8, u16 to u64, i16 to i64, u24, i24, f32 or f64"
 HexBytes = Annotated[str, Meta(pattern=r"^\s*([0-9A-Fa-f]{2}\s*)+$")]
 Byte = Annotated[int, Meta(ge=-MAX_FRAME_BYTES, le=MAX_FRAME_BYTES)]
-
-
-class Convention(Table, frozen=True):
-    """What the tracker's quaternion turns into what."""
-
-    #: Where the scalar of `q` stands, `"first"` or `"last"`, in JSON and in what a Python function gives.
-    scalar: Literal["first", "last"] = "first"
-    #: `"icrs_to_cam"`: it turns ICRS components into the tracker's. `"cam_to_icrs"`: the other way round.
-    direction: Literal["icrs_to_cam", "cam_to_icrs"] = "icrs_to_cam"
-    #: `"cam"`: the camera's axes. `"body"`: the spacecraft's, which `[tracker] q_body_to_cam` relates.
-    frame: Literal["cam", "body"] = "cam"
 
 
 class FrameField(Table, frozen=True):
@@ -92,7 +82,7 @@ class AnswersSettings(Table, frozen=True):
     #: What is sent to a tracker that answers only when it is asked, in hexadecimal. Default: none
     poll_hex: Annotated[HexBytes | None, Meta(extra={"form": '"55 AA 01 ..."'})] = None
     poll_hz: Annotated[float, Meta(ge=0.01, le=1000)] = 10.0  #: How often that is sent.
-    convention: Convention = Convention()  #: What the quaternion turns into what.
+    convention: Convention = HILSTARS
     #: Where in the exposure the tracker's stamp stands: in its `"middle"`, at its `"start"` or `"end"`. `"arrival"`: it is not
     #: used, or there is none.
     stamp: Literal["middle", "start", "end", "arrival"] = "middle"
@@ -226,6 +216,8 @@ def _frame_faults(settings: AnswersSettings) -> Faults:
     yield bool(twice), f'fields has name = "{"".join(twice[:1])}" twice; write each once'
     missing = [name for name in QUATERNION if name not in names]
     yield bool(missing), f"fields lacks {', '.join(missing)}; write each of qw, qx, qy, qz"
+    ordered = settings.convention.scalar == "last"
+    yield ordered, 'convention = { scalar = "last" }: fields says by the name qw which number is the scalar; remove it'
     some = 0 < sum(name in names for name in RATE) < len(RATE)
     yield some, "fields has one or two of wx, wy, wz; write all of them, or none"
     both = "t_ns" in names and ("t_s" in names or "t_sub" in names)

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from hilstar.attitude.wire.endpoint import ALLOW_FORM, AllowedSenders, UdpPlace, bound_place, parse_endpoint
+from hilstar.attitude.wire.source import HILSTARS, Convention
 from hilstar.bench.config.values import NotNegative
 from hilstar.errors import InputError
 from hilstar.toml_tables import Table
@@ -17,6 +18,10 @@ ENDPOINTS = {
     ("42", False): "tcp://127.0.0.1:10001",  # from 42's own Inp_IPC.txt
     ("42", True): "tcp://127.0.0.1:10001",
 }
+
+
+# Whose senders write hilstar's packets or JSON themselves, and so may have another convention.
+PACKET_SOURCES = ("zmq", "serial", "udp")
 
 
 class AttitudeSettings(Table, frozen=True):
@@ -51,6 +56,7 @@ class AttitudeSettings(Table, frozen=True):
     #: Vizard: `true` when the spacecraft's velocity aberrates the stars: 5 arcsec in low orbit. It adds to `[sky]
     #: observer_velocity_km_s`, which is then that of the origin of Basilisk's frame.
     use_velocity: bool = True
+    convention: Convention = HILSTARS
     curve_secret_key: str | None = None  #: ZeroMQ: the file of hilstar's own secret key. Default: none
     #: ZeroMQ: the file of the binding side's public key, when hilstar connects. Default: none
     curve_server_key: str | None = None
@@ -103,6 +109,8 @@ def check_road(settings: AttitudeSettings) -> None:
         raise InputError(f'allow is for source = "udp", and for "42" with bind = true; remove it (source = "{source}")')
     if source == "serial" and (not settings.port or isinstance(settings.port, int)):
         raise InputError('source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
+    if settings.convention != HILSTARS and source not in PACKET_SOURCES:
+        raise InputError(f'convention = {settings.convention}: source = "{source}" has a convention of its own; remove it')
     if settings.spacecraft is not None and source not in {"vizard", "42"}:
         raise InputError(f'spacecraft is for source = "vizard" or "42"; remove it (source = "{source}")')
     if source in {"vizard", "42"}:

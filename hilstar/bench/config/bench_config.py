@@ -244,6 +244,7 @@ def _check_meaning(config: BenchConfig) -> None:
     except InputError as error:
         raise InputError(f"[attitude] {error}") from error
     _check_answers(config)
+    _check_frames(config)
 
 
 def _check_colour(config: BenchConfig) -> None:
@@ -265,8 +266,15 @@ def _check_answers(config: BenchConfig) -> None:
         check_answers(config.answers)
     except InputError as error:
         raise InputError(f"[answers] {error}") from error
-    if config.answers.convention.frame == "body" and config.tracker.q_body_to_cam is None:
-        raise InputError('[answers] convention = { frame = "body" } needs [tracker] q_body_to_cam; write how the camera sits')
+
+
+def _check_frames(config: BenchConfig) -> None:
+    """Refuse (InputError) attitudes or answers of a body in which nobody says how the camera sits."""
+    for name, settings in (("attitude", config.attitude), ("answers", config.answers)):
+        of_body = settings is not None and settings.convention.frame == "body"
+        if of_body and config.tracker.q_body_to_cam is None:
+            needs = f'[{name}] convention = {{ frame = "body" }} needs [tracker] q_body_to_cam'
+            raise InputError(f"{needs}; write how the camera sits")
 
 
 def _check_sky(config: BenchConfig, tables: dict[str, Any]) -> None:

@@ -180,7 +180,7 @@ def see_stars(context: StepContext) -> StarsSeen:
 def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...]) -> ExpectedStars:
     """The isolated stars of a frame that are drawn whole, with their expected places in the tracker's image."""
     camera = tracker_camera(context.file.config.tracker, context.file.folder)
-    truth, vectors = frame.truth, bench.stars.directions(frame.star)
+    truth, vectors = frame.rows, bench.stars.directions(frame.star)
     place = np.stack(camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T), axis=1)
     width, height = camera.resolution_px
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)

@@ -51,6 +51,7 @@ from hilstar.run.record.ledger_records import (
     FaultRecord,
     FrameRecord,
     ProcessRecord,
+    raw_convention,
     schema_of,
 )
 from hilstar.units import NS_PER_S
@@ -233,6 +234,7 @@ class Ledger(Closing):
             "render_path": bench.renderer.path,
             "quantisation": bench.renderer.target.quantisation,
             "codes_ms": json.dumps(bench.config.render.codes_ms),
+            "raw_convention": raw_convention(bench.config),
             "output": json.dumps(bench.output),
             "monotonic_ns": str(time.monotonic_ns()),
             "unix_ns": str(time.time_ns()),

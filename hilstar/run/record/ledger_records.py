@@ -25,6 +25,7 @@ from hilstar.attitude.logs.mcap_log import (
 from hilstar.attitude.wire.packet import MAX_PLACE_KM, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config import BenchConfig
+from hilstar.bench.config.attitude import PACKET_SOURCES
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_read, printable
 from hilstar.reading import NOT_JSON, parse_toml
@@ -410,6 +411,21 @@ def codes_ms_of(head: dict[str, str]) -> tuple[float, float] | None:
         return msgspec.json.decode(head.get("codes_ms", "null"), type=tuple[float, float] | None)
     except msgspec.MsgspecError:
         return None
+
+
+def raw_convention(config: BenchConfig) -> str:
+    """What a ledger's head says of the bytes in `raw`: their convention and the mounting, by which `q` was made of them.
+
+    `q` and `rate` of the ledger are hilstar's own: whoever reads them applies neither again. JSON; null for a source that has
+    no packets.
+    """
+    settings = config.attitude
+    if settings.source not in PACKET_SOURCES:
+        return "null"
+    of_body = settings.convention.frame == "body"
+    mounting = config.tracker.q_body_to_cam if of_body else None
+    said = {**msgspec.structs.asdict(settings.convention), "q_body_to_cam": mounting}
+    return msgspec.json.encode(said).decode()
 
 
 def config_of(head: dict[str, str]) -> BenchConfig | None:

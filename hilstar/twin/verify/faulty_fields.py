@@ -144,10 +144,10 @@ class FaultyFields:
             toward = self._view.star_direction(fault)
             rows = np.flatnonzero((self._twin.bench.stars.vectors[frame.star.clip(0)] @ toward) > 1 - 1e-14)
         else:
-            rows = np.flatnonzero(frame.truth["name"] == fault.name)
+            rows = np.flatnonzero(frame.rows["name"] == fault.name)
         if not len(rows):
             return None
-        row = frame.truth[rows[0]]
+        row = frame.rows[rows[0]]
         x, y = self._twin.assumed_geometry.to_tracker(np.array([row["x_px"]]), np.array([row["y_px"]]))
         return np.array([x[0], y[0]])
 
@@ -165,7 +165,7 @@ class FaultyFields:
 
     def _stars_off_px(self, shot: _Shot) -> float | None:
         """How far the stars of a wrong attitude are from where that has them: the median."""
-        truth = shot.frame.truth
+        truth = shot.frame.rows
         x_px, y_px = self._twin.assumed_geometry.to_tracker(truth["x_px"], truth["y_px"])
         match = self._finder.match(shot.shown_e, x_px, y_px)
         found = match.index >= 0

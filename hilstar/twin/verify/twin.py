@@ -190,10 +190,10 @@ class Twin(Closing):
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
         discs, under_e = self.bench.discs(view), glow_e + self._background.of_view_e(view)
-        points = ~np.isin(frame.truth["name"], [disc.name for disc in discs])
+        points = ~np.isin(frame.rows["name"], [disc.name for disc in discs])
         x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
         found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
-        truth = frame.truth[points]
+        truth = frame.rows[points]
         if bayer is not None and self.bench.stars.colours is not None:
             of_channels = shares_at(self.bench.stars.colours, self.bench.stars, frame.star[points])
             truth["electrons_per_s"] *= of_channels @ [bayer.count(channel) / len(bayer) for channel in CHANNELS]

@@ -7,11 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
+from hilstar.bench.frame_files import write_truth_csv
 from hilstar.frame.truth import truth_table, with_errors
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
+from hilstar.twin.simulator import Simulator
 from tests.support.benches import bench_text
 
 
@@ -62,6 +65,21 @@ def test_a_frame_that_writes_no_truth_table_reads_no_facts(tmp_path, monkeypatch
     path.write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"faintest_v_mag": 4.0}}))
     with load(path) as bench:
         shot = bench.frame(from_radec_roll_deg(84.0, -1.2, 0.0))
-    assert len(shot.truth)
+    assert len(shot.rows)
     with pytest.raises(AssertionError, match="was read"):
-        with_errors(shot.truth, bench.stars.catalog, 2026.0)
+        print(shot.truth)
+
+
+def test_the_table_that_python_has_is_the_one_that_is_written(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"faintest_v_mag": 4.0}}))
+    with load(path) as bench:
+        shot = bench.frame(from_radec_roll_deg(84.0, -1.2, 0.0))
+    write_truth_csv(tmp_path / "truth.csv", shot)
+    written = np.genfromtxt(tmp_path / "truth.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    for name in ("sigma_pos_mas", "sigma_mag"):
+        assert np.isfinite(shot.truth[name]).all()
+        assert written[name].tolist() == shot.truth[name].tolist()
+    with Simulator(read_bench_file(path)) as simulator:
+        exposure = simulator.expose(simulator.view(from_radec_roll_deg(84.0, -1.2, 0.0), np.zeros(3)), None)
+    assert np.isfinite(exposure.truth["sigma_pos_mas"][exposure.truth["hip"] > 0]).all()

@@ -21,6 +21,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.attitude.logs.mcap_log import parts_of, read_chunks
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
+from hilstar.bench.config import AttitudeSettings
 from hilstar.cli.options import parse_split
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -50,7 +51,11 @@ def bench(small_bench_file):
         renderer=SimpleNamespace(
             gl_renderer="none", gl_version="none", path="NumPy", target=SimpleNamespace(quantisation="exact")
         ),
-        config=SimpleNamespace(render=SimpleNamespace(codes_ms=None)),
+        config=SimpleNamespace(
+            render=SimpleNamespace(codes_ms=None),
+            attitude=AttitudeSettings(),
+            tracker=SimpleNamespace(q_body_to_cam=None),
+        ),
     )
 
 

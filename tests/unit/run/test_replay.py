@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample, encode
-from hilstar.bench.config import parse_config
+from hilstar.bench.config import AttitudeSettings, parse_config
 from hilstar.errors import InputError
 from hilstar.monitor.quantisers import QUANTISERS
 from hilstar.run.record.ledger import Ledger
@@ -54,7 +54,11 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
         renderer=SimpleNamespace(
             gl_renderer="none", gl_version="none", path="NumPy", target=SimpleNamespace(quantisation="exact")
         ),
-        config=SimpleNamespace(render=SimpleNamespace(codes_ms=None)),
+        config=SimpleNamespace(
+            render=SimpleNamespace(codes_ms=None),
+            attitude=AttitudeSettings(),
+            tracker=SimpleNamespace(q_body_to_cam=None),
+        ),
     )
     with Ledger(path, bench) as kept:
         for k in range(10):

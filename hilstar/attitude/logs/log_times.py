@@ -1,0 +1,96 @@
+"""Whether the times of a log are in the unit that its format states: by its rates where it has them, else by its own steps.
+
+Rates and quaternions say how far a body turns from one sample to the next; the times say how long that took. In another unit
+than the stated one, the turn by the rates is that many times too large, for every interval alike and about the same axis.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.units import NS_PER_S
+
+TIMES = "log-times"  # the kind of these notices
+LOOKED_AT = 2000  # intervals
+MIN_INTERVALS = 5
+MIN_TURN_RAD = 1e-6  # 0.2 arcsec: below that a quaternion's own digits are the turn
+MAX_OFF = 0.1  # of the ratio: rates and quaternions of one motion agree better
+MIN_COSINE = 0.98  # between the two axes
+MIN_STEP_S, MAX_STEP_S = 1e-4, 10.0
+# How many seconds a log's second is, for units that people write instead; of ns, how many ns.
+SECONDS = {"ns": 1e-9, "100 ns": 1e-7, "us": 1e-6, "ms": 1e-3, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+OF_NS = {"100 ns": 100.0, "us": 1e3, "ms": 1e6, "s": 1e9}
+# What rates of another unit look like, by the same factor.
+RATES_LIKE = {1e-3: "mrad/s", 1e3: "rad/ms"}
+
+
+def median_step_s(samples: Sequence[AttitudeSample]) -> float:
+    """The median interval of a log, s; NaN of a single sample."""
+    t_ns = np.array([sample.t_ns for sample in samples], dtype=object)
+    return float(np.median(np.asarray(np.diff(t_ns) / NS_PER_S, dtype=np.float64))) if len(samples) > 1 else float("nan")
+
+
+def span_line(samples: Sequence[AttitudeSample]) -> str:
+    """How long a log is, for a person: its span, its attitudes and their step."""
+    span_s = (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S
+    if len(samples) < 2:
+        return "the log is a single attitude"
+    return f"the log is {span_s:.6g} s long: {len(samples)} attitudes, a step of {median_step_s(samples):.4g} s (median)"
+
+
+def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str, str]]:
+    """What to tell of the times of a log whose format states `unit` ("s" or "ns"): another one by the rates, or an odd step."""
+    if len(samples) < 2:
+        return []
+    step_s = median_step_s(samples)
+    named = _named(samples, unit, step_s)
+    if named:
+        return [(TIMES, f"the rates do not fit the times: probably {named}; the format has {unit}")]
+    if MIN_STEP_S <= step_s <= MAX_STEP_S:
+        return []
+    limit = f"over {MAX_STEP_S:g} s" if step_s > MAX_STEP_S else f"under {MIN_STEP_S * 1e3:g} ms"
+    return [(TIMES, f"{span_line(samples)}, which is {limit}: are its times in {unit}, as the format has them?")]
+
+
+def _named(samples: Sequence[AttitudeSample], unit: str, step_s: float) -> str:
+    """The unit of the times, or of the rates where that is as likely; "" where the rates fit, or say nothing."""
+    ratio = _too_far(samples[: LOOKED_AT + 1])
+    units = SECONDS if unit == "s" else OF_NS
+    for name, factor in units.items():
+        if not abs(ratio * factor - 1) <= MAX_OFF:  # NaN too
+            continue
+        line = f"the times are in {name}"
+        rates = RATES_LIKE.get(factor)
+        if rates is None or not MIN_STEP_S <= step_s <= MAX_STEP_S:
+            return line
+        own = f"the rates are in {rates}"
+        return f"{line}, or {own}" if MIN_STEP_S <= step_s * factor <= MAX_STEP_S else own
+    return ""
+
+
+def _too_far(samples: Sequence[AttitudeSample]) -> float:
+    """How many times as far as the quaternions the rates turn, the median; NaN where they have no rates or another axis."""
+    pairs = [(before, after) for before, after in pairwise(samples) if not after.discontinuity]
+    pairs = [pair for pair in pairs if all(sample.rate_cam_rad_s is not None for sample in pair)]
+    if len(pairs) < MIN_INTERVALS:
+        return float("nan")
+    q = np.array([[sample.q_icrs_to_cam for sample in pair] for pair in pairs])
+    rates = np.array([[sample.rate_cam_rad_s for sample in pair] for pair in pairs])
+    seconds = np.array([(after.t_ns - before.t_ns) / NS_PER_S for before, after in pairs])
+    turned = -to_rotation_vector(multiply(q[:, 1], conjugate(q[:, 0])))
+    by_rate = rates.mean(axis=1) * seconds[:, None]
+    return _ratio(turned, by_rate)
+
+
+def _ratio(turned: FloatArray, by_rate: FloatArray) -> float:
+    lengths, others = np.linalg.norm(turned, axis=1), np.linalg.norm(by_rate, axis=1)
+    turns = (lengths > MIN_TURN_RAD) & (others > 0)
+    if turns.sum() < MIN_INTERVALS:
+        return float("nan")
+    turned, by_rate, lengths, others = turned[turns], by_rate[turns], lengths[turns], others[turns]
+    cosines = (turned * by_rate).sum(axis=1) / (lengths * others)
+    return float(np.median(others / lengths)) if np.median(cosines) > MIN_COSINE else float("nan")

@@ -1,0 +1,124 @@
+"""The unit of a log's times, by its rates where it has them and by its own steps where not."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilstar.attitude.logs.entries import log_joins
+from hilstar.attitude.logs.log_file import open_log
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import run_hilstar_here
+from tests.support.sources.aem_messages import kvn
+
+RATE = np.radians([0.1, -0.3, 1.0])
+COUNT = 50
+
+
+def rows(step_s: float, rates: bool, scale: float = 1.0):
+    for k in range(COUNT):
+        turn = Rotation.from_rotvec(-RATE * step_s * k) * Rotation.from_euler("xyz", [10, 20, 30], degrees=True)
+        yield k * step_s, turn.as_quat(scalar_first=True).tolist(), (RATE * scale).tolist() if rates else None
+
+
+def written(tmp_path, kind: str, unit_s: float, step_s: float, rates: bool, scale: float = 1.0):
+    """A log whose times are written in a unit of `unit_s` seconds."""
+    path = tmp_path / f"a.{kind}"
+    if kind == "csv":
+        lines = ["t_s,qw,qx,qy,qz,rx,ry,rz"]
+        for t_s, q, rate in rows(step_s, rates, scale):
+            turning = ["", "", ""] if rate is None else map(repr, rate)
+            lines.append(",".join([repr(t_s / unit_s), *map(repr, q), *turning]))
+    else:
+        lines = []
+        for t_s, q, rate in rows(step_s, rates, scale):
+            lines.append(json.dumps({"t_ns": round(t_s / unit_s), "q": q} | ({"rate": rate} if rate else {})))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def notices(path) -> tuple[str, str]:
+    log = open_log(path)
+    return dict(log.told).get("log-times", ""), dict(log_joins(log.samples, log.told).told).get("log-rates", "")
+
+
+@pytest.mark.parametrize("step_s", [0.005, 0.02, 0.1])
+@pytest.mark.parametrize(("unit", "unit_s"), [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0), ("days", 86400.0)])
+def test_the_rates_of_a_csv_name_the_unit_of_its_times(tmp_path, unit, unit_s, step_s):
+    said, rates = notices(written(tmp_path, "csv", unit_s, step_s, rates=True))
+    assert said.startswith(f"the rates do not fit the times: probably the times are in {unit}")
+    assert said.endswith("; the format has s")
+    assert "probably" not in rates, "one cause is named, not two"
+
+
+@pytest.mark.parametrize(("unit", "unit_s"), [("us", 1e-6), ("ms", 1e-3), ("100 ns", 1e-7)])
+def test_the_rates_of_json_lines_name_the_unit_of_their_times(tmp_path, unit, unit_s):
+    said, _ = notices(written(tmp_path, "jsonl", unit_s, 0.02, rates=True))
+    assert f"the times are in {unit}" in said
+    assert said.endswith("; the format has ns")
+
+
+def test_rates_of_another_unit_are_named_where_the_times_would_be_odd(tmp_path):
+    said, _ = notices(written(tmp_path, "csv", 1.0, 0.02, rates=True, scale=1e3))
+    assert "probably the rates are in mrad/s" in said
+    said, _ = notices(written(tmp_path, "csv", 1e-3, 0.005, rates=True))
+    assert "the times are in ms, or the rates are in mrad/s" in said  # 5 s or 5 ms: both are a log's
+
+
+@pytest.mark.parametrize("rates", [False, True])
+@pytest.mark.parametrize(("kind", "unit_s"), [("csv", 1.0), ("jsonl", 1e-9)])
+def test_nothing_is_said_of_times_that_are_right(tmp_path, kind, unit_s, rates):
+    for step_s in (0.001, 0.02, 1.0):
+        assert notices(written(tmp_path, kind, unit_s, step_s, rates)) == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit_s", "limit"), [("csv", 1e-3, "over 10 s"), ("csv", 1e3, "under 0.1 ms"), ("jsonl", 1e-6, "under 0.1 ms")]
+)
+def test_without_rates_an_odd_step_is_told(tmp_path, kind, unit_s, limit):
+    said, _ = notices(written(tmp_path, kind, unit_s, 0.02 if unit_s != 1e3 else 0.05, rates=False))
+    assert limit in said
+    assert "a step of" in said
+
+
+def test_a_format_that_has_dates_is_not_asked(tmp_path):
+    path = tmp_path / "a.aem"
+    path.write_text(kvn([f"2026-01-01T00:{k:02}:00 0 0 0 1" for k in range(5)]))
+    assert notices(path) == ("", "")
+
+
+@pytest.mark.parametrize("command", ["replay", "attitude", "convert", "simulate", "send"])
+def test_every_command_that_reads_a_log_tells_of_an_odd_step(tmp_path, command):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(SMALL_BENCH)
+    log = written(tmp_path, "csv", 1e-3, 0.02, rates=False)
+    words = {
+        "replay": (bench, log, "--headless", "--speed", "max", "--step", "400"),
+        "attitude": (log,),
+        "convert": (log, tmp_path / "b.csv"),
+        "simulate": (bench, "--log", log, "--frames", "1", "-o", tmp_path / "out"),
+        "send": (log, "--to", "udp://127.0.0.1:9", "--wait", "0", "--count", "1"),
+    }
+    result = run_hilstar_here(command, *words[command])
+    assert result.returncode == 0, result.stderr
+    assert "the log is 980 s long: 50 attitudes, a step of 20 s (median), which is over 10 s" in result.stderr
+
+
+def test_a_replay_says_how_long_its_log_is(tmp_path):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(SMALL_BENCH)
+    log = written(tmp_path, "csv", 1.0, 0.02, rates=False)
+    result = run_hilstar_here("replay", bench, log, "--headless", "--speed", "max", "--step", "0.5")
+    assert "the log is 0.98 s long: 50 attitudes, a step of 0.02 s (median)\n" in result.stderr
+    assert "which is" not in result.stderr
+
+
+def test_a_csv_with_t_ns_is_refused_with_what_to_write(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t_ns,qw,qx,qy,qz\n0,1,0,0,0\n")
+    result = run_hilstar_here("attitude", path)
+    assert result.returncode == 2
+    assert "column t_ns: a CSV has its times in seconds; divide by 1e9, and write t_s,qw,qx,qy,qz" in result.stderr

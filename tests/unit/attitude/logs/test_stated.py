@@ -1,0 +1,214 @@
+"""What a user states of a log is used or refused by name: every format with every statement."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from scipy.spatial.transform import Rotation
+
+from hilstar.attitude.logs.entries import OPTIONS, Stated
+from hilstar.attitude.logs.log_file import FORMATS, LEDGER, check_stated, open_log, write_log
+from hilstar.attitude.logs.mcap_log import attitude_message, register_attitudes
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.attitude.wire.source import Convention, Mounting
+from hilstar.errors import InputError
+from tests.support.sources import ros_bags
+from tests.support.sources import spice_kernels as ck
+from tests.support.sources.aem_messages import kvn
+from tests.support.sources.ulog_files import ULogWriter
+
+ROUNDING = 1e-14  # of four products of unit quaternions
+TURNS = Rotation.from_euler("xyz", [[10, 20, 30 + k] for k in range(3)], degrees=True)
+QUATERNIONS = TURNS.as_quat(scalar_first=True)
+SAMPLES = [AttitudeSample(k * 10**9, q) for k, q in enumerate(QUATERNIONS)]
+MOUNTING = (0.5, -0.5, -0.5, -0.5)
+STATEMENTS = {
+    "mounting": Mounting(MOUNTING, by_option=True),
+    "kernels": (Path("no_such_file.tls"),),
+    "topic": "/other",
+    "body": "OTHER",
+    "reference": "ned",
+    "epoch_utc": "2024-01-01T00:00:00",
+    "place": (47.0, 8.0, 400.0),
+    "convention": Convention(direction="cam_to_icrs"),
+}
+
+
+def written(name: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        write_log(folder / name, SAMPLES)
+        return folder / name
+
+    return write
+
+
+def ledger(folder: Path) -> Path:
+    path = folder / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="hilstar")
+        writer.add_metadata("hilstar", {"run_id": "1", "part": "0"})
+        channel = register_attitudes(writer)
+        for sample in SAMPLES:
+            writer.add_message(channel, log_time=sample.t_ns, data=attitude_message(sample), publish_time=sample.t_ns)
+        writer.finish()
+    return path
+
+
+def aem(folder: Path) -> Path:
+    (folder / "a.aem").write_text(kvn([f"2026-01-01T00:00:0{k} 0 0 0 1" for k in range(3)], QUATERNION_TYPE="LAST"))
+    return folder / "a.aem"
+
+
+def oem(folder: Path) -> Path:
+    (folder / "a.oem").write_text("CCSDS_OEM_VERS = 2.0\n")
+    return folder / "a.oem"
+
+
+def bag(folder: Path) -> Path:
+    make = ros_bags.Make("humble")
+    sent = []
+    for k, (w, x, y, z) in enumerate(QUATERNIONS.tolist()):
+        sent.append(("/pose", ros_bags.IMU, k * 10**9 + 1, make.imu(k * 10**9 + 1, "cam", (w, -x, -y, -z), (0, 0, 0))))
+    return ros_bags.write_bag2(folder / "bag", sent, "humble")
+
+
+def ulog(folder: Path) -> Path:
+    log = ULogWriter(1_000_000)
+    log.topic("vehicle_attitude", 0)
+    for k, q in enumerate(QUATERNIONS.tolist()):
+        t_us = 2_000_000 + k * 100_000
+        log.add("vehicle_attitude", 0, timestamp=t_us, timestamp_sample=t_us, q=q, quat_reset_counter=0)
+    (folder / "a.ulg").write_bytes(log.data)
+    return folder / "a.ulg"
+
+
+def c_kernel(folder: Path) -> Path:
+    ck.write_texts(folder)
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, ck.Motion(np.random.default_rng(1)), np.arange(0.0, 5.0, 0.25))
+    return folder / "a.bc"
+
+
+# A file of each format, with what has to be stated of it to be read at all.
+LEVEL = Stated(reference="enu", place=(48.1, 11.6, 500.0), epoch_utc="2024-07-01T11:59:50")
+FILES: dict[str, tuple[Callable[[Path], Path], Stated]] = {
+    "CSV": (written("a.csv"), LEVEL),
+    "JSON lines": (written("a.jsonl"), LEVEL),
+    "MCAP": (written("a.mcap"), LEVEL),
+    LEDGER: (ledger, Stated()),
+    "a CCSDS AEM": (aem, Stated()),
+    "a CCSDS message": (oem, Stated()),
+    "a ROS bag": (bag, LEVEL),
+    "a ULog of PX4": (ulog, replace(LEVEL, reference=None)),
+    "a SPICE CK": (c_kernel, Stated()),
+}
+
+
+def attitudes(path: Path, stated: Stated) -> np.ndarray:
+    return np.array([sample.q_icrs_to_cam for sample in open_log(path, stated).samples])
+
+
+def test_every_format_and_every_statement_is_looked_at_here():
+    assert set(FILES) == {each.name for each in FORMATS}
+    assert set(STATEMENTS) == set(OPTIONS)
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("statement", OPTIONS)
+def test_a_statement_is_used_or_refused_by_name(tmp_path, name, statement):
+    make, needed = FILES[name]
+    path = make(tmp_path)
+    stated = replace(needed, **{statement: STATEMENTS[statement]})
+    own = next(each for each in FORMATS if each.name == name)
+    if statement not in own.uses:
+        with pytest.raises(InputError, match=f"{path}: {OPTIONS[statement]}: .*; leave it out"):
+            open_log(path, stated)
+        return
+    assert check_stated(path, stated) == own
+    try:
+        found = attitudes(path, stated)
+    except InputError as error:  # what it names is not there, or needs another statement beside it
+        said = str(error)
+        assert f"{OPTIONS[statement]} " in said or str(STATEMENTS[statement]) in said or "no_such_file" in said
+        return
+    if name == "a ULog of PX4" and statement == "reference":  # which it has anyway
+        return
+    assert not np.allclose(found, attitudes(path, needed), atol=1e-6), "it was stated, and changed nothing"
+
+
+@pytest.mark.parametrize("name", ["CSV", "JSON lines", "MCAP"])
+@pytest.mark.parametrize("statement", ["place", "epoch_utc"])
+def test_a_place_or_a_date_of_attitudes_in_the_icrs_is_refused(tmp_path, name, statement):
+    stated = Stated(**{statement: STATEMENTS[statement]})
+    with pytest.raises(InputError, match=f"{OPTIONS[statement]} is for attitudes that refer to a level frame"):
+        open_log(FILES[name][0](tmp_path), stated)
+
+
+@pytest.mark.parametrize("name", ["CSV", "JSON lines", "MCAP"])
+def test_a_mounting_of_the_command_says_that_a_log_is_the_bodys(tmp_path, name):
+    path = FILES[name][0](tmp_path)
+    found = Rotation.from_quat(attitudes(path, Stated(Mounting(MOUNTING, by_option=True))), scalar_first=True)
+    wanted = Rotation.from_quat(MOUNTING, scalar_first=True) * TURNS
+    assert (found * wanted.inv()).magnitude().max() < ROUNDING
+
+
+@pytest.mark.parametrize("name", ["CSV", "JSON lines", "MCAP"])
+def test_a_mounting_of_the_bench_file_that_turns_nothing_is_told(tmp_path, name):
+    log = open_log(FILES[name][0](tmp_path), Stated(Mounting(MOUNTING)))
+    assert "[tracker] q_body_to_cam does not turn these attitudes" in dict(log.told)["mounting"]
+    assert np.array_equal(log.samples[0].q_icrs_to_cam, QUATERNIONS[0])
+
+
+def test_a_mounting_where_the_file_says_the_cameras_is_refused(tmp_path):
+    path = tmp_path / "a.aem"
+    path.write_text(kvn([f"2026-01-01T00:00:0{k} 0 0 0 1" for k in range(3)], REF_FRAME_B="STARTRACKER_1"))
+    with pytest.raises(InputError, match="--mounting: its attitudes are the camera's own"):
+        open_log(path, Stated(Mounting(MOUNTING, by_option=True)))
+    assert not dict(open_log(path, Stated(Mounting(MOUNTING))).told)
+
+
+def test_what_a_bench_file_says_of_packets_is_not_done_to_a_ledger_again(tmp_path):
+    path = ledger(tmp_path)
+    other = Convention(scalar="last", direction="cam_to_icrs", frame="body")
+    by_bench = Stated(Mounting(MOUNTING), convention=other, convention_by="[attitude] convention")
+    log = open_log(path, by_bench)
+    assert np.array_equal([sample.q_icrs_to_cam for sample in log.samples], QUATERNIONS)
+    assert not log.told
+    with pytest.raises(InputError, match=r"\[attitude\] convention: a CCSDS AEM has a convention of its own"):
+        open_log(aem(tmp_path), by_bench)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 0, 1, 2), (1, 2, 3, 0)])
+def test_the_columns_of_a_csv_are_told_by_name_or_in_their_order(tmp_path, order):
+    names = [("qw", "qx", "qy", "qz")[k] for k in order]
+    rows = [[repr(float(q[k])) for k in order] for q in QUATERNIONS]
+    path = tmp_path / "a.csv"
+    lines = [f"{k},{','.join(row)}" for k, row in enumerate(rows)]
+    path.write_text("\n".join([f"t_s,{','.join(names)}", *lines]))
+    assert np.array_equal(attitudes(path, Stated()), QUATERNIONS)
+    last = [repr(float(c)) for c in TURNS[0].as_quat()]  # x, y, z, w
+    path.write_text(f"t_s,{','.join(names)}\n0,{','.join(last)}\n")
+    assert np.array_equal(attitudes(path, Stated(convention=Convention(scalar="last")))[0], QUATERNIONS[0])
+
+
+@pytest.mark.parametrize("scalar", ["first", "last"])
+@pytest.mark.parametrize("direction", ["icrs_to_cam", "cam_to_icrs"])
+@pytest.mark.parametrize("frame", ["cam", "body"])
+def test_json_lines_of_each_convention(tmp_path, scalar, direction, frame):
+    rate, to_cam = np.array([0.01, -0.02, 0.03]), Rotation.from_quat(MOUNTING, scalar_first=True)
+    turn, own = (TURNS[0], rate) if frame == "cam" else (to_cam.inv() * TURNS[0], to_cam.inv().apply(rate))
+    sent = turn if direction == "icrs_to_cam" else turn.inv()
+    row = {"t_ns": 0, "q": sent.as_quat(scalar_first=scalar == "first").tolist(), "rate": own.tolist()}
+    path = tmp_path / "a.jsonl"
+    path.write_text(json.dumps(row) + "\n")
+    convention = Convention(scalar=scalar, direction=direction, frame=frame)
+    (sample,) = open_log(path, Stated(Mounting(MOUNTING), convention=convention)).samples
+    assert (Rotation.from_quat(sample.q_icrs_to_cam, scalar_first=True) * TURNS[0].inv()).magnitude() < ROUNDING
+    assert sample.rate_cam_rad_s == pytest.approx(rate, abs=ROUNDING)

@@ -58,6 +58,7 @@ class _Kind:
     last_ns: int = 0
     unsaid: int = 0
     recorded: int = 0
+    detail: str = ""
 
     def words(self, notice: Notice) -> str | None:
         """What to say of one more; None where it is only counted."""
@@ -99,6 +100,7 @@ class Notices:
         with self._lock:
             self._counts[kind] += 1
             known = self._kinds.setdefault(kind, _Kind(deque(maxlen=MAX_SAID)))
+            known.detail = notice.detail
             words = known.words(notice)
             recorded = words is not None or known.recorded < MAX_RECORDED or bool(who) or kind in ALWAYS_RECORDED
             known.recorded += recorded
@@ -154,6 +156,11 @@ class Notices:
         """The kinds that have begun and not ended, with what was told of each."""
         with self._lock:
             return dict(self._active)
+
+    def latest(self, kind: str) -> str:
+        """What was told last of a kind; "" for one that never came."""
+        with self._lock:
+            return self._kinds[kind].detail if kind in self._kinds else ""
 
     def counts(self) -> dict[str, int]:
         """How often each kind came."""

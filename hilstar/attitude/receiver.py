@@ -129,10 +129,22 @@ class BackChannel:
 
 @dataclass(slots=True)
 class PacketCounts:
-    """How many attitude messages arrived, and how many of those were refused, by reason."""
+    """How many attitude messages arrived, and how many of those were refused, by reason.
+
+    `shown` is what was sent instead, by reason, where the bytes of the first refused message showed it.
+    """
 
     received: int = 0
     refused_by: dict[wire.Reason, int] = field(default_factory=lambda: dict.fromkeys(wire.REASONS, 0))
+    shown: dict[wire.Reason, str] = field(default_factory=dict)
+
+    def refuse(self, refusal: wire.Refusal) -> bool:
+        """Count a refused message; True for the first of its reason."""
+        self.refused_by[refusal.reason] += 1
+        first = self.refused_by[refusal.reason] == 1
+        if first and refusal.telling:
+            self.shown[refusal.reason] = refusal.detail
+        return first
 
     @property
     def refused(self) -> int:
@@ -338,8 +350,7 @@ class Receiver:
             self._notices.tell("jump", f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream continues")
 
     def _refuse(self, arrival: Arrival[wire.Event], refusal: wire.Refusal) -> None:
-        self.counts.refused_by[refusal.reason] += 1
-        if self.counts.refused_by[refusal.reason] == 1:
+        if self.counts.refuse(refusal):
             line = f"packet refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
             self._notices.mention("refused", line)
         sample = arrival.event if isinstance(arrival.event, wire.AttitudeSample) else None

@@ -187,7 +187,7 @@ def serve(
             summary = serve_stream(bench, link, limit, fed[0], outlet)
     running.end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, notices, as_json)
     if not summary.packets.accepted:
-        say(without_attitude(link.endpoint, summary.packets))
+        say(without_attitude(link.endpoint, summary.packets, link.trouble))
         raise typer.Exit(NO_ATTITUDE)
 
 

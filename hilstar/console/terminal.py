@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import msgspec
 import typer
+from msgspec import UNSET
 
 from hilstar.errors import one_line
 
@@ -107,12 +108,14 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         typer.echo(f"{name:20}{line}")
 
 
-def without_attitude(endpoint: str, packets: "PacketSummary") -> str:
-    """Why a run had no attitude, and what to change."""
+def without_attitude(endpoint: str, packets: "PacketSummary", trouble: str = "") -> str:
+    """Why a run had no attitude, and what to change; `trouble` is what its link knows of the other side."""
     if not packets.received:
-        return f"no attitude came from {endpoint}; start the sender, and check its address"
+        advice = trouble.removeprefix(f"{endpoint}: ") or "start the sender, and check its address"
+        return f"no attitude came from {endpoint}; {advice}"
     reasons = [(count, reason) for reason, count in packets.refused_by.items() if count]
-    told = "; ".join(f"{count} for {reason}: {INSTEAD[reason]}" for count, reason in sorted(reasons, reverse=True))
+    shown = INSTEAD if packets.shown is UNSET else {**INSTEAD, **packets.shown}
+    told = "; ".join(f"{count} for {reason}: {shown[reason]}" for count, reason in sorted(reasons, reverse=True))
     return f"all {packets.refused} packets from {endpoint} were refused, {told}"
 
 

@@ -93,4 +93,9 @@ def first_attitude(link: StreamLink, patience_s: float) -> AttitudeSample:
                     back(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
                 case Refusal(reason, detail):
                     refused = f"; the last message was refused ({reason}: {detail})"
-    raise InputError(f"{link.endpoint}: no attitude within {patience_s:g} s{refused}; start the sender, or give --wait S")
+    nothing = f"{link.endpoint}: no attitude within {patience_s:g} s"
+    if refused:
+        raise InputError(f"{nothing}{refused}")
+    if link.trouble:
+        raise InputError(f"{nothing}; {link.trouble.removeprefix(f'{link.endpoint}: ')}")
+    raise InputError(f"{nothing}; start the sender, or give --wait S")

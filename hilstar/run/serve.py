@@ -228,11 +228,9 @@ class LockstepRun:
             refusal = rate_refusal(self._rates.believed(sample), self._max_rate_rad_s)
         elif refusal is None:
             refusal = Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
-        if refusal is not None:
-            self.counts.refused_by[refusal.reason] += 1
-            if self.counts.refused_by[refusal.reason] == 1:
-                line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
-                self._loop.notices.mention("refused", line)
+        if refusal is not None and self.counts.refuse(refusal):
+            line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
+            self._loop.notices.mention("refused", line)
         shown = None
         if refusal is None and sample is not None:
             attitude = Attitude(

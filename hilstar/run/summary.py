@@ -17,12 +17,13 @@ from hilstar.units import NS_PER_MS
 
 
 class PacketSummary(msgspec.Struct, frozen=True):
-    """Packets of a run, those refused by reason."""
+    """Packets of a run, those refused by reason; `shown` is what was sent instead, where its bytes show that."""
 
     received: int
     accepted: int
     refused: int
     refused_by: dict[Reason, int]
+    shown: dict[Reason, str] | UnsetType = UNSET
 
 
 class StarSummary(msgspec.Struct, frozen=True):
@@ -139,7 +140,9 @@ class RunTally:
             fps=self.frames / duration_s if duration_s > 0 else None,
             frame_ms=self._frame_ms.percentiles(),
             attitude_age_ms=self._age_ms.percentiles(),
-            packets=PacketSummary(counts.received, counts.received - counts.refused, counts.refused, refused_by),
+            packets=PacketSummary(
+                counts.received, counts.received - counts.refused, counts.refused, refused_by, counts.shown or UNSET
+            ),
             stars_drawn=StarSummary(self._stars.mean, int(self._stars.max) if self.frames else None),
             clipped=ClippedSummary(self._clipped_max, stars, bodies),
             missed_frames=self.missed_frames,

@@ -10,9 +10,10 @@ Laws of the byte stream, whose frames are each followed by 0x00:
 1. However the bytes are cut into chunks, the events are the same.
 2. A frame is accepted only if `decode` accepts its content, so never with a wrong CRC-32.
 3. Whatever came before, the next complete frame after a 0x00 is decoded.
-4. At most MAX_FRAME_BYTES are kept between chunks: a sender that never sends 0x00 costs one refusal for each stretch
+4. At most MAX_KEPT_BYTES are kept between chunks: a sender that never sends 0x00 costs one refusal for each stretch
    of garbage, and no memory.
-5. The bytes before the stream's first 0x00 may be the end of a frame: they count only if they are a complete one.
+5. The bytes before the stream's first 0x00 may be the end of a frame: they count only if they are a complete one, or too many
+   for any.
 6. Passing over a frame undecoded loses nothing of the next.
 
 The layout is that of firmware_protocol/protocol.toml.
@@ -30,6 +31,7 @@ import msgspec
 from cobs import cobs
 
 from hilstar.attitude.wire import protocol
+from hilstar.attitude.wire.likeness import Likeness, frame_likeness, likeness, numbers_likeness, packet_likeness
 from hilstar.attitude.wire.protocol import FASTEST_RAD_S, NORM_TOLERANCE, VERSION
 
 if TYPE_CHECKING:
@@ -40,6 +42,8 @@ ATTITUDE_HEAD = bytes([VERSION, protocol.KIND_ATTITUDE])
 MAX_JSON_BYTES = 4096
 INT64 = range(-(2**63), 2**63)
 U32 = 2**32
+MESSAGE_FORM = f"send an attitude of {protocol.ATTITUDE_BYTES} bytes or a JSON object"
+FRAME_FORM = f"send attitudes of {protocol.ATTITUDE_BYTES} bytes as COBS frames, each followed by 0x00"
 JSON_FORM = '{"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]}'
 UNIT = 1e-15  # this close, dividing by the norm would only move the last bit
 
@@ -53,6 +57,7 @@ RATE_ROUNDING = 1e-6  # a packet's rate is float32
 DELIMITER = b"\x00"
 # COBS adds one byte to anything shorter than 254. Only packets are framed: JSON goes over ZeroMQ.
 MAX_FRAME_BYTES = max(protocol.PACKET_BYTES.values()) + 1
+MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES  # of bytes without a 0x00: enough to hold a whole frame wherever they begin
 FLAGS_AT = 3  # in an attitude's frame, behind the COBS byte, version and kind, of which none is 0
 
 
@@ -77,10 +82,14 @@ class AttitudeSample:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a message is not used as an attitude."""
+    """Why a message is not used as an attitude.
+
+    `telling`: the bytes show what was sent in an attitude's place, and `detail` says it with what to send.
+    """
 
     reason: Reason
     detail: str
+    telling: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,15 +180,26 @@ def decode(message: bytes) -> Event:
     """Decode one message: a packet's bytes, or an attitude as a JSON object."""
     if message[:1] == b"{" or message[:16].lstrip()[:1] == b"{":
         return _decode_json(message)
+    return _decode_packet(message, MESSAGE_FORM)
+
+
+def _decode_packet(message: bytes, form: str) -> Event:
+    """Decode a packet's bytes; `form` is what is expected on its road."""
     head = (message[0], message[1]) if len(message) > 1 else (-1, -1)
     size = protocol.PACKET_BYTES.get(head[1]) if head[0] == VERSION else None
     if len(message) not in {size, protocol.ATTITUDE_BYTES}:
-        return Refusal("format", f"{len(message)} bytes; send an attitude of {protocol.ATTITUDE_BYTES} bytes or a JSON object")
+        return named_refusal("format", f"{len(message)} bytes", likeness(message), form)
     if CRC.unpack_from(message, len(message) - CRC.size)[0] != zlib.crc32(message[: -CRC.size]):
-        return Refusal("crc", "the CRC-32 does not match the packet")
+        detail, found = "the CRC-32 does not match the packet", packet_likeness(message)
+        return Refusal("crc", detail) if found is None else named_refusal("crc", detail, found, form)
     if len(message) != size:
         return Refusal("format", f"version {head[0]}, kind {head[1]}; send version {VERSION}, kind 1")
     return _decode_body(head[1], message)
+
+
+def named_refusal(reason: Reason, detail: str, found: Likeness, form: str) -> Refusal:
+    """The refusal of a message that looks like something else."""
+    return Refusal(reason, f"{detail}: {found.what}; {found.instead or form}", telling=True)
 
 
 def declares_discontinuity(message: bytes) -> bool:
@@ -205,7 +225,10 @@ def _decode_body(kind: int, message: bytes) -> Event:
         return AnswerPacket(sequence, flags, t_ns, tuple(numbers[:4]), tuple(numbers[4:7]), numbers[7])
     _, _, flags, sequence, t_ns, w, x, y, z, *rate = protocol.ATTITUDE_BODY.unpack_from(message)
     known_rate = tuple(rate) if flags & protocol.FLAG_RATE_VALID else None
-    return checked_sample(t_ns, (w, x, y, z), known_rate, sequence, bool(flags & protocol.FLAG_DISCONTINUITY))
+    event = checked_sample(t_ns, (w, x, y, z), known_rate, sequence, bool(flags & protocol.FLAG_DISCONTINUITY))
+    if isinstance(event, Refusal) and (found := numbers_likeness(message)) is not None:
+        return named_refusal(event.reason, event.detail, found, MESSAGE_FORM)
+    return event
 
 
 def checked_sample(
@@ -273,6 +296,11 @@ class StreamDecoder:
         self._overlong = False
         self._synchronised = False
 
+    @property
+    def unended(self) -> bytes:
+        """The bytes since the last 0x00, which are no frame yet; none where they were refused already."""
+        return bytes(self._kept)
+
     def feed(self, chunk: bytes) -> list[tuple[Event, bytes]]:
         """The events that `chunk` completes, in order, each with its bytes as they came."""
         return [(decode_frame(frame), frame) for frame in self.frames(chunk)]
@@ -287,35 +315,44 @@ class StreamDecoder:
         body, overlong, whole = bytes(self._kept), self._overlong, self._synchronised
         self._kept.clear()
         self._overlong, self._synchronised = False, True
+        whole = whole or len(body) > MAX_FRAME_BYTES
         if body and not overlong and (whole or not isinstance(decode_frame(body), Refusal)):
             found.append(body)
         rest = others.pop()
-        found += [frame[: MAX_FRAME_BYTES + 1] for frame in others if frame]
+        found += [frame[: MAX_KEPT_BYTES + 1] for frame in others if frame]
         self._keep(rest, found)
         return found
 
     def _keep(self, part: bytes, found: list[bytes]) -> None:
         if self._overlong:
             return
-        self._kept += part[: MAX_FRAME_BYTES + 1 - len(self._kept)]
-        if len(self._kept) > MAX_FRAME_BYTES:
+        self._kept += part[: MAX_KEPT_BYTES + 1 - len(self._kept)]
+        if len(self._kept) > MAX_KEPT_BYTES:
             self._overlong = True
-            if self._synchronised:
-                found.append(bytes(self._kept))
+            found.append(bytes(self._kept))
             self._kept.clear()
 
 
 def decode_frame(body: bytes) -> Event:
     """What a frame says, or why it says nothing."""
     if len(body) > MAX_FRAME_BYTES:
-        return Refusal("format", f"no 0x00 within {MAX_FRAME_BYTES} bytes; send COBS frames, each followed by 0x00")
+        return named_refusal("format", f"no 0x00 within {MAX_FRAME_BYTES} bytes", frame_likeness(body), FRAME_FORM)
     try:
         message = cobs.decode(body)
     except cobs.DecodeError as error:
-        return Refusal("format", f"not COBS ({error})")
+        return named_refusal("format", f"not COBS ({error})", frame_likeness(body), f"{FRAME_FORM}, at this line's baud rate")
     if message.lstrip()[:1] == b"{":
-        return Refusal("format", f"a frame that starts with {message[:1]!r}; send JSON over ZeroMQ")
-    return decode(message)
+        return Refusal("format", f"a frame that starts with {message[:1]!r}; send JSON over ZeroMQ or UDP", telling=True)
+    event = _decode_packet(message, FRAME_FORM)
+    if isinstance(event, Refusal) and event.reason == "format" and (found := frame_likeness(body)).known:
+        return named_refusal("format", f"{len(message)} bytes", found, FRAME_FORM)
+    return event
+
+
+def unended_line(data: bytes) -> str:
+    """Why bytes of a serial line gave no packet, though no frame of theirs has ended."""
+    found = frame_likeness(data)
+    return f"{len(data)} bytes came, and no frame ended: {found.what}; {found.instead or FRAME_FORM}"
 
 
 def frame_declares_discontinuity(body: bytes) -> bool:

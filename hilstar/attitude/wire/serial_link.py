@@ -13,6 +13,7 @@ from serial.tools import list_ports
 
 from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import ReaderProcess
+from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, unframed_packet
 from hilstar.attitude.wire.links import Arrival, RawMessage, StreamLink
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.errors import InputError, one_line
@@ -86,7 +87,7 @@ class SerialLink(StreamLink):
         self.endpoint = f"serial:{port}@{baud}"
         self._port, self._baud = port, baud
         self._reopened = 0
-        self._decoder = wire.StreamDecoder()
+        self._decoder, self._recent = wire.StreamDecoder(), b""
         self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
         try:
             self._device: serial.Serial | None = self._open()
@@ -97,6 +98,12 @@ class SerialLink(StreamLink):
     def reconnects(self) -> int:
         """How often the device came back."""
         return self._reopened
+
+    @property
+    def trouble(self) -> str:
+        """See `Link.trouble`: the bytes that came, and are no frame."""
+        unended = self._decoder.unended
+        return f"{self.endpoint}: {wire.unended_line(unended)}" if unended else ""
 
     def _open(self) -> serial.Serial:
         self._decoder = wire.StreamDecoder()
@@ -115,11 +122,20 @@ class SerialLink(StreamLink):
             return []
         waiting: list[RawMessage] = []
         for chunk in chunks:
+            self._recent = (self._recent + chunk.parts[0])[-MAX_LOOKED_AT:]
             bodies = self._decoder.frames(chunk.parts[0])
             for k, body in enumerate(bodies, 1):  # frames before the chunk's last were there earlier, and waited for it
                 waiting.append(chunk._replace(parts=[body], timely=chunk.timely and k == len(bodies)))
         taken = self._gate.newest(waiting, wire.frame_declares_discontinuity)
-        return [Arrival(each.host_ns, self._decode(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
+        return [Arrival(each.host_ns, self._event(each.parts[0]), each.parts[0], each.waited_ns) for each in taken]
+
+    def _event(self, body: bytes) -> wire.Event:
+        """What a frame says. One that says nothing may be a piece of a packet that was not framed, cut at its zeros."""
+        event = self._decode(body)
+        if not isinstance(event, wire.Refusal) or event.reason != "format":
+            return event
+        unframed = unframed_packet(self._recent)
+        return event if unframed is None else wire.named_refusal("format", "not COBS", unframed, wire.FRAME_FORM)
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
         if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr

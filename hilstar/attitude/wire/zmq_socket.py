@@ -21,10 +21,12 @@ import zmq
 
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
 from hilstar.attitude.wire.keys import NO_KEYS, AllowList, CurveKeys, check_reach, load_public, load_secret
-from hilstar.attitude.wire.links import PAUSE_S, Link, LinkCounts
+from hilstar.attitude.wire.links import PAUSE_S, WRONG_PEER, Link, LinkCounts
+from hilstar.attitude.wire.zmq_peer import PeerLook
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
@@ -39,11 +41,13 @@ MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
 FEW_EVENTS = 50
 EVENT = struct.Struct("=Hi")  # zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
 HANDSHAKE_MS = 2000
+LEFT_EARLY = f"it left before its handshake, as another type of ZeroMQ socket does, or did not finish it within {HANDSHAKE_MS / 1000:g} s"
 FAILED = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "its key is not among those allowed",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "it is another type of ZeroMQ socket, or it has no keys",
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: f"it left, or did not finish its handshake within {HANDSHAKE_MS / 1000:g} s",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: LEFT_EARLY,
 }
+HANDSHAKE_NS = HANDSHAKE_MS * NS_PER_MS
 EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | sum(FAILED)
 # At most QUEUE_MESSAGES of a flood wait here; the rest wait at the sender or are lost there. A part over MAX_PART_BYTES drops
 # its connection, which is then made anew. Of a message of more than MAX_PARTS the rest is passed over, for other senders' wait
@@ -121,15 +125,26 @@ class _Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
     `lost` says that a connection has ended; the code that acts on it resets it. `place` is the port or path that was bound.
+    A connection that ends before its handshake was with no partner: `look` finds out what is there, None where we bind.
     """
 
     def __init__(
-        self, watched: zmq.Socket[bytes], *, bound: bool, counts: LinkCounts, notices: Notices, clock: HostClock = HOST_CLOCK
+        self,
+        watched: zmq.Socket[bytes],
+        *,
+        look: PeerLook | None,
+        counts: LinkCounts,
+        notices: Notices,
+        clock: HostClock = HOST_CLOCK,
     ) -> None:
         self.lost = False
         self.place: int | str = ""
-        self._watched, self._bound, self._counts, self._notices, self._clock = watched, bound, counts, notices, clock
+        self._watched, self._look, self._counts, self._notices, self._clock = watched, look, counts, notices, clock
+        self._bound = look is None
+        self._greeted = False  # whether the connection that we made had its handshake
         self._open: dict[int, str] = {}  # file descriptor: peer, in the order of arrival
+        # Those whose handshake is not known to have ended. libzmq names no peer of one that succeeded: the oldest is taken.
+        self._ungreeted: dict[int, int] = {}  # file descriptor: when it was accepted, host ns
         self._shut: set[int] = set()
         self._failure = ""
         self.monitor = watched.get_monitor_socket(EVENTS)
@@ -143,6 +158,7 @@ class _Doorkeeper:
                 events += 1
         if self._bound and len(self._open) > MAX_CONNECTIONS:
             self._shut_newest()
+        self._tell_look()
         if events > FEW_EVENTS:
             self._clock.sleep(PAUSE_S)
 
@@ -151,12 +167,16 @@ class _Doorkeeper:
             self._counts.connections += 1
             self._open.pop(value, None)
             self._open[value] = ""
+            self._ungreeted[value] = self._clock.now_ns()
             with _connection(value) as connection:
                 name = () if connection is None else connection.getpeername()
                 self._open[value] = f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
         elif event == zmq.EVENT_DISCONNECTED:
             self._leave(value)
-        elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED and not self._bound:
+        elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED and self._bound:
+            self._ungreeted.pop(next(iter(self._ungreeted), -1), None)
+        elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            self._greeted = True
             self._counts.connections += 1
             if self._counts.connections > 1:
                 self._notices.tell("back", "reconnected to the sender")
@@ -168,19 +188,28 @@ class _Doorkeeper:
     def _leave(self, file: int) -> None:
         self.lost = True
         who, failure = self._open.pop(file, ""), self._failure
-        self._failure = ""
+        greeted, self._failure, self._greeted = self._greeted, "", False
+        accepted_ns = self._ungreeted.pop(file, None)
+        if accepted_ns is not None and not failure and self._clock.now_ns() - accepted_ns < HANDSHAKE_NS:
+            failure = LEFT_EARLY
         if file in self._shut:
             self._shut.remove(file)
         elif failure and self._bound:
             self._counts.rejected += 1
             self._notices.tell("client-rejected", f"a connection from {who or 'an unknown peer'} was rejected: {failure}")
-        elif failure:
+        elif self._look is None:
+            pass
+        elif failure or not greeted:
             self._counts.rejected += 1
-            advice = "check its allowed_clients, and our curve_server_key"
-            self._notices.tell("link-rejected", f"the other side rejected us: {advice}")
-        elif not self._bound:
+            self._look.begin()
+        else:
             self._counts.lost += 1
             self._notices.tell("lost", "lost the connection to the sender; waiting for it")
+
+    def _tell_look(self) -> None:
+        found = "" if self._look is None else self._look.take()
+        if found:
+            self._notices.tell(WRONG_PEER, found)
 
     def _shut_newest(self) -> None:
         newest = [file for file in list(self._open)[MAX_CONNECTIONS:] if file not in self._shut]
@@ -282,7 +311,9 @@ class ZmqSocket(Link):
         made: zmq.Socket[bytes] = self._context.socket(self._kind)
         self._configure(made)
         self._socket = made
-        self._keeper = _Doorkeeper(made, bound=self._bind, counts=self.link_counts, notices=self._notices, clock=self._clock)
+        kind = zmq.SocketType(self._kind).name
+        look = None if self._bind else PeerLook(self._address, kind, keys=self._pair is not None)
+        self._keeper = _Doorkeeper(made, look=look, counts=self.link_counts, notices=self._notices, clock=self._clock)
         self._poller = zmq.Poller()
         self._poller.register(made, zmq.POLLIN)
         self._poller.register(self._keeper.monitor, zmq.POLLIN)

@@ -1,0 +1,62 @@
+"""What is said of a serial line whose bytes are no packets."""
+
+import os
+import pty
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from hilstar.attitude.wire.serial_link import SerialApart, SerialLink
+from hilstar.errors import InputError
+from hilstar.run.open_link import first_attitude
+
+BAUD = 115_200
+WITHIN_S = 20.0
+POLL_MS = 50
+
+
+@contextmanager
+def line() -> Iterator[tuple[int, str]]:
+    master, slave = pty.openpty()
+    tty.setraw(master)
+    tty.setraw(slave)
+    try:
+        yield master, os.ttyname(slave)
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+@pytest.mark.parametrize("kind", [SerialLink, SerialApart])
+def test_a_text_shorter_than_a_frame_is_told_as_text(kind: type[SerialLink]) -> None:
+    with line() as (master, name), kind(name, BAUD) as link:
+        assert link.trouble == ""
+        os.write(master, b"tick 12\r\n")
+        end_s = time.monotonic() + WITHIN_S
+        while not link.trouble and time.monotonic() < end_s:
+            assert link.receive(POLL_MS) == []
+        assert "9 bytes came, and no frame ended: text, 'tick 12" in link.trouble
+        assert "0x00" in link.trouble
+
+
+def test_the_wait_for_an_attitude_says_what_came_instead() -> None:
+    with line() as (master, name), SerialLink(name, BAUD) as link:
+        os.write(master, b"tick 12\r\n")
+        with pytest.raises(InputError, match="text, 'tick 12") as refused:
+            first_attitude(link, 0.5)
+        assert "start the sender" not in str(refused.value)
+
+
+def test_a_long_text_is_a_refused_message() -> None:
+    with line() as (master, name), SerialLink(name, BAUD) as link:
+        os.write(master, b"RA 84.057 Dec -1.200\r\n" * 20)
+        with pytest.raises(InputError, match=r"no 0x00 within \d+ bytes: text, 'RA 84.057"):
+            first_attitude(link, 0.5)
+
+
+def test_a_silent_line_is_a_sender_that_did_not_start() -> None:
+    with line() as (_, name), SerialLink(name, BAUD) as link, pytest.raises(InputError, match="start the sender"):
+        first_attitude(link, 0.2)

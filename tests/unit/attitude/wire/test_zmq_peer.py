@@ -1,0 +1,120 @@
+"""What is said of the other side of a ZeroMQ connection that is no sender's."""
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+import zmq
+
+from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
+from hilstar.notices import Notices
+
+WITHIN_S = 20.0  # a silent peer takes 3 s; a busy machine is slower
+POLL_MS = 50
+
+
+@contextlib.contextmanager
+def zmq_peer(kind: int, *, curve: bool = False) -> Iterator[str]:
+    with zmq.Context() as context, context.socket(kind) as made:
+        made.linger = 0
+        if curve:
+            made.curve_publickey, made.curve_secretkey = zmq.curve_keypair()
+            made.curve_server = True
+        port = made.bind_to_random_port("tcp://127.0.0.1")
+        yield f"tcp://127.0.0.1:{port}"
+
+
+@contextlib.contextmanager
+def plain_peer(answer: bytes) -> Iterator[str]:
+    """A TCP server that answers with these bytes and closes; without any it says nothing."""
+    connections: list[socket.socket] = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    made, _ = listener.accept()
+                    connections.append(made)
+                    if answer:
+                        made.recv(64)
+                        made.sendall(answer)
+                        made.close()
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+        listener.shutdown(socket.SHUT_RDWR)
+    for made in connections:
+        made.close()
+
+
+def trouble_at(endpoint: str, *, apart: bool = False) -> tuple[str, Notices]:
+    """What the link knows of its other side, as soon as it knows something."""
+    notices = Notices()
+    receiver = ZmqReceiver(endpoint, notices=notices)
+    with ZmqApart(receiver, notices) if apart else receiver as link:
+        end_s = time.monotonic() + WITHIN_S
+        while not link.trouble and time.monotonic() < end_s:
+            link.receive(POLL_MS)
+        return link.trouble, notices
+
+
+@pytest.mark.parametrize("kind", ["PUSH", "DEALER", "PAIR", "REP", "ROUTER", "SUB"])
+def test_another_type_of_socket_is_named_and_no_connection_called_lost(kind: str) -> None:
+    with zmq_peer(getattr(zmq, kind)) as endpoint:
+        trouble, notices = trouble_at(endpoint)
+    assert f"a {kind} socket is there" in trouble
+    assert "PUB socket" in trouble
+    assert "lost" not in notices.counts()
+
+
+def test_the_reading_process_says_it_too() -> None:
+    with zmq_peer(zmq.PUSH) as endpoint:
+        trouble, _ = trouble_at(endpoint, apart=True)
+    assert "a PUSH socket is there" in trouble
+
+
+@pytest.mark.parametrize("kind", ["PUB", "PUSH"])
+def test_a_peer_that_asks_for_keys_is_named(kind: str) -> None:
+    with zmq_peer(getattr(zmq, kind), curve=True) as endpoint:
+        trouble, _ = trouble_at(endpoint)
+    assert "it asks for keys (CURVE), and we have none" in trouble
+    assert "allowed_clients" not in trouble
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (b"HTTP/1.0 400 Bad Request\r\n\r\n", "HTTP"),
+        (b"220 bench FTP server ready\r\n", "text, '220 bench"),
+        (b"", "says nothing"),
+    ],
+)
+def test_what_is_no_zeromq_is_named(answer: bytes, words: str) -> None:
+    with plain_peer(answer) as endpoint:
+        trouble, _ = trouble_at(endpoint)
+    assert words in trouble
+
+
+def test_a_sender_is_no_trouble_and_nobody_is_neither() -> None:
+    with zmq_peer(zmq.PUB) as endpoint, ZmqReceiver(endpoint) as link:
+        end_s = time.monotonic() + WITHIN_S
+        while not link.link_counts.connections and time.monotonic() < end_s:
+            link.receive(POLL_MS)
+        assert link.link_counts.connections == 1
+        assert link.trouble == ""
+
+
+def test_another_type_of_socket_that_connects_to_ours_is_rejected_in_words() -> None:
+    notices = Notices()
+    with ZmqReceiver("tcp://127.0.0.1:*", bind=True, notices=notices) as link:
+        link.receive(POLL_MS)
+        with zmq.Context() as context, context.socket(zmq.PUSH) as made:
+            made.linger = 0
+            made.connect(link.endpoint)
+            end_s = time.monotonic() + WITHIN_S
+            while not notices.latest("client-rejected") and time.monotonic() < end_s:
+                link.receive(POLL_MS)
+    assert "another type of ZeroMQ socket" in notices.latest("client-rejected")

@@ -35,6 +35,13 @@ if TYPE_CHECKING:
     from hilstar.run.sync import BeatSummary
 
 UTC_MARK = "{utc}"  # stands for the time in a ledger's name
+Strict = Annotated[
+    bool,
+    Option(
+        "--strict",
+        help="Exit with 1 where over 1 % of the frames were missed or stale, or a wrong sky was shown for any time.",
+    ),
+]
 Windowed = Annotated[bool, Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
     bool,
@@ -258,10 +265,17 @@ def run_with_faults(
         yield faults
 
 
-def end_of_run(summary: "RunSummary", screen: Any, ledger: "LedgerSwitch", notices: Notices, as_json: bool) -> None:
-    """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed.
+def end_of_run(
+    summary: "RunSummary",
+    screen: Any,
+    ledger: "LedgerSwitch",
+    notices: Notices,
+    as_json: bool,
+    strict: bool = False,
+) -> None:
+    """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed, or the run is not `strict`.
 
-    Raises MachineError where the window went away or the GPU was lost.
+    Raises MachineError where the window went away or the GPU was lost. A run without an attitude is the caller's.
     """
     if ledger.last is not None:
         summary = msgspec.structs.replace(summary, ledger=ledger.last.summary())
@@ -269,7 +283,9 @@ def end_of_run(summary: "RunSummary", screen: Any, ledger: "LedgerSwitch", notic
     if screen is not None and screen.window.gone is not None:
         raise MachineError(f"the run ended early: {screen.window.gone}")
     refuse_lost_gpu(notices)
-    if ledger.failure is not None:
+    had_attitude = summary.frames > summary.blank_frames or summary.packets.accepted > 0
+    passed = not strict or not had_attitude or not summary.verdict or summary.verdict.strict
+    if ledger.failure is not None or not passed:
         raise typer.Exit(1)
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.clock.rate_check import OTHER_AXES, RIGHT, WRONG, RateCheck
+from hilstar.attitude.clock.rate_causes import OTHER_AXES
+from hilstar.attitude.clock.rate_check import RIGHT, WRONG, RateCheck
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.notices import Notices
 from hilstar.rotation import conjugate, from_radec_roll_deg, from_rotation_vectors, multiply

@@ -12,6 +12,7 @@ from typing import Literal
 from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter, KnownClockFilter
 from hilstar.attitude.clock.losses import LossCount, TimeUnit
 from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
+from hilstar.attitude.clock.resolution import Resolution
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
 from hilstar.attitude.clock.senders import Repeats, Senders
 from hilstar.attitude.clock.timeline import Timeline
@@ -185,7 +186,7 @@ class Receiver:
         self._watch = watch
         self._repeats = Repeats(self._notices)
         self._rates = RateCheck(wrong_rates, self._notices)
-        self._unit = TimeUnit(self._notices)
+        self._unit, self._resolution = TimeUnit(self._notices), Resolution(self._notices.tell)
         self._losses, self._tell_lost = LossCount(), lost
         self._lost_told = self._lost_before = self._lost_look_ns = 0
         self._senders = Senders(timeline.policy.stale_after_ns, self._notices)
@@ -310,6 +311,7 @@ class Receiver:
                 if refusal is not None:
                     self._refuse(arrival, refusal)
                     return
+                self._resolution.see(sample)
                 self._rates.see(sample, arrival.host_ns)
                 if self._repeats.resumed():
                     self.jumps.forgive()

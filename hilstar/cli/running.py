@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from hilstar.run.summary import RunSummary
     from hilstar.run.sync import BeatSummary
 
+POINTED = ("serve", "replay")  # commands whose attitudes come from elsewhere
 UTC_MARK = "{utc}"  # stands for the time in a ledger's name
 Strict = Annotated[
     bool,
@@ -352,6 +353,19 @@ def page_parts(
 
 
 @contextmanager
+def optional_pointing(description: "RunDescription", parts: "PageParts", sinks: "list[FrameSink]") -> Iterator[None]:
+    """Say where the first attitude points, while this is open; the demo knows where it does."""
+    if description.command not in POINTED:
+        yield
+        return
+    from hilstar.run.pointing import Pointing
+
+    with Pointing(parts.bench, parts.notices) as pointing:
+        sinks.append(pointing.see)
+        yield
+
+
+@contextmanager
 def followed(
     listener: "PageListener | None",
     control: bool,
@@ -366,7 +380,7 @@ def followed(
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
     if frames is not None:
         sinks.append(frames.see)
-    with Service(status.begun, status.alive, status.line):
+    with Service(status.begun, status.alive, status.line), optional_pointing(description, parts, sinks):
         if listener is None and scpi is None:
             yield _all_of(sinks), status.follow, None
             return

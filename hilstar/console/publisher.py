@@ -25,6 +25,7 @@ from hilstar.errors import HilstarError, did_you_mean, one_line, printable
 from hilstar.notices import Notice, Notices
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.run.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests, aid_levels_of
+from hilstar.run.pointing import POINTING
 from hilstar.run.record.ledger_records import MAX_CENTROIDS
 from hilstar.scene.sprites import brightest
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -193,6 +194,7 @@ class WatchedRun:
             forced="" if screen is None else printable("; ".join(screen.forced)),
             ledger=self._ledger(),
             faults=[] if faults is None else faults.on(),
+            pointing=self._notices.lasting.get(POINTING, ""),
             wrong_sky=[protocol.WrongCondition(one.kind, one.text) for one in self._notices.wrong_sky.now()],
             wrong_sky_s=self._wrong_sky_s(tally.first_swap_ns),
             tracker=None if running.answers is None else running.answers.figures,

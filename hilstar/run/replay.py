@@ -11,6 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from msgspec.structs import replace as replaced
 
+from hilstar.attitude.clock.resolution import coarse_lines
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
@@ -180,7 +181,8 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
         return PlayedFrame(slot, t_ns, timeline.at(t_ns))
 
     play = Play(frame, int(count) + 1, len(timeline), not math.isinf(factor), first_ns, samples[0].t_ns)
-    return replace(play, told=[*read.told, *joins.told], conventions=read.conventions)
+    told = [*read.told, *joins.told, *coarse_lines(samples)]
+    return replace(play, told=told, conventions=read.conventions)
 
 
 def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) -> Play:

@@ -29,6 +29,7 @@ UNIT_SHARE = 0.05  # of a pace: no simulation is by chance as near to a thousand
 MIN_PACE_NS, MIN_PACE_PACKETS = NS_PER_S // 2, 5
 MIN_TICKS, PATIENCE_NS = 20, 3 * NS_PER_S  # whole seconds advance by less in any short time
 MAX_PACE_GAP_NS = NS_PER_S
+OTHERS = 3  # paces in a row that are of no such unit: one may be uneven
 
 
 class LossCount:
@@ -83,7 +84,7 @@ class TimeUnit:
         self._notices = notices
         self._first: tuple[int, int] | None = None
         self._last_ns = 0
-        self._packets = 0
+        self._packets = self._others = 0
         self.named = ""
 
     def see(self, t_ns: int, host_ns: int) -> None:
@@ -107,8 +108,11 @@ class TimeUnit:
             if abs(pace / unit_pace - 1) < share:
                 send = "send nanoseconds" + (f": multiply by {factor}" if factor else "")
                 line = f"t_ns runs at {pace:.3g} times real time: it is in {name}, not in nanoseconds; {send}"
-                self.named = name
+                self.named, self._others = name, 0
                 self._notices.begin(UNIT, line)
                 return
+        self._others += 1
+        if self._others < OTHERS:
+            return
         self.named = ""
         self._notices.end(UNIT, "time-unit-right", f"t_ns runs at {pace:.3g} times real time")

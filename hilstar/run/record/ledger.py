@@ -299,12 +299,9 @@ class Ledger(Closing):
             record = event_record(notice)
             self._queue.put(QueueEntry("event", notice.host_ns, 0, partial(msgspec.json.encode, record)))
 
-    def stands(self, record: FaultRecord | EventRecord) -> None:
-        """Record what began before this ledger."""
-        if isinstance(record, FaultRecord):
-            self.fault(record)
-        else:
-            self._queue.put(QueueEntry("event", record.host_ns, 0, partial(msgspec.json.encode, record)))
+    def stands(self, record: EventRecord) -> None:
+        """Record an event from before this ledger."""
+        self._queue.put(QueueEntry("event", record.host_ns, 0, partial(msgspec.json.encode, record)))
 
     def fault(self, record: FaultRecord) -> None:
         """Record the beginning or the end of a fault; a replay needs each."""
@@ -586,7 +583,10 @@ class LedgerSwitch:
             ledger = make()
             ledger.standing = self._standing
             for record in self._standing():
-                ledger.stands(record)
+                if isinstance(record, FaultRecord):
+                    ledger.fault(record)
+                else:
+                    ledger.stands(record)
             self.last = self.current = ledger
         return ledger
 

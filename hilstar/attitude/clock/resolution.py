@@ -73,14 +73,18 @@ def coarse_lines(samples: Sequence[AttitudeSample]) -> list[tuple[str, str]]:
 
 
 def _evidence(q: list[float], step: float) -> int | None:
-    """How many components show that a unit quaternion was rounded to steps; 0 for an exact one, None where it was not."""
-    largest = max(q, key=abs)
+    """How many components show that a unit quaternion was rounded to steps; 0 for an exact one, None where it was not.
+
+    Components of one size show as much as one of them, and the largest shows only the norm.
+    """
+    largest = max(map(abs, q))
     count = round(largest / step)
     for near in (count - 1, count, count + 1):
         norm = near * step / largest
-        if abs(norm - 1) <= min(2 * step, NORM_TOLERANCE) and all(
-            abs(part * norm / step - round(part * norm / step)) < FIT for part in q
-        ):
+        if abs(norm - 1) > min(2 * step, NORM_TOLERANCE):
+            continue
+        steps = [abs(part) * norm / step for part in q]
+        if all(abs(each - round(each)) < FIT for each in steps):
             exact = abs(norm - 1) < NOT_EXACT * step
-            return 0 if exact else sum(part != 0 for part in q) - 1
+            return 0 if exact else len({round(each) for each in steps} - {0}) - 1
     return None

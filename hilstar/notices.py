@@ -15,29 +15,34 @@ from datetime import UTC, datetime
 from typing import Self
 
 from hilstar.errors import printable
+from hilstar.wrong_sky import KINDS, WrongSky
 
 MAX_SAID = 3
 SAID_WINDOW_S = 10.0
 MAX_QUIET_S = 640.0
 MAX_RECORDED = 20  # events of a kind that are recorded; further ones are only counted
-ALWAYS_RECORDED = frozenset({"fault"})
+ALWAYS_RECORDED = frozenset({"fault"}) | KINDS  # a report is made from each begin and end
 MAX_DETAIL_CHARACTERS = 400
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """One event of a run: when (host time, ns), of what kind (a word such as "stale"), a line for a person, who caused it."""
+    """One event of a run: when (host time, ns), of what kind (a word such as "stale"), a line for a person, who caused it.
+
+    `since_ns` is when that began of which it tells, where this was earlier.
+    """
 
     host_ns: int
     kind: str
     detail: str
     who: str = ""
+    since_ns: int | None = None
 
     @classmethod
-    def now(cls, kind: str, detail: str, who: str = "") -> Self:
+    def now(cls, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> Self:
         """An event of this moment, in text that JSON and a terminal hold, whatever a file in it is called."""
-        return cls(time.monotonic_ns(), kind, printable(detail)[:MAX_DETAIL_CHARACTERS], printable(who))
+        return cls(time.monotonic_ns(), kind, printable(detail)[:MAX_DETAIL_CHARACTERS], printable(who), since_ns)
 
 
 def at_now(line: str) -> str:
@@ -81,9 +86,13 @@ class _Kind:
 
 
 class Notices:
-    """Takes events from any thread; never waits, never raises for what a listener does."""
+    """Takes events from any thread; never waits, never raises for what a listener does.
+
+    `wrong_sky` has those that say that the sky shown is wrong.
+    """
 
     def __init__(self) -> None:
+        self.wrong_sky = WrongSky()
         self._counts: Counter[str] = Counter()
         self._active: dict[str, str] = {}
         self._kinds: dict[str, _Kind] = {}
@@ -94,9 +103,13 @@ class Notices:
         """Hand every further event to `listener` too."""
         self._listeners.append(listener)
 
-    def tell(self, kind: str, detail: str, who: str = "") -> None:
-        """Count an event, say it unless its kind floods, and hand it on; `who` is the person that it comes from, if one."""
-        notice = Notice.now(kind, detail, who)
+    def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> None:
+        """Count an event, say it unless its kind floods, and hand it on.
+
+        `who` is the person that it comes from, if one; `since_ns` is when that began of which it tells, host time.
+        """
+        notice = Notice.now(kind, detail, who, since_ns)
+        self.wrong_sky.see(kind, notice.detail, notice.host_ns, since_ns)
         with self._lock:
             self._counts[kind] += 1
             known = self._kinds.setdefault(kind, _Kind(deque(maxlen=MAX_SAID)))
@@ -129,13 +142,13 @@ class Notices:
         log.warning("%s", at_now(notice.detail))
         self._hand_on(notice)
 
-    def begin(self, kind: str, detail: str) -> None:
+    def begin(self, kind: str, detail: str, since_ns: int | None = None) -> None:
         """Tell of an event that lasts: its kind is in `active` until `end`. Nothing where it has begun already."""
         with self._lock:
             if kind in self._active:
                 return
             self._active[kind] = detail
-        self.tell(kind, detail)
+        self.tell(kind, detail, since_ns=since_ns)
 
     def end(self, kind: str, told_as: str, detail: str) -> None:
         """Tell of the end of what began, as an event of its own; nothing where it never began."""

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter, KnownClockFilter
+from hilstar.attitude.clock.losses import LossCount, TimeUnit
 from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
+from hilstar.attitude.clock.resolution import Resolution
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
 from hilstar.attitude.clock.senders import Repeats, Senders
 from hilstar.attitude.clock.timeline import Timeline
@@ -129,12 +131,13 @@ class BackChannel:
 
 @dataclass(slots=True)
 class PacketCounts:
-    """How many attitude messages arrived, and how many of those were refused, by reason.
+    """How many attitude messages arrived, how many of those were refused, by reason, and how many were lost on the way.
 
     `shown` is what was sent instead, by reason, where the bytes of the first refused message showed it.
     """
 
     received: int = 0
+    lost: int = 0
     refused_by: dict[wire.Reason, int] = field(default_factory=lambda: dict.fromkeys(wire.REASONS, 0))
     shown: dict[wire.Reason, str] = field(default_factory=dict)
 
@@ -160,6 +163,7 @@ class Receiver:
     """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it. `back` leads back.
 
     What arrives before `learn` is called fills the timeline, and teaches the clock little. `now_ns` is the host's clock.
+    `lost` is told of packets that never came, once it is clear that they will not.
     """
 
     def __init__(
@@ -171,6 +175,7 @@ class Receiver:
         notices: Notices | None = None,
         *,
         wrong_rates: WrongRates = "use-quaternions",
+        lost: Callable[[int], None] = lambda number: None,
         now_ns: Callable[[], int] = HOST_CLOCK.now_ns,
         unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset,
     ) -> None:
@@ -193,6 +198,9 @@ class Receiver:
         self._watch = watch
         self._repeats = Repeats(self._notices)
         self._rates = RateCheck(wrong_rates, self._notices)
+        self._unit, self._resolution = TimeUnit(self._notices), Resolution(self._notices.tell)
+        self._losses, self._tell_lost = LossCount(), lost
+        self._lost_told = self._lost_before = self._lost_look_ns = 0
         self._senders = Senders(timeline.policy.stale_after_ns, self._notices)
         self._begun_ns: int | None = None
         self._learn_from_ns: int | None = None
@@ -256,6 +264,13 @@ class Receiver:
         """Take the samples still in doubt: no more will come to decide them."""
         self._take_decided(self._senders.release())
         self._settle(self.jumps.release())
+        self._settle_losses(self.counts.lost)
+
+    def _settle_losses(self, lost: int) -> None:
+        """Hand on those losses that are old enough: a late packet is none."""
+        if lost > self._lost_told:
+            self._tell_lost(lost - self._lost_told)
+            self._lost_told = lost
 
     def listen(self) -> None:
         """Take what the link brings within POLL_MS. The thread calls this in a loop."""
@@ -280,6 +295,9 @@ class Receiver:
         if not arrivals:  # else the sender shown may have spoken, and is not read yet
             self._take_decided(self._senders.expire(now_ns))
         self._settle(self.jumps.expire(now_ns))
+        if now_ns - self._lost_look_ns >= NS_PER_S:
+            self._settle_losses(min(self._lost_before, self.counts.lost))
+            self._lost_before, self._lost_look_ns = self.counts.lost, now_ns
         if self._link.two_way:
             self.back.talk(now_ns, ask=self._learn_from_ns is not None)
 
@@ -300,11 +318,13 @@ class Receiver:
                     self.clock.exchange(exchange)
             case wire.AttitudeSample() as sample:
                 self.counts.received += 1
+                self._unit.see(sample.t_ns, arrival.host_ns)
                 refusal = self._repeats.judge(sample, arrival.host_ns, arrival.raw)
                 if refusal is not None:
                     self._refuse(arrival, refusal)
                     return
-                self._rates.see(sample)
+                self._resolution.see(sample)
+                self._rates.see(sample, arrival.host_ns)
                 if self._repeats.resumed():
                     self.jumps.forgive()
                 own = Arrival(arrival.host_ns, sample, arrival.raw, waited_ns, back=arrival.back)
@@ -320,13 +340,15 @@ class Receiver:
             if arrival.refusal is not None:
                 self._refuse(arrival, arrival.refusal)
                 continue
+            self._losses.see(arrival.event.sequence)
+            self.counts.lost = self._losses.lost
             if self._learn_from_ns is None or arrival.host_ns < self._learn_from_ns:
                 arrival = replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
             elif self.clock.unheard:
                 self.back.ask_quickly(arrival.host_ns)
             self._settle(self.jumps.take(arrival))
             slowness = self.jumps.slowness
-            if slowness and not self.clock.synchronised:
+            if slowness and not self.clock.synchronised and not self._unit.named:
                 detail = f"t_ns runs at {1 - slowness:.3g} times real time; it is followed in small steps"
                 if slowness > 0:
                     detail += " (a slow clock, or a link too slow for all packets)"

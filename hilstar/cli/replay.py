@@ -38,6 +38,7 @@ def replay(
     control: running.Control = False,
     token: running.Token = None,
     console_name: running.ConsoleName = None,
+    strict: running.Strict = False,
     explain: options.Explain = False,
     as_json: options.Json = False,
 ) -> None:
@@ -86,4 +87,4 @@ def replay(
         ):
             outlet = Outlet(screen, kept, notices, None, follower, requests, wrong, pulse, answers)
             summary = replay_log(bench, play, sink, outlet)
-    running.end_of_run(summary, screen, kept, notices, as_json)
+    running.end_of_run(summary, screen, kept, notices, as_json, strict)

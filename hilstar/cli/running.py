@@ -34,7 +34,15 @@ if TYPE_CHECKING:
     from hilstar.run.summary import RunSummary
     from hilstar.run.sync import BeatSummary
 
+POINTED = ("serve", "replay")  # commands whose attitudes come from elsewhere
 UTC_MARK = "{utc}"  # stands for the time in a ledger's name
+Strict = Annotated[
+    bool,
+    Option(
+        "--strict",
+        help="Exit with 1 where over 1 % of the frames were missed or stale, or a wrong sky was shown for any time.",
+    ),
+]
 Windowed = Annotated[bool, Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
     bool,
@@ -258,10 +266,17 @@ def run_with_faults(
         yield faults
 
 
-def end_of_run(summary: "RunSummary", screen: Any, ledger: "LedgerSwitch", notices: Notices, as_json: bool) -> None:
-    """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed.
+def end_of_run(
+    summary: "RunSummary",
+    screen: Any,
+    ledger: "LedgerSwitch",
+    notices: Notices,
+    as_json: bool,
+    strict: bool = False,
+) -> None:
+    """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed, or the run is not `strict`.
 
-    Raises MachineError where the window went away or the GPU was lost.
+    Raises MachineError where the window went away or the GPU was lost. A run without an attitude is the caller's.
     """
     if ledger.last is not None:
         summary = msgspec.structs.replace(summary, ledger=ledger.last.summary())
@@ -269,7 +284,9 @@ def end_of_run(summary: "RunSummary", screen: Any, ledger: "LedgerSwitch", notic
     if screen is not None and screen.window.gone is not None:
         raise MachineError(f"the run ended early: {screen.window.gone}")
     refuse_lost_gpu(notices)
-    if ledger.failure is not None:
+    had_attitude = summary.frames > summary.blank_frames or summary.packets.accepted > 0
+    passed = not strict or not had_attitude or not summary.verdict or summary.verdict.strict
+    if ledger.failure is not None or not passed:
         raise typer.Exit(1)
 
 
@@ -336,6 +353,19 @@ def page_parts(
 
 
 @contextmanager
+def optional_pointing(description: "RunDescription", parts: "PageParts", sinks: "list[FrameSink]") -> Iterator[None]:
+    """Say where the first attitude points, while this is open; the demo knows where it does."""
+    if description.command not in POINTED:
+        yield
+        return
+    from hilstar.run.pointing import Pointing
+
+    with Pointing(parts.bench, parts.notices) as pointing:
+        sinks.append(pointing.see)
+        yield
+
+
+@contextmanager
 def followed(
     listener: "PageListener | None",
     control: bool,
@@ -350,7 +380,7 @@ def followed(
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
     if frames is not None:
         sinks.append(frames.see)
-    with Service(status.begun, status.alive, status.line):
+    with Service(status.begun, status.alive, status.line), optional_pointing(description, parts, sinks):
         if listener is None and scpi is None:
             yield _all_of(sinks), status.follow, None
             return

@@ -118,6 +118,7 @@ def serve(
     token: running.Token = None,
     console_name: running.ConsoleName = None,
     scpi: running.Scpi = None,
+    strict: running.Strict = False,
     explain: Explain = False,
     as_json: Json = False,
     head_of: HeadOf = None,
@@ -135,7 +136,7 @@ def serve(
             raise InputError(f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench file of a head")
         valued = {"--frames": count, "--ledger-split": ledger_split, "--scenario": scenario}
         switches = {"--headless": headless, "--windowed": windowed, "--force": force, "--control": control}
-        switches |= {"--overwrite": overwrite, "--explain": explain}
+        switches |= {"--overwrite": overwrite, "--explain": explain, "--strict": strict}
         words = [word for name, value in valued.items() if value is not None for word in (name, str(value))]
         words += [name for name, on in switches.items() if on]
         asked = HeadsRun(file, tuple(words), duration, running.dated_ledger(ledger), token=token)
@@ -185,7 +186,8 @@ def serve(
         ):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), *fed[1:], wrong, pulse, answers)
             summary = serve_stream(bench, link, limit, fed[0], outlet)
-    running.end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, notices, as_json)
+    told_all = replaced(summary, beat=beat, fields_of_view=fields.keys())
+    running.end_of_run(told_all, screen, kept, notices, as_json, strict)
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets, link.trouble))
         raise typer.Exit(NO_ATTITUDE)

@@ -75,7 +75,6 @@ class RunState(protocol.SkyState, frozen=True, kw_only=True):
     gamma: str = ""
     forced: str = ""
     note: str = ""
-    rates: str = ""
     failed: list[str] = msgspec.field(default_factory=list)
 
 

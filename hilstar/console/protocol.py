@@ -78,7 +78,7 @@ class ShownClock(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Frames and packets since the run began; `refused` by reason."""
+    """Frames and packets since the run began; `refused` by reason; `lost` as gaps of their `sequence` show."""
 
     frames: int = 0
     missed: int = 0
@@ -86,6 +86,7 @@ class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
     given_up: int = 0
     received: int = 0
     accepted: int = 0
+    lost: int = 0
     refused: dict[str, int] = {}
 
 
@@ -116,8 +117,18 @@ class LedgerState(msgspec.Struct, frozen=True):
     failing: str = ""
 
 
+class WrongCondition(msgspec.Struct, frozen=True):
+    """A condition under which the sky that is shown is wrong: its kind, a line with figures and what to write instead."""
+
+    kind: str
+    line: str
+
+
 class SkyState(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run tells of itself and the page shows as it is; `operator` has the switches, `faults` those that are on."""
+    """What a run tells of itself and the page shows as it is; `operator` has the switches, `faults` those that are on.
+
+    `wrong_sky_s` is for how long the sky has been wrong in all, `pointing` where the first attitude points.
+    """
 
     attitude: ShownAttitude | None = None
     clock: ShownClock | None = None
@@ -127,6 +138,9 @@ class SkyState(msgspec.Struct, frozen=True, kw_only=True):
     faults: list[str] = []
     ledger: LedgerState | None = None
     tracker: TrackerFigures | None = None
+    wrong_sky: list[WrongCondition] = []
+    wrong_sky_s: float = 0.0
+    pointing: str = ""
 
 
 class PageState(SkyState, frozen=True, kw_only=True):

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from hilstar.attitude.clock.rate_check import WRONG
 from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 from hilstar.bench.certificate import certificate_number
 from hilstar.bench.frame import Bench
@@ -26,6 +25,7 @@ from hilstar.errors import HilstarError, did_you_mean, one_line, printable
 from hilstar.notices import Notice, Notices
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.run.operator import GAMMA, PATCHES, SwitchRequest, SwitchRequests, aid_levels_of
+from hilstar.run.pointing import POINTING
 from hilstar.run.record.ledger_records import MAX_CENTROIDS
 from hilstar.scene.sprites import brightest
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -181,6 +181,7 @@ class WatchedRun:
                 given_up=tally.given_up_frames,
                 received=packets.received,
                 accepted=packets.received - packets.refused,
+                lost=packets.lost,
                 refused={reason: count for reason, count in packets.refused_by.items() if count},
             ),
             operator=aids.states(),
@@ -193,9 +194,17 @@ class WatchedRun:
             forced="" if screen is None else printable("; ".join(screen.forced)),
             ledger=self._ledger(),
             faults=[] if faults is None else faults.on(),
-            rates=self._notices.lasting.get(WRONG, ""),
+            pointing=self._notices.lasting.get(POINTING, ""),
+            wrong_sky=[protocol.WrongCondition(one.kind, one.text) for one in self._notices.wrong_sky.now()],
+            wrong_sky_s=self._wrong_sky_s(tally.first_swap_ns),
             tracker=None if running.answers is None else running.answers.figures,
         )
+
+    def _wrong_sky_s(self, first_swap_ns: int | None) -> float:
+        wrong_sky = self._notices.wrong_sky
+        if first_swap_ns is None or not wrong_sky.any:
+            return 0.0
+        return wrong_sky.total(first_swap_ns, time.monotonic_ns()).seconds
 
     def _ledger(self) -> protocol.LedgerState | None:
         ledger = self._parts.ledger.current
@@ -425,7 +434,7 @@ FAILED, FORCED = "failed:", "forced"  # as `first-light` says of a step, and of 
 class _SessionNotices(Notices):
     """Events of a session: the terminal has its lines already."""
 
-    def tell(self, kind: str, detail: str, who: str = "") -> None:
+    def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> None:
         self._hand_on(Notice.now(kind, " ".join(detail.split()), who))
 
 

@@ -99,7 +99,7 @@ CAUTION = (
 class _Unreported(Notices):
     """Notices that are dropped: those of redrawing are not the run's."""
 
-    def tell(self, kind: str, detail: str, who: str = "") -> None:
+    def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> None:
         """Say nothing."""
 
 
@@ -233,10 +233,12 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
         (late, "with a stale attitude"),
         (found.hidden_frames, "not seen on the screen"),
         (found.operator_frames, "changed by the operator"),
+        (found.wrong_frames, "of a wrong sky"),
     )
     reasons = [f"{number} of {found.frames} frames {what}" for number, what in counted if number]
     if found.missed_frames:
         reasons.append(f"{found.missed_frames} refresh periods without a frame of their own")
+    reasons += [f"{one.seconds:.1f} s of {one.kind}: {one.text}" for one in found.wrong_sky.conditions if one.seconds]
     headline = "Sky was right throughout" if not reasons else "Sky was not right throughout"
     due = found.frames + found.missed_frames  # refresh periods in which a frame was due
     percent = 100 * found.right_frames / max(due, 1)

@@ -86,7 +86,8 @@ class RunStatus:
             return "no frame yet"
         attitude, tally, packets = _attitude_line(shown), running.loop.tally, running.packets
         told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
-        return f"attitude {attitude.text}; {told}" + ("; shown by --force" if self._source.forced else "")
+        wrong = "".join(f"{one.text}; " for one in running.loop.notices.wrong_sky.now())
+        return f"{wrong}attitude {attitude.text}; {told}" + ("; shown by --force" if self._source.forced else "")
 
     def lines(self, now_ns: int) -> list[StatusLine]:
         """The status at a host time; rates are since it was last asked for."""
@@ -105,7 +106,9 @@ class RunStatus:
             frames_line = StatusLine("frames", f"{frames_line.text}; none for {still_ns / NS_PER_S:.1f} s", False)
         refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
         told = f"{packets.received} received ({(packets.received - received) / seconds:.1f}/s), {packets.refused} refused"
+        refused = ", ".join([refused] * bool(refused) + [f"{packets.lost} lost"] * bool(packets.lost))
         return [
+            *(StatusLine("sky", f"WRONG: {one.text}", False) for one in running.loop.notices.wrong_sky.now()),
             _attitude_line(shown),
             frames_line,
             StatusLine("packets", told + (f" ({refused})" if refused else ""), not refused),

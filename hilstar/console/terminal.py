@@ -84,7 +84,7 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         "attitude age": f"{spread(summary.attitude_age_ms)} ms (p50 / p99 / max) at render",
         "stars drawn": f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
         + "".join(f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]),
-        "packets": f"{packets.received} received, {packets.refused} refused{turned_away}",
+        "packets": f"{packets.received} received, {packets.refused} refused{turned_away}, {packets.lost} lost",
     }
     if summary.clock:
         from hilstar.attitude.clock.sender_clock import KNOWN_MODES  # brings NumPy, which Tab and --help do not need
@@ -93,6 +93,14 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         if summary.receive_latency_ms:
             lines["receive latency"] = f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"
         lines["sender's clock"] = clock_line(summary.clock)
+    if summary.sync:
+        lines["pulses"] = summary.sync.line()
+    for name, line in [*lines.items(), *_last_lines(summary)]:
+        typer.echo(f"{name:20}{line}")
+
+
+def _last_lines(summary: "RunSummary") -> Iterator[tuple[str, str]]:
+    """What was wrong with the sky for a time, the renderer, and at the end the verdict."""
     for name, what in (
         ("operator", "changed by an operator's keys"),
         ("hidden", "not fully visible"),
@@ -100,12 +108,12 @@ def report(summary: "RunSummary", as_json: bool) -> None:
     ):
         lasted = (summary.screen or {}).get(name, {"frames": 0})
         if lasted["frames"]:
-            lines[name] = f"{lasted['frames']} frames, {lasted['s']:.1f} s, {what}"
-    if summary.sync:
-        lines["pulses"] = summary.sync.line()
-    lines["renderer"] = summary.gl_renderer
-    for name, line in lines.items():
-        typer.echo(f"{name:20}{line}")
+            yield name, f"{lasted['frames']} frames, {lasted['s']:.1f} s, {what}"
+    for condition in summary.wrong_sky.conditions:
+        yield condition.kind, f"{condition.seconds:.1f} s: {condition.text}"
+    yield "renderer", summary.gl_renderer
+    if summary.verdict:
+        yield "verdict", summary.verdict.line
 
 
 def without_attitude(endpoint: str, packets: "PacketSummary", trouble: str = "") -> str:

@@ -228,7 +228,10 @@ class FrameLoop:
         drawn, attitude = shown.drawn, shown.attitude
         age_ns = None if attitude is None else attitude.age_ns
         self.tally.add(shown.swap_ns - shown.draw_ns, age_ns, drawn.star_count, drawn.clipped_hip)
+        if self.tally.first_swap_ns is None:
+            self.tally.first_swap_ns = shown.swap_ns
         self.tally.stale_frames += shown.stale
+        self.tally.blank_frames += shown.missing
         if drawn.capped:
             if not self.tally.capped_frames:
                 line = (

@@ -4,13 +4,14 @@ import csv
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
 from msgspec.structs import replace as replaced
 
+from hilstar.attitude.clock.resolution import coarse_lines
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import NOTHING_STATED, check_stated, log_timeline, open_log
@@ -30,10 +31,18 @@ from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import NO_RECORDING, Recording, ReplayedFaults, RunFaults, read_recording
 from hilstar.run.loop import Limit, policy_of
 from hilstar.run.pacer import FrameSink, Moment, Shown, ignore
-from hilstar.run.record.ledger_records import FrameRecord, codes_ms_of, drawable_frames, frame_records, read_head
+from hilstar.run.record.ledger_records import (
+    FrameRecord,
+    codes_ms_of,
+    drawable_frames,
+    event_records,
+    frame_records,
+    read_head,
+)
 from hilstar.run.serve import Outlet, Running
 from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
+from hilstar.wrong_sky import ENDS, WrongSky
 
 MAX_FRAMES = 100_000_000
 # `exact` in NumPy is another program than its shader: of two choices that are as good it may take the other.
@@ -89,9 +98,10 @@ class Play:
 
     `first_ns` is the time of the first frame, and `zero_ns` that from which a scenario counts its seconds: the log's first
     sample, or the run's first frame. `moving` says whether stars are drawn along their paths; None: as the bench file says.
-    `told` are events to report before it begins, `span` says how long a log is, and its step. Only an earlier run has faults
-    in its `recording`, and a renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same renderer
-    draws the same codes from them bit for bit; another draws them within `DrawnBy.other_codes`.
+    `told` are events to report before it begins, `span` says how long a log is, and its step. `wrong_sky` is when the sky
+    of an earlier run was wrong: it is so again. Only an earlier run has faults in its `recording`, and a
+    renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same renderer draws the same codes
+    from them bit for bit; another draws them within `DrawnBy.other_codes`.
     """
 
     frame: Callable[[int], PlayedFrame]
@@ -107,6 +117,7 @@ class Play:
     recording: Recording = NO_RECORDING
     drawn_by: DrawnBy | None = None
     codes_ms: tuple[float, float] | None = None
+    wrong_sky: WrongSky = field(default_factory=WrongSky)
 
 
 def played_again(
@@ -173,7 +184,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
         return PlayedFrame(slot, t_ns, timeline.at(t_ns))
 
     play = Play(frame, int(count) + 1, len(timeline), not math.isinf(factor), first_ns, samples[0].t_ns)
-    told = [*read.told, *joins.told]
+    told = [*read.told, *joins.told, *coarse_lines(samples)]
     return replace(play, told=told, conventions=read.conventions, span=span_line(samples))
 
 
@@ -192,7 +203,27 @@ def _plan_run(log: Path, wanted: Wanted, first: FrameRecord, last: FrameRecord) 
     play = played_again(kept, count, sum(1 for _ in read_attitudes(log)), not math.isinf(wanted.speed), read_recording(log))
     head, names = read_head(log), ("gl_renderer", "gl_version", "render_path")
     drawn_by = DrawnBy(*(printable(head[name]) for name in names)) if set(names) <= head.keys() else None
-    return replace(play, zero_ns=first.t_ns, drawn_by=drawn_by, codes_ms=codes_ms_of(head))
+    wrong_sky = WrongSky()
+    for event in event_records(log):
+        wrong_sky.see(event.kind, event.detail, event.host_ns, event.since_ns)
+    return replace(play, zero_ns=first.t_ns, drawn_by=drawn_by, codes_ms=codes_ms_of(head), wrong_sky=wrong_sky)
+
+
+def _tell_of(play: Play, notices: Notices) -> None:
+    """Tell what is to be told before a replay begins; a condition of a log lasts for all of it."""
+    for kind, line in play.told:
+        tell = notices.begin if kind in ENDS else notices.tell
+        tell(kind, line)
+
+
+def _recall_conditions(wrong_sky: WrongSky, past: FrameRecord | None, notices: Notices) -> None:
+    """Begin and end the conditions of the run that is replayed, as they were at the swap of its frame."""
+    held = {} if past is None else dict(wrong_sky.at(past.swap_ns))
+    for condition in notices.wrong_sky.now():
+        if condition.kind not in held:
+            notices.end(condition.kind, ENDS[condition.kind], "no more in the run that is replayed")
+    for kind, text in held.items():
+        notices.begin(kind, f"in the run that is replayed: {text}")
 
 
 def _tell_other_renderer(before: DrawnBy | None, bench: Bench, notices: Notices) -> None:
@@ -222,14 +253,15 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
         faults.begin(play.zero_ns)
     loop = outlet.loop(bench, sink, play.moving)
     clock = loop.pacer.clock
-    for kind, line in play.told:
-        outlet.notices.tell(kind, line)
+    _tell_of(play, outlet.notices)
     _tell_other_renderer(play.drawn_by, bench, outlet.notices)
 
     def draw_slot(moment: Moment) -> Shown | None:
         number, t_ns, attitude, past = play.frame(moment.slot)
         if isinstance(faults, ReplayedFaults) and past is not None:
             faults.recall(past)
+        if play.wrong_sky.any:
+            _recall_conditions(play.wrong_sky, past, outlet.notices)
         shown = loop.draw(number, t_ns, attitude, moment)
         if shown is not None:
             outlet.record(bench, loop, shown, t_ns)

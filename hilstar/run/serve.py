@@ -31,7 +31,7 @@ from hilstar.run.pacer import FrameSink, Moment, Pacer, Shown, ignore
 from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.record.ledger_records import below_step, frame_record
 from hilstar.run.screen.screen import DisplayPacer, Screen
-from hilstar.run.summary import RunSummary
+from hilstar.run.summary import RunSummary, verdict_of
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -95,8 +95,12 @@ class Outlet:
 
     def complete(self, summary: RunSummary, loop: FrameLoop) -> RunSummary:
         """The summary of a run with its faults, pulses, events and screen."""
+        first_ns, now_ns = loop.tally.first_swap_ns, loop.pacer.clock.now_ns()
+        wrong_sky = self.notices.wrong_sky.total(now_ns if first_ns is None else first_ns, now_ns)
         return replaced(
             summary,
+            wrong_sky=wrong_sky,
+            verdict=verdict_of(replaced(summary, wrong_sky=wrong_sky)),
             faults=UNSET if self.faults is None else self.faults.summary(),
             sync=UNSET if self.pulse is None else self.pulse.summary(),
             answers=UNSET if self.answers is None else self.answers.figures,
@@ -127,7 +131,15 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
     timeline = Timeline(policy_of(settings))
     kept = "shared" if settings.source == "scpi" else settings.clock
     traffic = Traffic(settings.status_hz, settings.time_requests and kept == "estimated", kept)
-    receiver = Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, wrong_rates=settings.check_rates)
+    receiver = Receiver(
+        link,
+        timeline,
+        traffic,
+        outlet.ledger.packet,
+        outlet.notices,
+        wrong_rates=settings.check_rates,
+        lost=outlet.ledger.lost,
+    )
     outlet.follower(Running(loop, receiver.counts, receiver.clock_summary, outlet.answers))
     statuses = StatusMaker(outlet.ledger)
     if outlet.answers is not None and link.two_way:
@@ -224,7 +236,7 @@ class LockstepRun:
         sample = event if isinstance(event, AttitudeSample) else None
         refusal = event if isinstance(event, Refusal) else None
         if sample is not None:
-            self._rates.see(sample)
+            self._rates.see(sample, host_ns)
             refusal = rate_refusal(self._rates.believed(sample), self._max_rate_rad_s)
         elif refusal is None:
             refusal = Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")

@@ -14,16 +14,61 @@ from hilstar.render.backend import Backend
 from hilstar.run.sync import BeatSummary, SyncSummary
 from hilstar.running_statistics import Percentiles, RunningStatistics
 from hilstar.units import NS_PER_MS
+from hilstar.wrong_sky import WrongSkyTotal
 
 
 class PacketSummary(msgspec.Struct, frozen=True):
-    """Packets of a run, those refused by reason; `shown` is what was sent instead, where its bytes show that."""
+    """Packets of a run, those refused by reason, and how many were lost: gaps of their `sequence`.
+
+    `shown` is what was sent instead, by reason, where its bytes show that.
+    """
 
     received: int
     accepted: int
     refused: int
     refused_by: dict[Reason, int]
+    lost: int = 0
     shown: dict[Reason, str] | UnsetType = UNSET
+
+
+MAX_LATE_SHARE = 0.01  # of frames that may be missed or stale where --strict passes
+
+
+class RunVerdict(msgspec.Struct, frozen=True):
+    """Whether a run showed the right sky in time, in one line.
+
+    `late_share` is that of frames missed or stale from the first attitude on, `wrong_sky_s` the seconds of a wrong sky.
+    `strict` says whether `--strict` passes.
+    """
+
+    ok: bool
+    strict: bool
+    late_share: float
+    wrong_sky_s: float
+    line: str
+
+
+def verdict_of(summary: "RunSummary") -> RunVerdict:
+    """The verdict on a run. Frames before the first attitude are blank, and are late in nothing."""
+    stale = summary.stale_frames - summary.blank_frames
+    due = summary.frames - summary.blank_frames + summary.missed_frames
+    late_share = (stale + summary.missed_frames) / due if due else 0.0
+    wrong = summary.wrong_sky
+    reasons = [] if due else ["no frame had an attitude"]
+    if summary.missed_frames:
+        reasons.append(f"{summary.missed_frames} of {summary.frames + summary.missed_frames} frames missed")
+    if stale:
+        reasons.append(f"{stale} of {summary.frames} frames with a stale attitude")
+    if summary.blank_frames and due:
+        reasons.append(f"{summary.blank_frames} of {summary.frames} frames before the first attitude")
+    if wrong.seconds:
+        kinds = ", ".join(one.kind for one in wrong.conditions if one.seconds)
+        reasons.append(f"{wrong.seconds:.1f} s of a wrong sky ({kinds})")
+    good = not (stale or summary.missed_frames or wrong.seconds) and due > 0
+    head = f"the sky was right in all {due} frames" if good else "the sky was not right throughout"
+    line = "; ".join([head, *reasons])
+    strict = late_share <= MAX_LATE_SHARE and not wrong.seconds
+    return RunVerdict(good, strict, round(late_share, 4), wrong.seconds, line)
 
 
 class StarSummary(msgspec.Struct, frozen=True):
@@ -76,6 +121,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     beat: BeatSummary | UnsetType = UNSET
     sync: SyncSummary | UnsetType = UNSET
     fields_of_view: dict[str, Any] | UnsetType = UNSET
+    blank_frames: int = 0
+    wrong_sky: WrongSkyTotal = WrongSkyTotal()
+    verdict: RunVerdict | UnsetType = UNSET
 
 
 class SwapTally:
@@ -112,6 +160,8 @@ class RunTally:
         self._frame_ms, self._age_ms, self._stars = (RunningStatistics() for _ in range(3))
         self.clipped_hip: set[int | str] = set()
         self.swaps = SwapTally()
+        self.blank_frames = 0  # before the first attitude
+        self.first_swap_ns: int | None = None
         self._clipped_max = self.missed_frames = self.stale_frames = self.capped_frames = self.given_up_frames = 0
 
     @property
@@ -141,7 +191,12 @@ class RunTally:
             frame_ms=self._frame_ms.percentiles(),
             attitude_age_ms=self._age_ms.percentiles(),
             packets=PacketSummary(
-                counts.received, counts.received - counts.refused, counts.refused, refused_by, counts.shown or UNSET
+                counts.received,
+                counts.received - counts.refused,
+                counts.refused,
+                refused_by,
+                counts.lost,
+                counts.shown or UNSET,
             ),
             stars_drawn=StarSummary(self._stars.mean, int(self._stars.max) if self.frames else None),
             clipped=ClippedSummary(self._clipped_max, stars, bodies),
@@ -149,6 +204,7 @@ class RunTally:
             stale_frames=self.stale_frames,
             capped=self.capped_frames,
             given_up=self.given_up_frames,
+            blank_frames=self.blank_frames,
             gl_renderer=renderer.gl_renderer,
             gl_version=renderer.gl_version,
             render_path=renderer.path,

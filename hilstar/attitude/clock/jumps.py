@@ -22,6 +22,7 @@ from hilstar.attitude.wire.links import SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.wrong_sky import CLOCK, ENDS
 
 PACE_SLOTS = 9
 MIN_ODD_PACE = 0.004  # twice what a crystal is allowed: beyond it, and steadily, t_ns runs slow or fast
@@ -50,7 +51,18 @@ MAX_OFF_NS = NS_PER_S  # a sender may predict, or be late
 MIN_FUTURE_NS = 5 * NS_PER_MS
 PERSISTENT_NS = NS_PER_S  # a queue may be older for a moment
 MIN_OFF = 3
-UNSHARED = "clock-not-shared"
+AHEAD_FOR_NS = 3 * NS_PER_S // 10  # no queue makes a packet early; a step of this machine's clock is followed in 0.2 s
+SHARED_FOR_NS = NS_PER_S  # how long a clock must agree before it is believed again
+# By how much other clocks are behind Unix time, s: TAI - UTC is 37 s since 2017 (IERS Bulletin C), GPS is 19 s behind TAI.
+OTHER_CLOCKS = {
+    "TAI": -37.0,
+    "GPS time counted from 1970": -18.0,
+    "GPS time counted from 6 January 1980": 315_964_800.0 - 18.0,
+    "time counted from J2000": 946_728_000.0,
+    "Terrestrial Time": -69.184,
+}
+NEAR_S = 1.0
+HOUR_S, MAX_ZONE_HOURS = 3600.0, 14
 CLOCK_NAMES = {"shared": "CLOCK_MONOTONIC", "unix": "CLOCK_REALTIME (Unix time)"}
 
 
@@ -263,8 +275,20 @@ def _too_early(each: _Doubtful) -> SampleArrival:
     return replace(each.arrival, refusal=Refusal("time", detail))
 
 
+def clock_named(late_ns: int) -> str | None:
+    """The clock that is behind Unix time by `late_ns`, as far as one is known by that; None for none."""
+    late_s = late_ns / NS_PER_S
+    for name, behind_s in OTHER_CLOCKS.items():
+        if abs(late_s - behind_s) < NEAR_S:
+            return name
+    hours = round(4 * late_s / HOUR_S) / 4  # time zones are whole quarters of an hour
+    if 0 < abs(hours) <= MAX_ZONE_HOURS and abs(late_s - hours * HOUR_S) < NEAR_S:
+        return f"the local time of a zone {abs(hours):g} h {'west' if hours > 0 else 'east'} of UTC"
+    return None
+
+
 class KnownClockFilter:
-    """Takes the place of a `JumpFilter`: refuses times far ahead, and says once where the clock is another one."""
+    """Takes the place of a `JumpFilter`: refuses times far ahead, and says where the clock is another one, and when no more."""
 
     correction_ns = 0
     jumps = 0
@@ -273,29 +297,47 @@ class KnownClockFilter:
     def __init__(self, notices: Notices, clock: SenderClock) -> None:
         self._notices, self._clock = notices, clock
         self._off_since_ns: int | None = None
+        self._shared_since_ns: int | None = None
         self._off = 0
+        self._told = False
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
         """The sample itself, refused where its time is more than MAX_OFF_NS ahead of the clock's."""
         t_ns, host_ns = arrival.event.t_ns, arrival.host_ns
-        mode = self._clock.mode
         late_ns = round(self._clock.latency_ns(t_ns, host_ns) or 0.0)
         if -MIN_FUTURE_NS <= late_ns <= MAX_OFF_NS:
             self._off_since_ns, self._off = None, 0
+            self._shared(host_ns)
             return [arrival]
+        self._shared_since_ns = None
         self._off_since_ns = host_ns if self._off_since_ns is None else self._off_since_ns
         self._off += 1
-        if self._off >= MIN_OFF and host_ns - self._off_since_ns >= PERSISTENT_NS:
-            where = f"{late_ns / NS_PER_S:.3f} s behind" if late_ns > 0 else f"{-late_ns / NS_PER_S:.3f} s ahead of"
-            self._notices.begin(
-                UNSHARED,
-                f'[attitude] clock = "{mode}", but t_ns is {where} {CLOCK_NAMES[mode]} of this machine:'
-                ' stamp with that clock, or write clock = "estimated"',
-            )
+        for_ns = AHEAD_FOR_NS if late_ns < 0 else PERSISTENT_NS
+        if self._off >= MIN_OFF and host_ns - self._off_since_ns >= for_ns and not self._told:
+            self._told = True
+            self._notices.begin(CLOCK, self._line(t_ns, late_ns), self._off_since_ns)
         if late_ns >= -MAX_OFF_NS:
             return [arrival]
         detail = f"t_ns {t_ns} is {-late_ns / NS_PER_S:.3g} s ahead of this machine's clock"
         return [replace(arrival, refusal=Refusal("time", detail))]
+
+    def _shared(self, host_ns: int) -> None:
+        """A packet's time may be this machine's: the condition ends once that has lasted."""
+        if self._shared_since_ns is None:
+            self._shared_since_ns = host_ns
+        if self._told and host_ns - self._shared_since_ns >= SHARED_FOR_NS:
+            self._told = False
+            self._notices.end(CLOCK, ENDS[CLOCK], f"t_ns agrees with {CLOCK_NAMES[self._clock.mode]} of this machine again")
+
+    def _line(self, t_ns: int, late_ns: int) -> str:
+        mode = self._clock.mode
+        where = f"{late_ns / NS_PER_S:.3f} s behind" if late_ns > 0 else f"{-late_ns / NS_PER_S:.3f} s ahead of"
+        looks = "" if (other := clock_named(late_ns)) is None else f", as {other} is"
+        wrong = "" if late_ns > 0 else "; the sky that is drawn is as old"
+        return (
+            f'[attitude] clock = "{mode}", but t_ns is {where} {CLOCK_NAMES[mode]} of this machine{looks}{wrong}:'
+            ' stamp with that clock, or write clock = "estimated"'
+        )
 
     def forgive(self) -> None:
         """Jumps are never counted."""

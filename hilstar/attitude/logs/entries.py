@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.rate_causes import Cause
 from hilstar.attitude.clock.rate_check import cause_in
 from hilstar.attitude.clock.timeline import Join
 from hilstar.attitude.logs.log_times import TIMES
@@ -165,7 +166,7 @@ class LogJoins:
     usual_s: float = 0.0
     longest_s: float = 0.0
     misfits: int = 0
-    cause: str = ""
+    cause: Cause | None = None
 
     def __call__(self, before: AttitudeSample, after: AttitudeSample) -> Join:
         """How a timeline joins two successive samples."""
@@ -183,7 +184,10 @@ class LogJoins:
             lines.append(("log-gap", f"the log has {gaps}, {sizes}; the attitude is held there"))
         if self.misfits:
             misfits = f"in {self.misfits} intervals the log's rates do not fit its attitudes"
-            why = f"; probably {self.cause}" if self.cause else ""
+            why = f"; probably {self.cause.text}" if self.cause is not None else ""
+            if self.cause is not None and self.cause.reading is not None:
+                stated = f"write [attitude] convention = {self.cause.reading.line}"
+                lines.append((self.cause.kind, f"{misfits}{why}: the sky is drawn at another place; {stated}"))
             lines.append(("log-rates", f"{misfits}, and are ignored there{why}"))
         return lines
 
@@ -200,11 +204,10 @@ def log_joins(samples: Sequence[AttitudeSample], told: Iterable[tuple[str, str]]
     broken = np.array([sample.discontinuity for sample in samples[1:]])
     held = gap & ~fits & ~broken
     misfit = known & ~fits & ~broken & ~gap
-    cause = ""
+    cause: Cause | None = None
     if misfit.any() and TIMES not in dict(told):  # what is probably wrong from the first rate on that does not fit
         first = int(misfit.argmax())
-        found = cause_in([sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None])
-        cause = "" if found is None else found.text
+        cause = cause_in([sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None])
     return LogJoins(
         frozenset(t_ns[:-1][fits & ~broken].tolist()),
         frozenset(t_ns[:-1][held].tolist()),

@@ -102,7 +102,7 @@ class _ForwardedNotices(Notices):
         if grown != LinkCounts():
             self._wire.put(Record(self._order, counts=grown))
 
-    def tell(self, kind: str, detail: str, who: str = "", *, lasting: bool = True) -> None:
+    def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None, *, lasting: bool = True) -> None:
         with contextlib.suppress(EOFError):
             self.count()
             self._wire.put(Record(self._order, notice=(kind, detail, who), lasting=lasting))

@@ -43,6 +43,7 @@ export function writeAttitude(attitude, rows) {
 
 export function writeSource(state, rows) {
   const { attitude, source, clock: sender } = state;
+  rows.set("First attitude", state.pointing || NONE);
   rows.set("Age at light", attitude ? quantity(attitude.age_ms, "ms", 1) : NONE);
   rows.set("Source", source ? [source.kind, source.endpoint].filter(Boolean).join("  ") : NONE);
   rows.set("Clock offset", sender ? `${quantity(sender.offset_ms, "ms", 3)} \u00b1 ${quantity(sender.sigma_ms, "ms", 3)}` : NONE);
@@ -57,6 +58,7 @@ export function writeRun({ frame, counts, pacing, ledger }, rows) {
   rows.set("Stale", count(counts.stale), seen(counts.stale));
   rows.set("Given up", count(counts.given_up), seen(counts.given_up));
   rows.set("Packets", `${count(counts.accepted)} of ${count(counts.received)} accepted`);
+  rows.set("Lost", count(counts.lost ?? 0), seen(counts.lost));
   rows.set("Interval p50, p99", pacing ? `${quantity(pacing.p50_ms, "ms", 2)}, ${quantity(pacing.p99_ms, "ms", 2)}` : NONE);
   rows.set("Jitter (sd)", pacing ? quantity(pacing.sd_ms, "ms", 3) : NONE);
   rows.set("Stars drawn", count(frame.stars));

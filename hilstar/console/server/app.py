@@ -28,6 +28,7 @@ from hilstar.console.messages import Order, OrderAnswer, RunState, Setup
 from hilstar.console.protocol import CONTROLS, SUBPROTOCOL, TOKEN_PROTOCOL, OrderBody, PageText, SkyMap
 from hilstar.console.server.connections import OpenPage, OpenPages
 from hilstar.console.server.reader import RunReader
+from hilstar.wrong_sky import ENDS
 
 LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}  # no name server says where they are
 HEADERS = {
@@ -142,12 +143,19 @@ class RunCollector(Collector):
             ("frames_stale", "Frames shown with a stale attitude.", counts.stale),
             ("frames_given_up", "Frames given up because their moment had passed.", counts.given_up),
             ("packets_received", "Attitude packets received.", counts.received),
+            ("packets_lost", "Attitude packets that never came, by gaps of their sequence.", counts.lost),
+            ("wrong_sky_seconds", "Seconds in which the sky shown was wrong.", seen.wrong_sky_s),
         ):
             yield CounterMetricFamily(f"hilstar_{name}", words, value=count)
         refused = CounterMetricFamily("hilstar_packets_refused", "Attitude packets refused.", labels=["reason"])
         for reason, count in counts.refused.items():
             refused.add_metric([reason], count)
         yield refused
+        wrong = GaugeMetricFamily("hilstar_wrong_sky", "1 while the sky shown is wrong, by kind.", labels=["kind"])
+        lasting = {condition.kind for condition in seen.wrong_sky}
+        for kind in ENDS:
+            wrong.add_metric([kind], float(kind in lasting))
+        yield wrong
         tracker = seen.tracker
         if tracker is not None:
             yield from tracker_metrics(tracker)

@@ -83,8 +83,8 @@ def _of_rest(seen: messages.RunState, lately: RecentFrames) -> Iterator[str]:
         yield f"shown by --force: {seen.forced}"
     if seen.operator_text:
         yield f"changed by the operator: {seen.operator_text}"
-    if seen.rates:
-        yield seen.rates
+    for condition in seen.wrong_sky:
+        yield condition.line
     if seen.tracker is not None and seen.tracker.silent:
         yield seen.tracker.silent
     if seen.faults:

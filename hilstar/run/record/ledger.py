@@ -43,6 +43,7 @@ from hilstar.notices import Notice, Notices
 from hilstar.process.closing import Closing
 from hilstar.process.interrupts import caught, stop_on_signal
 from hilstar.run.record.ledger_records import (
+    LOST,
     MAX_RAW_BYTES,
     RECORDS,
     AnswerRecord,
@@ -55,6 +56,7 @@ from hilstar.run.record.ledger_records import (
     schema_of,
 )
 from hilstar.units import NS_PER_S
+from hilstar.wrong_sky import BEGINS, ENDS
 
 Kind = Literal["packet", "frame", "event", "fault", "answer"]
 MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stalls
@@ -106,7 +108,7 @@ class LedgerQueue:
         return taken
 
 
-Counted = Kind | Literal["pulse"]  # pulses are only counted
+Counted = Kind | Literal["pulse", "lost"]  # pulses and lost packets are only counted
 
 
 class Allowance:
@@ -244,7 +246,7 @@ class Ledger(Closing):
         self._lost = self._counted = self._part = 0
         self._thin = self._moved = False
         self._renewed_s, self._rest_s = -math.inf, EACH_S
-        self.standing: Callable[[], list[FaultRecord]] = list  # records that a file begun during a run repeats
+        self.standing: Callable[[], list[FaultRecord | EventRecord]] = list  # records that a file begun during a run repeats
         self._file, self._writer = self._begin(path, overwrite)
         self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
         self._begun_s = self._alive_s = time.monotonic()
@@ -296,8 +298,12 @@ class Ledger(Closing):
     def notice(self, notice: Notice) -> None:
         """Record an event of the run."""
         if self._filter.keeps("event", notice.kind, notice.host_ns):
-            record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail, who=notice.who)
+            record = event_record(notice)
             self._queue.put(QueueEntry("event", notice.host_ns, 0, partial(msgspec.json.encode, record)))
+
+    def stands(self, record: EventRecord) -> None:
+        """Record an event from before this ledger."""
+        self._queue.put(QueueEntry("event", record.host_ns, 0, partial(msgspec.json.encode, record)))
 
     def fault(self, record: FaultRecord) -> None:
         """Record the beginning or the end of a fault; a replay needs each."""
@@ -311,6 +317,10 @@ class Ledger(Closing):
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""
         self._filter.count("pulse", what)
+
+    def lost(self, number: int) -> None:
+        """Count packets that a gap of their `sequence` shows."""
+        self._filter.count("lost", LOST, number)
 
     # The writer's thread
 
@@ -361,7 +371,7 @@ class Ledger(Closing):
         for kind, number in dropped.items():
             self._lose(kind, number)
         for (kind, reason), number in self._filter.counted().items():
-            self._counted += 0 if reason == NO_ROOM or kind == "pulse" else number
+            self._counted += 0 if reason == NO_ROOM or kind in {"pulse", "lost"} else number
             record = CountRecord(host_ns=now_ns, kind=kind, reason=reason, count=number)
             self._add("count", now_ns, msgspec.json.encode(record))
         process = self._probe.record()
@@ -391,7 +401,8 @@ class Ledger(Closing):
         old, self._file, self._writer, self.path = self._file, file, writer, path
         self._begun_s, self._moved = time.monotonic(), False
         for record in self.standing():
-            self._add("fault", record.host_ns, msgspec.json.encode(record), record.number)
+            kind, number = ("fault", record.number) if isinstance(record, FaultRecord) else ("event", 0)
+            self._add(kind, record.host_ns, msgspec.json.encode(record), number)
         old.close()
 
     def _say_lost(self, line: str) -> None:
@@ -493,6 +504,11 @@ TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
 }
 
 
+def event_record(notice: Notice) -> EventRecord:
+    """The ledger's record of an event."""
+    return EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail, who=notice.who, since_ns=notice.since_ns)
+
+
 class LedgerSwitch:
     """Passes a run's records to the current ledger, which can be begun and ended during the run; drops them without one.
 
@@ -504,6 +520,7 @@ class LedgerSwitch:
         self._ending = threading.Lock()  # the end of a run waits for an end that an operator asked for
         self._scenario: list[FaultRecord] = []
         self._faults_on: dict[int, FaultRecord] = {}
+        self._wrong_sky: dict[str, EventRecord] = {}
         if ledger is not None:
             ledger.standing = self._standing
 
@@ -528,7 +545,11 @@ class LedgerSwitch:
             ledger.frame(record)
 
     def notice(self, notice: Notice) -> None:
-        """Record an event of the run."""
+        """Record an event of the run; a ledger that begins later repeats the conditions of a wrong sky that hold."""
+        if notice.kind in ENDS:
+            self._wrong_sky[notice.kind] = event_record(notice)
+        elif notice.kind in BEGINS:
+            self._wrong_sky.pop(BEGINS[notice.kind], None)
         if (ledger := self.current) is not None:
             ledger.notice(notice)
 
@@ -536,6 +557,11 @@ class LedgerSwitch:
         """Record an answer of the tracker."""
         if (ledger := self.current) is not None:
             ledger.answer(record)
+
+    def lost(self, number: int) -> None:
+        """Count packets that a gap of their `sequence` shows."""
+        if (ledger := self.current) is not None:
+            ledger.lost(number)
 
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""
@@ -559,12 +585,15 @@ class LedgerSwitch:
             ledger = make()
             ledger.standing = self._standing
             for record in self._standing():
-                ledger.fault(record)
+                if isinstance(record, FaultRecord):
+                    ledger.fault(record)
+                else:
+                    ledger.stands(record)
             self.last = self.current = ledger
         return ledger
 
-    def _standing(self) -> list[FaultRecord]:
-        return [*self._scenario, *list(self._faults_on.values())]
+    def _standing(self) -> list[FaultRecord | EventRecord]:
+        return [*self._scenario, *list(self._faults_on.values()), *list(self._wrong_sky.values())]
 
     def end(self) -> Ledger | None:
         """End the ledger and wait until it is complete on the disk; the ended ledger."""

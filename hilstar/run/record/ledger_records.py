@@ -36,6 +36,7 @@ FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/
 ANSWER_TOPIC = "/answer"
 # What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame "skipped" too.
 PULSES = ("sent", "skipped", "lost")
+LOST = "sequence"  # why packets count as lost
 MAX_RAW_BYTES = 1024  # kept of a message; every packet is shorter, a simulator's own messages may be cut
 MAX_CENTROIDS = 200  # kept of an answer
 HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, which began at its start
@@ -107,12 +108,16 @@ class ProcessRecord(msgspec.Struct, kw_only=True):
 
 
 class EventRecord(msgspec.Struct, kw_only=True):
-    """An event of a run (see `hilstar.notices`): host time, ns, its kind, its text, and the person that it comes from."""
+    """An event of a run (see `hilstar.notices`): host time, ns, its kind, its text, and the person that it comes from.
+
+    `since_ns` is when that began of which it tells, where this was earlier.
+    """
 
     host_ns: HostNs
     kind: str
     detail: str
     who: str = ""
+    since_ns: AnyNs | None = None
 
 
 class FaultRecord(msgspec.Struct, kw_only=True):
@@ -167,8 +172,8 @@ class AnswerRecord(msgspec.Struct, kw_only=True):
 class CountRecord(msgspec.Struct, kw_only=True):
     """What was only counted, second by second (host time, ns): refused packets by reason, a flood, or pulses.
 
-    `kind` is "packet", "frame", "event", "answer" or "pulse"; `reason` that of a refusal, "accepted" of other packets and
-    answers, the kind of an event, and of a pulse one of PULSES.
+    `kind` is "packet", "frame", "event", "answer", "pulse" or "lost"; `reason` that of a refusal, "accepted" of other packets
+    and answers, the kind of an event, of a pulse one of PULSES, and LOST of packets that a gap of their `sequence` shows.
     """
 
     host_ns: HostNs
@@ -283,6 +288,11 @@ def frame_records(path: Path, *, tell: bool = True) -> Iterator[FrameRecord]:
 def fault_records(path: Path) -> Iterator[FaultRecord]:
     """The beginnings and ends of faults in a ledger. Raises InputError for damage; says nothing of a missing end."""
     return _records(path, FAULT_TOPIC)
+
+
+def event_records(path: Path) -> Iterator[EventRecord]:
+    """The events of a run in its ledger. Raises InputError for damage; says nothing of a missing end."""
+    return _records(path, EVENT_TOPIC)
 
 
 def answer_records(path: Path) -> Iterator[AnswerRecord]:

@@ -37,6 +37,7 @@ from hilstar.run.record.ledger_records import (
 )
 from hilstar.running_statistics import Percentiles, RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
+from hilstar.wrong_sky import WrongSky, WrongSkyTotal
 
 SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
 SPANS = 8192  # in which a run is drawn along its time
@@ -168,6 +169,7 @@ WARM_UP_S = 60.0  # after this the process has allocated all the memory that it 
 KEYFRAMES = 16
 MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
 SMALL_RAD = 1e-8
+RECOUNTED = 8192  # newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz
 
 
 class Keyframes:
@@ -202,12 +204,36 @@ METRICS = {
     **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
 }
 HEAD = ("bench_sha256", "calibration", "calibration_sha256", "certificate", "gl_renderer", "gl_version", "render_path")
-FAULTS = ("stale_frames", "blank_frames", "operator_frames", "hidden_frames")
+FAULTS = ("stale_frames", "blank_frames", "operator_frames", "hidden_frames", "wrong_frames")
 COUNTED = ("frames", "right_frames", "capped_frames", *FAULTS)
 # The columns of the spans: METRICS, then these.
 COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
 ACCEPTED, REFUSED = range(2)
 NUMBERS, WORDS = ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step"), ("operator", "hidden")
+
+
+@dataclass(slots=True)
+class FrameMarks:
+    """The newest frames (n,): when each was swapped, whether nothing else is wrong with it, and whether its sky was."""
+
+    swap_ns: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    plain: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    wrong: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def add(self, swap_ns: npt.NDArray[np.int64], plain: BoolArray, wrong: BoolArray) -> None:
+        """Add frames, and forget the oldest ones."""
+        self.swap_ns = np.concatenate([self.swap_ns, swap_ns])[-RECOUNTED:]
+        self.plain = np.concatenate([self.plain, plain])[-RECOUNTED:]
+        self.wrong = np.concatenate([self.wrong, wrong])[-RECOUNTED:]
+
+
+def _covered(wrong_sky: WrongSky, swap_ns: npt.NDArray[np.int64]) -> BoolArray:
+    """Which of these moments (n,) of host time had a wrong sky."""
+    covered = np.zeros(len(swap_ns), dtype=bool)
+    if wrong_sky.any:
+        for begin_ns, end_ns in wrong_sky.spans_ns():
+            covered |= (swap_ns >= begin_ns) & (swap_ns < end_ns)
+    return covered
 
 
 @dataclass(slots=True)
@@ -236,9 +262,12 @@ class RunFigures:
     residuals: ThinnedRows = field(default_factory=lambda: ThinnedRows(4, SAMPLES // 4))  # host time in s, x, y, z in arcsec
     first_events: list[EventRecord] = field(default_factory=list)
     last_events: deque[EventRecord] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
+    wrong_sky: WrongSky = field(default_factory=WrongSky)
+    lost: int = 0  # packets
     first_process: ProcessRecord | None = None
     warm: ProcessRecord | None = None
     last_process: ProcessRecord | None = None
+    _newest: FrameMarks = field(default_factory=FrameMarks)
     _turned: FloatArray = field(default_factory=lambda: np.zeros(3))
     _q: FloatArray | None = None
     _first_t_ns: int | None = None
@@ -273,8 +302,19 @@ class RunFigures:
             self.packets.add(record)
         times_ns, known = _whole(packets, "receive_ns")
         self.packet_times.add(times_ns[known], np.where(accepted, ACCEPTED, REFUSED)[known])
+        self._recount()
         if frames:
             self._add_frames(frames)
+
+    def _recount(self) -> None:
+        """Count frames as wrong that were added before it was found that they are: conditions say since when they hold."""
+        if not self.wrong_sky.any:
+            return
+        newest = self._newest
+        found = _covered(self.wrong_sky, newest.swap_ns) & ~newest.wrong
+        newest.wrong |= found
+        self.counted["wrong_frames"] += int(found.sum())
+        self.counted["right_frames"] -= int((found & newest.plain).sum())
 
     def _add_one(self, record: ProcessRecord | CountRecord | EventRecord | FaultRecord | AnswerRecord) -> None:
         if isinstance(record, ProcessRecord):
@@ -284,11 +324,7 @@ class RunFigures:
             self.last_process = record
             self.process.add(np.array([(record.host_ns / NS_PER_S, record.resident_bytes / MEGABYTE, record.cpu_s)]))
         elif isinstance(record, EventRecord):
-            kind = record.kind[:MAX_REASON_CHARACTERS]
-            if kind in self.events or len(self.events) < MAX_REASONS:
-                self.events[kind] = self.events.get(kind, 0) + 1
-            record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
-            (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(record)
+            self._add_event(record)
         elif isinstance(record, FaultRecord):
             self.faults.append(record)
             self.answers.fault(record)
@@ -299,9 +335,19 @@ class RunFigures:
         elif record.kind == "pulse" and record.reason in PULSES:
             self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
             self.pulses[record.reason] += record.count
+        elif record.kind == "lost":
+            self.lost += record.count
         elif record.kind == "packet":
             place = ACCEPTED if record.reason == "accepted" else REFUSED
             self.packet_times.add(np.array([record.host_ns]), np.array([place]), record.count)
+
+    def _add_event(self, record: EventRecord) -> None:
+        kind = record.kind[:MAX_REASON_CHARACTERS]
+        if kind in self.events or len(self.events) < MAX_REASONS:
+            self.events[kind] = self.events.get(kind, 0) + 1
+        record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
+        self.wrong_sky.see(kind, record.detail, record.host_ns, record.since_ns)
+        (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(record)
 
     def _add_frames(self, frames: list[FrameRecord]) -> None:
         before, self.last = self.last, frames[-1]
@@ -311,13 +357,15 @@ class RunFigures:
         stale, capped, missed, stars, clipped, below = (_whole(frames, name)[0] for name in NUMBERS)
         blank = np.array([frame.q is None for frame in frames])
         words = [np.array([getattr(frame, name) != "" for frame in frames]) for name in WORDS]
-        masks = dict(zip(FAULTS, (stale > 0, blank, *words), strict=True))
+        swap_ns, _ = _whole(frames, "swap_ns")
+        wrong = _covered(self.wrong_sky, swap_ns)
+        masks = dict(zip(FAULTS, (stale > 0, blank, *words, wrong), strict=True))
+        self._newest.add(swap_ns, ~np.any([*masks.values()][:-1], axis=0), wrong)
         masks |= {"right_frames": ~np.any([*masks.values()], axis=0), "late": (stale > 0) & ~blank, "capped_frames": capped > 0}
         for name, mask in masks.items():
             self.counted[name] += int(mask.sum())
         for name, number in (("clipped", clipped), ("below_step", below), ("stars_drawn", stars)):
             self.most[name] = max(self.most[name], int(number.max()))
-        swap_ns, _ = _whole(frames, "swap_ns")
         times = _times_ms(frames, swap_ns, before, missed > 0)
         for name, values in zip(METRICS, times.T, strict=True):
             self.spreads[name].add_all(values[~np.isnan(values)])
@@ -415,7 +463,10 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     packets: dict[str, int]
     events: dict[str, int]
     pulses: dict[str, int]
-    right_frames: int = 0  # on the screen, with a fresh attitude, not changed by the operator
+    right_frames: int = 0  # on the screen, with a fresh attitude, not changed by the operator, of a sky that is right
+    wrong_frames: int = 0
+    wrong_sky: WrongSkyTotal = WrongSkyTotal()
+    lost_packets: int = 0
     clipped: int
     below_step: int
     stars_drawn: int
@@ -445,6 +496,8 @@ def summarise(run: RunFigures) -> RunReport:
         pacing_jitter_ms=run.spreads["interval"].deviation,
         attitude_age_frames=None if refresh_hz is None else times["attitude_age_ms"].times(refresh_hz / 1e3),
         packets=run.packets.counts,
+        lost_packets=run.lost,
+        wrong_sky=run.wrong_sky.total(run.first_swap_ns, run.first_swap_ns if last is None else last.swap_ns),
         answers=run.answers.report(run.first_swap_ns) or UNSET,
     )
 
@@ -477,7 +530,8 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ("age of the attitude at light", f"{three(found.attitude_age_ms)} = {three(found.attitude_age_frames, 'frames')}"),
         ("predicted past the last packet", three(found.prediction_ms)),
         ("packet to swap", three(found.packet_to_swap_ms)),
-        ("packets", f"{found.packets.get('accepted', 0)} accepted, {refused} refused"),
+        *[(one.kind, f"{one.seconds:.1f} s: {one.text}") for one in found.wrong_sky.conditions],
+        ("packets", f"{found.packets.get('accepted', 0)} accepted, {refused} refused, {found.lost_packets} lost"),
         ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
         ("pulses", pulses),
         ("stars", f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint"),

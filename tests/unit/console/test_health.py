@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from hilstar.answers.judge import TrackerFigures
 from hilstar.console.messages import RunState
-from hilstar.console.protocol import LedgerState, NewestFrame, ShownAttitude
+from hilstar.console.protocol import LedgerState, NewestFrame, ShownAttitude, WrongCondition
 from hilstar.console.server.reader import Health, RecentFrames, reasons
 
 S = 1_000_000_000
@@ -45,7 +45,10 @@ def test_a_run_that_goes_well_has_no_reason():
         ({"operator_text": "blank"}, "changed by the operator: blank"),
         ({"faults": ["flash"]}, "a fault is on: flash"),
         ({"tracker": TrackerFigures(silent="the tracker has not answered for 2.0 s")}, "has not answered for 2.0 s"),
-        ({"rates": "the packets' rates are wrong"}, "the packets' rates are wrong"),
+        (
+            {"wrong_sky": [WrongCondition("rates-wrong", "the packets' rates are wrong")]},
+            "the packets' rates are wrong",
+        ),
         ({"forced": "another monitor"}, "shown by --force: another monitor"),
     ],
 )

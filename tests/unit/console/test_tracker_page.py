@@ -15,6 +15,7 @@ from hilstar.console.protocol import AttitudeSource, Hello
 from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.server.app import RunCollector
 from hilstar.console.server.reader import RunReader
+from hilstar.notices import Notices
 from hilstar.rotation import from_rotation_vector, multiply
 from tests.support.benches import ORION_Q
 
@@ -72,8 +73,8 @@ def test_the_metrics_and_the_state_have_the_trackers_figures(reader):
 
 
 def test_the_terminal_has_a_line_of_the_tracker():
-    loop = SimpleNamespace(tally=SimpleNamespace(frames=1, missed_frames=0, stale_frames=0))
-    packets = SimpleNamespace(received=0, refused=0, refused_by={})
+    loop = SimpleNamespace(tally=SimpleNamespace(frames=1, missed_frames=0, stale_frames=0), notices=Notices())
+    packets = SimpleNamespace(received=0, refused=0, refused_by={}, lost=0)
     status = RunStatus(RunSource("zmq", "llvmpipe", 60.0))
     status.see(SimpleNamespace(attitude=None, missing=True, swap_ns=0, stale=False))
 

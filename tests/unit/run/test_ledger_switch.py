@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from hilstar.notices import Notice
 from hilstar.run.record.ledger import Ledger, LedgerSwitch
-from hilstar.run.record.ledger_records import FaultRecord
+from hilstar.run.record.ledger_records import EventRecord, FaultRecord
 
 
 class Kept:
@@ -23,6 +23,9 @@ class Kept:
 
     def fault(self, record: FaultRecord) -> None:
         self.taken.append((record.event, record.name))
+
+    def stands(self, record: EventRecord) -> None:
+        self.taken.append((record.kind, record.since_ns))
 
     def close(self) -> None:
         self.closed = True
@@ -69,3 +72,11 @@ def test_a_failure_is_told_after_its_ledger_has_ended():
     begun(switch).failure = "no room"
     switch.end()
     assert switch.failure == "no room"
+
+
+def test_a_later_ledger_has_the_conditions_of_a_wrong_sky_that_hold():
+    switch = LedgerSwitch()
+    switch.notice(Notice(5, "rates-wrong", "", since_ns=3))
+    switch.notice(Notice(6, "clock-not-shared", "", since_ns=4))
+    switch.notice(Notice(7, "clock-shared", ""))
+    assert begun(switch).taken == [("rates-wrong", 3)]

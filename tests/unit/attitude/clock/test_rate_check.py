@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.clock.rate_check import OTHER_AXES, RIGHT, WRONG, RateCheck
+from hilstar.attitude.clock.rate_causes import OTHER_AXES
+from hilstar.attitude.clock.rate_check import RIGHT, WRONG, RateCheck
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.notices import Notices
 from hilstar.rotation import conjugate, from_radec_roll_deg, from_rotation_vectors, multiply
 from hilstar.units import NS_PER_S
+from hilstar.wrong_sky import CONVENTION
 
 ARCSEC = math.radians(1 / 3600)
 FINE_S = 1e-3  # steps of the true motion: 0.1 arcsec off in a second of the fastest of these turns
@@ -69,6 +71,15 @@ WRONGS: dict[str, tuple[Callable[[FloatArray, FloatArray], FloatArray], str]] = 
     "another frame, deg/s": (lambda q, rates: np.degrees(rates @ OTHER_FRAME.T), "such as the body's, and in deg/s"),
     "ICRS": (in_icrs, "ICRS components"),
     "zeros": (lambda q, rates: np.zeros_like(rates), "zero; leave them out"),
+}
+
+FACTORS = (0.5, 0.75, 1.25, 1.5, 2.5)
+SWING_HZ, SWING_DEG_S = 0.5, 2.0
+LAG_WITHIN_S = 0.03  # of a lag, by noise of a coarse gyroscope
+LINES = {
+    ("first", "cam_to_icrs"): '{ direction = "cam_to_icrs" }',
+    ("last", "icrs_to_cam"): '{ scalar = "last" }',
+    ("last", "cam_to_icrs"): '{ scalar = "last", direction = "cam_to_icrs" }',
 }
 
 AXES = {"axes", "axes and signs", "signs", "another frame", "another frame, deg/s"}  # in noise these are one
@@ -204,3 +215,101 @@ def test_warn_believes_the_rate_and_off_does_not_look():
     assert [kind for kind, _ in told] == [WRONG] and "used all the same" in told[0][1]
     assert check.believed(stream[-1]) is stream[-1]
     assert watched(stream, "off")[1] == []
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+@pytest.mark.parametrize("hz", [20, 50, 100, 1000])
+def test_a_factor_is_named_at_half_a_degree_a_second(factor, hz):
+    t_ns, q, rates = steady(hz, turn=np.radians([0, 0, 0.5]))
+    check, told, _ = watched(samples(t_ns, q, factor * rates))
+    assert [kind for kind, _ in told] == [WRONG]
+    assert f"they are {factor:g} times the quaternions' own turn" in told[0][1] and check.distrusts
+
+
+def test_a_factor_within_a_fifth_is_not_told():
+    t_ns, q, rates = steady(turn=np.radians([0, 0, 0.5]))
+    assert watched(samples(t_ns, q, 1.15 * rates))[1] == []
+
+
+def test_noise_that_hides_half_of_an_error_does_not_show_that_it_is_gone():
+    t_ns, q, rates = steady(100, 6.0, np.radians([0, 0, 0.5]), np.random.default_rng(2))
+    assert {kind for kind, _ in watched(samples(t_ns, q, 0.5 * rates))[1]} == {WRONG}
+
+
+def test_a_constant_that_is_added_is_named():
+    t_ns, q, rates = steady(seconds=8.0, turn=np.radians([0, 0, 0.5]))
+    _, told, _ = watched(samples(t_ns, q, rates + np.radians([0.2, 0, 0])))
+    assert [kind for kind, _ in told] == [WRONG] and "a constant (0.2, " in told[0][1]
+
+
+def swing(late_s: float, hz: float = 100.0, seconds: float = 10.0, rng: np.random.Generator | None = None):
+    """A swing of SWING_HZ whose rates are those of `late_s` before."""
+    fine_s = np.arange(-1, seconds + 1, FINE_S)
+    rates = math.radians(SWING_DEG_S) * np.cos(math.tau * SWING_HZ * fine_s)[:, None] * [0.0, 0.6, 0.8]
+    t_s = np.arange(0, seconds, 1 / hz)
+    now, then = (np.round((t_s + 1 - by_s) / FINE_S).astype(int) for by_s in (0.0, late_s))
+    q, sent = moved(rates, FINE_S)[now], rates[then]
+    if rng is not None:
+        q = multiply(from_rotation_vectors(rng.normal(0, Q_NOISE_RAD, (len(q), 3))), q)
+        sent = sent + rng.normal(0, RATE_NOISE_RAD_S, sent.shape)
+    return samples(np.round(t_s * NS_PER_S).astype(int), q, sent)
+
+
+@pytest.mark.parametrize(("late_s", "hz"), [(0.2, 20), (0.2, 100), (-0.1, 50), (0.2, 200)])
+@pytest.mark.parametrize("noisy", [False, True])
+def test_late_rates_are_named_with_their_lag_and_stay_so(late_s, hz, noisy):
+    check, told, _ = watched(swing(late_s, hz, rng=np.random.default_rng(7) if noisy else None))
+    assert [kind for kind, _ in told] == [WRONG]
+    assert abs(check.cause.lag_s - late_s) < LAG_WITHIN_S
+    assert f"{abs(check.cause.lag_s) * 1e3:.0f} ms {'late' if late_s > 0 else 'early'}" in told[0][1]
+
+
+def test_rates_that_are_late_no_more_are_believed_again():
+    late, right = swing(0.2), swing(0.0, seconds=15.0)
+    later = [AttitudeSample(s.t_ns + 10 * NS_PER_S, s.q_icrs_to_cam, s.rate_cam_rad_s, s.sequence + 1000) for s in right]
+    assert [kind for kind, _ in watched(late + later)[1]] == [WRONG, RIGHT]
+
+
+def as_sent(q: FloatArray, scalar: str, direction: str) -> FloatArray:
+    sent = conjugate(q) if direction == "cam_to_icrs" else q
+    return sent if scalar == "first" else np.roll(sent, -1, axis=1)
+
+
+@pytest.mark.parametrize(("scalar", "direction"), LINES)
+@pytest.mark.parametrize("noisy", [False, True])
+def test_rates_that_fit_another_reading_of_the_quaternions_name_its_line(scalar, direction, noisy):
+    t_ns, q, rates = steady(seconds=4.0, rng=np.random.default_rng(3) if noisy else None)
+    _, told, _ = watched(samples(t_ns, as_sent(q, scalar, direction), rates))
+    assert [kind for kind, _ in told] == [CONVENTION]
+    assert f"write [attitude] convention = {LINES[scalar, direction]} " in told[0][1]
+
+
+def test_a_stated_convention_that_is_wrong_is_told_against_what_was_sent():
+    """The bench file says scalar last, and the sender has it first."""
+    t_ns, q, rates = steady()
+    notices, told = Notices(), []
+    notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
+    check = RateCheck("use-quaternions", notices, scalar="last")
+    for sample in samples(t_ns, np.roll(q, 1, axis=1), rates):
+        check.see(sample)
+    assert [kind for kind, _ in told] == [CONVENTION] and '{ scalar = "first" }' in told[0][1]
+
+
+def test_a_turn_that_no_reading_changes_names_the_sign_and_the_line():
+    """About the boresight from (1, 0, 0, 0) a conjugate and rates of the wrong sign are one."""
+    seconds = np.arange(0, 3, 0.01)
+    half = np.radians(0.5) * seconds / 2
+    q = np.column_stack([np.cos(half), 0 * half, 0 * half, np.sin(half)])
+    rates = np.tile(np.radians([0, 0, 0.5]), (len(q), 1))
+    _, told, _ = watched(samples(np.round(seconds * NS_PER_S).astype(int), q, rates))
+    assert [kind for kind, _ in told] == [WRONG]
+    assert "wrong sign" in told[0][1] and '[attitude] convention = { direction = "cam_to_icrs" }' in told[0][1]
+
+
+def test_a_condition_says_since_when_it_holds():
+    t_ns, q, rates = steady()
+    notices = Notices()
+    check = RateCheck("use-quaternions", notices)
+    for sample in samples(t_ns, q, -rates):
+        check.see(sample, sample.t_ns + 5 * NS_PER_S)
+    assert [condition.since_ns for condition in notices.wrong_sky.now()] == [5 * NS_PER_S]

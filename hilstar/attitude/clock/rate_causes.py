@@ -1,0 +1,447 @@
+"""What is wrong with rates that are not those of their own attitudes, from stretches of packets; no I/O.
+
+A stretch has the turn of its quaternions and the mean of its rates, each with its own noise. A cause without a free number (a
+unit, a sign, an order of axes) is found in MIN_STRETCHES in a row. One with a free number (a factor, a rotation, a constant)
+needs more. Rates may be right and the quaternions read in the wrong convention: then the rates fit another reading of their
+four numbers. Rates that are late fit and do not fit by turns: they are compared with the turn some time before (`lag_of`).
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hilstar.arrays import BoolArray, FloatArray
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.rotation import conjugate, multiply, rotate, to_rotation_vector
+from hilstar.units import NS_PER_S
+from hilstar.wrong_sky import CONVENTION, RATES
+
+MIN_INTERVALS = 5
+MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES = 4, 6, 12
+LONGEST_S = 0.5
+MAX_STEP_RAD = 1.5  # from packet to packet: half a turn has no direction
+MIN_TURN_RAD_S = math.radians(0.01)
+MIN_OFF_RAD_S, MIN_GROSS_RAD_S = math.radians(0.05), math.radians(1.0)
+OFF_SHARE, FIT_SHARE, AXES_SHARE, GROSS_SHARE = 0.2, 0.1, 0.03, 0.5  # shares of the faster turn
+MAX_HELD_SHARE = 0.2  # maximum share of packets that repeat an attitude: a turn in steps is not the camera's
+OFF_SIGMA, FIT_SIGMA, TURN_SIGMA = 6.0, 4.0, 3.0
+MIN_BETTER = 3.0  # a cause leaves at most a third of the error
+WALK = 1.1  # white noise of rates, summed up: the slope of its sum is off by sqrt(6/5) of its mean's error
+STEADY_SHARE = 0.2
+SHARP_SHARE = 0.25  # the shares of the turn that noise may hide, for another reading
+MUCH_LESS = 0.5
+MIN_HISTORY_S = 3.0
+MAX_LAG_S, LAG_SPAN_S = 0.5, 0.2  # lags that are tried, and the time over which each turn is taken
+LAG_STEPS_S = (0.01, 0.002)  # coarse, then fine
+MIN_LAG_S = 0.02
+MIN_TURNS = 5
+NOISE_RATIO = 2.0  # over ten and more turns a chance error is within 1.5 times the noise
+LAG_TIE = 0.02  # share of the range of errors
+
+
+class Reading(NamedTuple):
+    """Another reading of a quaternion's four numbers: what it is, the line that states it, and (n, 4) read by it."""
+
+    text: str
+    line: str
+    read: Callable[[FloatArray], FloatArray]
+
+
+def _scalar_last(q: FloatArray) -> FloatArray:
+    return np.asarray(q[..., [3, 0, 1, 2]])
+
+
+def readings(scalar: str = "first", direction: str = "icrs_to_cam") -> tuple[Reading, ...]:
+    """The other readings of quaternions that are read as this `[attitude] convention` says."""
+    found = []
+    for other_scalar, other_direction in itertools.product(("first", "last"), ("icrs_to_cam", "cam_to_icrs")):
+        if (other_scalar, other_direction) == (scalar, direction):
+            continue
+        text = "quaternions" if other_direction == direction else "conjugate of the quaternions"
+        text += "" if other_scalar == scalar else f" read with the scalar {other_scalar}"
+        parts = [f'scalar = "{other_scalar}"'] if other_scalar != "first" or scalar != "first" else []
+        if other_direction != "icrs_to_cam" or direction != "icrs_to_cam":
+            parts.append(f'direction = "{other_direction}"')
+
+        def read(q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar) -> FloatArray:
+            sent = conjugate(q) if direction == "cam_to_icrs" else q
+            sent = np.roll(sent, -1, axis=-1) if scalar == "last" else sent
+            sent = np.roll(sent, 1, axis=-1) if to == "last" else sent
+            return conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
+
+        found.append(Reading(text, f"{{ {', '.join(parts)} }}", read))
+    return tuple(found)
+
+
+@dataclass(slots=True)
+class Stretch:
+    """Some packets in a row: (3,) rates, rad/s, cam, and their standard errors, rad/s; times ns of the sender's clock.
+
+    `turn` is that of the quaternions, `rate` the mean of the rates, and `rate_as_icrs` the same if they had ICRS components.
+    `turned_rad` and `summed_rad` (n, 3) are turn and rates summed up to the times `at_s` (n,) after `from_ns`.
+    """
+
+    turn: FloatArray
+    rate: FloatArray
+    rate_as_icrs: FloatArray
+    turn_sigma: float
+    rate_sigma: float
+    from_ns: int
+    to_ns: int
+    q: FloatArray
+    whole: BoolArray
+    at_s: FloatArray
+    turned_rad: FloatArray
+    summed_rad: FloatArray
+    _read: dict[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def turns(self) -> bool:
+        """Whether its attitude turns by more than its noise."""
+        return float(np.linalg.norm(self.turn)) > max(MIN_TURN_RAD_S, TURN_SIGMA * self.turn_sigma)
+
+    def turn_as(self, reading: Reading) -> FloatArray:
+        """The turn (3,) of its quaternions in another reading of their numbers."""
+        found = self._read.get(reading.line)
+        if found is None:
+            turned = np.cumsum(_turns_rad(reading.read(self.q))[self.whole], axis=0)
+            weight = self.at_s - self.at_s.mean()
+            found = self._read[reading.line] = np.asarray(weight[1:] @ turned / float(weight @ weight))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """What may be wrong with rates: `mends` (3, 3) makes them right, and `scale` is what that multiplies their noise by.
+
+    They are taken to have ICRS components where `in_icrs`, else the camera's. `constant` (3,), rad/s, is added to them all.
+    Where they fit another `reading` of the quaternions, it is the sky that is wrong.
+    """
+
+    text: str
+    mends: FloatArray
+    scale: float = 1.0
+    in_icrs: bool = False
+    constant: FloatArray | None = None
+    reading: Reading | None = None
+    lag_s: float = 0.0
+
+    @property
+    def kind(self) -> str:
+        """The kind of condition that it is."""
+        return RATES if self.reading is None else CONVENTION
+
+    def error(self, stretch: Stretch) -> float:
+        """How far turn and rate of a stretch are apart without it, rad/s."""
+        turn = stretch.turn if self.reading is None else stretch.turn_as(self.reading)
+        sent = stretch.rate_as_icrs if self.in_icrs else stretch.rate
+        mended = self.mends @ sent
+        if self.constant is not None:
+            mended = mended - self.constant
+        return float(np.linalg.norm(turn - mended))
+
+
+# What a rate of 1 rad/s is in units that senders confuse with it.
+UNITS = {
+    "deg/s": math.degrees(1.0),
+    "arcsec/s": math.degrees(3600.0),
+    "mrad/s": 1e3,
+    "rad/ms": 1e-3,
+    "rpm": 60 / math.tau,
+    "revolutions/s": 1 / math.tau,
+    "rad/s times pi/180": math.radians(1.0),
+}
+DEGREES = (("", 1.0), (" and in deg/s", UNITS["deg/s"]))
+SAME = np.eye(3)
+OTHER_FRAME = "they are of another frame than the camera's, such as the body's"
+OTHER_AXES = f"their axes are in another order or have the wrong sign, or {OTHER_FRAME}"
+GROSS = "no unit, sign or order of axes explains them"
+
+
+def _causes() -> Iterator[Cause]:
+    for unit, size in UNITS.items():
+        yield Cause(f"they are in {unit}; send rad/s", SAME / size, 1 / size)
+    for unit, size in DEGREES:
+        yield Cause(f"they have the wrong sign{unit}; send the turn of the camera in the sky, rad/s", -SAME / size, 1 / size)
+    for unit, size in (("", 1.0), (", in deg/s", UNITS["deg/s"])):
+        yield Cause(f"they have ICRS components{unit}; send the camera's, rad/s", SAME / size, 1 / size, in_icrs=True)
+
+
+def read_otherwise(others: Sequence[Reading]) -> Iterator[Cause]:
+    """The causes by which rates fit another reading of the quaternions."""
+    for unit, size in DEGREES:
+        for reading in others:
+            yield Cause(f"they fit the {reading.text}{unit}", SAME / size, 1 / size, reading=reading)
+
+
+def _permutations() -> Iterator[Cause]:
+    """Every order and sign of the axes but the right one and its opposite."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            if order == (0, 1, 2) and abs(sum(signs)) == 3:
+                continue
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            sent = ", ".join(("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3))
+            what = "some of their axes have the wrong sign" if order == (0, 1, 2) else "their axes are in another order"
+            for unit, size in DEGREES:
+                yield Cause(f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)", matrix / size, 1 / size)
+
+
+CAUSES, PERMUTATIONS = tuple(_causes()), tuple(_permutations())
+READ_OTHERWISE = tuple(read_otherwise(readings()))
+
+
+def _turns_rad(q: FloatArray) -> FloatArray:
+    """The turn (n - 1, 3) from each attitude (n, 4) to the next, as a rate times a second."""
+    return -to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))
+
+
+def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
+    """Turn and mean rate of packets in the order of their times; None where most of them follow a break."""
+    t_s = np.array([sample.t_ns - samples[0].t_ns for sample in samples]) / NS_PER_S
+    q = np.array([sample.q_icrs_to_cam for sample in samples])
+    rate = np.array([sample.rate_cam_rad_s for sample in samples])
+    step_s = np.diff(t_s)[:, None]
+    turn_rad = _turns_rad(q)
+    mean = (rate[1:] + rate[:-1]) / 2
+    held = (q[1:] == q[:-1]).all(axis=1)
+    if MAX_HELD_SHARE < held.mean() < 1.0:
+        return None
+    whole = np.array([not sample.discontinuity for sample in samples[1:]])
+    for vectors_rad in (turn_rad, mean * step_s):
+        whole &= np.linalg.norm(vectors_rad, axis=1) < MAX_STEP_RAD
+    count = int(whole.sum())
+    if count < max(MIN_INTERVALS, (len(samples) - 1) / 2):
+        return None
+    at_s, turned, summed, as_icrs = (
+        np.vstack((np.zeros(part.shape[1]), np.cumsum(part[whole], axis=0)))
+        for part in (step_s, turn_rad, mean * step_s, rotate(q[1:], mean) * step_s)
+    )
+    weight = at_s[:, 0] - at_s.mean()
+    spread_s2 = float(weight @ weight)
+    turn = weight @ turned / spread_s2
+    scatter = turned - turned.mean(axis=0) - weight[:, None] * turn
+    turn_sigma = math.sqrt(float((scatter**2).sum()) / (3 * (count - 1)) / spread_s2)
+    rate_sigma = WALK * math.sqrt(float((np.diff(rate, axis=0)[whole] ** 2).sum()) / (6 * count) / count)
+    return Stretch(
+        turn,
+        weight @ summed / spread_s2,
+        weight @ as_icrs / spread_s2,
+        turn_sigma,
+        rate_sigma,
+        samples[0].t_ns,
+        samples[-1].t_ns,
+        q,
+        whole,
+        at_s[:, 0],
+        turned,
+        summed,
+    )
+
+
+def cause_of(
+    stretches: Sequence[Stretch],
+    length_s: float,
+    history_s: float = math.inf,
+    others: Sequence[Cause] = READ_OTHERWISE,
+) -> Cause | None:
+    """What is wrong with the rates of these stretches, all but one in MORE_STRETCHES of them; None where they may be right.
+
+    `length_s` is how long a stretch is meant to be, `history_s` for how long `lag_of` could look already, and `others` are the
+    other readings of the quaternions.
+    """
+    off = [
+        s.turns and _error(s, s.rate) > max(MIN_OFF_RAD_S, OFF_SHARE * _turning(s), OFF_SIGMA * _noise_of(s)) for s in stretches
+    ]
+    if off.count(False) > len(stretches) // MORE_STRETCHES:
+        return None
+    if not any(stretch.rate.any() for stretch in stretches):
+        coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(np.linalg.norm(s.turn) for s in stretches)
+        return Cause("they are zero; leave them out", SAME) if coherent else None
+    sharp = all(FIT_SIGMA * _noise_of(s) < SHARP_SHARE * _turning(s) for s in stretches)
+    read = next((cause for cause in others if _explains(stretches, cause, AXES_SHARE)), None)
+    if read is not None and not sharp and length_s < LONGEST_S:
+        return None  # in noise a longer stretch tells it from a sign and an order of axes
+    return _definite(stretches, read, sharp) or _indefinite(stretches, length_s, history_s)
+
+
+def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
+    """Whether without this cause the rates fit, all but one in MORE_STRETCHES of them, and far better than with it."""
+    off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
+    errors = [cause.error(stretch) for stretch in stretches]
+    fitting = [error <= _limit(s, share, FIT_SIGMA, cause.scale) for s, error in zip(stretches, errors, strict=True)]
+    return fitting.count(False) <= len(stretches) // MORE_STRETCHES and off >= MIN_BETTER * float(np.median(errors))
+
+
+def _definite(stretches: Sequence[Stretch], read: Cause | None, sharp: bool) -> Cause | None:
+    """The simplest of the causes without a free choice that explains the rates.
+
+    `read` is the other reading of the quaternions that does; `sharp` says that noise hides no other turn.
+    """
+    other = "" if read is None or read.reading is None else f", or {_stated(read.reading)}"
+    for cause in CAUSES:
+        if _explains(stretches, cause, FIT_SHARE):
+            # Of a turn about an axis that both readings share nothing tells a sign from a conjugate.
+            return replace(cause, text=cause.text + other)
+    if read is not None and sharp:
+        return read
+    sharp = all(FIT_SIGMA * _noise_of(s) < FIT_SHARE * _faster(s) for s in stretches)
+    found = [cause for cause in PERMUTATIONS if _explains(stretches, cause, AXES_SHARE)]
+    if not found:
+        return read
+    return found[0] if sharp and len(found) == 1 else replace(found[0], text=OTHER_AXES + other)
+
+
+def _stated(reading: Reading) -> str:
+    return f"they are right and fit the {reading.text}: [attitude] convention = {reading.line}"
+
+
+def _indefinite(stretches: Sequence[Stretch], length_s: float, history_s: float) -> Cause | None:
+    """A cause with a free number that explains the rates, or that nothing does though they are far off."""
+    if len(stretches) < MORE_STRETCHES:
+        return None
+    turns, rates = (np.array([getattr(stretch, name) for stretch in stretches]) for name in ("turn", "rate"))
+    factor = float((rates * rates).sum()) / float((rates * turns).sum() or math.inf)
+    if abs(factor) > 0:
+        times = Cause(f"they are {factor:.3g} times the quaternions' own turn", SAME / factor, 1 / abs(factor))
+        if _explains(stretches, times, AXES_SHARE):
+            return times
+    # The rotation that turns rates best into turns (Kabsch 1976).
+    u, _, vt = np.linalg.svd(turns.T @ rates)
+    rotation = np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+    for unit, size in (("", 1.0), (", and in deg/s", UNITS["deg/s"])):
+        turned = Cause(OTHER_FRAME + unit, rotation / size, 1 / size)
+        if _explains(stretches, turned, AXES_SHARE):
+            return turned
+    if len(stretches) >= MANY_STRETCHES and length_s >= LONGEST_S:
+        return _constant(stretches, rates - turns)
+    # While the turn changes, late rates are off as far: `lag_of` is to look first.
+    changes = np.linalg.norm(turns - turns.mean(axis=0), axis=1).max() > STEADY_SHARE * np.linalg.norm(turns, axis=1).max()
+    if changes and history_s < MIN_HISTORY_S:
+        return None
+    gross = [_error(s, s.rate) > max(MIN_GROSS_RAD_S, GROSS_SHARE * _faster(s)) for s in stretches]
+    return Cause(GROSS, SAME) if all(gross) else None
+
+
+def _constant(stretches: Sequence[Stretch], off: FloatArray) -> Cause | None:
+    """A constant that is added to the rates; `off` (n, 3) is by how much they differ from the turns, rad/s."""
+    constant = off.mean(axis=0)
+    x, y, z = np.degrees(constant).tolist()
+    cause = Cause(f"a constant ({x:.3g}, {y:.3g}, {z:.3g}) deg/s is added to them", SAME, constant=constant)
+    return cause if _explains(stretches, cause, AXES_SHARE) else None
+
+
+def off_share(stretch: Stretch) -> float:
+    """By which share of its turn the rates of a stretch are off."""
+    return _error(stretch, stretch.rate) / _turning(stretch)
+
+
+def fits(stretch: Stretch, was_off: float) -> bool:
+    """Whether a turn shows that its rates are right again, where they were off by a share of the turn: noise hides no half."""
+    limit = _limit(stretch, FIT_SHARE, FIT_SIGMA)
+    return stretch.turns and _error(stretch, stretch.rate) <= limit < MUCH_LESS * was_off * _turning(stretch)
+
+
+def _error(stretch: Stretch, rate: FloatArray) -> float:
+    return float(np.linalg.norm(stretch.turn - rate))
+
+
+def _faster(stretch: Stretch) -> float:
+    return float(max(np.linalg.norm(stretch.turn), np.linalg.norm(stretch.rate)))
+
+
+def _turning(stretch: Stretch) -> float:
+    return float(np.linalg.norm(stretch.turn))
+
+
+def _noise_of(stretch: Stretch) -> float:
+    return math.hypot(stretch.turn_sigma, stretch.rate_sigma)
+
+
+def _limit(stretch: Stretch, share: float, sigma: float, scale: float = 1.0) -> float:
+    """How far turn and rate may be apart: a share of the turn, and the noise of both."""
+    size = _faster(stretch) if scale == 1.0 else float(np.linalg.norm(stretch.turn))
+    return max(share * size, sigma * math.hypot(stretch.turn_sigma, scale * stretch.rate_sigma))
+
+
+class LagFit(NamedTuple):
+    """Rates against the turn over some seconds, medians, rad/s: how fast it turned, how far off rates are, and their lag.
+
+    `lag_s` is by how much rates are late, negative where they are early; 0 where none explains the error.
+    """
+
+    fast_rad_s: float
+    off_rad_s: float
+    lag_s: float
+
+
+def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
+    """Whether rates are those of the turn some time before; None where successive stretches are too short to say.
+
+    Medians: of a single jump a mean would be mended by any lag that moves it out of what is compared.
+    """
+    if not stretches:
+        return None
+    zero_ns = stretches[0].from_ns
+    parts = [(stretch.at_s + (stretch.from_ns - zero_ns) / NS_PER_S)[1:] for stretch in stretches]
+    t_s = np.concatenate([[0.0], *parts])
+    turned, summed = (_joined([getattr(stretch, name) for stretch in stretches]) for name in ("turned_rad", "summed_rad"))
+    edges_s = np.arange(MAX_LAG_S, t_s[-1] - MAX_LAG_S, LAG_SPAN_S)
+    if t_s[-1] < MIN_HISTORY_S or len(edges_s) <= MIN_TURNS:
+        return None
+    rate = _between(t_s, summed, edges_s) / LAG_SPAN_S
+
+    def off_by(lags_s: FloatArray) -> FloatArray:
+        turn = _between(t_s, turned, edges_s[None, :] - lags_s[:, None]) / LAG_SPAN_S
+        return np.asarray(np.median(np.linalg.norm(turn - rate, axis=2), axis=1))
+
+    turn = _between(t_s, turned, edges_s) / LAG_SPAN_S
+    fast = max(float(np.median(np.linalg.norm(part, axis=1))) for part in (turn, rate))
+    off, noise = float(off_by(np.zeros(1))[0]), _noise(stretches)
+    if off <= max(MIN_OFF_RAD_S, OFF_SHARE * fast, NOISE_RATIO * noise):
+        return LagFit(fast, off, 0.0)
+    lags_s = np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEPS_S[0] / 2, LAG_STEPS_S[0])
+    lag_s = _least(lags_s, off_by(lags_s))
+    near_s = lag_s + np.arange(-LAG_STEPS_S[0], LAG_STEPS_S[0] + LAG_STEPS_S[1] / 2, LAG_STEPS_S[1])
+    near_s = near_s[np.abs(near_s) <= MAX_LAG_S]
+    left = off_by(near_s)
+    explained = (
+        float(left.min()) <= min(off / MIN_BETTER, max(FIT_SHARE * fast, NOISE_RATIO * noise)) and abs(lag_s) >= MIN_LAG_S
+    )
+    return LagFit(fast, off, float(near_s[left.argmin()]) if explained else 0.0)
+
+
+def _noise(stretches: Sequence[Stretch]) -> float:
+    """How far apart noise alone brings turn and rate over LAG_SPAN_S, rms, rad/s."""
+    squares = []
+    for stretch in stretches:
+        slope = np.outer(stretch.at_s - stretch.at_s.mean(), stretch.turn)
+        scatter = stretch.turned_rad - stretch.turned_rad.mean(axis=0) - slope
+        of_turn = 2 * float((scatter**2).sum(axis=1).mean()) / LAG_SPAN_S**2
+        of_rate = 3 * stretch.rate_sigma**2 * float(stretch.at_s[-1]) / LAG_SPAN_S
+        squares.append(of_turn + of_rate)
+    return math.sqrt(float(np.median(squares)))
+
+
+def _joined(parts: Sequence[FloatArray]) -> FloatArray:
+    """Sums (n, 3) that begin at 0 each, as one that goes on."""
+    ends = np.cumsum([part[-1] for part in parts], axis=0)
+    begins = np.vstack((np.zeros(3), ends[:-1]))
+    return np.vstack([np.zeros(3), *(part[1:] + begin for part, begin in zip(parts, begins, strict=True))])
+
+
+def _between(t_s: FloatArray, summed: FloatArray, edges_s: FloatArray) -> FloatArray:
+    """What a sum (n, 3) over times (n,) gains between edges (..., m): (..., m - 1, 3)."""
+    at_edges = np.stack([np.interp(edges_s, t_s, axis) for axis in summed.T], axis=-1)
+    return np.diff(at_edges, axis=-2)
+
+
+def _least(lags_s: FloatArray, off: FloatArray) -> float:
+    """The lag of the smallest error: the shortest of those that are nearly as good, as in a swing a whole period more is."""
+    good = lags_s[off <= off.min() + LAG_TIE * (off.max() - off.min())]
+    return float(good[np.abs(good).argmin()])

@@ -1,0 +1,75 @@
+"""What the times and counts of packets say: how many were lost, and in which unit `t_ns` is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.clock.losses import RECENT, UNIT, LossCount, TimeUnit
+from hilstar.attitude.wire.packet import U32
+from hilstar.notices import Notices
+from hilstar.units import NS_PER_S
+
+
+def lost_of(*sequences: int) -> int:
+    count = LossCount()
+    for sequence in sequences:
+        count.see(sequence)
+    return count.lost
+
+
+@pytest.mark.parametrize(
+    ("sequences", "lost"),
+    [
+        ([1, 2, 3, 4], 0),
+        ([1, 2, 5, 6], 2),
+        ([1, 2, 5, 3, 6], 1),  # 3 came late
+        ([1, 2, 5, 5, 5, 6], 2),  # 5 came twice
+        ([U32 - 2, U32 - 1, 0, 1], 0),
+        ([U32 - 2, 1, 2], 2),
+        ([0, 0, 0, 0], 0),  # it does not count
+        ([10, 0, 11, 0, 12], 0),  # others among them do not
+        ([10, 20, 30, 50, 60], 1),  # it counts by ten
+        ([5000, 5001, 5003, 1, 2, 3], 1),  # begun anew
+        ([5, 6, 8, 4_000_000_000, 4_000_000_001], 1),
+    ],
+)
+def test_gaps_of_the_sequence_are_lost_packets(sequences, lost):
+    assert lost_of(*sequences) == lost
+
+
+def test_many_lost_of_a_shuffled_stream_are_counted_exactly():
+    rng = np.random.default_rng(1)
+    sent = np.arange(20_000)
+    kept = rng.random(len(sent)) > 0.02
+    kept[[0, -1]] = True
+    order = np.argsort(sent[kept] + rng.uniform(0, RECENT / 8, int(kept.sum())))
+    count = LossCount()
+    count.see(0)
+    for sequence in sent[kept][order].tolist():
+        count.see((sequence + 1) % U32)
+    assert count.lost == int((~kept).sum())
+
+
+@pytest.mark.parametrize(
+    ("divisor", "words"),
+    [(10**9, "seconds"), (10**6, "milliseconds"), (10**3, "microseconds"), (100, "ticks of 100 ns")],
+)
+@pytest.mark.parametrize("hz", [10, 50, 200])
+def test_the_unit_of_t_ns_is_named(divisor, words, hz):
+    notices = Notices()
+    unit = TimeUnit(notices)
+    rng = np.random.default_rng(2)
+    for k in range(8 * hz):
+        t_ns = 10**15 + k * NS_PER_S // hz
+        unit.see(t_ns // divisor, t_ns + round(rng.exponential(2e6)))
+    assert unit.named == words and f"it is in {words}" in notices.lasting[UNIT]
+
+
+@pytest.mark.parametrize("pace", [1.0, 0.9, 0.5, 2.0, 0.1, 10.0, 0.002])
+def test_a_clock_of_another_pace_is_of_no_unit(pace):
+    notices = Notices()
+    unit = TimeUnit(notices)
+    for k in range(500):
+        unit.see(round(pace * k * NS_PER_S / 100), k * NS_PER_S // 100)
+    assert not unit.named and UNIT not in notices.counts()

@@ -1,0 +1,59 @@
+"""The steps in which a sender rounds its quaternions, and what is not rounded."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.clock.resolution import COARSE, Resolution, coarse_lines
+from hilstar.attitude.wire.packet import AttitudeSample, checked_sample
+from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+
+TURN_RAD_S = np.radians([0.1, -0.2, 0.5])
+START = from_radec_roll_deg(84.057, -1.2, 10.0)
+
+
+def turning(rounded, count: int = 100) -> list[AttitudeSample]:
+    made = []
+    for k in range(count):
+        q = rounded(propagate(START, TURN_RAD_S, k / 50))
+        made.append(checked_sample(k * NS_PER_S // 50, tuple(q.tolist()), None))
+    assert all(isinstance(sample, AttitudeSample) for sample in made)
+    return made
+
+
+@pytest.mark.parametrize("decimals", [3, 4, 5])
+def test_decimals_are_told_in_arcsec_as_they_are_off(decimals):
+    stream = turning(lambda q: np.round(q, decimals))
+    ((kind, line),) = coarse_lines(stream)
+    assert kind == COARSE and f"steps of {10.0**-decimals:.3g}:" in line
+    truth = [propagate(START, TURN_RAD_S, k / 50) for k in range(len(stream))]
+    off = [angle_between_rad(q, s.q_icrs_to_cam) for q, s in zip(truth, stream, strict=True)]
+    said_arcsec = float(line.split("off by ")[1].split()[0])
+    # The norm takes one of four components back: 3/4 of the squares are left, which the estimate's three axes are.
+    assert said_arcsec == pytest.approx(np.sqrt(np.mean(np.square(off))) * ARCSEC_PER_RAD, rel=0.15)
+
+
+@pytest.mark.parametrize("step", [2.0**-15, 1 / 32767])
+def test_fixed_point_numbers_are_told(step):
+    assert f"steps of {step:.3g}:" in coarse_lines(turning(lambda q: np.round(q / step) * step))[0][1]
+
+
+def test_a_rounded_attitude_at_rest_is_told_and_a_sender_is_told_of_once():
+    told: list[str] = []
+    resolution = Resolution(lambda kind, line: told.append(kind))
+    for sample in [turning(lambda q: np.round(q, 3), 1)[0]] * 500:
+        resolution.see(sample)
+    assert told == [COARSE]
+
+
+@pytest.mark.parametrize("rounded", [lambda q: q, lambda q: q.astype(np.float32).astype(float), lambda q: np.round(q, 7)])
+def test_fine_quaternions_are_not_told(rounded):
+    assert coarse_lines(turning(rounded)) == []
+
+
+@pytest.mark.parametrize("q", [(1.0, 0.0, 0.0, 0.0), (0.5, 0.5, -0.5, 0.5), (0.6, 0.8, 0.0, 0.0), (0.1, 0.7, 0.5, 0.5)])
+def test_an_exact_attitude_is_not_rounded(q):
+    sample = checked_sample(0, q, None)
+    assert coarse_lines([sample] * 100) == []

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from hilstar.arrays import FloatArray
+from hilstar.units import NS_PER_S
+
+JUMP_NS = NS_PER_S  # a stamp that is off by more is of a clock that was set, not of an answer that was overtaken
 
 
 class ReportedStar(NamedTuple):
@@ -35,6 +38,22 @@ class Answer:
     centroids: tuple[ReportedStar, ...] = ()
 
 
+class StampOrder:
+    """Counts the stamps that are before an earlier answer's (`fallen`): a datagram was overtaken by another."""
+
+    def __init__(self) -> None:
+        self.fallen = 0
+        self._newest_ns: int | None = None
+
+    def take(self, t_ns: int) -> None:
+        """Take the stamp of the next answer. A step back by more than JUMP_NS begins anew: the clock was set."""
+        newest_ns = self._newest_ns
+        if newest_ns is not None and 0 < newest_ns - t_ns <= JUMP_NS:
+            self.fallen += 1
+        else:
+            self._newest_ns = t_ns
+
+
 class AnswerSource(Protocol):
     """Where answers come from. Never waits, never raises for what a tracker sends."""
 
@@ -43,6 +62,9 @@ class AnswerSource(Protocol):
 
     def refusals(self) -> dict[str, int]:
         """How much was refused so far, by reason."""
+
+    def trouble(self) -> str:
+        """What is wrong with the tracker's line for as long as it lasts, "" while nothing is."""
 
     def close(self) -> None:
         """Close it."""

@@ -4,6 +4,10 @@
 times up to the shortest delay D from an exposure's middle to its answer. D is found from the motion: reading the lit attitude
 too late by delta turns a residual by omega delta, so that e_i = b + omega_i delta. Bias b and delta are fitted together to the
 answers of the last minute. Before the rate has changed enough, D is what is guessed: half an exposure and GUESSED_DELAY_S.
+
+**Laws.** Answers of finite numbers, however odd and in whatever order, never end the judging. No number that is not finite is
+stored. A fit that is not finite, that has too few answers near it, or whose delay is over MAX_DELAY_S is dropped, and the delay
+before it stays. A delay under which answers are no longer right is given up for the guess.
 """
 
 import math
@@ -15,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 import msgspec
 import numpy as np
 
-from hilstar.answers.answer import Answer
-from hilstar.answers.pairing import Lit, LitFrames, residual_arcsec
+from hilstar.answers.answer import JUMP_NS, Answer, StampOrder
+from hilstar.answers.pairing import KEPT_NS, Lit, LitFrames, residual_arcsec
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.sender_clock import SenderClock
 from hilstar.process.scheduling import HOST_CLOCK, UnixOffset
@@ -25,18 +29,20 @@ from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
 if TYPE_CHECKING:
     from hilstar.bench.config import BenchConfig
 
-Verdict = Literal["right", "wrong", "invalid", "unpaired"]
+Verdict = Literal["right", "wrong", "invalid", "unpaired", "unjudged"]
 Stamp = Literal["start", "middle", "end", "arrival"]
 TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # from the stamp to the middle, in exposures
 WINDOW_S = 60.0
 MAX_IN_WINDOW = 4096  # at over 68 answers a second less than a minute
 GUESSED_DELAY_S, GUESSED_SIGMA_S = 0.1, 0.1
 FIT_EACH_NS, MIN_FITTED = NS_PER_S, 10
+MAX_ROUNDS = 8  # of the fit, which ends earlier where the same answers count as in the round before
 CUT_SIGMAS = 8.0
 MIN_NOISE_ARCSEC = 0.1  # least noise that the fit takes: answers without noise have errors of the pairing
+MAX_DELAY_S = KEPT_NS / NS_PER_S / 2  # under a longer one the frames of an exposure are soon forgotten
 SURE, MAX_EXCUSED_S = 3.0, 0.3  # sigmas of the time by which an answer may be off for its rate, and at most so long
 KNOWN_AGAIN_NS = NS_PER_S  # between two looks at how far this host's Unix time is off
-JUMP_NS, JUMPS = NS_PER_S, 3  # answers in a row that are later by so much: the tracker's clock was set
+JUMPS = 3  # answers in a row that are later by JUMP_NS: the tracker's clock was set
 SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0  # without an answer; before the first one
 
 
@@ -71,12 +77,19 @@ class Judged(NamedTuple):
     residual: FloatArray | None = None
 
 
+def unjudged(answer: Answer) -> Judged:
+    """An answer that is compared with nothing: its exposure is not known, and its arrival stands for it."""
+    return Judged(answer, "unjudged", answer.host_ns, 0.0)
+
+
 class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
     """A tracker's answers: counts of the run, the newest answer, and the last minute's figures; arcsec about x, y, z (cam).
 
+    `out_of_order` counts answers whose stamp is before that of one that came earlier, `unjudged` those that judging failed on.
     `rms_arcsec` is about zero, `sigma3_arcsec` three standard deviations about the mean, both of right answers.
     `latency_ms` is from the exposure's middle to the last byte, known to `latency_sigma_ms` (null: not known). `availability`
-    is right answers over those due while a sky was shown. `silent` says that no answer comes, "" while they do.
+    is right answers over those due while a sky was shown. `silent` says that no answer comes, "" while they do, and `trouble`
+    what is wrong with the tracker's line for as long as it lasts.
     """
 
     answers: int = 0
@@ -84,6 +97,8 @@ class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
     wrong: int = 0
     invalid: int = 0
     unpaired: int = 0
+    unjudged: int = 0
+    out_of_order: int = 0
     refused: dict[str, int] = {}
     residual_arcsec: list[float] | None = None
     verdict: str = ""
@@ -98,6 +113,7 @@ class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
     latency_sigma_ms: float | None = None
     age_s: float | None = None
     silent: str = ""
+    trouble: str = ""
 
 
 class AnswerTimes:
@@ -108,13 +124,25 @@ class AnswerTimes:
         self._known, self._known_ns = UnixOffset(0, 0), -KNOWN_AGAIN_NS
         self._clock = SenderClock()
         self._late = 0
+        self.order = StampOrder()
         self.guess_s = rules.exposure_s / 2 + GUESSED_DELAY_S if rules.latency_s is None else rules.latency_s
         self.fits = rules.latency_s is None and (rules.clock == "own" or rules.stamp == "arrival")
         self.delay_s, self.sigma_s = self.guess_s, GUESSED_SIGMA_S if self.fits else 0.0
 
+    def shift(self, delay: "DelayFit") -> None:
+        """Take a delay that was found from the motion."""
+        self.delay_s += delay.shift_s
+        self.sigma_s = delay.sigma_s
+
+    def give_up(self) -> None:
+        """Go back to the guess: under the delay that was found, answers are not right."""
+        self.delay_s, self.sigma_s = self.guess_s, GUESSED_SIGMA_S
+
     def middle(self, answer: Answer) -> tuple[int, float]:
         """The middle of the exposure, host time, ns, and its sigma, s."""
         rules = self._rules
+        if answer.t_ns is not None:
+            self.order.take(answer.t_ns)
         if answer.t_ns is None or rules.stamp == "arrival":
             return answer.host_ns - round(self.delay_s * NS_PER_S), self.sigma_s
         t_ns = answer.t_ns + round(TO_MIDDLE[rules.stamp] * rules.exposure_s * NS_PER_S)
@@ -135,7 +163,46 @@ class AnswerTimes:
         return answer.host_ns - round(late_ns + self.delay_s * NS_PER_S), sigma_s
 
 
-VERDICTS: tuple[Verdict, ...] = ("right", "wrong", "invalid", "unpaired")
+class DelayFit(NamedTuple):
+    """What the delay changes by, s, and one sigma of it, s."""
+
+    shift_s: float
+    sigma_s: float
+
+
+def fitted_delay(error_arcsec: FloatArray, rate_arcsec_s: FloatArray, pull_s: float) -> DelayFit | None:
+    """The delay, together with a bias, by residuals (n, 3) and rates (n, 3), cam; None where they tell none.
+
+    `pull_s` is from the present delay to the guessed one, which is known to GUESSED_SIGMA_S. An axis has its own noise: a
+    tracker's roll is many times as noisy as its cross axes. Answers far from the others, by their axes' noise, do not count.
+    """
+    design = np.zeros((len(error_arcsec), 3, 4))
+    design[:, range(3), range(3)], design[:, :, 3] = 1.0, rate_arcsec_s
+    precision = np.array([0.0, 0.0, 0.0, GUESSED_SIGMA_S**-2])
+    off = error_arcsec - np.median(error_arcsec, axis=0)
+    near_before = None
+    for _ in range(MAX_ROUNDS):
+        noise = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), MIN_NOISE_ARCSEC)
+        near = ((off / noise) ** 2).sum(axis=1) < CUT_SIGMAS**2
+        if near.sum() < MIN_FITTED:
+            return None
+        if near_before is not None and np.array_equal(near, near_before):
+            break
+        scaled = design[near] / noise[:, None] ** 2
+        normal = np.einsum("nij,nik->jk", scaled, design[near]) + np.diag(precision)
+        pulled = np.einsum("nij,ni->j", scaled, error_arcsec[near]) + precision * pull_s
+        try:
+            fitted = np.linalg.solve(normal, pulled)
+            variance = np.linalg.inv(normal)[3, 3]
+        except np.linalg.LinAlgError:
+            return None
+        off, near_before = error_arcsec - design @ fitted, near
+        if not (np.isfinite(off).all() and np.isfinite(variance) and variance >= 0):
+            return None
+    return DelayFit(float(fitted[3]), float(np.sqrt(variance)))
+
+
+VERDICTS: tuple[Verdict, ...] = ("right", "wrong", "invalid", "unpaired", "unjudged")
 # Columns of the last minute: host time, s; place in VERDICTS; how long it was dark until then, s; residual; rate, arcsec/s.
 HOST_S, VERDICT, DARK_S, ERROR, RATE, COLUMNS = 0, 1, 2, slice(3, 6), slice(6, 9), 9
 
@@ -147,7 +214,7 @@ class AnswerJudge:
         self.counts: Counter[Verdict] = Counter()
         self.times = AnswerTimes(rules)
         self._rules, self._frames = rules, frames
-        self._rows = np.full((MAX_IN_WINDOW, COLUMNS), np.nan)
+        self._rows = np.zeros((MAX_IN_WINDOW, COLUMNS))
         self._count = 0
         self._fitted_ns = 0
         self._newest: Judged | None = None
@@ -164,23 +231,42 @@ class AnswerJudge:
             lit = self._frames.over(middle_ns - half_ns, middle_ns + half_ns)
             if lit is not None:
                 residual = residual_arcsec(answer.q_icrs_to_cam, lit.q)
-                rate = ARCSEC_PER_RAD * lit.rate_rad_s
-                excused_s = min(SURE * sigma_s, MAX_EXCUSED_S)
-                bound = self._rules.wrong_arcsec + excused_s * float(np.linalg.norm(rate))
-                verdict = "wrong" if float(np.linalg.norm(residual)) > bound else "right"
+                verdict = self._verdict(residual, lit, sigma_s)
+        if verdict == "unjudged":
+            lit = residual = None
         found = Judged(answer, verdict, middle_ns, sigma_s, lit, residual)
-        row = self._rows[self._count % MAX_IN_WINDOW]
-        row[:] = np.nan
-        row[:3] = answer.host_ns / NS_PER_S, VERDICTS.index(verdict), self._frames.dark_ns / NS_PER_S
-        if lit is not None and residual is not None:
-            row[ERROR], row[RATE] = residual, ARCSEC_PER_RAD * lit.rate_rad_s
-        self._count += 1
-        self.counts[verdict] += 1
-        self._newest = found
-        if self.times.fits and answer.host_ns - self._fitted_ns > FIT_EACH_NS:
+        self._keep(found)
+        if self.times.fits and abs(answer.host_ns - self._fitted_ns) > FIT_EACH_NS:
             self._fitted_ns = answer.host_ns
             self._fit(answer.host_ns)
         return found
+
+    def pass_over(self, answer: Answer) -> Judged:
+        """An answer that judging failed on: it is counted, and compared with nothing."""
+        found = unjudged(answer)
+        self._keep(found)
+        return found
+
+    def _verdict(self, residual: FloatArray, lit: Lit, sigma_s: float) -> Verdict:
+        """Whether a residual is an attitude of the sky that was lit, by a time known to `sigma_s`."""
+        off_arcsec = float(np.linalg.norm(residual))
+        rate_arcsec_s = ARCSEC_PER_RAD * float(np.linalg.norm(lit.rate_rad_s))
+        if not math.isfinite(off_arcsec) or not math.isfinite(rate_arcsec_s):
+            return "unjudged"
+        excused_s = min(SURE * sigma_s, MAX_EXCUSED_S)
+        bound_arcsec = self._rules.wrong_arcsec + excused_s * rate_arcsec_s
+        return "wrong" if off_arcsec > bound_arcsec else "right"
+
+    def _keep(self, found: Judged) -> None:
+        """Count an answer, and keep its row; without a comparison its error and rate are 0, which nothing reads."""
+        row = self._rows[self._count % MAX_IN_WINDOW]
+        row[:] = 0.0
+        row[:3] = found.answer.host_ns / NS_PER_S, VERDICTS.index(found.verdict), self._frames.dark_ns / NS_PER_S
+        if found.lit is not None and found.residual is not None:
+            row[ERROR], row[RATE] = found.residual, ARCSEC_PER_RAD * found.lit.rate_rad_s
+        self._count += 1
+        self.counts[found.verdict] += 1
+        self._newest = found
 
     def _lately(self, now_ns: int) -> FloatArray:
         at = self._count % MAX_IN_WINDOW
@@ -189,33 +275,35 @@ class AnswerJudge:
 
     def _fit(self, now_ns: int) -> None:
         """Find the delay, together with the bias, from the last minute's right answers."""
-        rows = self._lately(now_ns)
-        rows = rows[rows[:, VERDICT] == 0]
-        if len(rows) < MIN_FITTED:
+        rows, times = self._lately(now_ns), self.times
+        right = rows[rows[:, VERDICT] == VERDICTS.index("right")]
+        if len(right) < MIN_FITTED:
+            wrong = rows[:, VERDICT] == VERDICTS.index("wrong")
+            if wrong.sum() >= MIN_FITTED:
+                before_s = times.delay_s
+                times.give_up()
+                self._turn_errors(times.delay_s - before_s)
             return
-        error, rate = rows[:, ERROR], rows[:, RATE]
-        design = np.zeros((len(rows), 3, 4))
-        design[:, range(3), range(3)], design[:, :, 3] = 1.0, rate
-        prior = np.diag([0.0, 0.0, 0.0, 1 / GUESSED_SIGMA_S**2])
-        left, weight = error - np.median(error, axis=0), np.ones(len(rows))
-        for _ in range(3):  # answers that are off by less than the bound, and far more than the others, do not count
-            noise = max(MAD_TO_SIGMA * float(np.median(np.abs(left[weight > 0]))), MIN_NOISE_ARCSEC)
-            scaled = design * (weight / noise**2)[:, None, None]
-            normal = np.einsum("nij,nik->jk", scaled, design) + prior
-            pull = np.array([0.0, 0.0, 0.0, prior[3, 3] * (self.times.guess_s - self.times.delay_s)])
-            fitted = np.linalg.solve(normal, np.einsum("nij,ni->j", scaled, error) + pull)
-            left = error - design @ fitted
-            weight = (np.linalg.norm(left, axis=1) < CUT_SIGMAS * noise).astype(np.float64)
-        shift_s = max(float(fitted[3]), self._rules.exposure_s / 2 - self.times.delay_s)
-        self.times.delay_s += shift_s
-        self.times.sigma_s = float(np.sqrt(np.linalg.inv(normal)[3, 3]))
+        found = fitted_delay(right[:, ERROR], right[:, RATE], times.guess_s - times.delay_s)
+        if found is None or times.delay_s + found.shift_s > max(MAX_DELAY_S, times.guess_s):
+            return
+        shift_s = max(found.shift_s, self._rules.exposure_s / 2 - times.delay_s)
+        times.shift(DelayFit(shift_s, found.sigma_s))
+        self._turn_errors(shift_s)
+
+    def _turn_errors(self, shift_s: float) -> None:
+        """The errors of the answers that are kept, under a delay that is longer by `shift_s`."""
         self._rows[:, ERROR] -= self._rows[:, RATE] * shift_s
 
-    def figures(self, now_ns: int, refused: dict[str, int]) -> TrackerFigures:
-        """The figures at a host time; `refused` counts bytes or messages that were no answer, by reason."""
+    def figures(self, now_ns: int, refused: dict[str, int], trouble: str = "") -> TrackerFigures:
+        """The figures at a host time; `refused` counts bytes or messages that were no answer, by reason.
+
+        `trouble` is what is wrong with the tracker's line.
+        """
         self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
         rows, newest = self._lately(now_ns), self._newest
         told: dict[str, Any] = {verdict: self.counts[verdict] for verdict in VERDICTS}
+        told["out_of_order"] = self.times.order.fallen
         cycle_s = cycle_of(rows[:, HOST_S])
         since_s = (now_ns - (self._begun_ns if newest is None else newest.answer.host_ns)) / NS_PER_S
         limit_s = FIRST_S if newest is None else max(SILENT_S, SILENT_CYCLES * (cycle_s or 0.0))
@@ -237,8 +325,13 @@ class AnswerJudge:
             due = math.floor((now_ns / NS_PER_S - rows[0, HOST_S] - dark_s) / cycle_s - 0.5) + 1
             told |= {"rate_hz": round(1 / cycle_s, 3), "availability": round(min(len(error) / max(due, 1), 1.0), 4)}
         words = "the tracker has not answered" + (" yet" if newest is None else f" for {since_s:.1f} s")
+        words += f" ({trouble})" if trouble else ""
         return TrackerFigures(
-            answers=sum(self.counts.values()), refused=refused, silent=words if since_s > limit_s else "", **told
+            answers=sum(self.counts.values()),
+            refused=refused,
+            silent=words if since_s > limit_s else "",
+            trouble=trouble,
+            **told,
         )
 
 

@@ -2,7 +2,8 @@
 
 The other process (`hilstar.attitude.wire.apart_child`) opens the road, asks, stamps, decodes, and hands over answers and counts
 of what it refused. It decodes at most MAX_BYTES_PER_S, for at most WORK_SHARE of the time, and gives at most MAX_ANSWERS_PER_S;
-the rest is counted as `flood`: noise in which a frame may begin at every byte would otherwise take a whole core.
+the rest is counted as `flood`: noise in which a frame may begin at every byte would otherwise take a whole core. What cannot
+end is read no faster than a chunk each FLOOD_REST_S: a core that only reads and drops is missing to the frames.
 """
 
 from collections import Counter
@@ -38,16 +39,21 @@ WORK_SHARE, MAX_WORK_S = 0.2, 0.1
 PIECE_BYTES = 4096  # decoded in one go, of what is no message
 MAX_ANSWERS_PER_S = 200  # no tracker says more; 1000 decoded here would delay one frame in ten by a millisecond or two
 FLOOD = "flood"
+FLOOD_REST_S = 0.01
 CHUNK_BYTES, LOOK_MS = 65_536, 100
 MAX_DETAILS = 20  # reasons whose newest example is kept
 
 
 class HandedOver(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What the other process decoded: an answer, or counts of refusals with an example of each."""
+    """What the other process decoded: an answer, or counts of refusals with an example of each.
+
+    `trouble` is what is wrong with the line from now on, "" for nothing; None where that is as before.
+    """
 
     answer: Answer | None = None
     refused: dict[str, int] = {}
     details: dict[str, str] = {}
+    trouble: str | None = None
 
 
 hand_over = msgspec.msgpack.Encoder(enc_hook=np.ndarray.tolist).encode
@@ -102,6 +108,7 @@ class DecodingLink:
         self._next_question = clock.within(0.0)
         self._bytes_left, self._answers_left, self._work_left_s = float(MAX_BURST_BYTES), float(MAX_ANSWERS_PER_S), MAX_WORK_S
         self._seen_ns = clock.now_ns()
+        self._trouble: str | None = None
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """Never known before it is read."""
@@ -116,10 +123,7 @@ class DecodingLink:
             timeout_ms = min(timeout_ms, max(int(self._next_question.left_s * 1000), 1))
         chunks = self._link.taken(timeout_ms)
         now_ns = self._clock.now_ns()
-        passed_s, self._seen_ns = (now_ns - self._seen_ns) / NS_PER_S, now_ns
-        self._bytes_left = min(self._bytes_left + passed_s * MAX_BYTES_PER_S, MAX_BURST_BYTES)
-        self._answers_left = min(self._answers_left + passed_s * MAX_ANSWERS_PER_S, MAX_ANSWERS_PER_S)
-        self._work_left_s = min(self._work_left_s + passed_s * WORK_SHARE, MAX_WORK_S)
+        self._refill(now_ns)
         refused: Counter[str] = Counter()
         details: dict[str, str] = {}
         given: list[RawMessage] = []
@@ -145,7 +149,21 @@ class DecodingLink:
             self._work_left_s -= (self._clock.now_ns() - begun_ns) / NS_PER_S
         if refused:
             given.append(RawMessage(now_ns, [hand_over(HandedOver(refused=dict(refused), details=details))]))
-        return given
+            self._clock.sleep(FLOOD_REST_S if refused[FLOOD] else 0.0)
+        return given + self._new_trouble(now_ns)
+
+    def _refill(self, now_ns: int) -> None:
+        passed_s, self._seen_ns = (now_ns - self._seen_ns) / NS_PER_S, now_ns
+        self._bytes_left = min(self._bytes_left + passed_s * MAX_BYTES_PER_S, MAX_BURST_BYTES)
+        self._answers_left = min(self._answers_left + passed_s * MAX_ANSWERS_PER_S, MAX_ANSWERS_PER_S)
+        self._work_left_s = min(self._work_left_s + passed_s * WORK_SHARE, MAX_WORK_S)
+
+    def _new_trouble(self, now_ns: int) -> list[RawMessage]:
+        trouble = self._link.trouble()
+        if trouble == self._trouble:
+            return []
+        self._trouble = trouble
+        return [RawMessage(now_ns, [hand_over(HandedOver(trouble=trouble))])]
 
     def _pieces(self, chunks: list[RawMessage]) -> Iterator[tuple[RawMessage, bytes]]:
         for chunk in chunks:
@@ -171,6 +189,7 @@ class AnswersApart(Closing):
         plan.decoder(messages)
         self._refused: Counter[str] = Counter()
         self.details: dict[str, str] = {}
+        self._trouble = ""
         self._process = ReaderProcess(notices, clock=clock, name="the reader of the tracker's answers")
         self._process.read(stream=partial(DecodingLink, plan))
 
@@ -188,12 +207,18 @@ class AnswersApart(Closing):
             if said.answer is not None:
                 found.append(said.answer)
             self._refused.update(said.refused)
+            if said.trouble is not None:
+                self._trouble = said.trouble
             self.details = dict(list({**self.details, **said.details}.items())[-MAX_DETAILS:])
         return found
 
     def refusals(self) -> dict[str, int]:
         """How much was refused so far, by reason."""
         return dict(self._refused)
+
+    def trouble(self) -> str:
+        """What is wrong with the tracker's line for as long as it lasts, "" while nothing is."""
+        return self._trouble
 
     def close(self) -> None:
         """End the process."""

@@ -152,7 +152,11 @@ def _tracker_line(found: "TrackerFigures") -> StatusLine:
     text = f"{three(found.residual_arcsec)} arcsec off, rms {three(found.rms_arcsec)}, {share} available, {late} late"
     text += f", {found.mode}" if found.mode else ""
     text += f"; {found.wrong} of {found.answers} answers wrong" if found.wrong else f"; {found.answers} answers"
-    return StatusLine("tracker", found.silent or text, not found.silent and found.verdict != "wrong")
+    text += f", {found.out_of_order} out of order" if found.out_of_order else ""
+    text += f", {found.unjudged} not judged" if found.unjudged else ""
+    text += f"; {found.trouble}" if found.trouble else ""
+    well = not found.silent and not found.trouble and found.verdict != "wrong"
+    return StatusLine("tracker", found.silent or text, well)
 
 
 @contextmanager

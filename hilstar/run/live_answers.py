@@ -1,7 +1,7 @@
 """The tracker in the loop of a run: its answers, taken beside the frame loop, judged, recorded and told.
 
 The frame loop only leaves each frame here. One thread takes what the reader's process has decoded, fifty times a second and at
-most MAX_JUDGED_HZ answers a second; those beyond that are counted.
+most MAX_JUDGED_HZ answers a second. Those beyond that are counted and recorded without a verdict, as one that judging fails on.
 """
 
 import math
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from hilstar.answers.answer import Answer, AnswerSource
-from hilstar.answers.judge import AnswerJudge, AnswerRules, Judged, TrackerFigures
+from hilstar.answers.judge import AnswerJudge, AnswerRules, Judged, TrackerFigures, unjudged
 from hilstar.answers.pairing import LitFrame, LitFrames
 from hilstar.bench.frame import Bench
 from hilstar.errors import one_line
@@ -87,13 +87,14 @@ class LiveAnswers:
         for answer in self._source.take():
             if not self._allowance.take(answer.host_ns):
                 self._too_many += 1
+                self._record(unjudged(answer))
                 continue
             try:
-                self._take(answer)
-                self._untold = True
-                self._stop.wait(REST_S)
+                self._take(self._judged(answer))
             except Exception as error:  # whatever it is: the run goes on, and so does this
-                self._notices.tell("answers-failed", one_line(f"an answer failed ({type(error).__name__}: {error}); going on"))
+                self._failed(error)
+            self._untold = True
+            self._stop.wait(REST_S)
         now_ns = self._clock.now_ns()
         if self._frames.newest is None or now_ns - self._figures_ns < (PROMPT_NS if self._untold else FIGURES_NS):
             return
@@ -101,7 +102,7 @@ class LiveAnswers:
         refused = dict(self._source.refusals())
         if self._too_many:
             refused[TOO_MANY] = refused.get(TOO_MANY, 0) + self._too_many
-        self.figures = self._judge.figures(now_ns, refused)
+        self.figures = self._judge.figures(now_ns, refused, self._source.trouble())
         if self.figures.silent:
             self._notices.begin(SILENT, self.figures.silent)
         else:
@@ -110,11 +111,25 @@ class LiveAnswers:
             self._untold = False
             self.heard(self)
 
-    def _take(self, answer: Answer) -> None:
-        judged = self.newest = self._judge.judge(answer)
-        self.passed_on(answer, judged.middle_ns)
+    def _judged(self, answer: Answer) -> Judged:
+        try:
+            return self._judge.judge(answer)
+        except Exception as error:  # an answer that cannot be judged is counted and recorded all the same
+            self._failed(error)
+            return self._judge.pass_over(answer)
+
+    def _failed(self, error: Exception) -> None:
+        self._notices.tell("answers-failed", one_line(f"an answer failed ({type(error).__name__}: {error}); going on"))
+
+    def _take(self, judged: Judged) -> None:
+        self.newest = judged
+        self._record(judged)
         if judged.verdict == "wrong":
             self._notices.tell(WRONG, wrong_line(judged))
+        if judged.verdict != "unjudged":
+            self.passed_on(judged.answer, judged.middle_ns)
+
+    def _record(self, judged: Judged) -> None:
         if self._ledger.on:
             self._ledger.answer(answer_record(judged))
 

@@ -8,6 +8,7 @@ import errno
 import os
 import select
 import socket
+import stat
 from abc import abstractmethod
 from pathlib import Path
 
@@ -28,6 +29,9 @@ MAX_DATAGRAMS = 200
 MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.05, 0.5
 CONNECT_S = 0.5
 FILE_LOOK_S = 0.005
+HELD_S = 3.0  # for so long after its last byte a tracker's connection holds the line
+ACCEPT_EACH_S = 0.02  # between two connections: whoever connects in a loop does not keep a core busy
+TOLD_S = 10.0  # for so long after the last one a refused connection stands in the status
 Place = tuple[str, int]
 
 
@@ -40,6 +44,10 @@ class ByteLink(Closing):
         self.endpoint, self.link_counts = endpoint, LinkCounts()
         self._notices, self._clock = notices, clock
         self._retry = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
+
+    def trouble(self) -> str:
+        """What is wrong with the line for as long as it lasts, "" while nothing is."""
+        return ""
 
     @abstractmethod
     def taken(self, timeout_ms: int) -> list[RawMessage]:
@@ -165,7 +173,11 @@ class UdpBytes(ByteLink):
 
 
 class TcpBytes(ByteLink):
-    """TCP: connects to a tracker, or listens for the one that connects; the newest connection counts. Raises InputError."""
+    """TCP: connects to a tracker, or listens for the one that connects. Raises InputError.
+
+    Of several that connect the first holds the line while it has sent within HELD_S; others are refused and named meanwhile.
+    Then the next one to connect takes its place: a tracker that rebooted behind a line that never closed.
+    """
 
     def __init__(
         self, place: UdpPlace | Place, allowed: AllowedSenders, notices: Notices, clock: HostClock = HOST_CLOCK
@@ -174,6 +186,9 @@ class TcpBytes(ByteLink):
         super().__init__(f"tcp://{f'[{host}]' if ':' in host else host}:{port}", notices, clock)
         self._place, self._allowed = (host, port), allowed
         self._listener = self._connection = None
+        self._peer, self._refused = "", ""
+        self._holds, self._told = clock.within(0.0), clock.within(0.0)
+        self._accepts = clock.within(0.0)
         if isinstance(place, UdpPlace):
             try:
                 family = socket.AF_INET6 if place.host.version == 6 else socket.AF_INET
@@ -192,14 +207,19 @@ class TcpBytes(ByteLink):
             if not self._retry.over:
                 return self._rest(timeout_ms)
             self._connect()
-        ends = [end for end in (self._listener, self._connection) if end is not None]
+        waited_for = self._listener if self._accepts.over else None
+        ends = [end for end in (waited_for, self._connection) if end is not None]
+        ready = select.select(ends, [], [], timeout_ms / 1000)[0] if ends else []
+        # The tracker's own bytes first: they hold the line, and its end lets a new connection in.
+        chunks = self._read(self._connection) if self._connection in ready else []
+        if self._listener in ready:
+            self._accept()
+        return chunks
+
+    def _read(self, connection: socket.socket | None) -> list[RawMessage]:
+        if connection is None:
+            return []
         try:
-            ready = select.select(ends, [], [], timeout_ms / 1000)[0] if ends else []
-            if self._listener in ready:
-                self._accept()
-            connection = self._connection
-            if connection is None or connection not in ready:
-                return []
             data = connection.recv(MAX_READ_BYTES)
         except BlockingIOError:
             return []
@@ -209,28 +229,45 @@ class TcpBytes(ByteLink):
         if not data:
             self._shut("the other side closed it")
             return []
+        self._holds = self._clock.within(HELD_S)
         return self._chunk(data)
+
+    def trouble(self) -> str:
+        """See `ByteLink.trouble`."""
+        return "" if self._told.over else self._refused
 
     def _connect(self) -> None:
         try:
-            self._take(socket.create_connection(self._place, CONNECT_S))
+            self._take(socket.create_connection(self._place, CONNECT_S), self.endpoint)
         except OSError:
             self._retry.put_off()
 
     def _accept(self) -> None:
         if self._listener is None:
             return
-        made, (host, *_) = self._listener.accept()
+        try:
+            made, (host, port, *_) = self._listener.accept()
+        except OSError:  # it has gone again
+            return
+        self._accepts = self._clock.within(ACCEPT_EACH_S)
+        peer = f"{host}:{port}"
         if not self._allowed.admits(host):
             self.link_counts.rejected += 1
             self._notices.begin("sender-not-allowed", f"a connection from {host} is refused: it is not in [answers] allow")
             made.close()
             return
-        if self._connection is not None:
-            self._connection.close()
-        self._take(made)
+        if self._connection is not None and not self._holds.over:
+            self.link_counts.rejected += 1
+            self._refused = f"a second connection, from {peer}, is refused: {self._peer} holds the line and sends"
+            self._told = self._clock.within(TOLD_S)
+            self._notices.tell("second-connection", f"{self.endpoint}: {self._refused}")
+            made.close()
+            return
+        self._shut(f"{self._peer} has sent nothing for {HELD_S:g} s, and {peer} connects")
+        self._take(made, peer)
 
-    def _take(self, made: socket.socket) -> None:
+    def _take(self, made: socket.socket, peer: str) -> None:
+        self._peer, self._holds, self._refused = peer, self._clock.within(HELD_S), ""
         made.setblocking(False)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self._connection = made
@@ -273,22 +310,59 @@ class ZmqBytes(ByteLink):
         self._receiver.close()
 
 
+KINDS = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+def no_file_kind(mode: int) -> str:
+    """What a file's mode says that it is, "" for a regular file."""
+    return "" if stat.S_ISREG(mode) else KINDS.get(stat.S_IFMT(mode), "no file")
+
+
 class FileBytes(ByteLink):
-    """What is appended to a file after the start; one that is made anew or cut is read from its beginning."""
+    """What is appended to a regular file after the start; one that is made anew or cut is read from its beginning.
+
+    A path that comes to name something else (a device, a FIFO, a directory) is let go and told: a device may have bytes for
+    ever. It is looked at again until it names a file. Raises InputError where it names no regular file at the start.
+    """
 
     def __init__(self, path: Path, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         super().__init__(str(path), notices, clock)
-        if path.is_dir():
-            raise InputError(f"[answers] path = {path}: a directory; write the file to which answers are appended")
-        self._path, self._file = path, -1
-        if path.is_file():
+        self._path, self._file, self._trouble = path, -1, ""
+        with contextlib.suppress(OSError):
+            kind = no_file_kind(path.stat().st_mode)
+            if kind:
+                raise InputError(f"[answers] path = {path}: {kind}; write the file to which answers are appended")
             self._open()
+        if self._file >= 0:
             os.lseek(self._file, 0, os.SEEK_END)
 
+    def trouble(self) -> str:
+        """See `ByteLink.trouble`."""
+        return self._trouble
+
     def _open(self) -> None:
-        with contextlib.suppress(OSError):
-            self._file = os.open(self._path, os.O_RDONLY | os.O_NONBLOCK)
-            self._opened()
+        """Open what the path names, if that is a regular file. Raises OSError."""
+        file = os.open(self._path, os.O_RDONLY | os.O_NONBLOCK)
+        kind = no_file_kind(os.fstat(file).st_mode)
+        if kind:
+            os.close(file)
+            self._let_go(kind)
+            return
+        self._file, self._trouble = file, ""
+        self._opened()
+
+    def _let_go(self, kind: str) -> None:
+        self.close()
+        said = f"it is {kind} now, and no regular file"
+        if self._trouble != said:
+            self._trouble = said
+            self._lose(said)
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
         """See `ByteLink.taken`."""
@@ -304,6 +378,10 @@ class FileBytes(ByteLink):
 
     def _follow(self) -> None:
         named = self._path.stat()
+        kind = no_file_kind(named.st_mode)
+        if kind:
+            self._let_go(kind)
+            return
         if self._file < 0:
             self._open()
             return

@@ -69,7 +69,7 @@ export function writeRun({ frame, counts, pacing, ledger }, rows) {
 }
 
 // The verdict on the newest answer: its words, and its colour.
-const VERDICTS = { right: ["right", "ok"], wrong: ["wrong", "bad"], invalid: ["no attitude", "warn"], unpaired: ["no sky was shown", "warn"] };
+const VERDICTS = { right: ["right", "ok"], wrong: ["wrong", "bad"], invalid: ["no attitude", "warn"], unpaired: ["no sky was shown", "warn"], unjudged: ["not judged", "warn"] };
 
 export function three(values) {
   return values ? values.map((value) => signed(value, 1)).join("  ") : NONE;
@@ -95,6 +95,8 @@ export function writeTracker(said, rows) {
   rows.set("Wrong", count(said.wrong), said.wrong ? "bad" : "");
   const refused = Object.entries(said.refused).map(([reason, n]) => `${n} ${reason}`);
   rows.set("Refused", refused.join(", ") || "none", refused.length ? "warn" : "");
+  rows.set("Out of order", count(said.out_of_order), said.out_of_order ? "warn" : "");
+  rows.set("Line", said.trouble || "in order", said.trouble ? "warn" : "");
 }
 
 // A bar for each reason, as long as its share of all refusals.

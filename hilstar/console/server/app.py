@@ -198,6 +198,8 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
     for reason, count in found.refused.items():
         refused.add_metric([reason], count)
     yield refused
+    words = "Answers whose stamp is before an earlier answer's."
+    yield CounterMetricFamily("hilstar_tracker_out_of_order", words, value=found.out_of_order)
     for name, words, values in (
         ("residual", "Of the newest answer.", found.residual_arcsec),
         ("residual_rms", "Of the last minute's right answers.", found.rms_arcsec),
@@ -213,6 +215,7 @@ def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
         ("latency_seconds", "From the exposure's middle to the answer.", found.latency_ms, 1e-3),
         ("answer_age_seconds", "Since the newest answer.", found.age_s, 1),
         ("silent", "1 while the tracker does not answer.", bool(found.silent), 1),
+        ("trouble", "1 while something is wrong with the tracker's line.", bool(found.trouble), 1),
     ):
         if figure is not None:
             yield GaugeMetricFamily(f"hilstar_tracker_{name}", words, value=float(figure * unit))

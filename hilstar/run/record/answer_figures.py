@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from hilstar.answers.answer import StampOrder
 from hilstar.arrays import FloatArray
 from hilstar.run.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 from hilstar.running_statistics import Percentiles, RunningStatistics
@@ -17,7 +18,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 
 AROUND_S = 10.0  # before and after a fault
 MAX_FAULTS = 500
-VERDICTS = ("right", "wrong", "invalid", "unpaired")
+VERDICTS = ("right", "wrong", "invalid", "unpaired", "unjudged")
 MAX_WRONG = 1000  # whose times are kept
 
 
@@ -53,13 +54,18 @@ class FaultEffect(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AnswerReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The tracker's answers over a run. `rms_arcsec` is about zero, `sigma3_arcsec` about the mean; of right answers."""
+    """The tracker's answers over a run. `rms_arcsec` is about zero, `sigma3_arcsec` about the mean; of right answers.
+
+    `out_of_order` counts stamps before an earlier answer's, `unjudged` answers that were compared with nothing.
+    """
 
     answers: int
     right: int
     wrong: int
     invalid: int
     unpaired: int
+    unjudged: int
+    out_of_order: int
     rate_hz: float | None
     availability: float | None
     mean_arcsec: list[float] | None
@@ -185,11 +191,16 @@ class AnswerTally:
         self._shown: frozenset[int] = frozenset()
         self._lately: deque[AnswerRecord] = deque()
         self._interval_s, self._latency_ms = RunningStatistics(), RunningStatistics()
+        self._order = StampOrder()
         self._first_ns = self._last_ns = self._host_ns = 0
 
     def answer(self, record: AnswerRecord) -> None:
         """Add an answer."""
         self.whole.add(record)
+        if record.t_ns is not None:
+            self._order.take(record.t_ns)
+        if record.verdict == "unjudged":  # of more than are judged: the others stand for the rate and for what is due
+            return
         if self._host_ns:
             self._interval_s.add((record.host_ns - self._host_ns) / NS_PER_S)
         self._latency_ms.add((record.host_ns - record.middle_ns) / NS_PER_MS)
@@ -251,6 +262,7 @@ class AnswerTally:
         return AnswerReport(
             answers=answers,
             **{verdict: counts[verdict] for verdict in VERDICTS},
+            out_of_order=self._order.fallen,
             rate_hz=round(1 / cycle_s, 3) if cycle_s else None,
             availability=round(min(counts["right"] / due, 1.0), 4) if due > 0 else None,
             mean_arcsec=self.whole.mean(),
@@ -266,6 +278,10 @@ def answer_rows(found: AnswerReport | None) -> list[tuple[str, str]]:
     if found is None:
         return []
     refused = f"{found.right} right, {found.wrong} wrong, {found.invalid} without an attitude, {found.unpaired} of no sky"
+    if found.unjudged:
+        refused += f", {found.unjudged} not judged"
+    if found.out_of_order:
+        refused += f"; {found.out_of_order} came out of order"
     late = found.latency_ms
     times = "" if late.p50 is None else f", {late.p50:.1f} / {late.p99 or 0:.1f} ms late (p50 / p99)"
     rows = [

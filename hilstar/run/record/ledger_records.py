@@ -145,8 +145,10 @@ class AnswerRecord(msgspec.Struct, kw_only=True):
 
     Host times, ns: `host_ns` of its last byte, `middle_ns` of its exposure's middle, as known then. `t_ns` is the tracker's
     stamp on its own clock, `light_ns` the exposure's middle on the sender's clock. `centroids` are [x_px, y_px, dn, hip].
-    `verdict` is "right", "wrong" (see `[answers] wrong_arcsec`), "invalid" (without an attitude) or "unpaired" (no one sky was
-    lit). `q_lit` is the mean attitude of the frames `first_frame` to `last_frame`, `residual_arcsec` the rotation vector from
+    `verdict` is "right", "wrong" (see `[answers] wrong_arcsec`), "invalid" (without an attitude), "unpaired" (no one sky was
+    lit) or "unjudged" (compared with nothing; `middle_ns` is then `host_ns`).
+
+    `q_lit` is the mean attitude of the frames `first_frame` to `last_frame`, `residual_arcsec` the rotation vector from
     it to `q`, cam.
     """
 

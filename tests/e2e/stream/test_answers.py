@@ -9,6 +9,7 @@ import os
 import socket
 import struct
 import threading
+import time
 import tty
 import zlib
 from collections.abc import Callable, Iterator
@@ -100,7 +101,7 @@ def test_udp_takes_each_datagram_from_who_may_send(tmp_path):
         assert_answers(found)
 
 
-def test_tcp_listens_and_takes_the_newest_connection(tmp_path):
+def test_tcp_listens_and_takes_a_connection_after_the_former_one_closed(tmp_path):
     port = free_port()
     with reading(tmp_path, f'source = "tcp"\nlisten = "127.0.0.1:{port}"') as source:
         for _ in range(2):
@@ -154,6 +155,38 @@ def test_a_growing_file_counts_from_the_start_on_and_again_when_it_is_made_anew(
         path.unlink()
         path.write_bytes(STREAM)
         assert_answers(gathered(source, 3))
+
+
+@pytest.mark.parametrize("kind", ["device", "endless file"])
+def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
+    """A link to /dev/zero is let go; a file of zeros to 64 GB is read and dropped, no faster than a chunk each 10 ms."""
+    path, notices = tmp_path / "tracker.bin", Notices()
+    path.touch()
+    with reading(tmp_path, 'source = "file"\npath = "tracker.bin"', notices) as source:
+        path.unlink()
+        if kind == "device":
+            path.symlink_to("/dev/zero")
+            wait_for(lambda: source.take(20) == [] and source.trouble(), "the trouble")
+            assert source.trouble() == "it is a device now, and no regular file"
+            assert notices.counts() == {"answers-lost": 1}
+        else:
+            with path.open("wb") as file:
+                file.truncate(64 * 10**9)
+            wait_for(lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 100, "what is dropped")
+        before_s, begun_ns = cpu_s(source), time.monotonic_ns()
+        wait_for(lambda: source.take(20) == [] and time.monotonic_ns() - begun_ns > 10**9, "a second")
+        # Without a rest the reader takes the whole of a core.
+        assert cpu_s(source) - before_s < 0.3 * (time.monotonic_ns() - begun_ns) / 1e9
+        path.unlink()
+        path.write_bytes(STREAM)
+        assert_answers(gathered(source, 3))
+        assert source.trouble() == ""
+
+
+def cpu_s(source: AnswersApart) -> float:
+    """The CPU time of the process that reads."""
+    fields = Path(f"/proc/{source._process._process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def test_a_babbling_tracker_is_bounded_and_its_good_answers_still_come(tmp_path, rng):

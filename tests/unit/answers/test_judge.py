@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from hilstar.answers import judge as judge_module
 from hilstar.answers.answer import Answer
-from hilstar.answers.judge import AnswerJudge, AnswerRules, AnswerTimes
+from hilstar.answers.judge import VERDICTS, AnswerJudge, AnswerRules, AnswerTimes, fitted_delay
 from hilstar.answers.pairing import LitFrame, LitFrames, residual_arcsec
 from hilstar.process.scheduling import UnixOffset
 from hilstar.rotation import from_rotation_vector, multiply, propagate
@@ -176,3 +180,123 @@ def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
         verdicts.append(judge.judge(Answer(middle_ns + NS_PER_S // 6, b"", middle_ns + set_ns, START)).verdict)
     assert verdicts.count("right") >= 197 and "wrong" not in verdicts
     assert set(verdicts[:120] + verdicts[124:]) == {"right"}
+
+
+ROLL_RATIO, CROSS_ARCSEC = 40.0, 2.0
+OUTLIER_ARCSEC, OFF_ARCSEC, OFF_SHARE = 1000.0, 60.0, 0.3
+
+
+def spoilt(kind: str, seed: int) -> tuple[AnswerJudge, list]:
+    """Half a minute of a turning tracker on its own clock, whose roll is ROLL_RATIO times as noisy as its cross axes."""
+    rng = np.random.default_rng(seed)
+    frames = LitFrames(PERIOD_NS)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), frames)
+    found, k = [], 0
+    for i in range(int(30 * ANSWER_HZ)):
+        middle_s = 0.2 + i / ANSWER_HZ
+        host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
+        while k * PERIOD_NS < host_ns:
+            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S)))
+            k += 1
+        error_arcsec = CROSS_ARCSEC * rng.standard_normal(3) * [1.0, 1.0, ROLL_RATIO]
+        if kind == "early outlier" and i == 4:
+            error_arcsec = np.array([OUTLIER_ARCSEC, 0.0, 0.0])
+        if kind == "some off" and rng.random() < OFF_SHARE:
+            error_arcsec[0] += OFF_ARCSEC
+        q = multiply(from_rotation_vector(error_arcsec / ARCSEC_PER_RAD), attitude(middle_s))
+        found.append(judge.judge(Answer(host_ns, b"", round(middle_s * NS_PER_S) + EPOCH_NS, q)))
+    return judge, found
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("kind", ["noisy roll", "early outlier", "some off"])
+def test_a_noisy_roll_and_odd_answers_leave_every_answer_judged_and_the_delay_found(kind, seed):
+    judge, found = spoilt(kind, seed)
+    assert {each.verdict for each in found} == {"right"}
+    # The noise of 300 answers at 0.3 deg/s leaves 0.1 ms; shortest arrivals of JITTER_S and answers that are off a few ms more.
+    assert judge.times.delay_s == pytest.approx(LATENCY_S, abs=0.02)
+    assert judge.times.sigma_s < 0.01
+    assert all_finite(judge, found[-1].answer.host_ns)
+
+
+def all_finite(judge: AnswerJudge, now_ns: int) -> bool:
+    figures = judge.figures(now_ns, {})
+    lists = [figures.residual_arcsec, figures.mean_arcsec, figures.rms_arcsec, figures.sigma3_arcsec]
+    numbers = [figures.latency_ms, figures.latency_sigma_ms, figures.age_s, figures.availability, figures.rate_hz]
+    numbers += [judge.times.delay_s, judge.times.sigma_s]
+    for each in lists:
+        numbers += each or []
+    known = [number for number in numbers if number is not None]
+    return all(map(math.isfinite, known)) and bool(np.isfinite(judge._rows).all())
+
+
+NEAR = st.tuples(*[st.floats(-4000.0, 4000.0)] * 3)  # arcsec from what was lit: right, and a little wrong
+ANY_Q = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3)
+ODD_NS = st.one_of(st.just(0), st.integers(-(10**9), 10**9), st.integers(-(2**62), 2**62))
+ONE = st.tuples(st.one_of(NEAR, ANY_Q), ODD_NS, st.booleans())
+MANY = st.lists(ONE, min_size=12, max_size=60)
+EXAMPLES = 100  # a fixed budget: three seconds
+
+
+@settings(max_examples=EXAMPLES, deadline=None, derandomize=True)
+@given(st.sampled_from(["own", "host", "unix"]), MANY, st.integers(0, 2**32))
+def test_no_finite_answers_in_any_order_end_the_judging(clock, many, seed):
+    """Attitudes near and far, stamps right, odd and wild, arrivals in order and shuffled: each answer is judged."""
+    frames = lit_until(8.0)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock=clock), frames)
+    arrivals_s = 0.5 + 0.11 * np.arange(len(many))
+    if seed % 2:
+        np.random.default_rng(seed).shuffle(arrivals_s)
+    for (error, odd_ns, stamped), at_s in zip(many, arrivals_s.tolist(), strict=True):
+        q = np.array(error)
+        if len(error) == 3:
+            q = multiply(from_rotation_vector(q / ARCSEC_PER_RAD), attitude(at_s - 0.15))
+        t_ns = round((at_s - 0.15) * NS_PER_S) + odd_ns
+        answer = Answer(round(at_s * NS_PER_S), b"", t_ns if stamped else None, q / np.linalg.norm(q))
+        judged_one = judge.judge(answer)
+        assert judged_one.verdict in VERDICTS and judged_one.verdict != "unjudged"
+        assert all_finite(judge, answer.host_ns)
+    assert judge.figures(9 * NS_PER_S, {}).answers == len(many)
+
+
+def test_a_fit_that_keeps_no_answer_or_is_not_finite_is_none():
+    rng = np.random.default_rng(4)
+    rate, error = rng.normal(0, 1000.0, (40, 3)), rng.normal(0, 2.0, (40, 3))
+    assert fitted_delay(error, rate, 0.0).shift_s == pytest.approx(0.0, abs=1e-3)
+    assert fitted_delay(error[:5], rate[:5], 0.0) is None
+    # Each axis has its own third of the rows far off: the medians hold, and no row is near in all three.
+    apart = np.zeros((39, 3))
+    apart[np.arange(39), np.arange(39) % 3] = 1e4
+    assert fitted_delay(apart, np.zeros((39, 3)), 0.0) is None
+    assert fitted_delay(error, np.full((40, 3), 1e200), 0.0) is None
+
+
+def test_a_delay_under_which_no_answer_is_right_is_given_up():
+    judge, found = judged("own", 20.0, wild=0.0)
+    judge.times.delay_s, judge.times.sigma_s = 4.0, 1e-4
+    host_ns = found[-1][0].answer.host_ns
+    again = []
+    for k in range(1, 800):  # the right answers before are forgotten after a minute
+        at_ns = host_ns + k * NS_PER_S // 10
+        for number in range(6):
+            lit_ns = at_ns - NS_PER_S // 10 + number * PERIOD_NS
+            judge._frames.add(LitFrame(10_000 + 6 * k + number, lit_ns, lit_ns, attitude(lit_ns / NS_PER_S)))
+        middle_ns = at_ns - round(LATENCY_S * NS_PER_S)
+        own_ns = round(middle_ns * (1 + DRIFT)) + EPOCH_NS
+        again.append(judge.judge(Answer(at_ns, b"", own_ns, attitude(middle_ns / NS_PER_S))).verdict)
+    assert again[0] == "wrong" and set(again[-100:]) == {"right"}
+    assert judge.times.delay_s == pytest.approx(LATENCY_S, abs=0.02)
+
+
+def test_answers_that_were_overtaken_are_counted_and_judged_and_a_clock_that_is_set_is_not_one():
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), lit_until(30.0))
+    order = np.arange(100)
+    order[[20, 21, 50, 51, 52]] = order[[21, 20, 52, 50, 51]]
+    for k, number in enumerate(order.tolist()):
+        middle_ns = NS_PER_S + number * NS_PER_S // 10
+        host_ns = NS_PER_S + k * NS_PER_S // 10 + NS_PER_S // 4
+        set_ns = -(10**15) if k >= 80 else 0
+        answer = Answer(host_ns, b"", middle_ns + set_ns, attitude(middle_ns / NS_PER_S))
+        judge.judge(answer)
+    figures = judge.figures(host_ns, {})
+    assert figures.out_of_order == 3 and figures.wrong == 0

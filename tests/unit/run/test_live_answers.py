@@ -40,6 +40,9 @@ class Queued:
     def refusals(self) -> dict[str, int]:
         return self.refused
 
+    def trouble(self) -> str:
+        return ""
+
     def close(self) -> None:
         pass
 
@@ -110,16 +113,21 @@ def test_a_flood_of_answers_is_judged_up_to_a_rate_and_counted_beyond():
     source.waiting.extend(Answer(NS_PER_S + k, b"", NS_PER_S // 2, Q) for k in range(5000))
     with answers.running():
         wait_for(lambda: answers.figures.answers)
-    assert answers.figures.answers == len(kept.records) == MAX_JUDGED_HZ
+    assert answers.figures.answers == MAX_JUDGED_HZ
+    judged = [record for record in kept.records if record.verdict != "unjudged"]
+    assert len(judged) == MAX_JUDGED_HZ and len(kept.records) == 5000
     assert answers.figures.refused == {"too many": 5000 - MAX_JUDGED_HZ}
 
 
 def test_a_source_that_fails_ends_neither_the_run_nor_what_comes_after():
-    source, notices = Queued(), Notices()
-    answers = LiveAnswers(BENCH, RULES, source, notices, Kept(), clock=FakeClock(NS_PER_S))
+    source, notices, kept = Queued(), Notices(), Kept()
+    answers = LiveAnswers(BENCH, RULES, source, notices, kept, clock=FakeClock(NS_PER_S))
     second_of_frames(answers)
-    source.waiting.append(Answer(NS_PER_S // 2, b"", NS_PER_S // 2, np.ones(3)))
+    source.waiting.append(Answer(NS_PER_S // 2, b"\x07", NS_PER_S // 2, np.ones(3)))
     source.waiting.append(Answer(NS_PER_S // 2, b"", NS_PER_S // 2, Q))
     with answers.running():
         wait_for(lambda: answers.figures.right)
     assert notices.counts() == {"answers-failed": 1}
+    # The one that could not be judged is counted and recorded all the same.
+    assert (answers.figures.answers, answers.figures.unjudged) == (2, 1)
+    assert [(record.raw, record.verdict) for record in kept.records] == [("07", "unjudged"), ("", "right")]

@@ -1,0 +1,166 @@
+"""Who holds a tracker's TCP line, and which files are read: what is refused, let go, told, and taken again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Iterator
+from ipaddress import ip_address
+from pathlib import Path
+
+import pytest
+
+from hilstar.attitude.wire.byte_links import ACCEPT_EACH_S, HELD_S, TOLD_S, FileBytes, TcpBytes
+from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
+from hilstar.errors import InputError
+from hilstar.notices import Notices
+from tests.support.fake_clock import FakeClock
+from tests.support.waiting import wait_for
+
+SOON_MS = 20
+
+
+@contextlib.contextmanager
+def listening(clock: FakeClock, notices: Notices) -> Iterator[tuple[TcpBytes, int]]:
+    with socket.socket() as made:
+        made.bind(("127.0.0.1", 0))
+        port = made.getsockname()[1]
+    place = UdpPlace(ip_address("127.0.0.1"), port)
+    with TcpBytes(place, AllowedSenders(), notices, clock) as link:
+        yield link, port
+
+
+def connect(port: int) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", port), 5)
+
+
+def taken(link: TcpBytes | FileBytes) -> bytes:
+    """What has come within a look."""
+    return b"".join(chunk.parts[-1] for chunk in link.taken(SOON_MS))
+
+
+def closed(link: TcpBytes, made: socket.socket) -> bool:
+    """Whether the link has closed a connection, which it may do at its next look."""
+    link.taken(SOON_MS)
+    made.settimeout(0.05)
+    try:
+        return made.recv(1) == b""
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def hold(link: TcpBytes, port: int, clock: FakeClock) -> socket.socket:
+    """A connection that is accepted and has sent."""
+    made = connect(port)
+    made.sendall(b"a")
+    wait_for(lambda: taken(link) == b"a", "the first bytes")
+    clock.work(1e9 * ACCEPT_EACH_S)
+    return made
+
+
+def test_a_second_connection_is_refused_and_named_while_the_first_sends():
+    clock, notices = FakeClock(), Notices()
+    with listening(clock, notices) as (link, port), hold(link, port, clock) as first:
+        assert link.trouble() == ""
+        for _ in range(5):
+            second = connect(port)
+            own = second.getsockname()[1]
+            second.sendall(b"lies")
+            wait_for(lambda second=second: closed(link, second), "the refusal")
+            second.close()
+            assert f"from 127.0.0.1:{own}" in link.trouble() and f":{first.getsockname()[1]} holds the line" in link.trouble()
+            clock.work(0.9e9 * HELD_S)
+            first.sendall(b"b")
+            wait_for(lambda: taken(link) == b"b", "the first one's bytes")
+        assert notices.counts() == {"second-connection": 5}
+        assert (link.link_counts.rejected, link.link_counts.connections) == (5, 1)
+        clock.work(1e9 * TOLD_S)
+        assert link.trouble() == ""
+
+
+def test_a_tracker_behind_a_half_open_line_is_back_after_three_seconds_and_not_before():
+    clock, notices = FakeClock(), Notices()
+    with listening(clock, notices) as (link, port), hold(link, port, clock) as half_open:
+        clock.work(0.9e9 * HELD_S)
+        with connect(port) as early:
+            wait_for(lambda: closed(link, early), "the refusal")
+        clock.work(0.1e9 * HELD_S)
+        with connect(port) as again:
+            again.sendall(b"c")
+            wait_for(lambda: taken(link) == b"c", "the tracker's bytes")
+            assert closed(link, half_open)
+            assert link.trouble() == ""
+    assert notices.counts() == {"second-connection": 1, "answers-lost": 1, "answers-back": 1}
+
+
+def test_a_tracker_that_closed_its_line_is_back_at_once():
+    clock, notices = FakeClock(), Notices()
+    with listening(clock, notices) as (link, port):
+        hold(link, port, clock).close()
+        with connect(port) as again:  # both wait: the end of the first line, and the second
+            again.sendall(b"d")
+            wait_for(lambda: taken(link) == b"d", "the tracker's bytes")
+    assert "second-connection" not in notices.counts()
+
+
+def test_a_line_that_never_sent_holds_for_as_long_and_no_longer():
+    clock = FakeClock()
+    with listening(clock, Notices()) as (link, port), connect(port):
+        wait_for(lambda: link.taken(SOON_MS) == [] and link.link_counts.connections == 1, "the silent one")
+        clock.work(1e9 * HELD_S)
+        with connect(port) as tracker:
+            tracker.sendall(b"e")
+            wait_for(lambda: taken(link) == b"e", "the tracker's bytes")
+
+
+def replaced(path: Path, kind: str) -> None:
+    path.unlink(missing_ok=True)
+    if kind == "a device":
+        path.symlink_to("/dev/zero")
+    elif kind == "a FIFO":
+        os.mkfifo(path)
+    elif kind == "a directory":
+        path.mkdir()
+    else:
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(str(path))
+
+
+@pytest.mark.parametrize("kind", ["a device", "a FIFO", "a directory", "a socket"])
+def test_a_file_that_becomes_something_else_is_let_go_told_once_and_taken_again(tmp_path, kind):
+    path, notices, clock = tmp_path / "t.bin", Notices(), FakeClock()
+    path.touch()
+    with FileBytes(path, notices, clock) as link:
+        path.write_bytes(b"one")
+        assert taken(link) == b"one"
+        replaced(path, kind)
+        for _ in range(3):
+            assert taken(link) == b""
+        assert link.trouble() == f"it is {kind} now, and no regular file"
+        assert notices.counts() == {"answers-lost": 1}
+        if kind == "a directory":
+            path.rmdir()
+        else:
+            path.unlink()
+        path.write_bytes(b"two")
+        assert taken(link) == b"two"
+        assert link.trouble() == ""
+        assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
+
+
+@pytest.mark.parametrize("kind", ["a device", "a FIFO", "a directory", "a socket"])
+def test_a_path_that_names_no_regular_file_at_the_start_is_refused(tmp_path, kind):
+    replaced(tmp_path / "t.bin", kind)
+    with pytest.raises(InputError, match=f"path = .*t.bin: {kind}; write the file"):
+        FileBytes(tmp_path / "t.bin", Notices(), FakeClock())
+
+
+def test_a_path_that_names_nothing_yet_and_then_a_device_is_not_opened(tmp_path):
+    path, notices = tmp_path / "t.bin", Notices()
+    with FileBytes(path, notices, FakeClock()) as link:
+        assert taken(link) == b"" and link.trouble() == ""
+        path.symlink_to("/dev/zero")
+        assert taken(link) == b"" and "a device" in link.trouble()

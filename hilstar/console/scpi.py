@@ -5,6 +5,8 @@ Laws:
 2. A keyword has two forms, short and long, in any case. Nodes in brackets may be left out. A header after `;` goes on from the
    node before the last keyword of the header before; `:` goes back to the root, and a common command (`*`) moves nothing.
 3. Memory is bounded: a line by MAX_LINE_BYTES, the queue of errors by MAX_ERRORS, whose last then says that it is full.
+4. What no test stand sends ends the connection (`NotScpi`): a web page can have a browser send a line of SCPI, but only after
+   the request line of HTTP, or after the first byte of TLS or STUN, which is a control character.
 """
 
 import itertools
@@ -19,6 +21,7 @@ MAX_LINE_BYTES = 4096
 MAX_ERRORS = 20
 MAX_MNEMONIC = 12
 MAX_DIGITS = 255
+HEAD_BYTES, END_BYTES = 128, 64  # of a line of any length, by which HTTP is known
 MAX_DETAIL = 200  # SCPI-1999 vol. 2, 21.8: 255 characters with the description
 NOT_A_NUMBER = "9.91E37"  # SCPI-1999 vol. 1, 7.2.1.5
 
@@ -97,7 +100,7 @@ class Unit(NamedTuple):
 
 NODE = re.compile(r"(\[)?:?([A-Za-z*]+)\]?")
 HEADER = re.compile(r"(\*[A-Za-z][A-Za-z0-9_]*|:?[A-Za-z][A-Za-z0-9_]*(?::[A-Za-z][A-Za-z0-9_]*)*)(\?)?(?:[ \t]+|$)")
-NUMBER = re.compile(r"([+-]?)(\d+\.?\d*|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?[ \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?")
+NUMBER = re.compile(r"([+-]?)(\d+(?:\.\d*)?|\.\d+)(?:[ \t]*[Ee][ \t]*([+-]?\d+))?[ \t]*([A-Za-z/%][A-Za-z0-9/.^-]*)?")
 INTEGER = re.compile(r"#(?:[Hh]([0-9A-Fa-f]+)|[Qq]([0-7]+)|[Bb]([01]+))")
 WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -319,24 +322,47 @@ class InstrumentStatus:
         return found | MASTER * bool(found & self.service_enable & ~MASTER)
 
 
+class NotScpi(Exception):
+    """Something came that no test stand sends, and the connection has to be closed; the message says what."""
+
+
+# All but tab, LF and CR.
+CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+WHITE = re.compile(rb"[ \t\r]+")
+# A request line of HTTP (RFC 9112, 3): a method in any case, a target, and since HTTP/1.0 a version. Either end tells it from
+# SCPI, whose headers have a colon before what follows a blank, and whose lines never end with a version.
+REQUEST_BEGINS = re.compile(rb"[ \t]*[A-Za-z][A-Za-z0-9_-]*[ \t]+(?:/|[A-Za-z][A-Za-z0-9+.-]*://)")
+REQUEST_ENDS = re.compile(rb"[ ]HTTP/\d+(?:\.\d+)?[ ]?\Z", re.IGNORECASE)
+
+
 class LineBuffer:
     """Bytes to lines, however they are cut: a line ends with LF, before which a CR counts as a space."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
+        self._head, self._end = b"", b""  # of the line so far, also of one that is too long to be kept
         self._too_long = False
 
     def feed(self, data: bytes) -> Iterator[str | None]:
-        """The lines that are whole now; None for one that was longer than MAX_LINE_BYTES."""
+        """The lines that are whole now; None for one that was longer than MAX_LINE_BYTES. Raises NotScpi."""
         *whole, rest = data.split(b"\n")
         for part in whole:
             self._add(part)
+            if REQUEST_ENDS.search(self._end):
+                raise NotScpi("the request line of HTTP")
             yield None if self._too_long else self._bytes.decode("latin-1").rstrip("\r")
             self._bytes.clear()
+            self._head, self._end = b"", b""
             self._too_long = False
         self._add(rest)
 
     def _add(self, part: bytes) -> None:
+        if CONTROL.search(part):
+            raise NotScpi("a control character, as TLS begins with one")
+        self._head += part[: HEAD_BYTES - len(self._head)]
+        self._end = WHITE.sub(b" ", self._end + part)[-END_BYTES:]
+        if REQUEST_BEGINS.match(self._head):
+            raise NotScpi("the request line of HTTP")
         self._too_long |= len(self._bytes) + len(part) > MAX_LINE_BYTES
         if self._too_long:
             self._bytes.clear()

@@ -3,15 +3,19 @@
 Commands go where the page's go: the run's state is read from shared memory, orders are those of an operator. With `[attitude]
 source = "scpi"` an attitude packet goes to the run's own UDP port on loopback SENT_HZ times a second, as any sender's does. No
 frame waits for any of it. Every connection has registers and a queue of errors of its own. docs/scpi.md has the commands.
+
+A controller is a connection that gave the token, or acted where none is needed; any other is a stranger. Whatever strangers do,
+attitudes go out in time: a connection has few commands a turn, all strangers together have one turn in STRANGERS_S, and a
+stranger takes the place of strangers alone (`Turns`, `Peers`).
 """
 
 import asyncio
 import contextlib
 import hmac
 import math
-import re
 import socket
 import time
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from typing import NamedTuple
 
@@ -21,7 +25,16 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import Refusal, checked_sample, encode
 from hilstar.console import scpi
 from hilstar.console.messages import FRAME, HAS_AGE, FrameNumbers, Order, OrderAnswer, RunState, ScpiSetup, SharedMemory
-from hilstar.console.scpi import NOT_A_NUMBER, OPERATION_COMPLETE, Headers, InstrumentStatus, LineBuffer, ScpiError, Unit
+from hilstar.console.scpi import (
+    NOT_A_NUMBER,
+    OPERATION_COMPLETE,
+    Headers,
+    InstrumentStatus,
+    LineBuffer,
+    NotScpi,
+    ScpiError,
+    Unit,
+)
 from hilstar.console.server.reader import TICK_S, RunReader
 from hilstar.rotation import propagate
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -32,13 +45,16 @@ SETTLES_NS = 2 * NS_PER_S  # an attitude that is not shown by then is given up (
 MARGIN_NS = NS_PER_MS  # between a state's time and what it was read from
 POLL_S = 0.01
 ALIVE_NS = NS_PER_S  # the run writes its state ten times a second
-MAX_CLIENTS = 16
+MAX_CONTROLLERS, MAX_STRANGERS = 16, 16
+# Lines, commands and queries of a turn: 0.2 ms of work. A controller that floods then leaves 1 ms to the others.
+UNITS_A_TURN, TURN_S = 8, 0.001
+# Strangers have 800 a second together, 3 % of a core.
+STRANGER_UNITS_A_TURN, STRANGERS_S = 4, 0.005
 MAX_READ_BYTES = 4096
 MAX_UNSENT_BYTES = 65_536
 UNREAD_S = 10.0
 MAX_WRONG_TOKENS = 5
 WRONG_TOKEN_S = 0.5
-HTTP = re.compile(r"[A-Z]+ \S+ HTTP/\d")  # a browser that another site's page made ask here
 ORDER_ERRORS = {400: -224, 404: -224, 409: -221, 500: -250, 504: -365}  # by an order's HTTP status; else -310
 UNLOCKED = {"*IDN?", "*CLS", "SYSTem:AUTHenticate", "SYSTem:ERRor[:NEXT]?", "SYSTem:ERRor:COUNt?", "SYSTem:VERSion?"}
 
@@ -108,6 +124,61 @@ class Settled(NamedTuple):
     seen_ns: int
 
 
+class Turns:
+    """Whose commands are next. Attitudes are sent between any two turns."""
+
+    def __init__(self) -> None:
+        self._strangers = asyncio.Lock()  # whose waiters are in order of arrival
+        self._next_s = 0.0
+
+    async def await_turn(self, stranger: bool) -> int:
+        """Wait for a turn; how many lines, commands and queries it has."""
+        if not stranger:
+            await asyncio.sleep(TURN_S)
+            return UNITS_A_TURN
+        clock_s = asyncio.get_running_loop().time
+        async with self._strangers:
+            await asyncio.sleep(self._next_s - clock_s())
+            self._next_s = clock_s() + STRANGERS_S
+        return STRANGER_UNITS_A_TURN
+
+
+class Peers:
+    """The connections that are open, controllers and strangers apart, in each the one that was silent longest first."""
+
+    def __init__(self) -> None:
+        self.controllers: dict[Connection, asyncio.StreamWriter] = {}
+        self.strangers: dict[Connection, asyncio.StreamWriter] = {}
+
+    def enter(self, client: "Connection", outgoing: asyncio.StreamWriter) -> None:
+        """Let a stranger in. Where there are too many, one of the address that has most of them gives way."""
+        if len(self.strangers) >= MAX_STRANGERS:
+            ((crowded, _),) = Counter(each.address for each in self.strangers).most_common(1)
+            first = next(each for each in self.strangers if each.address == crowded)
+            self.strangers.pop(first).transport.abort()
+        self.strangers[client] = outgoing
+
+    def heard(self, client: "Connection") -> None:
+        """Something came from this one."""
+        for peers in (self.controllers, self.strangers):
+            if client in peers:
+                peers[client] = peers.pop(client)
+
+    def promote(self, client: "Connection") -> None:
+        """A stranger is a controller from now on. Where there are too many, the one that was silent longest gives way."""
+        outgoing = self.strangers.pop(client, None)
+        if outgoing is None:
+            return
+        if len(self.controllers) >= MAX_CONTROLLERS:
+            self.controllers.pop(next(iter(self.controllers))).transport.abort()
+        self.controllers[client] = outgoing
+
+    def leave(self, client: "Connection") -> None:
+        """A connection has ended."""
+        self.controllers.pop(client, None)
+        self.strangers.pop(client, None)
+
+
 class ScpiServer:
     """What all connections share: the run, its orders, and the sky where SCPI steers it."""
 
@@ -115,7 +186,7 @@ class ScpiServer:
         self.setup, self.reader, self.give = setup, reader, give
         self.sky = SkySource(setup.steer_port, setup.max_rate_deg_s) if setup.steer_port else None
         self._memory = memory
-        self._clients: dict[Connection, asyncio.StreamWriter] = {}  # the one that was silent longest is the first
+        self.peers, self.turns = Peers(), Turns()
         self._missed = 0
         self._settled = Settled(0, 0)
 
@@ -131,7 +202,7 @@ class ScpiServer:
 
     def _look(self) -> None:
         self.pending()  # what is shown while nobody waits counts, too
-        for client in self._clients:
+        for client in (*self.peers.controllers, *self.peers.strangers):
             client.look()
         self._missed = 0 if self.reader.seen is None else self.reader.seen.counts.missed
 
@@ -180,30 +251,27 @@ class ScpiServer:
         connected = outgoing.get_extra_info("socket")
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         outgoing.transport.set_write_buffer_limits(MAX_UNSENT_BYTES)
-        if len(self._clients) >= MAX_CLIENTS:
-            locked = next((each for each in self._clients if not each.unlocked), next(iter(self._clients)))
-            self._clients.pop(locked).transport.abort()
-        self._clients[client] = outgoing
+        self.peers.enter(client, outgoing)
         lines = LineBuffer()
         try:
             while data := await incoming.read(MAX_READ_BYTES):
                 connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)  # else a write after a write waits for 40 ms
-                if client in self._clients:
-                    self._clients[client] = self._clients.pop(client)
+                self.peers.heard(client)
+                await client.turn()
                 for line in lines.feed(data):
-                    if line is not None and HTTP.match(line):
-                        return
                     answer = await client.answer(line)
-                    if client.wrong_tokens >= MAX_WRONG_TOKENS:
+                    if client.wrong_tokens >= MAX_WRONG_TOKENS or outgoing.is_closing():  # it gave way to another
                         return
                     if answer:
                         outgoing.write(answer.encode("ascii", "replace") + b"\n")
                         async with asyncio.timeout(UNREAD_S):
                             await outgoing.drain()
+        except NotScpi:
+            outgoing.transport.abort()  # a browser, as a rule, that another site's page made ask here: it gets no answer
         except (OSError, TimeoutError):
             outgoing.transport.abort()  # it has gone, or does not read
         finally:
-            self._clients.pop(client, None)
+            self.peers.leave(client)
             outgoing.close()
 
 
@@ -213,10 +281,24 @@ class Connection:
     def __init__(self, server: ScpiServer, address: str) -> None:
         self.status = InstrumentStatus()
         self.unlocked = not server.setup.token
+        self.is_controller = False
         self.wrong_tokens = 0
+        self.address = address
+        self._units_left = 0
         self._server, self._reader = server, server.reader
         self._who = "SCPI" + ("" if address in {"127.0.0.1", "::1", ""} else f" ({address})")
         self._answers: list[str] = []
+
+    async def turn(self) -> None:
+        """Wait until this connection may go on, before each line, command and query."""
+        if not self._units_left:
+            self._units_left = await self._server.turns.await_turn(not self.is_controller)
+        self._units_left -= 1
+
+    def _acts(self) -> None:
+        """This connection has shown that it may act, and does."""
+        self.is_controller = True
+        self._server.peers.promote(self)
 
     def look(self) -> None:
         """Take the run's conditions as they are now."""
@@ -230,10 +312,12 @@ class Connection:
     async def answer(self, line: str | None) -> str:
         """Do what a line says; its answers, "" for none. None is a line that was too long."""
         self._answers = []
+        await self.turn()
         try:
             if line is None:
                 raise ScpiError(-363, f"a line has at most {scpi.MAX_LINE_BYTES} bytes")
             for unit in HEADERS.units(line):
+                await self.turn()
                 await self._do(unit)
         except ScpiError as error:  # bad syntax: the rest of the line has no meaning
             self.status.add(error)
@@ -243,6 +327,8 @@ class Connection:
         try:
             if not self.unlocked and unit.pattern not in UNLOCKED:
                 raise ScpiError(-203, 'write SYST:AUTH "TOKEN" first, with the token that hilstar printed or was given')
+            if unit.pattern not in UNLOCKED:
+                self._acts()
             if unit.pattern in BARE:
                 scpi.count(unit, 0)
             self.look()
@@ -303,6 +389,7 @@ class Connection:
             await asyncio.sleep(WRONG_TOKEN_S)
             raise ScpiError(-203, "that is not the token")
         self.unlocked = True
+        self._acts()
 
     async def switch(self, unit: Unit) -> None:
         """`SKY:BLAN ON` (no light) and `LEDG:STAT ON`: the switches of the page."""

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
 from hilstar.console import scpi
-from hilstar.console.scpi import MAX_ERRORS, MAX_LINE_BYTES, Headers, InstrumentStatus, LineBuffer, ScpiError, Unit
+from hilstar.console.scpi import (
+    MAX_ERRORS,
+    MAX_LINE_BYTES,
+    Headers,
+    InstrumentStatus,
+    LineBuffer,
+    NotScpi,
+    ScpiError,
+    Unit,
+)
 from hilstar.console.server.scpi import BARE, COMMANDS, HEADERS, QUERIES
 
 LINES = 6000
+CPU_S = 0.1  # a line of 4096 bytes takes a millisecond; 0.9 s where digits were tried in every split
 
 
 def units(line: str) -> list[Unit]:
@@ -162,11 +174,17 @@ def mutated(rng: np.random.Generator) -> bytes:
 
 
 def test_whatever_bytes_come_give_units_or_a_standard_error():
-    rng, buffer, status = np.random.default_rng(34), LineBuffer(), InstrumentStatus()
-    good = 0
+    rng, status = np.random.default_rng(34), InstrumentStatus()
+    good = closed = 0
     for k in range(LINES):
         data = mutated(rng) if k % 3 else rng.integers(256, size=rng.integers(60), dtype=np.uint8).tobytes()
-        for line in buffer.feed(data + b"\n"):
+        try:
+            lines = list(LineBuffer().feed(data + b"\n"))
+        except NotScpi:
+            closed += 1
+            assert any(byte < 32 and byte not in b"\t\r\n" or byte == 127 for byte in data)
+            continue
+        for line in lines:
             try:
                 for unit in HEADERS.units(line or ""):
                     good += 1
@@ -176,7 +194,93 @@ def test_whatever_bytes_come_give_units_or_a_standard_error():
             except ScpiError as error:
                 status.add(error)
                 assert error.number in scpi.DESCRIPTIONS and error.text.isascii() and len(error.text) < 260
-    assert good > LINES / 30 and len(status.errors) == MAX_ERRORS
+    assert good > LINES / 30 and closed > LINES / 30 and len(status.errors) == MAX_ERRORS
+
+
+BLANKED = b"\nSKY:BLAN ON\n"
+LONG_PATH = b"/" + b"a" * 5000
+METHODS = (b"GET", b"HEAD", b"POST", b"PUT", b"DELETE", b"CONNECT", b"OPTIONS", b"TRACE", b"PATCH", b"PRI", b"M-SEARCH", b"X!Y")
+TARGETS = (b"/", b"*", b"/a?b=SKY:BLAN%20ON", LONG_PATH, b"http://127.0.0.1:5025/", b"127.0.0.1:5025")
+CLIENT_HELLO = bytes.fromhex("16030100c8010000c40303") + bytes(range(32)) + BLANKED
+SSL_2_HELLO = bytes.fromhex("802e010002001500000010") + BLANKED
+STUN = bytes.fromhex("000300082112a442") + b"turn:127.0.0.1" + BLANKED
+
+
+def obeyed(data: bytes, cuts: list[int]) -> tuple[list[str | None], bool]:
+    """The lines that come of data cut at these places, and whether the connection is closed."""
+    buffer, lines = LineBuffer(), []
+    try:
+        for begin, end in zip([0, *cuts], [*cuts, len(data)], strict=True):
+            lines += buffer.feed(data[begin:end])
+    except NotScpi:
+        return lines, True
+    return lines, False
+
+
+def request(method: bytes, target: bytes, version: bytes, blank: bytes = b" ", end: bytes = b"\r\n") -> bytes:
+    return method + blank + target + blank + version + end + b"Host: 127.0.0.1:5025\r\nOrigin: http://a" + end + BLANKED
+
+
+def test_a_request_of_any_method_case_length_and_cut_is_closed_before_a_line_of_it_is_read(rng):
+    for method in METHODS:
+        for target in TARGETS:
+            for version in (b"HTTP/1.1", b"HTTP/1.0", b"HTTP/2.0"):
+                for blank, end in ((b" ", b"\r\n"), (b"  ", b"\n"), (b"\t", b" \r\n")):
+                    whole = request(method, target, version, blank, end)
+                    for data in (whole, whole.lower(), whole.swapcase(), b"\r\n\r\n" + whole):
+                        cuts = sorted(rng.integers(0, len(data), size=rng.integers(0, 4)).tolist())
+                        lines, closed = obeyed(data, cuts)
+                        assert closed and not any(lines), (data[:60], cuts)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"POST " + LONG_PATH + b" HTTP/1.1" + b" " * 9000 + b"\r\n" + BLANKED,
+        b" " * 9000 + b"post * http/1.1\r\n" + BLANKED,
+        b"A" * 9000 + b" / HTTP/1.1\r\n" + BLANKED,
+        b"GET /\r\n" + BLANKED,  # HTTP/0.9
+        b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + BLANKED,
+        CLIENT_HELLO,
+        SSL_2_HELLO,
+        STUN,
+    ],
+)
+@pytest.mark.parametrize("piece", [1, 7, 10_000])
+def test_what_a_browser_sends_otherwise_is_closed_too(data, piece):
+    lines, closed = obeyed(data, list(range(piece, len(data), piece)))
+    assert closed and not any(lines)
+
+
+@pytest.mark.parametrize("byte", [*range(9), 11, 12, *range(14, 32), 127])
+def test_a_control_character_closes_the_connection_wherever_it_stands(byte):
+    assert obeyed(bytes([byte]), []) == ([], True)
+    assert obeyed(b"*IDN?\n*ID" + bytes([byte]) + b"N?" + BLANKED, [3]) == (["*IDN?"], True)
+    assert obeyed(b"x" * 5000 + bytes([byte]) + BLANKED, [4999]) == ([], True)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "SKY:FAUL 'GET / HTTP/1.1'",
+        "SKY:RATE 1,2,3 DEG/S",
+        "POST",
+        "post:sky /1",
+        "*ESE /1",
+        "HTTP/1.1",
+        "SKY:ATT 1,0,0,0 /",
+        "SKY:BLAN ON;\tATT?",
+        "SKY:BLANK \u00e9",
+    ],
+)
+def test_a_mistyped_line_is_none_of_these(line):
+    assert obeyed(line.encode("latin-1") + b"\r\n", []) == ([line], False)
+
+
+def test_a_number_of_four_thousand_digits_is_refused_at_once():
+    begun_s = time.process_time()
+    assert error_of(f"SKY:ATT {'1' * 4000}!,0,0,0") == -121
+    assert time.process_time() - begun_s < CPU_S
 
 
 def test_a_device_s_own_headers_may_leave_out_what_stands_in_brackets():

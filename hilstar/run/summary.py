@@ -75,6 +75,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     beat: BeatSummary | UnsetType = UNSET
     sync: SyncSummary | UnsetType = UNSET
     fields_of_view: dict[str, Any] | UnsetType = UNSET
+    star: dict[str, Any] | UnsetType = UNSET
 
 
 class SwapTally:

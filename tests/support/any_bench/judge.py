@@ -153,7 +153,7 @@ def _light(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     """Light of white, electrons per second, at pixels (n,) of the image."""
     monitor = file.config.monitor
     grid = bench_calibration(file.config, file.folder).uniformity_map(monitor.resolution_px)
-    white = file.config.render.flux_at_white_e_per_s or math.nan
+    white = file.config.render.flux_at_white_e_per_s or 1.0
     if grid is None:
         return np.full(len(x_px), white)
     columns, rows = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)

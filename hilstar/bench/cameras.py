@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -24,11 +24,14 @@ from hilstar.scene.camera import Camera, bounded
 from hilstar.scene.psf import GaussianPsf, Psf, SampledPsf, read_psf
 
 NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
-MIN_SEEN, MIN_FILLED = 0.1, 0.5  # share of the screen that the tracker sees; share of the tracker's field that the screen fills
+# Share of the screen that the tracker sees, and of the tracker's field that the screen fills. A bench may have 2 % of the one,
+# or a field of three screens; a length in another unit changes them a hundred times.
+MIN_SEEN, MIN_FILLED = 0.015, 0.3
 MAX_PIXELS = 10.0  # tracker pixels to a monitor pixel, or the reverse
-# Limits of any bench: lenses are f/0.5 to f/10 (a factor of ten in one length leaves this), the widest sees 100 degrees,
-# pixels are those of the smallest sensors and of LED walls.
-F_NUMBERS, MAX_FIELD_DEG, APERTURES_MM = (0.5, 10.0), 100.0, (1.0, 2000.0)
+# Limits of any bench: lenses are f/0.5 to f/21 (a factor of ten in one length mostly leaves this), the widest sees 100 degrees,
+# collimators are not shorter than a microscope's objective and not longer than a room, pixels are those of the smallest
+# sensors and of LED walls.
+F_NUMBERS, MAX_FIELD_DEG, APERTURES_MM, COLLIMATORS_MM = (0.5, 21.0), 100.0, (1.0, 2000.0), (2.0, 50_000.0)
 TRACKER_PITCHES_UM, MONITOR_PITCHES_UM = (0.5, 100.0), (1.0, 10_000.0)
 TRUE_RATIOS = (0.5, 2.0)  # a length of [verify] to the same length elsewhere in the file
 LENGTHS = (
@@ -44,8 +47,12 @@ MM = {"um": 1e-3, "cm": 10.0, "inches": 25.4, "m": 1000.0}
 UM = {"nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 GRID = 64  # places along each side
 MAX_MENDS = 3
+# A unit is named where it leaves nothing implausible; where none does, one that takes away three quarters of it (in decades),
+# if no other takes away much more.
+MAX_LEFT, AS_GOOD = 0.25, 0.6
 FIELD_PLACES = 5  # along each side of the detector, where the PSFs that a display may draw are compared
 OBLIQUE, UM_PER_MM = 1e-3, 1e3
+TINY = 1e-12  # a share of none, so that it has a logarithm
 NO_OBJECTIVE_PX = 1e-3, 1e-3  # far under a monitor pixel on the detector, by whose own squares light is spread
 
 
@@ -198,9 +205,9 @@ class FieldsOfView:
 
     def line(self) -> str:
         """ "screen 18.0 x 10.2 deg, tracker 10.9 deg, 0.89 tracker px a monitor px"."""
-        screen, tracker = ([_figure(side) for side in sides] for sides in (self.screen_deg, self.tracker_deg))
+        screen, tracker = ([figure(side) for side in sides] for sides in (self.screen_deg, self.tracker_deg))
         across = tracker[0] if tracker[0] == tracker[1] else " x ".join(tracker)
-        pixel = _figure(self.tracker_px_a_monitor_px)
+        pixel = figure(self.tracker_px_a_monitor_px)
         return f"screen {' x '.join(screen)} deg, tracker {across} deg, {pixel} tracker px a monitor px"
 
     def keys(self) -> dict[str, Any]:
@@ -211,12 +218,12 @@ class FieldsOfView:
 def fields_of_view(config: BenchConfig, folder: Path) -> FieldsOfView:
     """The fields of view of a bench's screen and tracker, with a warning where a length cannot be right. Raises InputError."""
     found = _measured(config, folder)
-    odd = next(_oddities(config, found), None)
-    if odd is None:
+    odd = list(_oddities(config, found))
+    if not odd:
         return found
-    mends = list(_mends(config, folder))[:MAX_MENDS]
+    mends = _mends(config, folder, sum(one.decades for one in odd))[:MAX_MENDS]
     advice = f"is {', or '.join(mends)}?" if mends else "check the units of its lengths (_mm, _um) and its resolutions"
-    return dataclasses.replace(found, warning=f"{odd}; {advice}")
+    return dataclasses.replace(found, warning=f"{odd[0].text}; {advice}")
 
 
 def _measured(config: BenchConfig, folder: Path) -> FieldsOfView:
@@ -252,37 +259,60 @@ def _share(of: Camera, within: Camera) -> float:
     return float(inside.mean())
 
 
-def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[str]:
+class _Oddity(NamedTuple):
+    """What cannot be right, and by how many decades."""
+
+    text: str
+    decades: float
+
+
+def _decades_outside(value: float, limits: tuple[float, float]) -> float:
+    """How far a value is outside limits, in decades; 0 within them."""
+    low, high = limits
+    return max(0.0, math.log10(low / max(value, TINY)), math.log10(max(value, TINY) / high))
+
+
+def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
     """Lengths that cannot be right, the plainest first."""
     tracker, monitor, verify = config.tracker, config.monitor, config.verify
-    pixels = found.tracker_px_a_monitor_px
-    if found.field_on_screen < MIN_FILLED:
-        yield f"the tracker sees past the screen: {_percent(found.field_on_screen)} of its field is on it ({found.line()})"
-    if found.screen_seen < MIN_SEEN:
-        yield f"the tracker sees {_percent(found.screen_seen)} of the screen ({found.line()})"
-    if not 1 / MAX_PIXELS <= pixels <= MAX_PIXELS:
-        yield f"a monitor pixel is {_figure(pixels)} of the tracker's ({found.line()})"
+    pixels, widest_deg = found.tracker_px_a_monitor_px, max(*found.screen_deg, *found.tracker_deg)
+    past = f"the tracker sees past the screen: {_percent(found.field_on_screen)} of its field is on it ({found.line()})"
+    part = f"the tracker sees {_percent(found.screen_seen)} of the screen ({found.line()})"
+    judged = [
+        (past, found.field_on_screen, (MIN_FILLED, 1.0)),
+        (part, found.screen_seen, (MIN_SEEN, 1.0)),
+        (f"a monitor pixel is {figure(pixels)} of the tracker's ({found.line()})", pixels, (1 / MAX_PIXELS, MAX_PIXELS)),
+    ]
     for name, value, (low, high), unit in (
         ("the tracker's lens", tracker.focal_length_mm / tracker.aperture_mm, F_NUMBERS, "f/"),
         ("[tracker] aperture_mm", tracker.aperture_mm, APERTURES_MM, ""),
         ("[tracker] pixel_pitch_um", tracker.pixel_pitch_um, TRACKER_PITCHES_UM, ""),
         ("[monitor] pixel_pitch_um", monitor.pixel_pitch_um, MONITOR_PITCHES_UM, ""),
+        ("[collimator] focal_length_mm", config.collimator.focal_length_mm, COLLIMATORS_MM, ""),
     ):
-        if not low <= value < high:
-            yield f"{name} is {unit}{_figure(value)}, and none is known outside {unit}{low:g} to {unit}{high:g}"
-    widest_deg = max(*found.screen_deg, *found.tracker_deg)
-    if widest_deg > MAX_FIELD_DEG:
-        yield f"{_figure(widest_deg)} deg is wider than a lens sees ({found.line()})"
+        text = f"{name} is {unit}{figure(value)}, and none is known outside {unit}{low:g} to {unit}{high:g}"
+        judged.append((text, value, (low, high)))
+    text = f"{figure(widest_deg)} deg is wider than a lens sees ({found.line()})"
+    judged.append((text, math.tan(math.radians(widest_deg) / 2), (TINY, math.tan(math.radians(MAX_FIELD_DEG) / 2))))
     for key, true, said in (
         ("true_focal_length_mm", verify.true_focal_length_mm, config.collimator.focal_length_mm),
         ("true_pixel_pitch_um", verify.true_pixel_pitch_um, monitor.pixel_pitch_um),
     ):
-        if true is not None and not TRUE_RATIOS[0] <= true / said <= TRUE_RATIOS[1]:
-            yield f"[verify] {key} is {true:.6g}, and elsewhere this file says {said:.6g}"
+        if true is not None:
+            text = f"[verify] {key} is {true:.6g}, and elsewhere this file says {said:.6g}"
+            judged.append((text, true / said, TRUE_RATIOS))
+    for text, value, limits in judged:
+        decades = _decades_outside(value, limits)
+        if decades > 0:
+            yield _Oddity(text, decades)
 
 
-def _mends(config: BenchConfig, folder: Path) -> Iterator[str]:
-    """Each length that makes the bench plausible if it is converted from another unit, with that unit."""
+def _mends(config: BenchConfig, folder: Path, decades: float) -> list[str]:
+    """Each length that makes the bench plausible, or nearly so, if it is converted from another unit, with that unit.
+
+    What else is odd of a bench may stay: the length that takes most away is named, and those that take as much.
+    """
+    left: dict[str, float] = {}
     for table, key in LENGTHS:
         settings = getattr(config, table)
         value = getattr(settings, key)
@@ -291,14 +321,16 @@ def _mends(config: BenchConfig, folder: Path) -> Iterator[str]:
                 continue
             changed = replace(config, **{table: replace(settings, **{key: value * factor})})
             try:
-                mended = next(_oddities(changed, _measured(changed, folder)), None) is None
+                rest = sum(one.decades for one in _oddities(changed, _measured(changed, folder)))
             except InputError:  # such a lens leaves the screen
-                mended = False
-            if mended:
-                yield f"[{table}] {key} = {value:.6g} in {unit}, which is {value * factor:.6g}"
+                continue
+            left[f"[{table}] {key} = {value:.6g} in {unit}, which is {value * factor:.6g}"] = rest
+    least = min(left.values(), default=math.inf)
+    limit = 0.0 if least == 0 else min(MAX_LEFT * decades, least + AS_GOOD)
+    return [text for text, rest in left.items() if rest <= limit]
 
 
-def _figure(value: float) -> str:
+def figure(value: float) -> str:
     """One digit after the point, two figures of a small number, four of a large one."""
     return f"{value:.1f}" if 0.95 <= value < 1000 else f"{value:.2g}" if value < 1 else f"{value:.4g}"
 

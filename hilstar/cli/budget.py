@@ -6,6 +6,7 @@ from typing import Annotated
 from typer import Option
 
 from hilstar.cli.options import BenchFile, Json, RadecText, parse_attitude
+from hilstar.cli.running import say_optics
 from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import check_directory, make_directory
@@ -29,6 +30,7 @@ def budget(
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
     from hilstar.bench.build import load
+    from hilstar.bench.cameras import fields_of_view
     from hilstar.bench.frame import colour_line, shares_line
     from hilstar.tracker.centroiders import FAMILY
     from hilstar.twin.budget import By, budget_lines, write_report
@@ -48,10 +50,12 @@ def budget(
         meant = did_you_mean(centroider, choices)
         raise InputError(f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}")
     with load(bench_file) as bench:
+        fields = fields_of_view(bench.config, bench.file.folder)
         found, assumed = find_budget(bench, by), shares_line(bench) or colour_line(bench)
     if output is not None:
         write_report(make_directory(output), found)
     print_found(as_json, found, budget_lines(found))
+    say_optics(fields, found.star)
     if assumed is not None:
         say(assumed)
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from hilstar.cli import options
-from hilstar.cli.running import explain_bench, optional_scenario, say_units
+from hilstar.cli.running import explain_bench, optional_scenario, say_optics
 from hilstar.console.terminal import print_found
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, check_ending
@@ -34,6 +34,7 @@ def frame(
     from hilstar.bench.bench_file import at_moment, read_bench_file
     from hilstar.bench.build import open_bench
     from hilstar.bench.cameras import fields_of_view
+    from hilstar.bench.star_size import star_size
     from hilstar.frame.truth import clipped_in
 
     q = options.parse_attitude("frame", radec, quaternion)
@@ -67,6 +68,7 @@ def frame(
         if preview is not None:
             files.write_preview_png(preview, shot.levels)
         clipped = clipped_in(shot.rows)
+        star = star_size(file.config, file.folder, bench.camera)
         summary: dict[str, Any] = {
             "stars": len(shot.rows),
             "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
@@ -78,6 +80,7 @@ def frame(
             "faults": [] if effects is None else [one.fault.name for one in effects.now],
             "written": [str(path) for path in targets],
             "fields_of_view": fields.keys(),
+            "star": star.keys(),
             "gl_renderer": bench.renderer.gl_renderer,
         }
     names = f", clipped: {clipped_text(summary['clipped_mag'])}" if clipped else ""
@@ -86,8 +89,9 @@ def frame(
         names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
     if summary["faults"]:
         names += f", faults: {', '.join(summary['faults'])}"
-    print_found(as_json, summary, [f"{len(shot.rows)} stars{names}; wrote {', '.join(summary['written'])}", fields.line()])
-    say_units(fields)  # after the refusals: a failing command prints one line
+    drawn = f"{len(shot.rows)} stars{names}; wrote {', '.join(summary['written'])}"
+    print_found(as_json, summary, [drawn, fields.line(), star.line()])
+    say_optics(fields, star)  # after the refusals: a failing command prints one line
 
 
 def clipped_text(loss_mag: dict[int | str, float]) -> str:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.cameras import FieldsOfView
     from hilstar.bench.scenario import Scenario
+    from hilstar.bench.star_size import StarSize
     from hilstar.console.listener import PageListener
     from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.faults import AnyFaults, Recording
@@ -148,10 +149,26 @@ def say_of_light(bench: Any) -> None:
             say(line)
 
 
-def say_units(fields: "FieldsOfView") -> None:
-    """Warn of a length in the bench file that is probably in another unit than its key."""
+def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
+    """Warn of a length in the bench file that is probably in another unit than its key; else of a star that is too wide."""
+    fault = star.fault()
     if fields.warning is not None:
         say(f"check the units: {fields.warning}")
+    elif fault is not None:
+        say(f"{fault}; hilstar doctor lists panels")
+
+
+def say_seen(bench: Any) -> dict[str, Any]:
+    """Say what screen and tracker see and how wide a star is then, with what is wrong of it; both for the run's summary."""
+    from hilstar.bench.cameras import fields_of_view
+    from hilstar.bench.star_size import star_size
+
+    fields = fields_of_view(bench.config, bench.file.folder)
+    star = star_size(bench.config, bench.file.folder, bench.camera)
+    say(fields.line())
+    say(star.line())
+    say_optics(fields, star)
+    return {"fields_of_view": fields.keys(), "star": star.keys()}
 
 
 def say_beat(bench: Any, screen: Any) -> "BeatSummary":

@@ -143,7 +143,6 @@ def serve(
         serve_heads(asked, console, overwrite, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.bench.cameras import fields_of_view
     from hilstar.run.loop import Limit
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import serve as serve_stream
@@ -151,7 +150,6 @@ def serve(
     ledger = running.dated_ledger(ledger)
     check_ending("--ledger", ledger, MCAP)
     faults = running.optional_scenario(scenario)
-    fields = fields_of_view(file.config, file.folder)
     check_files([scenario], [], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
@@ -173,8 +171,7 @@ def serve(
         limit = Limit(math.inf if duration is None else round(duration * refresh_hz), math.inf if count is None else count)
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
-        say(fields.line())
-        running.say_units(fields)
+        optics = running.say_seen(bench)
         running.say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
         told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, limit.shortest, running.forced_on(screen))
@@ -186,8 +183,8 @@ def serve(
         ):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), *fed[1:], wrong, pulse, answers)
             summary = serve_stream(bench, link, limit, fed[0], outlet)
-    told_all = replaced(summary, beat=beat, fields_of_view=fields.keys())
-    running.end_of_run(told_all, screen, kept, notices, as_json, strict)
+    whole_summary = replaced(summary, beat=beat, **optics)
+    running.end_of_run(whole_summary, screen, kept, notices, as_json, strict)
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets, link.trouble))
         raise typer.Exit(NO_ATTITUDE)

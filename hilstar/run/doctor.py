@@ -22,8 +22,9 @@ from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
 from hilstar.attitude.wire.zmq_socket import zmq_version
 from hilstar.bench.bench_file import BenchFile, read_bench_or_heads
 from hilstar.bench.build import bench_calibration, bench_optics
-from hilstar.bench.cameras import FieldsOfView, fields_of_view
+from hilstar.bench.cameras import FieldsOfView, bench_camera, fields_of_view
 from hilstar.bench.measured_on import MonitorCheck, check_monitor
+from hilstar.bench.star_size import StarSize, star_size
 from hilstar.errors import HilstarError, MachineError
 from hilstar.monitor.identity import TABLE, edid_identity
 from hilstar.monitor.window.output_settings import findings
@@ -99,19 +100,27 @@ def examine() -> Examination:
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """What a bench's screen and tracker see, and its monitor against its files."""
+    """What a bench's screen and tracker see, how wide a star is then, and its monitor against its files."""
 
     fields: FieldsOfView
+    star: StarSize
     monitor: MonitorCheck
 
     def keys(self) -> dict[str, Any]:
         """By the keys of `doctor --json`."""
         now, told = self.monitor.now, {"fault": self.monitor.fault, "notice": self.monitor.notice}
-        return {**self.fields.keys(), **({} if now is None else {"monitor": {TABLE: now.known(), **told}})}
+        return {
+            **self.fields.keys(),
+            "star": self.star.keys(),
+            **({} if now is None else {"monitor": {TABLE: now.known(), **told}}),
+        }
 
     def lines(self, name: str) -> Iterator[str]:
         """For a person, by the bench file's name."""
         yield f"{'ok' if self.fields.warning is None else 'check':8}{name:12}{self.fields.line()}"
+        yield f"{'check' if self.star.too_wide else 'ok':8}{'star':12}{self.star.line()}"
+        if self.star.would_do is not None:
+            yield from (f"{'':20}{line}" for line in (self.star.would_do.text(), *self.star.would_do.lines()))
         if self.monitor.now is not None:
             yield f"{'CHANGED' if self.monitor.fault else 'ok':8}{'monitor':12}{self.monitor.now.name()}"
             yield from [f"{'':20}{self.monitor.notice}"] * bool(self.monitor.notice)
@@ -135,7 +144,8 @@ def examine_bench(path: Path | None, today: datetime.date) -> dict[str, BenchRep
 def _report_on(file: BenchFile, today: datetime.date) -> BenchReport:
     now = identity_here(file.config.monitor.display)
     check = MonitorCheck(None) if now is None else check_monitor(file, now, today)
-    return BenchReport(fields_of_view(file.config, file.folder), check)
+    config, folder = file.config, file.folder
+    return BenchReport(fields_of_view(config, folder), star_size(config, folder, bench_camera(config, folder)), check)
 
 
 def _check(name: str, look: Callable[[], str]) -> Check:

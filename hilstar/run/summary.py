@@ -121,6 +121,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     beat: BeatSummary | UnsetType = UNSET
     sync: SyncSummary | UnsetType = UNSET
     fields_of_view: dict[str, Any] | UnsetType = UNSET
+    star: dict[str, Any] | UnsetType = UNSET
     blank_frames: int = 0
     wrong_sky: WrongSkyTotal = WrongSkyTotal()
     verdict: RunVerdict | UnsetType = UNSET

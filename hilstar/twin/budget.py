@@ -13,6 +13,7 @@ import numpy as np
 from hilstar.arrays import IntArray
 from hilstar.bench.build import bench_primaries, named_channels
 from hilstar.bench.frame import Bench, clipping_hip, named
+from hilstar.bench.star_size import StarSize, star_size
 from hilstar.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
@@ -91,6 +92,7 @@ class LightBudget:
     primaries: ChannelMatrix | None
     near_infrared: list[dict[str, Any]]
     out_of_gamut: float | None
+    star: StarSize
 
 
 def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
@@ -133,6 +135,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         primaries=primaries,
         near_infrared=red_shares(channels, ends_nm),
         out_of_gamut=out_of_gamut(bench),
+        star=star_size(bench.config, bench.file.folder, bench.camera),
     )
 
 
@@ -284,6 +287,7 @@ def budget_lines(found: LightBudget) -> list[str]:
         f"{'clipped stars':22}{named(found.clipped_hip, MAX_NAMED)}",
         f"{'not drawn':22}{found.left_out.stars} stars, too faint: {found.left_out.flux_share:.2e} of all light",
         f"{'black':22}{found.black_e_per_s_px:.4g} e-/s in a monitor pixel",
+        f"{'in the tracker':22}{found.star.line()}",
     ]
     if found.primaries is not None:
         one = found.primaries

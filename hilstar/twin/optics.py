@@ -1,11 +1,10 @@
 """The monitor as the tracker sees it: its pixels on the tracker's detector and back, and their light through the optics.
 
-A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: four or nine Gaussians that
-have the square's variance together, spread by the tracker's PSF. The black level is a glow over the whole monitor, by its own
-density on the image.
+A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: four, nine or more Gaussians
+that have the square's variance together (`square_points`), spread by the tracker's PSF. The black level is a glow over the
+whole monitor, by its own density on the image.
 """
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -22,17 +21,11 @@ from hilstar.process.closing import Closing
 from hilstar.render.backend import Target
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.scene.camera import Camera
-from hilstar.scene.psf import GaussianPsf, Psf
+from hilstar.scene.psf import Psf, square_points
 from hilstar.scene.sprites import mean_share, pack_sprites
 from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
-# Gaussians along a pixel's side, in sides. Three for thirds of it: against squares a star's centroid is off by 3e-6 px and
-# its flux by 1e-9 mag on the demo's bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by 1e-5 px with a PSF
-# of 0.3, by 1e-4 px with monitor pixels of 2.7 tracker pixels. Two are off by 3e-6 px on the demo's bench too, for their fourth
-# moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF. Other PSFs may have finer parts than their width.
-TWO, TWO_UP_TO_SIGMAS = np.array([-0.2525, 0.2525]), 1.7
-THREE = np.array([-1.0, 0.0, 1.0]) / 3
 POINTS_AT_ONCE = 400_000
 
 
@@ -139,9 +132,7 @@ class TwinOptics(Closing):
     def __init__(self, geometry: BenchGeometry, psf: Psf) -> None:
         self.geometry = geometry
         side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-        few = isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * min(psf.width_px)
-        self._steps = TWO if few else THREE
-        self._psf = psf.blurred(side_px * math.sqrt(1 / 12 - float(np.mean(self._steps**2))))
+        self._steps, self._psf = square_points(side_px, psf)
         self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 
     def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray | LitLight], primaries: Sequence[Primary]) -> FloatArray:

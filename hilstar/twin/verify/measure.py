@@ -19,6 +19,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.moving import wide_bodies
+from hilstar.bench.star_size import StarSize, star_size
 from hilstar.monitor.calibration import Calibration
 from hilstar.optics.glass_psf import GlassPsf
 from hilstar.scene.camera import Camera
@@ -252,6 +253,7 @@ class Measured:
     true_calibration: Calibration | None
     gl_renderer: str
     wide_bodies: list[str]
+    star: StarSize
     glass: "GlassEffect | None" = None
 
 
@@ -377,6 +379,7 @@ class Comparison:
             true_calibration=None if name is None else true_calibration(bench, name),
             gl_renderer=bench.renderer.gl_renderer,
             wide_bodies=wide_bodies(bench.moving, bench.camera),
+            star=star_size(self.twin.config, bench.file.folder, self.twin.true_camera),
             glass=glass_effect(bench.tracker_psf, self.tally.stars),
         )
 

@@ -143,6 +143,9 @@ def codes_at_fault(verdict: Verdict) -> bool:
 def _not_the_codes(verdict: Verdict) -> str | None:
     """The first limit that is exceeded even without the codes' share (errors add in squares); None if all are met."""
     limits, errors = verdict.measured.config.verify, verdict.errors
+    wide = verdict.measured.star.fault()
+    if wide is not None:
+        return wide
     elsewhere = sum(math.isfinite(star.codes_mag) for star in errors.lost)
     if elsewhere > limits.lost_share * errors.looked_for:
         return f"{elsewhere} of {errors.looked_for} stars are lost that the codes alone would show"

@@ -10,6 +10,7 @@ import numpy as np
 
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.scenario import Scenario
+from hilstar.bench.star_size import StarSize
 from hilstar.charts import BLUE, MUTED, RED, SMALL_PT, chart, label_ends, write_csv
 from hilstar.error_spread import ErrorSpread, error_spread
 from hilstar.monitor.quantise import MASK_TURNS
@@ -101,6 +102,7 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
         "calibration": {"name": calibration.name, "sha256": calibration.sha256},
         "gl_renderer": measured.gl_renderer,
         "drawn_as_discs": measured.wide_bodies,
+        "star": measured.star.keys(),
         "faults": verdict.faults,
     }
 
@@ -148,10 +150,15 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
             for row in summary["by_magnitude"]
         ),
         *(f"{'':20}{line}" for line in summary["drawn_as_discs"]),
+        f"{'star':20}{_star_line(summary['star'])}",
         *fault_lines(summary["faults"]),
         *(f"{'':20}{reason}" for reason in summary["reasons"]),
         f"{'verdict':20}{'passed' if summary['passed'] else 'NOT passed'}",
     ]
+
+
+def _star_line(star: dict[str, Any]) -> str:
+    return StarSize(**star).line()
 
 
 def _number(value: float | None) -> str:

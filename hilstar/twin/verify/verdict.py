@@ -69,15 +69,22 @@ def p95(errors: FloatArray) -> float:
 
 def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
     """The reasons against a bench; none where it passes."""
+    too_wide = _too_wide(measured)
     if not errors.looked_for:
-        return ["no star could be measured: no field has one that is shown, unclipped and alone"]
+        return ["no star could be measured: no field has one that is shown, unclipped and alone", *too_wide]
     lost = _lost(measured, errors)
     centroid = _centroids(measured, errors)
     geometry = _geometry(measured, errors) if lost or centroid else []
     # A few stars found by chance, or far from the middle of their windows, say nothing about light.
     mostly_lost = len(errors.lost) > MIN_SHARE * errors.looked_for
     light = [] if mostly_lost else [*_light(measured, errors), *_codes(measured, errors)]
-    return [*lost, *centroid, *geometry, *light, *_black(measured), *_floor(measured, errors)]
+    return [*lost, *centroid, *geometry, *light, *_black(measured), *_floor(measured, errors), *too_wide]
+
+
+def _too_wide(measured: Measured) -> list[str]:
+    """A star of the display that is too wide for a tracker that knows the sky's."""
+    fault = measured.star.fault()
+    return [] if fault is None else [fault]
 
 
 def _lost(measured: Measured, errors: DisplayErrors) -> list[str]:

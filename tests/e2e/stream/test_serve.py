@@ -29,6 +29,7 @@ SUMMARY_KEYS |= {
     "gl_renderer",
     "gl_version",
     "fields_of_view",
+    "star",
     "render_path",
     "stale_events",
     "receive_latency_ms",

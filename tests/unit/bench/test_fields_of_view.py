@@ -16,6 +16,7 @@ from tests.support.commands import run_hilstar_here
 
 BENCH = (ROOT / "examples" / "bench.toml").read_text()
 SHIPPED = sorted([*(ROOT / "configs").glob("*.toml"), *(ROOT / "examples").glob("*bench.toml")])
+STAR = "star 1.0 px sigma, of the sky 0.55; brightest pixel 1.1 mag fainter; 13.6 px share it, of the sky 4.5"
 LINE = "screen 18.0 x 10.2 deg, tracker 10.9 deg, 0.89 tracker px a monitor px"
 FIGURE_DEG = 1e-9  # of angles that are one arctangent each
 
@@ -87,7 +88,7 @@ def test_a_length_in_another_unit_is_named_with_what_was_meant(tmp_path, key, va
         ([("= 70\n", "= 7\n"), ("= 350\n", "= 35\n")], "f/0.23"),  # both focal lengths in cm
         ([("= 13\n", "= 1000\n"), ("= 57.65\n", "= 4434\n")], r"\[tracker\] pixel_pitch_um is 1000"),
         ([("= 13\n", "= 0.13\n"), ("= 57.65\n", "= 0.5765\n")], r"\[tracker\] pixel_pitch_um is 0.13"),
-        ([("[1024, 1024]", "[300, 300]")], "the tracker sees .* % of the screen"),
+        ([("[1024, 1024]", "[150, 150]")], "the tracker sees .* % of the screen"),
         ([("[1920, 1080]", "[640, 480]")], "the tracker sees past the screen"),
         ([("[background]\n", "[verify]\ntrue_focal_length_mm = 35\n[background]\n")], r"\[verify\] true_focal_length_mm is 35"),
     ],
@@ -98,12 +99,60 @@ def test_what_cannot_be_is_said(tmp_path, changes, words):
     assert re.search(words, warning), warning
 
 
+# A 27-inch monitor behind 500 mm before a narrow tracker, which sees 6 % of it: odd, and no length is in another unit.
+NEWCOMER = [
+    ("= 57.65\n", "= 233.1\n"),
+    ("[1920, 1080]", "[2560, 1440]"),
+    ("= 350\n", "= 500\n"),
+    ("= 70\n", "= 50\n"),
+    ("= 13\n", "= 5.5\n"),
+    ("[1024, 1024]", "[2048, 2048]"),
+]
+
+
+def test_a_small_part_of_the_screen_and_a_fine_tracker_are_no_units(tmp_path):
+    found = fields(tmp_path, *NEWCOMER)
+    assert found.screen_seen == pytest.approx(0.064, abs=0.002)
+    assert found.warning is None
+
+
+@pytest.mark.parametrize(
+    ("change", "meant"),
+    [
+        (("= 233.1\n", "= 0.2331\n"), "pixel_pitch_um = 0.2331 in mm, which is 233.1"),
+        (("= 500\n", "= 50\n"), "[collimator] focal_length_mm = 50 in cm, which is 500"),
+        (("= 500\n", "= 0.5\n"), "[collimator] focal_length_mm = 0.5 in m, which is 500"),
+        (("= 50\n", "= 0.05\n"), "[tracker] focal_length_mm = 0.05 in m, which is 50"),
+    ],
+)
+@pytest.mark.parametrize("odd", [None, ("= 30\n", "= 1.9\n"), ("[2560, 1440]", "[250, 200]")], ids=["", "f/26", "past"])
+def test_a_unit_is_named_on_a_bench_that_is_odd_in_other_ways(tmp_path, change, meant, odd):
+    text = BENCH
+    for old, new in [*NEWCOMER, change, *([] if odd is None else [odd])]:
+        text = text.replace(old, new)
+    (tmp_path / "bench.toml").write_text(text)
+    file = read_bench_file(tmp_path / "bench.toml")
+    warning = fields_of_view(file.config, file.folder).warning
+    assert warning is not None
+    assert meant in warning, warning
+
+
+@pytest.mark.parametrize("f_number", [0.7, 1.4, 8.0, 20.0])
+@pytest.mark.parametrize("share", [0.02, 0.3, 3.0])
+def test_a_bench_that_a_lab_may_have_is_not_warned_of(tmp_path, f_number, share):
+    side_mm = 1024 * 0.013
+    focal_mm = 70.0
+    collimator_mm = math.sqrt(share * 1920 * 1080 * 0.05765**2) * focal_mm / side_mm
+    changes = [("= 30\n", f"= {focal_mm / f_number}\n"), ("= 350\n", f"= {collimator_mm}\n")]
+    assert fields(tmp_path, *changes).warning is None
+
+
 def test_frame_and_doctor_print_the_line_and_warn_on_stderr(tmp_path):
     (tmp_path / "bench.toml").write_text(BENCH)
     (tmp_path / "wrong.toml").write_text(BENCH.replace("57.65", "0.05765"))
     at = ("--radec", "84.057,-1.2,0", "-o", "o.fits")
     drawn = run_hilstar_here("frame", "bench.toml", *at, cwd=tmp_path)
-    assert (drawn.returncode, drawn.stdout.splitlines()[1:], drawn.stderr) == (0, [LINE], "")
+    assert (drawn.returncode, drawn.stdout.splitlines()[1:], drawn.stderr) == (0, [LINE, STAR], "")
     wrong = run_hilstar_here("frame", "wrong.toml", *at, cwd=tmp_path)
     assert wrong.returncode == 0
     assert wrong.stdout.splitlines()[1] == "screen 0.018 x 0.01 deg, tracker 10.9 deg, 0.00089 tracker px a monitor px"
@@ -112,7 +161,7 @@ def test_frame_and_doctor_print_the_line_and_warn_on_stderr(tmp_path):
     told = run_hilstar_here("frame", "bench.toml", *at, "--json", cwd=tmp_path)
     assert json.loads(told.stdout)["fields_of_view"]["screen_deg"] == pytest.approx([17.97, 10.16], abs=0.01)
     examined = run_hilstar_here("doctor", "bench.toml", cwd=tmp_path)
-    assert examined.stdout.splitlines()[-1] == f"ok      bench.toml  {LINE}"
+    assert examined.stdout.splitlines()[-2:] == [f"ok      bench.toml  {LINE}", f"ok      star        {STAR}"]
     told = run_hilstar_here("doctor", "wrong.toml", "--json", cwd=tmp_path)
     assert "which is 57.65?" in json.loads(told.stdout)["benches"]["wrong.toml"]["warning"]
     assert len(told.stderr.splitlines()) == 1

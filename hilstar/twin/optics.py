@@ -1,7 +1,7 @@
 """The monitor as the tracker sees it: its pixels on the tracker's detector and back, and their light through the optics.
 
-A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: four or nine Gaussians that
-have the square's variance together, spread by the tracker's PSF. The black level is a glow over the whole monitor, by its own
+A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: four or nine Gaussians, more
+where it is wide, that have the square's variance together, spread by the tracker's PSF. The black level is a glow over the whole monitor, by its own
 density on the image.
 """
 
@@ -33,6 +33,9 @@ Mirror = Literal["none", "x", "y", "swap"]
 # moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF. Other PSFs may have finer parts than their width.
 TWO, TWO_UP_TO_SIGMAS = np.array([-0.2525, 0.2525]), 1.7
 THREE = np.array([-1.0, 0.0, 1.0]) / 3
+# A Gaussian's side of a wide pixel: its edge is then softer than the PSF's by 2 % of sigma. By thirds of 4.2 tracker pixels
+# before a PSF of 0.55 it is softer by 24 %, which a fit of the PSF to dots takes for the PSF's own.
+FINE_SIGMAS, MAX_STEPS = 0.7, 16
 POINTS_AT_ONCE = 400_000
 
 
@@ -133,14 +136,24 @@ class DisplayColours:
         return image if self.bayer is None else in_pixels(np.multiply.outer(self.white, image), self.bayer)
 
 
+def _steps_of(side_px: float, psf: Psf) -> FloatArray:
+    """Where the Gaussians of a pixel of `side_px` tracker px stand along its side (n,), in sides."""
+    if not isinstance(psf, GaussianPsf):
+        return THREE
+    sides = side_px / min(psf.width_px)
+    if sides <= TWO_UP_TO_SIGMAS:
+        return TWO
+    count = min(max(math.ceil(sides / FINE_SIGMAS), len(THREE)), MAX_STEPS)
+    return np.asarray((np.arange(count) + 0.5) / count - 0.5)
+
+
 class TwinOptics(Closing):
     """Images of a monitor on the tracker's detector. Free it with `close`, or use it as a context manager."""
 
     def __init__(self, geometry: BenchGeometry, psf: Psf) -> None:
         self.geometry = geometry
         side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-        few = isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * min(psf.width_px)
-        self._steps = TWO if few else THREE
+        self._steps = _steps_of(side_px, psf)
         self._psf = psf.blurred(side_px * math.sqrt(1 / 12 - float(np.mean(self._steps**2))))
         self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 

@@ -1,8 +1,8 @@
 """The monitor as the tracker sees it: its pixels on the tracker's detector and back, and their light through the optics.
 
 A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: four or nine Gaussians, more
-where it is wide, that have the square's variance together, spread by the tracker's PSF. The black level is a glow over the whole monitor, by its own
-density on the image.
+where it is wide, that have the square's variance together, spread by the tracker's PSF. The black level is a glow over the
+whole monitor, by its own density on the image.
 """
 
 import math

@@ -50,10 +50,13 @@ MIN_WIDTH_PX, WIDTH_ROUNDS = 0.05, 60  # the Gaussian nearest to a sampled PSF; 
 # Gaussians along the side of a lit square, in sides, in place of its light. Thirds of it: against squares a star's centroid is
 # off by 3e-6 px and its flux by 1e-9 mag on the demo's bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by
 # 1e-5 px with a PSF of 0.3, by 1e-4 px with monitor pixels of 2.7 tracker pixels. Two are off by 3e-6 px on the demo's bench
-# too, for their fourth moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF. Other PSFs may have finer
-# parts than their width.
+# too, for their fourth moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF.
 TWO, TWO_UP_TO_SIGMAS = np.array([-0.2525, 0.2525]), 1.7
-MIN_PARTS = 3
+MIN_PARTS, MAX_PARTS = 3, 16
+# Sides of a part, in sigmas of a Gaussian PSF: a wide square's edge is then softer than the PSF's by 2 % of sigma. Thirds of
+# 4.2 pixels before a sigma of 0.55 soften it by 24 %, which a fit of the PSF to dots takes for the PSF's own.
+FINE_SIGMAS = 0.7
+# Other PSFs may have finer parts than their width, so that no share of it bounds what parts do: there ripples do.
 # Gaussians d apart ripple by 0.4 exp(-19.7 (sigma / d)^2): 1e-3 at 1.8 sigmas, where sigma has the pixel that sees them in it.
 PART_SIGMAS = 1.8
 
@@ -468,8 +471,10 @@ def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
     if isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * narrow_px:
         points = TWO
     else:
-        seen_px = math.sqrt(narrow_px**2 + PIXEL_VARIANCE)
-        parts = max(MIN_PARTS, math.ceil(side_px / (PART_SIGMAS * seen_px)))
+        longest_px = PART_SIGMAS * math.sqrt(narrow_px**2 + PIXEL_VARIANCE)
+        if isinstance(psf, GaussianPsf):
+            longest_px = FINE_SIGMAS * narrow_px
+        parts = min(max(math.ceil(side_px / longest_px), MIN_PARTS), MAX_PARTS)
         points = (np.arange(parts) + 0.5) / parts - 0.5
     return points, psf.blurred(side_px * math.sqrt(PIXEL_VARIANCE - float(np.mean(points**2))))
 

@@ -282,7 +282,11 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[str]:
 
 
 def _mends(config: BenchConfig, folder: Path) -> Iterator[str]:
-    """Each length that makes the bench plausible if it is converted from another unit, with that unit."""
+    """Each length that makes the bench plausible if it is another quantity, or in another unit, with that."""
+    tracker = config.tracker
+    changed = replace(config, tracker=replace(tracker, aperture_mm=tracker.focal_length_mm / tracker.aperture_mm))
+    if F_NUMBERS[0] <= tracker.aperture_mm < F_NUMBERS[1] and _is_plausible(changed, folder):
+        yield f"[tracker] aperture_mm = {tracker.aperture_mm:.6g} the f-number, which is {changed.tracker.aperture_mm:.6g}"
     for table, key in LENGTHS:
         settings = getattr(config, table)
         value = getattr(settings, key)
@@ -290,12 +294,15 @@ def _mends(config: BenchConfig, folder: Path) -> Iterator[str]:
             if value is None:
                 continue
             changed = replace(config, **{table: replace(settings, **{key: value * factor})})
-            try:
-                mended = next(_oddities(changed, _measured(changed, folder)), None) is None
-            except InputError:  # such a lens leaves the screen
-                mended = False
-            if mended:
+            if _is_plausible(changed, folder):
                 yield f"[{table}] {key} = {value:.6g} in {unit}, which is {value * factor:.6g}"
+
+
+def _is_plausible(config: BenchConfig, folder: Path) -> bool:
+    try:
+        return next(_oddities(config, _measured(config, folder)), None) is None
+    except InputError:  # such a lens leaves the screen
+        return False
 
 
 def _figure(value: float) -> str:

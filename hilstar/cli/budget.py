@@ -6,6 +6,7 @@ from typing import Annotated
 from typer import Option
 
 from hilstar.cli.options import BenchFile, Json, RadecText, parse_attitude
+from hilstar.cli.running import say_units_of
 from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import check_directory, make_directory
@@ -49,11 +50,13 @@ def budget(
         raise InputError(f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}")
     with load(bench_file) as bench:
         found, assumed = find_budget(bench, by), shares_line(bench) or colour_line(bench)
+        file = bench.file
     if output is not None:
         write_report(make_directory(output), found)
     print_found(as_json, found, budget_lines(found))
     if assumed is not None:
         say(assumed)
+    say_units_of(file)
 
 
 def star_noise(bench_file: Path, output: Path | None, radec: str | None, as_json: bool) -> None:

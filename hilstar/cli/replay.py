@@ -76,6 +76,7 @@ def replay(
         running.optional_answers(bench, notices, kept, screen) as answers,
         running.optional_frames(frames, bench, screen) as watched,
     ):
+        running.say_units_of(file)
         running.say_of_light(bench)
         if explain:
             running.explain_bench(bench, of_source=play.conventions.lines(mounting))

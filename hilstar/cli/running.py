@@ -146,6 +146,13 @@ def say_units(fields: "FieldsOfView") -> None:
         say(f"check the units: {fields.warning}")
 
 
+def say_units_of(file: "BenchFile") -> None:
+    """Warn of a length of a bench file that is probably another quantity, or in another unit than its key."""
+    from hilstar.bench.cameras import fields_of_view
+
+    say_units(fields_of_view(file.config, file.folder))
+
+
 def say_beat(bench: Any, screen: Any) -> "BeatSummary":
     """The beat between the tracker's exposures and the screen's refresh, with a line where it matters."""
     from hilstar.run.sync import beat_line, beat_of

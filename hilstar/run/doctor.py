@@ -111,7 +111,8 @@ class BenchReport:
 
     def lines(self, name: str) -> Iterator[str]:
         """For a person, by the bench file's name."""
-        yield f"{'ok' if self.fields.warning is None else 'check':8}{name:12}{self.fields.line()}"
+        state = "ok" if self.fields.warning is None else "check"
+        yield f"{state:8}{name + ' ':12}{self.fields.line()}"  # a name of any length stands apart from the text
         if self.monitor.now is not None:
             yield f"{'CHANGED' if self.monitor.fault else 'ok':8}{'monitor':12}{self.monitor.now.name()}"
             yield from [f"{'':20}{self.monitor.notice}"] * bool(self.monitor.notice)

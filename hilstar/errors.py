@@ -28,6 +28,10 @@ class MachineError(HilstarError):
     exit_code = 3
 
 
+class NotThereError(MachineError):
+    """A device that the command or a file names is not there; the line says what to plug in or which others are."""
+
+
 class GpuError(MachineError):
     """The GPU or its driver no longer answers, or has lost what it held."""
 

@@ -13,13 +13,14 @@ import re
 import secrets
 import shutil
 import stat
+import sys
 import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 from hilstar.errors import InputError, cannot_write
 from hilstar.reading import CHUNK_BYTES, MAX_TOML_BYTES, MCAP_MAGIC, exists, open_regular, parse_toml, read_text
@@ -49,6 +50,14 @@ KNOWN = {
 }
 
 Place = tuple[int, int] | str
+STDOUT = Path("-")  # the output that is stdout: for text alone
+
+
+def stdout_bytes() -> IO[bytes]:
+    """The process's own stdout, wherever what a command prints goes meanwhile. Raises InputError without one."""
+    if sys.__stdout__ is None:
+        raise cannot_write("stdout", "it is closed", "write the name of a file")
+    return cast(IO[bytes], sys.__stdout__.buffer)
 
 
 def place_of(path: Path) -> Place | None:
@@ -116,8 +125,13 @@ def _texts(value: Any) -> Iterator[str]:
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
     """A temporary file beside `path`, open for writing; at the end it replaces `path`, and an error leaves that unchanged.
 
-    Devices and pipes are written themselves. Raises InputError where nothing can be written, and for a run's ledger.
+    Devices and pipes are written themselves, and stdout for `STDOUT`. Raises InputError where nothing can be written, and for a
+    run's ledger.
     """
+    if path == STDOUT:
+        yield stdout_bytes()
+        stdout_bytes().flush()
+        return
     try:
         status = _status(path)
         if status is not None and not stat.S_ISREG(status.st_mode):
@@ -387,6 +401,10 @@ def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> No
     """
     if path is None:
         return
+    if path == STDOUT:
+        if endings in (CSV, TOML):
+            return
+        raise InputError(f"{option} -: {_article(endings)} is no text, so it does not go to stdout; write OUT{endings[0]}")
     ending = path.suffix.lower()
     if endings is FITS and ending == ".gz":
         ending = path.with_suffix("").suffix.lower()
@@ -396,6 +414,12 @@ def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> No
         raise InputError(f"{option} {path}: {_article(endings)} is written there; write {better}{endings[0]}")
 
 
+def refuse_stdout(option: str, path: Path) -> None:
+    """Refuse (InputError) stdout where several files are written."""
+    if path == STDOUT:
+        raise InputError(f"{option} -: several files are written, which stdout cannot take; write a name")
+
+
 def check_directory(option: str, path: Path | None) -> None:
     """Refuse (InputError) the name of a file where a directory is created, and a place where nothing can be.
 
@@ -403,6 +427,7 @@ def check_directory(option: str, path: Path | None) -> None:
     """
     if path is None:
         return
+    refuse_stdout(option, path)
     if path.suffix.lower() in KNOWN and not path.is_dir():
         raise InputError(
             f"{option} {path}: several files are written, into a directory; write the name of one, such as {path.stem}"
@@ -416,4 +441,5 @@ def check_directory(option: str, path: Path | None) -> None:
 
 def _article(endings: tuple[str, ...]) -> str:
     names = {FITS: "a FITS file", PNG: "a PNG picture", PNG_OR_TIFF: "a PNG or TIFF picture", CSV: "a CSV table"}
-    return (names | {TOML: "a TOML file", MCAP: "an MCAP file"})[endings]
+    names |= {TOML: "a TOML file", MCAP: "an MCAP file"}
+    return names.get(endings, f"a {endings[0]} file")

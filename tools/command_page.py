@@ -26,7 +26,8 @@ HEAD = f"""\
 `hilstar COMMAND -h` (or `--help`) prints the same for one command, and `hilstar --version` the version. This page is generated
 from the commands themselves (`python tools/make_pages.py`).
 
-Every command that has `--json` then prints one JSON object on stdout and nothing else there.
+Every command that has `--json` then prints one JSON object on stdout and nothing else there. An output named `-`
+is stdout, for CSV and TOML alone; what the command says then goes to stderr.
 
 | exit code | meaning |
 |---|---|
@@ -34,7 +35,7 @@ Every command that has `--json` then prints one JSON object on stdout and nothin
 | 1 | `compare`: not the same sky; `verify --strict`: not passed; `first-light`: a failed step; \
 `serve` and `replay`: the ledger failed. |
 | {InputError.exit_code} | The command line or a file was wrong. |
-| {MachineError.exit_code} | The machine lacks something, such as OpenGL or a display, or its display went away. |
+| {MachineError.exit_code} | The machine lacks something, such as OpenGL, or a display or port that a file names, or its display went away. |
 | 4 | `serve`: the run ended without ever having had an attitude. |
 | 128 + N | Ended by signal N: 130 for Ctrl-C. |
 

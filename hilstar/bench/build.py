@@ -44,7 +44,7 @@ from hilstar.sky.air import SiteAir, dimmed_mag
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Optics, Photometry, all_channels, star_temperatures_k, tabulate, tabulate_pickles
 from hilstar.sky.spectral_types import star_types, tabulate_types
-from hilstar.sky.spectrum import Curve, load_curve
+from hilstar.sky.spectrum import QUANTUM_EFFICIENCIES, Curve, load_curve
 from hilstar.sky.star_table import TableChoice, choose_catalog
 from hilstar.sky.stars import BV_MAG, Stars, aberrate, make_stars, split_by_rate, total_and_colours, unit_vectors_icrs
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -230,7 +230,8 @@ def seen_by(file: BenchFile, camera: Camera) -> Seen:
 
 def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
     """The tracker's light-gathering part by channel: what it tells apart; curve paths are relative to `folder`."""
-    efficiencies = [load_curve(source, f"[tracker] {key}", folder) for key, source in tracker.quantum_efficiencies.items()]
+    given = tracker.quantum_efficiencies.items()
+    efficiencies = [load_curve(source, f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES) for key, source in given]
     transmission = glass_transmission(tracker, folder)
     return tuple(
         Optics(tracker.aperture_mm, Curve(one.wavelength_nm, one.value * tracker.detector.fill_factor), transmission)

@@ -308,26 +308,36 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
 
 
 def _mends(config: BenchConfig, folder: Path, decades: float) -> list[str]:
-    """Each length that makes the bench plausible, or nearly so, if it is converted from another unit, with that unit.
+    """Each length that makes the bench plausible, or nearly so, if it is another quantity, or in another unit, with that.
 
     What else is odd of a bench may stay: the length that takes most away is named, and those that take as much.
     """
-    left: dict[str, float] = {}
+    rest_decades: dict[str, float] = {}
+    for text, changed in _readings(config):
+        try:
+            rest_decades[text] = sum(oddity.decades for oddity in _oddities(changed, _measured(changed, folder)))
+        except InputError:  # such a lens leaves the screen
+            continue
+    smallest = min(rest_decades.values(), default=math.inf)
+    limit = 0.0 if smallest == 0 else min(MAX_LEFT * decades, smallest + AS_GOOD)
+    return [text for text, rest in rest_decades.items() if rest <= limit]
+
+
+def _readings(config: BenchConfig) -> Iterator[tuple[str, BenchConfig]]:
+    """The bench with one length read as another quantity or in another unit, and what was written then."""
+    tracker = config.tracker
+    if F_NUMBERS[0] <= tracker.aperture_mm < F_NUMBERS[1]:
+        aperture_mm = tracker.focal_length_mm / tracker.aperture_mm
+        text = f"[tracker] aperture_mm = {tracker.aperture_mm:.6g} the f-number, which is {aperture_mm:.6g}"
+        yield text, replace(config, tracker=replace(tracker, aperture_mm=aperture_mm))
     for table, key in LENGTHS:
         settings = getattr(config, table)
         value = getattr(settings, key)
         for unit, factor in (MM if key.endswith("_mm") else UM).items():
             if value is None:
                 continue
-            changed = replace(config, **{table: replace(settings, **{key: value * factor})})
-            try:
-                rest = sum(one.decades for one in _oddities(changed, _measured(changed, folder)))
-            except InputError:  # such a lens leaves the screen
-                continue
-            left[f"[{table}] {key} = {value:.6g} in {unit}, which is {value * factor:.6g}"] = rest
-    least = min(left.values(), default=math.inf)
-    limit = 0.0 if least == 0 else min(MAX_LEFT * decades, least + AS_GOOD)
-    return [text for text, rest in left.items() if rest <= limit]
+            text = f"[{table}] {key} = {value:.6g} in {unit}, which is {value * factor:.6g}"
+            yield text, replace(config, **{table: replace(settings, **{key: value * factor})})
 
 
 def figure(value: float) -> str:

@@ -12,7 +12,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import StarRates, bench_optics, catalogue_choice, star_kinds, star_rates
 from hilstar.charts import write_csv
 from hilstar.errors import InputError, MachineError
-from hilstar.files import whole_file
+from hilstar.files import STDOUT, whole_file
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.electrons import Photometry, star_temperatures_k
 from hilstar.sky.facts import errors_of, motion_at, sigma_v_mag
@@ -242,7 +242,7 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
     """Write a CSV, a FITS table, a VOTable or a Parquet file by the name's ending. Raises InputError or MachineError."""
     from astropy.table import Table
 
-    ending = path.suffix.lower()
+    ending = ".csv" if path == STDOUT else path.suffix.lower()
     table = Table({name: column.values for name, column in catalogue.columns.items()})
     for name, column in catalogue.columns.items():
         table[name].unit, table[name].description = column.unit or None, column.words

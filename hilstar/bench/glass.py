@@ -14,7 +14,7 @@ from hilstar.optics.glass_psf import GlassPsf, NodeSpline, glass_psf, regridded
 from hilstar.optics.psf_file import Glass, read_glass
 from hilstar.scene.camera import Camera
 from hilstar.sky.electrons import Optics
-from hilstar.sky.spectrum import Curve, integration_nodes, load_curve
+from hilstar.sky.spectrum import QUANTUM_EFFICIENCIES, TRANSMISSIONS, Curve, integration_nodes, load_curve
 
 log = logging.getLogger(__name__)
 MAX_UNSAID = 0.01  # share of a tracker's light beyond a file's wavelengths that is not worth a word
@@ -118,7 +118,7 @@ def _mean_shares(glass: Glass, tracker: Tracker, folder: Path) -> FloatArray:
 
 def _detected(tracker: Tracker, key: str, folder: Path) -> FloatArray:
     """Wavelengths and the tracker's relative response there, by the integration's nodes: (2, n)."""
-    efficiency = load_curve(tracker.quantum_efficiencies[key], f"[tracker] {key}", folder)
+    efficiency = load_curve(tracker.quantum_efficiencies[key], f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES)
     optics = Optics(tracker.aperture_mm, efficiency, glass_transmission(tracker, folder))
     nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
     return np.stack([nm, optics.quantum_efficiency(nm) * optics.transmission(nm) * weight_m])
@@ -128,11 +128,11 @@ def glass_transmission(tracker: Tracker, folder: Path) -> Curve:
     """The transmission of a tracker's optics: its own key where that is given, else its glass's, else 1. Raises InputError."""
     glass = glass_in(tracker, folder)
     if glass is None or glass.transmission is None:
-        return load_curve(tracker.transmission, "[tracker] transmission", folder)
+        return load_curve(tracker.transmission, "[tracker] transmission", folder, TRANSMISSIONS)
     if tracker.transmission == 1.0:
         return glass.transmission
     say_once(f"its transmission is not used: [tracker] transmission is {tracker.transmission}")
-    return load_curve(tracker.transmission, "[tracker] transmission", folder)
+    return load_curve(tracker.transmission, "[tracker] transmission", folder, TRANSMISSIONS)
 
 
 def through_glass(camera: Camera, tracker: Tracker, folder: Path) -> Camera:

@@ -8,6 +8,7 @@ import typer
 from typer import Option
 from typer.core import TyperGroup
 
+from hilstar.errors import InputError
 from hilstar.version import __version__
 
 # By their panels, each a file of this folder and its function.
@@ -113,6 +114,12 @@ def built(only: str | None) -> Any:
 
 
 def run(words: list[str]) -> Any:
-    """Run a command line. Raises EarlyEnd, and what typer and the command raise."""
+    """Run a command line; one without a command prints the help, and its exit code is 2.
+
+    Raises EarlyEnd, and what typer and the command raise.
+    """
+    if not words or (len(words) == 1 and words[0] in GROUPS):  # no command was given: the help lists them
+        run([*words, "--help"])
+        return InputError.exit_code
     names = {public(name) for names in COMMANDS.values() for name in names} | GROUPS.keys()
-    return built(words[0] if words and words[0] in names else None)(words, standalone_mode=False)
+    return built(words[0] if words[0] in names else None)(words, standalone_mode=False)

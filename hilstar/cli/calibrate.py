@@ -11,7 +11,7 @@ from hilstar.cli.options import MAX_SEED, BenchFile, Json, Overwrite, check_file
 from hilstar.cli.running import Windowed
 from hilstar.console.terminal import print_found, print_json, say
 from hilstar.errors import InputError
-from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory
+from hilstar.files import CSV, FITS, PNG, TOML, check_directory, check_ending, make_directory, refuse_stdout
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 NAMED = "in the bench file, under [collimator]: geometry = {!r}"
@@ -226,6 +226,7 @@ def photometric(
     from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
 
     check_ending("-o", output, TOML)
+    refuse_stdout("-o", output)
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
     identity = _monitor_of(int(display) if display.isdecimal() else display)

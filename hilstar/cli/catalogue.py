@@ -8,7 +8,7 @@ from typer import Option
 from hilstar.cli.options import BenchFile, Json
 from hilstar.console.terminal import print_found
 from hilstar.errors import InputError, shortened
-from hilstar.files import check_outputs
+from hilstar.files import STDOUT, check_outputs
 
 
 def catalogue(
@@ -29,8 +29,8 @@ def catalogue(
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.bench.catalogue import ENDINGS, bench_catalogue, write_catalogue
 
-    if output.suffix.lower() not in ENDINGS:
-        raise InputError(f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}")
+    if output != STDOUT and output.suffix.lower() not in ENDINGS:
+        raise InputError(f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}, or - for CSV on stdout")
     check_outputs([bench_file], [output])
     file = read_bench_file(bench_file)
     found = bench_catalogue(file, to, epoch)

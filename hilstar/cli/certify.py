@@ -9,7 +9,7 @@ import msgspec
 import typer
 from typer import Option
 
-from hilstar.cli.first_light import image_source
+from hilstar.cli.first_light import image_source, virtual_truth
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
 from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError
@@ -59,6 +59,7 @@ def certify(
 
     check_directory("-o", output)
     file = read_bench_file(bench_file)
+    virtual = virtual_truth(virtual)
     check_files([virtual, dark], [], file)
     for name, given in (("--grab", grab), ("--whole", whole or None), ("--dark", dark), ("--diode", diode)):
         if given is not None and (virtual is not None) != (name == "--whole"):

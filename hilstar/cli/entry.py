@@ -1,11 +1,13 @@
 """The entry point of the command line: runs a command, and turns each refusal into one line and an exit code."""
 
+import contextlib
 import io
 import logging
 import os
 import re
 import sys
-from itertools import takewhile
+from itertools import pairwise, takewhile
+from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
@@ -16,10 +18,12 @@ from hilstar.console.terminal import fail
 from hilstar.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
 from hilstar.process import interrupts
 from hilstar.process.interrupts import finish_stderr, queue_stderr
+from hilstar.reading import exists
 
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"
 READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # longest wait for a slow reader of stderr, without and with a signal
+INPUT_ENDINGS = (".toml", ".mcap", ".csv", ".json", ".jsonl", ".fits", ".png", ".aem", ".ulg")
 NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")  # several numbers, with commas
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")  # a word that a shell makes of numbers with spaces between them
@@ -41,9 +45,20 @@ def main() -> NoReturn:
 def run_command(words: list[str]) -> int:
     """Run a command line in this process. Returns its exit code; a refusal is one line on stderr."""
     try:
-        return _run(with_values(words))
+        if not writes_to_stdout(words):
+            return _run(with_values(words))
+        if "--json" in words:
+            fail("--json and an output to -: both are for stdout; give a name for the output", InputError.exit_code)
+        with contextlib.redirect_stdout(sys.stderr):  # stdout is the file's alone
+            return _run(with_values(words))
     except SystemExit as end:  # raised by `fail`
         return end.code if isinstance(end.code, int) else 1
+
+
+def writes_to_stdout(words: list[str]) -> bool:
+    """Whether an option of a command line has the value "-", as in -o - or --truth=-."""
+    joined = any(re.fullmatch(r"--[a-z][a-z-]*=-|-o-", word) for word in words)
+    return joined or any(word == "-" and before.startswith("-") and before != "-" for before, word in pairwise(words))
 
 
 def _run(words: list[str]) -> int:
@@ -80,6 +95,8 @@ def usage_line(error: Any, words: list[str]) -> str:
     see = f"(see {'hilstar' if at is None else at.command_path} --help)"
     if (spaced := _spaced_numbers(words)) is not None:
         return spaced
+    if said.startswith("Missing option") and (missing := _missing_file(words)) is not None:
+        return f"{missing}: no such file; give one that is there {see}"
     if (other := re.match(r"No such command '(.*?)'", said)) and at is not None:
         known = list(getattr(at.command, "commands", {}))
         advice = ELSEWHERE.get(other[1]) or did_you_mean(other[1], known).strip() or f"the commands are {', '.join(known)}"
@@ -92,6 +109,17 @@ def usage_line(error: Any, words: list[str]) -> str:
         meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2])).strip()
         return f"{said}{meant and '; '}{meant} {see}"
     return f"{said} {see}"
+
+
+def _missing_file(words: list[str]) -> str | None:
+    """The first input of a command line that is not there, by its ending; None if there is none.
+
+    It is said before an option that is missing too: with another file the option may be another.
+    """
+    for before, word in pairwise(words):
+        if not before.startswith("-") and Path(word).suffix.lower() in INPUT_ENDINGS and not exists(Path(word)):
+            return word
+    return None
 
 
 def _spaced_numbers(words: list[str]) -> str | None:

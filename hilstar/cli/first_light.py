@@ -100,8 +100,7 @@ def first_light(
         raise InputError(f"--again {wrong[0]}: {did_you_mean(wrong[0], NAMES)}write one of {', '.join(NAMES)}")
     check_directory("-o", output)
     file = read_bench_file(bench_file)
-    if virtual is not None and virtual.name == EXAMPLE_TRUTH and not exists(virtual):
-        virtual = resource_path("configs", EXAMPLE_TRUTH)
+    virtual = virtual_truth(virtual)
     check_files([virtual, dark], [], file)
     by_hand = grab is None and virtual is None
     readings = (0 if by_hand else PATCHES) if patches is None else patches
@@ -149,6 +148,13 @@ def _shown(
             feed.say(line)
 
         yield tell, feed.show
+
+
+def virtual_truth(path: Path | None) -> Path | None:
+    """The file of --virtual; the example that comes with hilstar is found by its name."""
+    if path is not None and path.name == EXAMPLE_TRUTH and not exists(path):
+        return resource_path("configs", EXAMPLE_TRUTH)
+    return path
 
 
 def image_source(

@@ -37,6 +37,7 @@ def frame(
     from hilstar.bench.star_size import star_size
     from hilstar.frame.truth import clipped_in
 
+    file = read_bench_file(bench_file)
     q = options.parse_attitude("frame", radec, quaternion)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
     if not targets:
@@ -45,7 +46,6 @@ def frame(
     check_ending("--truth", truth, CSV)
     check_ending("--codes", codes, PNG)
     check_ending("--preview", preview, PNG)
-    file = read_bench_file(bench_file)
     t_ns, wrong = options.parse_at("frame", at, file.config, scenario is not None), optional_scenario(scenario)
     file = at_moment(file, t_ns)
     options.check_files([scenario], targets, file)

@@ -73,6 +73,7 @@ def replay(
     ):
         if play.span:
             say(play.span)
+        running.say_units_of(file)
         running.say_of_light(bench)
         if explain:
             running.explain_bench(bench, of_source=play.conventions.lines(stated.mounting))

@@ -171,6 +171,15 @@ def say_seen(bench: Any) -> dict[str, Any]:
     return {"fields_of_view": fields.keys(), "star": star.keys()}
 
 
+def say_units_of(file: "BenchFile") -> None:
+    """Warn of a length of a bench file that is probably another quantity, or in another unit than its key."""
+    from hilstar.bench.cameras import fields_of_view
+
+    warning = fields_of_view(file.config, file.folder).warning
+    if warning is not None:
+        say(f"check the units: {warning}")
+
+
 def say_beat(bench: Any, screen: Any) -> "BeatSummary":
     """The beat between the tracker's exposures and the screen's refresh, with a line where it matters."""
     from hilstar.run.sync import beat_line, beat_of

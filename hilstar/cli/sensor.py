@@ -7,7 +7,7 @@ from typer import Argument, Option
 
 from hilstar.cli.options import Json, check_files
 from hilstar.console.terminal import print_found
-from hilstar.files import TOML, check_ending
+from hilstar.files import TOML, check_ending, refuse_stdout
 
 if TYPE_CHECKING:
     from hilstar.calibrate.sensor import SensorFile
@@ -23,7 +23,7 @@ def import_(
     """Make a bench file's [tracker.detector] and quantum efficiency of an EMVA 1288 data sheet, and its curves."""
     from hilstar.calibrate.sensor import import_emva
 
-    check_ending("-o", output, TOML)
+    _check(output)
     check_files([data], [output])
     _tell(output, import_emva(data), f"By hilstar sensor import from {data.name}", as_json)
 
@@ -39,9 +39,14 @@ def measure(
     """Measure gain, noise, full well and fixed pattern of a sensor by photon transfer, and write [tracker.detector]."""
     from hilstar.calibrate.sensor import measure_sensor
 
-    check_ending("-o", output, TOML)
+    _check(output)
     check_files([*flats, *darks], [output])
     _tell(output, measure_sensor(flats, darks), "By hilstar sensor measure; errors are one sigma", as_json)
+
+
+def _check(output: Path) -> None:
+    check_ending("-o", output, TOML)
+    refuse_stdout("-o", output)
 
 
 def _tell(output: Path, sensor: "SensorFile", source: str, as_json: bool) -> None:

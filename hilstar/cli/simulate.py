@@ -8,7 +8,7 @@ import typer
 from typer import Option
 
 from hilstar.cli import options
-from hilstar.cli.running import optional_scenario
+from hilstar.cli.running import optional_scenario, say_units_of
 from hilstar.console.terminal import print_found, progress, say
 from hilstar.errors import InputError
 from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
@@ -55,13 +55,13 @@ def simulate(
         simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output, scenario, statements)
         return
     statements.refuse("it is for --log LOG, and there is none; leave it out")
+    file = read_bench_file(bench_file)
     targets = [path for path in (output, png, dn_png) if path is not None]
     if not targets:
         raise InputError("simulate: no output was asked for; add -o OUT.fits, --png OUT.png or --dn-png OUT.png")
     check_ending("-o", output, FITS)
     check_ending("--png", png, PNG)
     check_ending("--dn-png", dn_png, PNG_OR_TIFF)
-    file = read_bench_file(bench_file)
     wrong = optional_scenario(scenario)
     options.check_files([scenario], targets, file)
     q = options.parse_attitude("simulate", radec, quaternion)
@@ -91,6 +91,7 @@ def simulate(
     dn, named = summary["dn"], f", faults: {', '.join(exposure.faults)}" if exposure.faults else ""
     line = f"{summary['stars']} stars{named}, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}"
     print_found(as_json, summary, [line])
+    say_units_of(file)  # after the refusals: a failing command prints one line
 
 
 def simulate_log(
@@ -122,3 +123,4 @@ def simulate_log(
     with progress("exposing", len(views)) as advance:
         simulate_views(file, views, noise, output, advance, faults)
     typer.echo(f"{len(views)} exposures in {output}")
+    say_units_of(file)

@@ -8,7 +8,7 @@ import typer
 from typer import Option
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, ScenarioFile
-from hilstar.cli.running import optional_scenario
+from hilstar.cli.running import optional_scenario, say_units_of
 from hilstar.console.terminal import print_found, print_json, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
@@ -61,6 +61,7 @@ def verify(
     proposed = _proposed(file, verdict, seed, write, as_json) if propose or write else {}
     if as_json:
         print_json(summary | proposed)
+    say_units_of(file)
     mended = bool(proposed.get("written"))
     if strict and not verdict.passed and not mended:
         raise typer.Exit(1)

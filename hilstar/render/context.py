@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from glcontext import egl
 
-from hilstar.errors import InputError, MachineError, did_you_mean
+from hilstar.errors import InputError, MachineError, NotThereError, did_you_mean
 from hilstar.monitor.exact import COMPUTE_VERSION
 from hilstar.process.scheduling import drawing_threads_apart
 from hilstar.render.backend import EGL_LIBRARY
@@ -69,7 +69,7 @@ def _device_count() -> int:
 def create_context(gpu: int | str | None = None) -> moderngl.Context:
     """A headless core context of the newest OpenGL, 3.3 at least. Raises MachineError with what to install.
 
-    `gpu` is an index of EGL's list or a part of a GL_RENDERER (InputError where there is no such one), by default EGL's
+    `gpu` is an index of EGL's list or a part of a GL_RENDERER (NotThereError where there is no such one), by default EGL's
     first. Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
     """
     if gpu is None or (isinstance(gpu, int) and gpu < _device_count()):
@@ -80,7 +80,7 @@ def create_context(gpu: int | str | None = None) -> moderngl.Context:
             return _context_on(one.index)
     known = "; ".join(one.line() for one in found) or "none: EGL lists no devices"
     meant = did_you_mean(gpu, (one.renderer for one in found))
-    raise InputError(f"[render] gpu = {gpu!r}: no such GPU; {meant}write the index or name of one of {known}")
+    raise NotThereError(f"[render] gpu = {gpu!r}: no such GPU; {meant}write the index or name of one of {known}")
 
 
 def _context_on(index: int | None) -> moderngl.Context:

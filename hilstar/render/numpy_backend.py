@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray
-from hilstar.errors import MachineError
+from hilstar.errors import MachineError, NotThereError
 from hilstar.monitor.quantise import FrameLight
 from hilstar.monitor.response import Levels
 from hilstar.render.aids import LINE_SHARE, lay_over
@@ -52,6 +52,8 @@ def headless_context(gpu: int | str | None = None) -> "Context | None":
 
     try:
         return create_context(gpu)
+    except NotThereError:  # a named one is meant, and no other draws in its place
+        raise
     except MachineError as error:
         _say_once(str(error))
         return None

@@ -117,7 +117,8 @@ class BenchReport:
 
     def lines(self, name: str) -> Iterator[str]:
         """For a person, by the bench file's name."""
-        yield f"{'ok' if self.fields.warning is None else 'check':8}{name:12}{self.fields.line()}"
+        state = "ok" if self.fields.warning is None else "check"
+        yield f"{state:8}{name + ' ':12}{self.fields.line()}"  # a name of any length stands apart from the text
         yield f"{'check' if self.star.too_wide else 'ok':8}{'star':12}{self.star.line()}"
         if self.star.would_do is not None:
             yield from (f"{'':20}{line}" for line in (self.star.would_do.text(), *self.star.would_do.lines()))

@@ -22,7 +22,9 @@ MAX_CURVE_BYTES = 1_000_000
 MIN_CONSTANT = 1e-6  # smallest constant curve: no sensor or lens is below, and products stay within float64
 MAX_CURVE_ROWS = 10_000
 RANGE_NM = (1.0, 100_000.0)  # beyond any sensor; each MAX_INTERVAL_NM costs nodes
-BUILT_IN_CURVES = ("ccd47-20", "kai-4021", "n-bk7-10mm", "johnson-v")
+QUANTUM_EFFICIENCIES = ("ccd47-20", "kai-4021")
+TRANSMISSIONS = ("n-bk7-10mm",)
+BUILT_IN_CURVES = (*QUANTUM_EFFICIENCIES, *TRANSMISSIONS, "johnson-v")
 
 # Gauss-Legendre nodes in each interval between knots of the curves; intervals are at most this wide.
 # A Planck curve at 1000 K over 25 nm, times two straight lines, is then integrated to 1e-13.
@@ -73,24 +75,24 @@ def constant_curve(value: float) -> Curve:
     return Curve(np.empty(0), np.array([value]))
 
 
-def load_curve(source: str | float, what: str, folder: Path = DATA_DIR) -> Curve:
+def load_curve(source: str | float, what: str, folder: Path = DATA_DIR, built_in: tuple[str, ...] = BUILT_IN_CURVES) -> Curve:
     """A curve from a built-in name, a CSV path (wavelength_nm,value; relative to `folder`) or a number.
 
-    `what` names the curve in the InputError that bad input raises.
+    `what` names the curve in the InputError that bad input raises, `built_in` are the names of its kind.
     """
     if isinstance(source, int | float):
         if not MIN_CONSTANT <= source <= 1.0:
             raise InputError(f"{what} = {shortened(source)}: write a number from {MIN_CONSTANT:g} to 1")
         return constant_curve(float(source))
-    if source in BUILT_IN_CURVES:
+    if source in built_in:
         return read_curve_csv(DATA_DIR / f"{source}.csv")
     path = folder / source
     if not exists(path):
-        names = ", ".join(f'"{name}"' for name in BUILT_IN_CURVES[:3])
+        names = ", ".join(f'"{name}"' for name in built_in)
         shown = shortened(source)
         raise InputError(
             f"{what} = {shown!r}: no such built-in or file {path}; "
-            f"{did_you_mean(source, BUILT_IN_CURVES)}write {names}, a CSV path or a number"
+            f"{did_you_mean(source, built_in)}write {names}, a CSV path or a number"
         )
     return read_curve_csv(path)
 

@@ -8,7 +8,7 @@ import os
 import pytest
 
 from hilstar.bench.build import load
-from hilstar.errors import InputError
+from hilstar.errors import MachineError
 from hilstar.render.context import create_context, gpus
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
@@ -39,8 +39,8 @@ def test_without_a_key_egl_s_first_draws():
 @pytest.mark.parametrize("wrong", ["99", '"voodoo"'])
 def test_a_gpu_that_is_not_there_is_refused_in_one_line_that_lists_those_that_are(tmp_path, wrong):
     result = run_hilstar_here("frame", bench_with(tmp_path, wrong), "--radec", "84,-1,0", "-o", tmp_path / "out.fits")
-    assert_refused(result, 2, "[render] gpu", gpus()[0].line())
-    with pytest.raises(InputError, match="no such GPU"):
+    assert_refused(result, 3, "[render] gpu", gpus()[0].line())
+    with pytest.raises(MachineError, match="no such GPU"):
         create_context(json.loads(wrong))
 
 

@@ -16,7 +16,7 @@ import serial
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.links import LinkCounts, RawMessage
-from hilstar.attitude.wire.serial_link import LOST, open_port, opening_fault
+from hilstar.attitude.wire.serial_link import LOST, open_port, opening_refusal
 from hilstar.attitude.wire.udp import Datagrams
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.errors import InputError, one_line
@@ -86,7 +86,7 @@ class SerialBytes(ByteLink):
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:
-            raise InputError(f"[answers] {self.endpoint}: {opening_fault(error, port)}") from error
+            raise opening_refusal(f"[answers] {self.endpoint}", error, port) from error
 
     def _open(self) -> serial.Serial:
         device = open_port(self._port, self._baud)

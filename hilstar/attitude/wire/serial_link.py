@@ -1,12 +1,14 @@
 """Serial ports: the link of COBS frames on a device that may be unplugged and come back, lines of text, and the RTS output."""
 
 import contextlib
+import errno
 import os
 import re
 import select
 import termios
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 
 import serial
 from serial.tools import list_ports
@@ -16,7 +18,7 @@ from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, unframed_packet
 from hilstar.attitude.wire.links import Arrival, RawMessage, StreamLink
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
-from hilstar.errors import InputError, one_line
+from hilstar.errors import HilstarError, InputError, NotThereError, one_line
 from hilstar.notices import Notices
 from hilstar.process.scheduling import HOST_CLOCK, BackOff, HostClock
 from hilstar.units import NS_PER_S
@@ -30,6 +32,8 @@ BITS_PER_BYTE = 10  # 8N1
 FRAMING_BYTES = 2  # the COBS byte and the 0x00
 READ_S = 0.05
 MAX_LINE_BYTES = 256
+NO_SERVER = re.compile("refused|timed out|unreachable|No route", re.IGNORECASE)  # of a port on the network
+NOT_THERE = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
 # What pyserial raises for a port that is gone: OSError from the system, the others from its own port over a network.
 LOST = (OSError, TypeError, ValueError)
 
@@ -67,7 +71,7 @@ def open_port(port: str, baud: int) -> serial.Serial:
 class SerialLink(StreamLink):
     """A serial port that is reopened, with back-off, whenever it disappears.
 
-    Raises InputError where the port cannot be opened at the start.
+    Raises InputError where the port cannot be opened at the start, MachineError where it is not there.
     """
 
     two_way = True
@@ -92,7 +96,7 @@ class SerialLink(StreamLink):
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
-            raise InputError(f"{self.endpoint}: {opening_fault(error, port)}") from error
+            raise opening_refusal(self.endpoint, error, port) from error
 
     @property
     def reconnects(self) -> int:
@@ -223,7 +227,7 @@ class SerialLink(StreamLink):
 class SerialApart(SerialLink):
     """A SerialLink whose bytes a process of its own reads and stamps; it is opened, written to and decoded here.
 
-    Raises InputError where the port cannot be opened at the start.
+    Raises InputError where the port cannot be opened at the start, MachineError where it is not there.
     """
 
     stamped = True
@@ -271,8 +275,20 @@ class SerialApart(SerialLink):
         self._reader.close()
 
 
-def opening_fault(error: BaseException, port: str) -> str:
-    """Why a port could not be opened, and what to do."""
+def opening_refusal(where: str, error: BaseException, port: str) -> HilstarError:
+    """The refusal of a port that could not be opened: a NotThereError where the device is not there, else an InputError."""
+    if getattr(error, "errno", None) in NOT_THERE:
+        if not port.startswith("/") and Path("/dev", port).exists():
+            return InputError(f"{where}: no such file; write /dev/{port}")
+        here = ", ".join(serial_ports()) or "none"
+        return NotThereError(f"{where}: no such device; plug it in, or write another serial port (there now: {here})")
+    if "://" in port and NO_SERVER.search(str(error)):
+        return NotThereError(f"{where}: {one_line(str(error))}; start the server of that port, or write another port")
+    return InputError(f"{where}: {_opening_fault(error, port)}")
+
+
+def _opening_fault(error: BaseException, port: str) -> str:
+    """Why a port that is there could not be opened, and what to do."""
     text = str(error).lower()
     if "permission" in text:
         instead = "join the group that owns it (often dialout)"
@@ -294,7 +310,7 @@ def read_lines(port: str, baud: int, seconds: float, clock: HostClock = HOST_CLO
     try:
         device = serial.Serial(port, baud, timeout=READ_S, exclusive=True)
     except (OSError, ValueError, OverflowError) as error:
-        raise InputError(f"{name}: {opening_fault(error, port)}") from error
+        raise opening_refusal(name, error, port) from error
     with device:
         device.reset_input_buffer()
         end, line = clock.within(seconds), b""
@@ -325,10 +341,10 @@ class RtsLine:
         try:
             self.open()
         except (*LOST, OverflowError) as error:
-            fault = opening_fault(error, port)
-            if self._device is not None:
-                self.close()
-                fault = f"has no line RTS ({one_line(str(error))}); write a serial port with modem lines, such as /dev/ttyUSB0"
+            if self._device is None:
+                raise opening_refusal(f"[sync] port = {port}", error, port) from error
+            self.close()
+            fault = f"has no line RTS ({one_line(str(error))}); write a serial port with modem lines, such as /dev/ttyUSB0"
             raise InputError(f"[sync] port = {port}: {fault}") from error
 
     @property

@@ -41,7 +41,10 @@ MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
 FEW_EVENTS = 50
 EVENT = struct.Struct("=Hi")  # zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
 HANDSHAKE_MS = 2000
-LEFT_EARLY = f"it left before its handshake, as another type of ZeroMQ socket does, or did not finish it within {HANDSHAKE_MS / 1000:g} s"
+LEFT_EARLY = (
+    "it left before its handshake, as another type of ZeroMQ socket does,"
+    f" or did not finish it within {HANDSHAKE_MS / 1000:g} s"
+)
 FAILED = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "its key is not among those allowed",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "it is another type of ZeroMQ socket, or it has no keys",

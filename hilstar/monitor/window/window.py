@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.errors import InputError, MachineError, did_you_mean
+from hilstar.errors import MachineError, NotThereError, did_you_mean
 from hilstar.monitor.window.awake import Awake
 from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.output_settings import OutputState
@@ -28,6 +28,10 @@ TITLE = "hilstar"
 USUAL_REFRESH_HZ = 60
 GL_RENDERER = 0x1F01
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
+DEAD_DISPLAY = (
+    "no X server answers there, or it does not let us in (XAUTHORITY); start it, set DISPLAY to one that runs, or run with "
+    "--headless"
+)
 WAYLAND = (
     "no X11 display: this session is Wayland's, where a program can neither time its frames nor set the gamma ramp; "
     "use an Xorg session, or run with --headless"
@@ -106,8 +110,11 @@ def _glfw() -> Any:
 def _start() -> None:
     glfw.ERROR_REPORTING = "ignore"
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
-    if not os.environ.get("DISPLAY") or not glfw.init():
+    display = os.environ.get("DISPLAY")
+    if not display:
         raise MachineError(WAYLAND if os.environ.get("WAYLAND_DISPLAY") else NO_DISPLAY)
+    if not glfw.init():
+        raise MachineError(f"DISPLAY={display}: {DEAD_DISPLAY}")
 
 
 def _describe(index: int, monitor: Any) -> Display:
@@ -138,7 +145,7 @@ class Window(Closing):
     """A window whose GL context is current in the thread that opened it. Free it with `close`.
 
     `lost` is true while its display is unplugged; `gone` says why the window is no more. Raises MachineError without a
-    display or GL, InputError for a display that is not there.
+    display or GL, and for a display that is not there.
     """
 
     def __init__(self, settings: WindowSettings) -> None:
@@ -431,4 +438,5 @@ def _find(wanted: int | str) -> tuple[Display, Any]:
             return display, monitor
     known = "; ".join(display.line() for display in described)
     meant = did_you_mean(wanted, (display.name for display in described))
-    raise InputError(f"[monitor] display = {wanted!r}: no such display; {meant}write the index or name of one of {known}")
+    advice = f"plug it in, or write the index or name of one of {known}"
+    raise NotThereError(f"[monitor] display = {wanted!r}: no such display; {meant}{advice}")

@@ -13,7 +13,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench, orientation_of
 from hilstar.bench.config import Monitor
-from hilstar.bench.measured_on import SHOWN_ANYWAY, check_monitor
+from hilstar.bench.measured_on import SHOWN_ANYWAY, MonitorCheck, check_monitor
 from hilstar.errors import MachineError
 from hilstar.monitor.identity import TABLE
 from hilstar.monitor.window.output_settings import findings
@@ -77,7 +77,18 @@ def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force:
     size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
     sleep_in_waits()
     settings = WindowSettings(size_px, monitor.bits, display, monitor.refresh_hz)
-    with Window(settings) as window, open_bench(file, window_context(), timed=timed) as bench:
+    with Window(settings) as window:
+        fault = size_fault(window, monitor)
+        if fault and not force:  # said before anything is drawn on it
+            raise MachineError(f"{fault}; or add --force")
+        with _bench_on(window, file, found, timed=timed, force=force) as screen:
+            yield screen
+
+
+@contextmanager
+def _bench_on(window: Window, file: BenchFile, found: MonitorCheck, *, timed: bool, force: bool) -> Iterator[Screen]:
+    """The bench of a file in a window, past the gate."""
+    with open_bench(file, window_context(), timed=timed) as bench:
         wanted, draws = file.config.render.gpu, bench.renderer.gl_renderer
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
             log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)
@@ -207,13 +218,21 @@ def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timi
     return Timing(period_ms, int(dropped.sum()), by_screen, waits=by_screen or not known_hz, period_error_ms=error_ms)
 
 
+def size_fault(window: Window, monitor: Monitor) -> str:
+    """What is wrong with the size of a display, and what to do about it; "" for nothing."""
+    wanted_px = orientation_of(monitor).screen_px(monitor.resolution_px)
+    if window.size_px == wanted_px:
+        return ""
+    (width, height), (wide, high) = window.size_px, wanted_px
+    sizes = f"{width} x {height} px and the bench file says {wide} x {high}"
+    return f"the display is {sizes}; set [monitor] resolution_px, or the display's mode"
+
+
 def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:
     """What is wrong with a display, and what to do about it."""
-    wanted_px = orientation_of(monitor).screen_px(monitor.resolution_px)
-    if window.size_px != wanted_px:
-        (width, height), (wide, high) = window.size_px, wanted_px
-        sizes = f"{width} x {height} px and the bench file says {wide} x {high}"
-        yield f"the display is {sizes}; set [monitor] resolution_px, or the display's mode"
+    size = size_fault(window, monitor)
+    if size:
+        yield size
     yield from _desktop_faults(window)
     if timing.paced_by_screen:
         yield from _timing_faults(monitor, timing)

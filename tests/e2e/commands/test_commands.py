@@ -164,7 +164,6 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
         (["send", "--spin", "z,1", "--to", "tcp://127.0.0.1:70000"], ["tcp://HOST:PORT"]),
         (["send", "--spin", "z,1", "--rate", "0"], ["--rate 0"]),
         (["nonsense"], ["nonsense", "--help"]),
-        ([], ["--help"]),
         (["frame", "BENCH", "--quaternion", "1e308,1e308,0,0", "-o", "x.fits"], ["its norm is"]),
         (["serve", "BENCH", "--headless", "--duration", "inf"], ["--duration"]),
         (["send", "--spin", "z,1e300"], ["AXIS,DEG_PER_S"]),

@@ -81,10 +81,10 @@ def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
     assert "only_counted" not in summary["ledger"]
 
 
-def test_a_port_that_is_not_there_is_a_wrong_file(tmp_path):
+def test_a_port_that_is_not_there_is_the_machine_s(tmp_path):
     path = bench(tmp_path, "/dev/nothing-there")
     result = run_hilstar_here("serve", path, "--headless", "--frames", "1")
-    assert_refused(result, 2, "[sync] port = /dev/nothing-there", "write the serial port")
+    assert_refused(result, 3, "[sync] port = /dev/nothing-there", "plug it in")
 
 
 def served(tmp_path, *changes):

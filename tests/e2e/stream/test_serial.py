@@ -183,12 +183,12 @@ def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_t
 
 def test_a_port_that_is_not_there_or_no_port_gets_one_line(tmp_path):
     bench = tmp_path / "bench.toml"
-    for port, said in (("/dev/ttyNowhere", "ttyUSB0"), ("/dev/null", "ttyUSB0")):
+    for port, code, said in (("/dev/ttyNowhere", 3, "plug it in"), ("/dev/null", 2, "ttyUSB0")):
         bench.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{port}"\n')
-        assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, port, said)
+        assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), code, port, said)
     bench.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\n')
     assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, "port")
-    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"), 2, "ttyNowhere")
+    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"), 3, "ttyNowhere")
     assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:@115200"), 2, "serial:/dev/ttyX@BAUD")
 
 

@@ -10,7 +10,7 @@ import pytest
 from hilstar.attitude.wire import serial_link
 from hilstar.attitude.wire.serial_link import RtsLine
 from hilstar.bench.config import SyncSettings
-from hilstar.errors import InputError
+from hilstar.errors import InputError, MachineError
 from hilstar.notices import Notices
 from hilstar.run.frame_pulse import FramePulse
 from tests.support.rts_server import KeptLine
@@ -160,13 +160,13 @@ def test_a_port_without_modem_lines_is_refused_in_a_line():
 
 
 @pytest.mark.parametrize(
-    ("port", "said"),
+    ("port", "said", "refusal"),
     [
-        ("/dev/nothing-there", "No such file.*write the serial port, such as /dev/ttyUSB0"),
-        ("rfc2217://127.0.0.1:1", "Connection refused"),
-        ("smoke://signals", "protocol 'smoke' not known"),
+        ("/dev/nothing-there", "no such device; plug it in", MachineError),
+        ("rfc2217://127.0.0.1:1", "Connection refused.*start the server", MachineError),
+        ("smoke://signals", "protocol 'smoke' not known", InputError),
     ],
 )
-def test_a_port_that_is_not_there_is_refused_in_a_line(port, said):
-    with pytest.raises(InputError, match=rf"\[sync\] port = {port}: .*{said}"):
+def test_a_port_that_is_not_there_is_refused_in_a_line(port, said, refusal):
+    with pytest.raises(refusal, match=rf"\[sync\] port = {port}: .*{said}"):
         RtsLine(port, True)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import datetime
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.config import parse_config
 from hilstar.errors import MachineError
 from hilstar.monitor.window.output_settings import OutputState
 from hilstar.monitor.window.x11 import BackBuffer
+from hilstar.run.screen import gate
 from hilstar.run.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
 from tests.support.benches import SMALL_BENCH
 from tests.support.model_display import model_screen, plain_window
@@ -117,3 +122,23 @@ def test_a_window_that_is_gone_is_refused_even_with_force(tmp_path):
     screen, display = model_screen(tmp_path, gone="its display was unplugged")
     with pytest.raises(MachineError, match="unplugged"):
         pass_gate(screen, force=True, clock=display.clock)
+
+
+def test_a_wrong_size_is_said_before_the_bench_is_opened_or_a_frame_drawn(tmp_path, monkeypatch):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    file = read_bench_file(path)
+    opened = []
+
+    @contextmanager
+    def window_of(settings):
+        yield plain_window(size_px=(1, 2))
+
+    monkeypatch.setattr(gate, "Window", window_of)
+    monkeypatch.setattr(gate, "open_bench", lambda *arguments, **named: opened.append(arguments))
+    with (
+        pytest.raises(MachineError, match="the display is 1 x 2 px and the bench file says"),
+        gate.open_screen(file, datetime.date(2024, 1, 1), windowed=True, force=False, timed=False),
+    ):
+        raise AssertionError("a display of another size is refused")
+    assert opened == []

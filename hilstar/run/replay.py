@@ -89,9 +89,10 @@ class Play:
 
     `first_ns` is the time of the first frame, and `zero_ns` that from which a scenario counts its seconds: the log's first
     sample, or the run's first frame. `moving` says whether stars are drawn along their paths; None: as the bench file says.
-    `told` are events to report before it begins, `span` says how long a log is, and its step. Only an earlier run has faults
-    in its `recording`, and a renderer (`drawn_by`) and what codes cost (`codes_ms`) that its ledger may name. The same renderer
-    draws the same codes from them bit for bit; another draws them within `DrawnBy.other_codes`.
+    `told` are events to report before it begins, `span` says how long a log is, and its step. Only
+    an earlier run has faults in its `recording`, and a renderer (`drawn_by`) and what codes cost
+    (`codes_ms`) that its ledger may name. The same renderer draws the same codes from them bit for
+    bit; another draws them within `DrawnBy.other_codes`.
     """
 
     frame: Callable[[int], PlayedFrame]

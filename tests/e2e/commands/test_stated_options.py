@@ -1,4 +1,6 @@
-"""What is stated of a log on the command line of each command that reads one: used by all of them alike, or refused by name."""
+"""What is stated of a log on the command line of each command that reads one: used by all of them
+alike, or refused by name.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A sender of another convention over a real socket: the sky is right live, in the ledger and in its replay, applied once."""
+"""A sender of another convention over a real socket: the sky is right live, in the ledger and in
+its replay, applied once.
+"""
 
 from __future__ import annotations
 

@@ -131,7 +131,9 @@ def test_a_scenario_is_varied_like_any_key_and_a_file_that_changes_is_another_ca
 
 
 def test_a_log_s_convention_and_mounting_are_the_bench_files(tmp_path: Path) -> None:
-    """A body's attitude, sent from the body to the ICRS, scalar last: the case looks where the camera does."""
+    """A body's attitude, sent from the body to the ICRS, scalar last: the case looks where the
+    camera does.
+    """
     to_cam = Rotation.from_quat([-0.5, -0.5, -0.5, 0.5])
     camera = Rotation.from_euler("zyx", [10, 20, 30], degrees=True)
     x, y, z, w = (to_cam.inv() * camera).inv().as_quat().tolist()

@@ -77,7 +77,9 @@ class JsonAnswer(msgspec.Struct, frozen=True):
 
 
 def answer_of(sent: SentAttitudes, host_ns: int, raw: bytes, said: JsonAnswer) -> Answer | RefusedAnswer:
-    """The answer that a tracker's numbers are, or why they are none; `sent` says what its quaternions mean."""
+    """The answer that a tracker's numbers are, or why they are none; `sent` says what its
+    quaternions mean.
+    """
     t_ns = said.t_ns
     if t_ns is not None and t_ns not in INT64:
         return RefusedAnswer("time", f"t_ns {t_ns} does not fit 64 bits", raw)

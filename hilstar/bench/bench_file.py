@@ -6,8 +6,9 @@ A file may also name several bench files, one for each head of an attitude deter
     [attitude]
     endpoint = "tcp://127.0.0.1:5560"
 
-The source's attitude is the body's, whatever its `convention` is otherwise; each head's `[tracker] q_body_to_cam` makes it its
-camera's. `[attitude]` holds for all heads, in place of their own.
+The source's attitude is the body's, whatever its `convention` is otherwise; each head's
+`[tracker] q_body_to_cam` makes it its camera's. `[attitude]` holds for all heads, in place of their
+own.
 """
 
 import hashlib
@@ -99,7 +100,9 @@ def at_moment(file: BenchFile, t_ns: int | None) -> BenchFile:
 
 
 def stated_in(config: BenchConfig) -> "Stated":
-    """What a bench file states of a log that is read with it: the mounting and, if it is not hilstar's, the convention."""
+    """What a bench file states of a log that is read with it: the mounting and, if it is not
+    hilstar's, the convention.
+    """
     from hilstar.attitude.logs.entries import Stated
 
     convention = None if config.attitude.convention == HILSTARS else config.attitude.convention

@@ -59,8 +59,8 @@ class Frame:
     array or with bit stealing (height, width, 3). Where the primaries are driven apart, levels and codes are one array
     (height, width, 3). `rows` is a structured array of TRUTH_DTYPE, a row for each star whose
     sprite touches the monitor, and `star` (n,) the places of the same stars in the bench's, negative for light that a fault
-    adds. `t_ns` is the moment for which bodies were placed. `truth` is `rows` with the errors of the stars, which `errors`
-    reads when they are first asked for.
+    adds. `t_ns` is the moment for which bodies were placed. `truth` is `rows` with the errors of
+    the stars, which `errors` reads when they are first asked for.
     """
 
     q_icrs_to_cam: FloatArray
@@ -74,7 +74,9 @@ class Frame:
 
     @cached_property
     def truth(self) -> npt.NDArray[np.void]:
-        """The truth table of the frame, as `hilstar frame --truth` writes it: TRUTH_DTYPE, brightest first."""
+        """The truth table of the frame, as `hilstar frame --truth` writes it: TRUTH_DTYPE,
+        brightest first.
+        """
         return self.errors(self.rows)
 
     @property

@@ -210,7 +210,9 @@ def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, c
 
 
 def write_truth_csv(path: Path, frame: Frame) -> None:
-    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0, an unknown figure is nan."""
+    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0,
+    an unknown figure is nan.
+    """
     truth = frame.truth
     with whole_file(path) as whole, as_text(whole) as file:
         writer = csv.writer(file, lineterminator="\n")

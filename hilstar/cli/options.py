@@ -202,7 +202,9 @@ def parse_mounting(text: str) -> "Mounting":
 
 
 def parse_convention(text: str) -> dict[str, str]:
-    """The keys of `[attitude] convention` that "scalar=last,frame=body" names, and their values. Raises InputError."""
+    """The keys of `[attitude] convention` that "scalar=last,frame=body" names, and their values.
+    Raises InputError.
+    """
     from typing import get_args, get_type_hints
 
     from hilstar.attitude.wire.source import Convention
@@ -221,7 +223,9 @@ def parse_convention(text: str) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class LogStatements:
-    """What the command line states of a log, as it was typed; `log_statements` gives a command an option for each."""
+    """What the command line states of a log, as it was typed; `log_statements` gives a command an
+    option for each.
+    """
 
     kernel: KernelFiles = None
     topic: TopicName = None
@@ -233,17 +237,19 @@ class LogStatements:
     convention: ConventionText = None
 
     def stated(self, config: "BenchConfig | None" = None) -> "Stated":
-        """The same for a log's reader, in place of what the bench file states. Raises InputError, also for contradictions."""
+        """The same for a log's reader, in place of what the bench file states. Raises InputError,
+        also for contradictions.
+        """
         from hilstar.attitude.logs.entries import Stated
         from hilstar.attitude.wire.source import Convention
         from hilstar.bench.bench_file import stated_in
 
-        own = Stated() if config is None else stated_in(config)
-        place = parse_place(self.place)
-        found = replace(own, topic=self.topic, body=self.body, reference=self.reference, epoch_utc=self.epoch_utc, place=place)
-        found = replace(found, kernels=tuple(self.kernel or ()))
+        by_file = Stated() if config is None else stated_in(config)
+        stated = replace(by_file, kernels=tuple(self.kernel or ()), topic=self.topic, body=self.body)
+        stated = replace(stated, reference=self.reference, epoch_utc=self.epoch_utc)
+        stated = replace(stated, place=parse_place(self.place))
         if self.mounting is not None:
-            found = replace(found, mounting=parse_mounting(self.mounting))
+            stated = replace(stated, mounting=parse_mounting(self.mounting))
         if self.convention is not None:
             named = parse_convention(self.convention)
             if self.mounting is not None and named.get("frame") == "cam":
@@ -251,8 +257,8 @@ class LogStatements:
                     f"--mounting {self.mounting}: --convention {self.convention} says that the attitudes are the camera's;"
                     " write frame=body, or leave out --mounting"
                 )
-            found = replace(found, convention=Convention(**named), convention_by="--convention")  # type: ignore[arg-type]
-        return found
+            stated = replace(stated, convention=Convention(**named), convention_by="--convention")  # type: ignore[arg-type]
+        return stated
 
     def refuse(self, why: str) -> None:
         """Refuse (InputError) each statement where there is no log."""
@@ -275,9 +281,9 @@ def log_statements(command: Callable[..., None]) -> Callable[..., None]:
         command(**arguments, statements=LogStatements(**stated))
 
     kinds = get_type_hints(LogStatements, include_extras=True)
-    own = inspect.signature(command)
+    signature = inspect.signature(command)
     parameters: list[inspect.Parameter] = []
-    for parameter in own.parameters.values():
+    for parameter in signature.parameters.values():
         if parameter.name != "statements":
             parameters.append(parameter)
             continue
@@ -286,7 +292,7 @@ def log_statements(command: Callable[..., None]) -> Callable[..., None]:
             for field in fields(LogStatements)
         ]
     parameters.sort(key=lambda parameter: parameter.kind)
-    with_statements.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    with_statements.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     with_statements.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {"return": None}
     return with_statements
 

@@ -100,7 +100,8 @@ def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> np
 def with_errors(truth: npt.NDArray[np.void], catalog: Catalog, epoch_jyear: float) -> npt.NDArray[np.void]:
     """Rows of TRUTH_DTYPE with the errors of their stars: of V, and of a place at `epoch_jyear`, rms of its two axes.
 
-    Both stay NaN for bodies, and for stars that have no errors in their `catalog`, whose facts are read here.
+    Both stay NaN for bodies, and for stars that have no errors in their `catalog`, whose facts are
+    read here.
     """
     listed = np.flatnonzero(truth["hip"] > 0)
     near = np.flatnonzero(np.isin(catalog.hip, truth["hip"][listed]))  # a tenth of the time that sorting a catalogue takes

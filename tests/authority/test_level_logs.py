@@ -1,6 +1,8 @@
-"""CSV and JSON lines whose attitudes are a body's, or refer to a level frame, against SciPy's rotations and Astropy's Earth.
+"""CSV and JSON lines whose attitudes are a body's, or refer to a level frame, against SciPy's
+rotations and Astropy's Earth.
 
-ICRS components become the Earth's by Astropy's GCRS and ITRS; east, north and up are at a geodetic latitude and longitude.
+ICRS components become the Earth's by Astropy's GCRS and ITRS; east, north and up are at a geodetic
+latitude and longitude.
 """
 
 from __future__ import annotations
@@ -25,8 +27,9 @@ PLACE_DEG, DATE = (47.0, 8.0), "2024-01-01T00:00:00"
 LEVEL = ("--place", "47,8,400", "--epoch-utc", DATE)
 # Four digits of a degree are shown.
 SHOWN_DEG = 6e-5
-# hilstar leaves out s', tides and the pole's offsets: 1 mas. Its rate of a level frame is about the Earth's third axis, from
-# which the pole of rotation is 0.6 arcsec away at most: 7.3e-5 rad/s of 3e-6 rad.
+# hilstar leaves out s', tides and the pole's offsets: 1 mas. Its rate of a level frame is about the
+# Earth's third axis, from which the pole of rotation is 0.6 arcsec away at most: 7.3e-5 rad/s of
+# 3e-6 rad.
 EARTH_RAD, RATE_RAD_S = 1e-8, 2.2e-10
 
 
@@ -87,7 +90,9 @@ def test_a_log_that_refers_to_east_north_up_looks_where_astropy_says(log):
 @pytest.mark.parametrize("kind", ["enu", "ned"])
 @pytest.mark.parametrize("direction", ["icrs_to_cam", "cam_to_icrs"])
 def test_attitudes_and_rates_of_a_body_in_a_level_frame_become_the_cameras_in_the_stars(tmp_path, kind, direction):
-    """A body that turns at a constant rate with respect to the level frame; rates are in the body's components."""
+    """A body that turns at a constant rate with respect to the level frame; rates are in the body's
+    components.
+    """
     rate, mounting = np.array([0.01, -0.02, 0.03]), Rotation.from_quat(MOUNTING, scalar_first=True)
     rows, camera = [], []
     for k in range(3):

@@ -236,8 +236,8 @@ class Reference(NamedTuple):
 def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> Reference:
     """The reference of that kind, once all is stated that it needs; `first_ns` is the log's first time.
 
-    Raises InputError where a level frame has no place, or its times are no dates and their zero is not stated, or is twice;
-    and where a place or a zero is stated of the ICRS, which needs none.
+    Raises InputError where a level frame has no place, or its times are no dates and their zero is
+    not stated, or is twice; and where a place or a zero is stated of the ICRS, which needs none.
     """
     if kind == "icrs":
         for option, value in (("--place", stated.place), ("--epoch-utc", stated.epoch_utc)):
@@ -262,7 +262,8 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
 
 
 def reference_kind(path: Path, stated: Stated, told: list[tuple[str, str]]) -> Kind:
-    """What the axes of a log's reference are by `--reference` alone, the log itself naming no frame; the ICRS without one.
+    """What the axes of a log's reference are by `--reference` alone, the log itself naming no
+    frame; the ICRS without one.
 
     Raises InputError for a name that does not say what its axes are.
     """

@@ -70,8 +70,9 @@ class Stated:
     """What the user states of a log, where the file itself does not say it; None where nothing is stated.
 
     `kernels` are SPICE kernels; `topic` and `body` choose one of several; `reference` names the frame that attitudes refer to;
-    `epoch_utc` is the UTC of the log's time zero; `place` is latitude and longitude in degrees and height in metres (WGS84);
-    `convention` is that of the quaternions of CSV, JSON lines and MCAP, `convention_by` who states it.
+    `epoch_utc` is the UTC of the log's time zero; `place` is latitude and longitude in degrees and
+    height in metres (WGS84); `convention` is that of the quaternions of CSV, JSON lines and MCAP,
+    `convention_by` who states it.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -85,7 +86,9 @@ class Stated:
     convention_by: str = "--convention"
 
     def __iter__(self) -> Iterator[tuple[str, str]]:
-        """The field of each statement that the user makes, and how it is written; a bench file's mounting is none."""
+        """The field of each statement that the user makes, and how it is written; a bench file's
+        mounting is none.
+        """
         for name, option in OPTIONS.items():
             if name == "mounting":
                 stated = self.mounting.by_option
@@ -193,7 +196,9 @@ class LogJoins:
 
 
 def log_joins(samples: Sequence[AttitudeSample], told: Iterable[tuple[str, str]] = ()) -> LogJoins:
-    """How the samples of a log join; their times must increase. `told` are notices that may explain rates that do not fit."""
+    """How the samples of a log join; their times must increase. `told` are notices that may explain
+    rates that do not fit.
+    """
     if len(samples) < 2:
         return LogJoins()
     t_ns = np.array([sample.t_ns for sample in samples], dtype=object)

@@ -4,9 +4,11 @@ CSV and JSON lines are read and written here. CSV columns, in any order: `t_s,qw
 `sequence` and `discontinuity`. A JSON line is the wire's JSON form of an attitude. The other formats have a module each.
 
 What a user states of a log is used or refused:
-1. Each format of FORMATS declares the statements that its reader uses. Any other is refused by name, before the file is read.
-2. A statement that a format uses, but not for this file, is refused by the reader (`stated_reference` for a place) or, for a
-   mounting where the attitudes are the camera's own, by `open_log`.
+1. Each format of FORMATS declares the statements that its reader uses. Any other is refused by
+   name, before the file is read.
+2. A statement that a format uses, but not for this file, is refused by the reader
+   (`stated_reference` for a place) or, for a mounting where the attitudes are the camera's own, by
+   `open_log`.
 """
 
 import contextlib
@@ -74,7 +76,9 @@ TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 
 
 def _read_csv(lines: Iterable[str], scalar: Literal["first", "last"]) -> Iterator[LogEntry]:
-    """The attitudes of a CSV, each quaternion as it was sent: with the scalar last, its columns count as x, y, z, w in turn."""
+    """The attitudes of a CSV, each quaternion as it was sent: with the scalar last, its columns
+    count as x, y, z, w in turn.
+    """
     reader = csv.reader(lines)
     rows = (row for row in reader if row and not row[0].startswith("#"))
     header = [name.strip() for name in next(rows, [])]
@@ -254,7 +258,9 @@ Opened = contextlib.AbstractContextManager[LogReading]
 
 
 class LogFormat(NamedTuple):
-    """A format: its name in a message, the statements (fields of `Stated`) that its reader uses, how it is told and opened."""
+    """A format: its name in a message, the statements (fields of `Stated`) that its reader uses,
+    how it is told and opened.
+    """
 
     name: str
     uses: frozenset[str]
@@ -263,24 +269,28 @@ class LogFormat(NamedTuple):
 
 
 def check_stated(path: Path, stated: Stated) -> LogFormat:
-    """The format of a log. Raises InputError for a statement that the format does not use, and for a file that is no log."""
+    """The format of a log. Raises InputError for a statement that the format does not use, and for
+    a file that is no log.
+    """
     head = b""
     if not path.is_dir():
         with open_regular(path, READABLE) as file:
             head = file.read(HEAD_BYTES)
     beginning = LogHead(path, head)
-    found = next(each for each in FORMATS if each.begins(beginning))
+    log_format = next(each for each in FORMATS if each.begins(beginning))
     for name, written in stated:
-        if name in found.uses or (found.name == LEDGER and written != OPTIONS[name]):
+        if name in log_format.uses or (log_format.name == LEDGER and written != OPTIONS[name]):
             continue  # what a run's bench file says of its packets, its ledger has already done
-        own = " has a convention of its own" if name == "convention" else " does not use it"
-        raise InputError(f"{path}: {written}: {found.name}{own}; leave it out")
-    return found
+        reason = " has a convention of its own" if name == "convention" else " does not use it"
+        raise InputError(f"{path}: {written}: {log_format.name}{reason}; leave it out")
+    return log_format
 
 
 @contextlib.contextmanager
 def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
-    """The reading of a file, by what it holds. A format's reader, and its library, are imported where a log needs them."""
+    """The reading of a file, by what it holds. A format's reader, and its library, are imported
+    where a log needs them.
+    """
     with check_stated(path, stated).open(path, stated) as reading:
         yield reading
 
@@ -288,7 +298,8 @@ def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
 def _of_packets(
     path: Path, entries: Iterator[LogEntry], source: str, stated: Stated, advice: str = "sort the log by time"
 ) -> LogReading:
-    """The reading of entries that have the numbers of a packet, as they were sent: their convention, then their reference.
+    """The reading of entries that have the numbers of a packet, as they were sent: their
+    convention, then their reference.
 
     Rates are with respect to the reference, in the frame's own components.
     """
@@ -296,24 +307,24 @@ def _of_packets(
     by = [] if stated.convention is None else [stated.convention_by]
     if stated.mounting.by_option:  # which says that the attitudes are the body's
         convention, by = structs.replace(convention, frame="body"), [*by, OPTIONS["mounting"]]
-    told: list[tuple[str, str]] = []
+    notices: list[tuple[str, str]] = []
     if convention != HILSTARS:
-        told.append(("log-convention", f"read with convention = {convention} ({', '.join(by)})"))
+        notices.append(("log-convention", f"read with convention = {convention} ({', '.join(by)})"))
     if not convention.is_hilstars:
         entries = _by_convention(entries, convention)
     conventions = packet_conventions(convention, source)
     if stated.reference is None and stated.place is None and stated.epoch_utc is None:
-        return LogReading(entries, conventions, advice, told)
+        return LogReading(entries, conventions, advice, notices)
     from hilstar.attitude.logs.earth import reference_kind, stated_reference, to_icrs  # 30 ms
 
-    kind = reference_kind(path, stated, told)
+    kind = reference_kind(path, stated, notices)
     first = next(entries, None)
     sample = None if first is None else first.event
     if first is None or not isinstance(sample, AttitudeSample):  # which is refused when it is read
-        return LogReading([] if first is None else [first], conventions, advice, told)
+        return LogReading([] if first is None else [first], conventions, advice, notices)
     reference = stated_reference(path, kind, stated, sample.t_ns)
-    turned = to_icrs(itertools.chain([first], entries), reference, False, told)
-    return LogReading(turned, _referred(conventions, convention, reference, sample.t_ns), advice, told)
+    turned = to_icrs(itertools.chain([first], entries), reference, False, notices)
+    return LogReading(turned, _referred(conventions, convention, reference, sample.t_ns), advice, notices)
 
 
 def _by_convention(entries: Iterable[LogEntry], convention: Convention) -> Iterator[LogEntry]:
@@ -323,7 +334,9 @@ def _by_convention(entries: Iterable[LogEntry], convention: Convention) -> Itera
 
 
 def _referred(conventions: Conventions, convention: Convention, reference: "Reference", first_ns: int) -> Conventions:
-    """The conventions of a log whose attitudes refer to a reference; the self-check is for its first time."""
+    """The conventions of a log whose attitudes refer to a reference; the self-check is for its
+    first time.
+    """
     if reference.kind == "icrs":
         return conventions
 

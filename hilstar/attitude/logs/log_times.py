@@ -1,7 +1,9 @@
-"""Whether the times of a log are in the unit that its format states: by its rates where it has them, else by its own steps.
+"""Whether the times of a log are in the unit that its format states: by its rates where it has
+them, else by its own steps.
 
-Rates and quaternions say how far a body turns from one sample to the next; the times say how long that took. In another unit
-than the stated one, the turn by the rates is that many times too large, for every interval alike and about the same axis.
+Rates and quaternions say how far a body turns from one sample to the next; the times say how long
+that took. In another unit than the stated one, the turn by the rates is that many times too large,
+for every interval alike and about the same axis.
 """
 
 from collections.abc import Sequence
@@ -43,13 +45,15 @@ def span_line(samples: Sequence[AttitudeSample]) -> str:
 
 
 def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str, str]]:
-    """What to tell of the times of a log whose format states `unit` ("s" or "ns"): another one by the rates, or an odd step."""
+    """What to tell of the times of a log whose format states `unit` ("s" or "ns"): another one by
+    the rates, or an odd step.
+    """
     if len(samples) < 2:
         return []
     step_s = median_step_s(samples)
-    named = _named(samples, unit, step_s)
-    if named:
-        return [(TIMES, f"the rates do not fit the times: probably {named}; the format has {unit}")]
+    unit_line = _named(samples, unit, step_s)
+    if unit_line:
+        return [(TIMES, f"the rates do not fit the times: probably {unit_line}; the format has {unit}")]
     if MIN_STEP_S <= step_s <= MAX_STEP_S:
         return []
     limit = f"over {MAX_STEP_S:g} s" if step_s > MAX_STEP_S else f"under {MIN_STEP_S * 1e3:g} ms"
@@ -57,7 +61,9 @@ def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str
 
 
 def _named(samples: Sequence[AttitudeSample], unit: str, step_s: float) -> str:
-    """The unit of the times, or of the rates where that is as likely; "" where the rates fit, or say nothing."""
+    """The unit of the times, or of the rates where that is as likely; "" where the rates fit, or
+    say nothing.
+    """
     ratio = _too_far(samples[: LOOKED_AT + 1])
     units = SECONDS if unit == "s" else OF_NS
     for name, factor in units.items():
@@ -67,13 +73,15 @@ def _named(samples: Sequence[AttitudeSample], unit: str, step_s: float) -> str:
         rates = RATES_LIKE.get(factor)
         if rates is None or not MIN_STEP_S <= step_s <= MAX_STEP_S:
             return line
-        own = f"the rates are in {rates}"
-        return f"{line}, or {own}" if MIN_STEP_S <= step_s * factor <= MAX_STEP_S else own
+        other = f"the rates are in {rates}"
+        return f"{line}, or {other}" if MIN_STEP_S <= step_s * factor <= MAX_STEP_S else other
     return ""
 
 
 def _too_far(samples: Sequence[AttitudeSample]) -> float:
-    """How many times as far as the quaternions the rates turn, the median; NaN where they have no rates or another axis."""
+    """How many times as far as the quaternions the rates turn, the median; NaN where they have no
+    rates or another axis.
+    """
     pairs = [(before, after) for before, after in pairwise(samples) if not after.discontinuity]
     pairs = [pair for pair in pairs if all(sample.rate_cam_rad_s is not None for sample in pair)]
     if len(pairs) < MIN_INTERVALS:

@@ -155,7 +155,9 @@ def read_metadata(path: Path, name: str) -> dict[str, str]:
 
 
 def begins_as_ledger(path: Path) -> bool:
-    """Whether a file has the head of a run's ledger, which stands before its topics. Raises InputError for damage before it."""
+    """Whether a file has the head of a run's ledger, which stands before its topics. Raises
+    InputError for damage before it.
+    """
     heads = takewhile(lambda record: isinstance(record, kinds.Header | kinds.Metadata), records_of(path))
     return any(isinstance(head, kinds.Metadata) and head.name == RUN_METADATA for head in heads)
 

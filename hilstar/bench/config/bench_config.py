@@ -269,7 +269,9 @@ def _check_answers(config: BenchConfig) -> None:
 
 
 def _check_frames(config: BenchConfig) -> None:
-    """Refuse (InputError) attitudes or answers of a body in which nobody says how the camera sits."""
+    """Refuse (InputError) attitudes or answers of a body in which nobody says how the camera
+    sits.
+    """
     for name, settings in (("attitude", config.attitude), ("answers", config.answers)):
         of_body = settings is not None and settings.convention.frame == "body"
         if of_body and config.tracker.q_body_to_cam is None:

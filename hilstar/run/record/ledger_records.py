@@ -426,18 +426,19 @@ def codes_ms_of(head: dict[str, str]) -> tuple[float, float] | None:
 
 
 def raw_convention(config: BenchConfig) -> str:
-    """What a ledger's head says of the bytes in `raw`: their convention and the mounting, by which `q` was made of them.
+    """What a ledger's head says of the bytes in `raw`: their convention and the mounting, by which
+    `q` was made of them.
 
-    `q` and `rate` of the ledger are hilstar's own: whoever reads them applies neither again. JSON; null for a source that has
-    no packets.
+    `q` and `rate` of the ledger are hilstar's own: whoever reads them applies neither again. JSON;
+    null for a source that has no packets.
     """
     settings = config.attitude
     if settings.source not in PACKET_SOURCES:
         return "null"
     of_body = settings.convention.frame == "body"
     mounting = config.tracker.q_body_to_cam if of_body else None
-    said = {**msgspec.structs.asdict(settings.convention), "q_body_to_cam": mounting}
-    return msgspec.json.encode(said).decode()
+    meaning = {**msgspec.structs.asdict(settings.convention), "q_body_to_cam": mounting}
+    return msgspec.json.encode(meaning).decode()
 
 
 def config_of(head: dict[str, str]) -> BenchConfig | None:

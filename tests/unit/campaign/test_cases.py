@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from scipy.spatial.transform import Rotation
 
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.campaign.cases import CaseMaker
 from hilstar.campaign.plan import Design, parse_plan
 from hilstar.campaign.session import Job, Session, files_sha256
 from hilstar.rotation import propagate
@@ -19,7 +22,6 @@ from tests.support.commands import run_hilstar_here
 def session(folder: Path, images: bool = False) -> Session:
     """A session of the plan in a folder."""
     plan, bench = folder / "plan.toml", folder / "bench.toml"
-    from hilstar.bench.bench_file import read_bench_file
 
     digest = read_bench_file(bench).sha256
     return Session(
@@ -126,3 +128,21 @@ def test_a_scenario_is_varied_like_any_key_and_a_file_that_changes_is_another_ca
     before = files_sha256(this.plan, tmp_path)
     (tmp_path / "dark.toml").write_text(SCENARIO + "# another\n")
     assert files_sha256(this.plan, tmp_path) != before
+
+
+def test_a_log_s_convention_and_mounting_are_the_bench_files(tmp_path: Path) -> None:
+    """A body's attitude, sent from the body to the ICRS, scalar last: the case looks where the
+    camera does.
+    """
+    to_cam = Rotation.from_quat([-0.5, -0.5, -0.5, 0.5])
+    camera = Rotation.from_euler("zyx", [10, 20, 30], degrees=True)
+    x, y, z, w = (to_cam.inv() * camera).inv().as_quat().tolist()
+    (tmp_path / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n0,{x},{y},{z},{w}\n9,{x},{y},{z},{w}\n")
+    plan = write_campaign(tmp_path, attitudes={"kind": "log", "log": "log.csv"})
+    bench = tmp_path / "bench.toml"
+    text = bench.read_text().replace("[tracker]", "[tracker]\nq_body_to_cam = [0.5, -0.5, -0.5, -0.5]", 1)
+    table = 'convention = { scalar = "last", direction = "cam_to_icrs", frame = "body" }'
+    bench.write_text(f"{text}\n[attitude]\n{table}\n")
+    maker = CaseMaker(parse_plan(plan, plan.read_text()), read_bench_file(bench), tmp_path)
+    first = maker.case(0, np.full(maker.attitude_dimensions + len(maker.parameters), 0.5)).first
+    assert (Rotation.from_quat(first.q_icrs_to_cam, scalar_first=True) * camera.inv()).magnitude() < 1e-12

@@ -1,4 +1,6 @@
-"""Packets and JSON of every convention become the camera's attitude, on every road, once; SciPy is the authority."""
+"""Packets and JSON of every convention become the camera's attitude, on every road, once; SciPy is
+the authority.
+"""
 
 from __future__ import annotations
 

@@ -82,7 +82,8 @@ class Stretch:
     """Some packets in a row: (3,) rates, rad/s, cam, and their standard errors, rad/s; times ns of the sender's clock.
 
     `turn` is that of the quaternions, `rate` the mean of the rates, and `rate_as_icrs` the same if they had ICRS components.
-    `turned_rad` and `summed_rad` (n, 3) are turn and rates summed up to the times `at_s` (n,) after `from_ns`.
+    `turned_rad` and `summed_rad` (n, 3) are turn and rates summed up to the times `at_s` (n,) after `from_ns`. `error` is how
+    far turn and rate are apart, rad/s, and `is_off` says that this is more than their noise and what rates may be off.
     """
 
     turn: FloatArray
@@ -97,12 +98,14 @@ class Stretch:
     at_s: FloatArray
     turned_rad: FloatArray
     summed_rad: FloatArray
+    error: float = 0.0
+    is_off: bool = False
     _read: dict[str, FloatArray] = field(default_factory=dict)
 
     @property
     def turns(self) -> bool:
         """Whether its attitude turns by more than its noise."""
-        return float(np.linalg.norm(self.turn)) > max(MIN_TURN_RAD_S, TURN_SIGMA * self.turn_sigma)
+        return _turning(self) > max(MIN_TURN_RAD_S, TURN_SIGMA * self.turn_sigma)
 
     def turn_as(self, reading: Reading) -> FloatArray:
         """The turn (3,) of its quaternions in another reading of their numbers."""
@@ -228,7 +231,7 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
     scatter = turned - turned.mean(axis=0) - weight[:, None] * turn
     turn_sigma = math.sqrt(float((scatter**2).sum()) / (3 * (count - 1)) / spread_s2)
     rate_sigma = WALK * math.sqrt(float((np.diff(rate, axis=0)[whole] ** 2).sum()) / (6 * count) / count)
-    return Stretch(
+    stretch = Stretch(
         turn,
         weight @ summed / spread_s2,
         weight @ as_icrs / spread_s2,
@@ -242,6 +245,10 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
         turned,
         summed,
     )
+    limit = max(MIN_OFF_RAD_S, OFF_SHARE * _turning(stretch), OFF_SIGMA * _noise_of(stretch))
+    stretch.error = _error(stretch, stretch.rate)
+    stretch.is_off = stretch.turns and stretch.error > limit
+    return stretch
 
 
 def cause_of(
@@ -255,10 +262,7 @@ def cause_of(
     `length_s` is how long a stretch is meant to be, `history_s` for how long `lag_of` could look already, and `others` are the
     other readings of the quaternions.
     """
-    off = [
-        s.turns and _error(s, s.rate) > max(MIN_OFF_RAD_S, OFF_SHARE * _turning(s), OFF_SIGMA * _noise_of(s)) for s in stretches
-    ]
-    if off.count(False) > len(stretches) // MORE_STRETCHES:
+    if sum(not stretch.is_off for stretch in stretches) > len(stretches) // MORE_STRETCHES:
         return None
     if not any(stretch.rate.any() for stretch in stretches):
         coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(np.linalg.norm(s.turn) for s in stretches)
@@ -348,15 +352,15 @@ def fits(stretch: Stretch, was_off: float) -> bool:
 
 
 def _error(stretch: Stretch, rate: FloatArray) -> float:
-    return float(np.linalg.norm(stretch.turn - rate))
+    return math.hypot(*(stretch.turn - rate).tolist())  # plain floats: each stretch passes here
 
 
 def _faster(stretch: Stretch) -> float:
-    return float(max(np.linalg.norm(stretch.turn), np.linalg.norm(stretch.rate)))
+    return max(_turning(stretch), math.hypot(*stretch.rate.tolist()))
 
 
 def _turning(stretch: Stretch) -> float:
-    return float(np.linalg.norm(stretch.turn))
+    return math.hypot(*stretch.turn.tolist())
 
 
 def _noise_of(stretch: Stretch) -> float:
@@ -365,7 +369,7 @@ def _noise_of(stretch: Stretch) -> float:
 
 def _limit(stretch: Stretch, share: float, sigma: float, scale: float = 1.0) -> float:
     """How far turn and rate may be apart: a share of the turn, and the noise of both."""
-    size = _faster(stretch) if scale == 1.0 else float(np.linalg.norm(stretch.turn))
+    size = _faster(stretch) if scale == 1.0 else _turning(stretch)
     return max(share * size, sigma * math.hypot(stretch.turn_sigma, scale * stretch.rate_sigma))
 
 
@@ -385,8 +389,12 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
 
     Medians: of a single jump a mean would be mended by any lag that moves it out of what is compared.
     """
-    if not stretches:
+    if not stretches or stretches[-1].to_ns - stretches[0].from_ns < MIN_HISTORY_S * NS_PER_S:
         return None
+    # The stretches' own figures say at little cost that there is nothing to look for.
+    fast, off = _turning_median(stretches), float(np.median([stretch.error for stretch in stretches]))
+    if off <= 0.5 * max(MIN_OFF_RAD_S, OFF_SHARE * fast):
+        return LagFit(fast, off, 0.0)
     zero_ns = stretches[0].from_ns
     parts = [(stretch.at_s + (stretch.from_ns - zero_ns) / NS_PER_S)[1:] for stretch in stretches]
     t_s = np.concatenate([[0.0], *parts])
@@ -402,8 +410,11 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
 
     turn = _between(t_s, turned, edges_s) / LAG_SPAN_S
     fast = max(float(np.median(np.linalg.norm(part, axis=1))) for part in (turn, rate))
-    off, noise = float(off_by(np.zeros(1))[0]), _noise(stretches)
-    if off <= max(MIN_OFF_RAD_S, OFF_SHARE * fast, NOISE_RATIO * noise):
+    off = float(off_by(np.zeros(1))[0])
+    if off <= max(MIN_OFF_RAD_S, OFF_SHARE * fast):
+        return LagFit(fast, off, 0.0)
+    noise = _noise(stretches)
+    if off <= NOISE_RATIO * noise:
         return LagFit(fast, off, 0.0)
     lags_s = np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEPS_S[0] / 2, LAG_STEPS_S[0])
     lag_s = _least(lags_s, off_by(lags_s))
@@ -414,6 +425,10 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
         float(left.min()) <= min(off / MIN_BETTER, max(FIT_SHARE * fast, NOISE_RATIO * noise)) and abs(lag_s) >= MIN_LAG_S
     )
     return LagFit(fast, off, float(near_s[left.argmin()]) if explained else 0.0)
+
+
+def _turning_median(stretches: Sequence[Stretch]) -> float:
+    return float(np.median([_faster(stretch) for stretch in stretches]))
 
 
 def _noise(stretches: Sequence[Stretch]) -> float:

@@ -43,6 +43,21 @@ NOISE_RATIO = 2.0  # over ten and more turns a chance error is within 1.5 times 
 LAG_TIE = 0.02  # share of the range of errors
 
 
+@dataclass(frozen=True, slots=True)
+class ReadAs:
+    """How a sender's four numbers become the camera's attitude: as `[attitude] convention` says, then by `q_body_to_cam` (4,).
+
+    That is None where they are the camera's own.
+    """
+
+    scalar: str = "first"
+    direction: str = "icrs_to_cam"
+    q_body_to_cam: FloatArray | None = None
+
+
+AS_PACKETS = ReadAs()
+
+
 class Reading(NamedTuple):
     """Another reading of a quaternion's four numbers: what it is, the line that states it, and (n, 4) read by it."""
 
@@ -55,9 +70,9 @@ def _scalar_last(q: FloatArray) -> FloatArray:
     return np.asarray(q[..., [3, 0, 1, 2]])
 
 
-def readings(scalar: str = "first", direction: str = "icrs_to_cam") -> tuple[Reading, ...]:
-    """The other readings of quaternions that are read as this `[attitude] convention` says."""
-    found = []
+def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
+    """The other readings of quaternions that are read like this."""
+    found, scalar, direction, mounting = [], read_as.scalar, read_as.direction, read_as.q_body_to_cam
     for other_scalar, other_direction in itertools.product(("first", "last"), ("icrs_to_cam", "cam_to_icrs")):
         if (other_scalar, other_direction) == (scalar, direction):
             continue
@@ -68,10 +83,12 @@ def readings(scalar: str = "first", direction: str = "icrs_to_cam") -> tuple[Rea
             parts.append(f'direction = "{other_direction}"')
 
         def read(q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar) -> FloatArray:
-            sent = conjugate(q) if direction == "cam_to_icrs" else q
+            own = q if mounting is None else multiply(conjugate(mounting), q)
+            sent = conjugate(own) if direction == "cam_to_icrs" else own
             sent = np.roll(sent, -1, axis=-1) if scalar == "last" else sent
             sent = np.roll(sent, 1, axis=-1) if to == "last" else sent
-            return conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
+            own = conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
+            return own if mounting is None else multiply(mounting, own)
 
         found.append(Reading(text, f"{{ {', '.join(parts)} }}", read))
     return tuple(found)

@@ -11,6 +11,7 @@ from typing import Literal
 
 from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter, KnownClockFilter
 from hilstar.attitude.clock.losses import LossCount, TimeUnit
+from hilstar.attitude.clock.rate_causes import AS_PACKETS, ReadAs
 from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
 from hilstar.attitude.clock.resolution import Resolution
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
@@ -163,7 +164,8 @@ class Receiver:
     """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it. `back` leads back.
 
     What arrives before `learn` is called fills the timeline, and teaches the clock little. `now_ns` is the host's clock.
-    `lost` is told of packets that never came, once it is clear that they will not.
+    `read_as` is how the link has read quaternions. `tell_lost` is called with a number of packets once it is clear that they
+    never came.
     """
 
     def __init__(
@@ -175,7 +177,7 @@ class Receiver:
         notices: Notices | None = None,
         *,
         wrong_rates: WrongRates = "use-quaternions",
-        lost: Callable[[int], None] = lambda number: None,
+        read_as: ReadAs = AS_PACKETS,
         now_ns: Callable[[], int] = HOST_CLOCK.now_ns,
         unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset,
     ) -> None:
@@ -197,9 +199,10 @@ class Receiver:
         self.back = BackChannel(link, traffic, now_ns)
         self._watch = watch
         self._repeats = Repeats(self._notices)
-        self._rates = RateCheck(wrong_rates, self._notices)
+        self._rates = RateCheck(wrong_rates, self._notices, read_as=read_as)
         self._unit, self._resolution = TimeUnit(self._notices), Resolution(self._notices.tell)
-        self._losses, self._tell_lost = LossCount(), lost
+        self._losses = LossCount()
+        self.tell_lost: Callable[[int], None] = lambda number: None
         self._lost_told = self._lost_before = self._lost_look_ns = 0
         self._senders = Senders(timeline.policy.stale_after_ns, self._notices)
         self._begun_ns: int | None = None
@@ -269,7 +272,7 @@ class Receiver:
     def _settle_losses(self, lost: int) -> None:
         """Hand on those losses that are old enough: a late packet is none."""
         if lost > self._lost_told:
-            self._tell_lost(lost - self._lost_told)
+            self.tell_lost(lost - self._lost_told)
             self._lost_told = lost
 
     def listen(self) -> None:

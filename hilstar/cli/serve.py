@@ -55,14 +55,16 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
         assert not link.steps  # read_heads refuses lockstep
         told = run_heads(asked, link, say)
-    lines = []
+    lines, verdicts = [], []
     for name, head in told.items():
         summary = head["summary"]
         frames = summary.get("frames") if isinstance(summary, dict) else None
         counted = "no summary" if frames is None else f"{frames} frames"
         again = f", started again {head['restarts']} times" if head["restarts"] else ""
         lines.append(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
-    print_found(as_json, {"heads": told}, lines)
+        if isinstance(summary, dict) and "verdict" in summary:
+            verdicts.append(f"{'verdict':20s}{name}: {summary['verdict']['line']}")
+    print_found(as_json, {"heads": told}, [*lines, *verdicts])
     codes = [head["exit_code"] for head in told.values()]
     if all(code == NO_ATTITUDE for code in codes):
         raise typer.Exit(NO_ATTITUDE)

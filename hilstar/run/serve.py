@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
+import numpy as np
 from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
 from hilstar.answers.answer import Answer
+from hilstar.attitude.clock.rate_causes import AS_PACKETS, ReadAs
 from hilstar.attitude.clock.rate_check import RateCheck
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Attitude, Timeline
@@ -126,6 +128,13 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
     return replaced(outlet.complete(summary, loop), link=told | link.link_counts.summary())
 
 
+def _read_as(bench: Bench, link: AnyLink) -> ReadAs:
+    """How a link's quaternions become the camera's."""
+    if not link.conventions.of_body:
+        return AS_PACKETS
+    return ReadAs(q_body_to_cam=np.asarray(Mounting(bench.config.tracker.q_body_to_cam).q_body_to_cam))
+
+
 def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
     settings, clock = bench.config.attitude, loop.pacer.clock
     timeline = Timeline(policy_of(settings))
@@ -138,8 +147,9 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
         outlet.ledger.packet,
         outlet.notices,
         wrong_rates=settings.check_rates,
-        lost=outlet.ledger.lost,
+        read_as=_read_as(bench, link),
     )
+    receiver.tell_lost = outlet.ledger.lost
     outlet.follower(Running(loop, receiver.counts, receiver.clock_summary, outlet.answers))
     statuses = StatusMaker(outlet.ledger)
     if outlet.answers is not None and link.two_way:
@@ -204,10 +214,11 @@ class LockstepRun:
         self._bench, self._limit, self._loop, self._outlet = bench, limit, loop, outlet
         self._clock = loop.pacer.clock
         self._max_rate_rad_s = math.radians(bench.config.attitude.max_rate_deg_s)
-        self._rates = RateCheck(bench.config.attitude.check_rates, loop.notices, used=False)
 
     def serve(self, link: LockstepLink) -> RunSummary:
         """Answer requests up to the limit, or until a signal; returns the summary. A refused request leaves the last frame."""
+        check = self._bench.config.attitude.check_rates
+        self._rates = RateCheck(check, self._loop.notices, used=False, read_as=_read_as(self._bench, link))
         loop, statuses, turn_ms = self._loop, StatusMaker(self._outlet.ledger), RunningStatistics()
         self._outlet.follower(Running(loop, self.counts, answers=self._outlet.answers))
         tracker = self._bench.config.tracker

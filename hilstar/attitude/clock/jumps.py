@@ -52,6 +52,7 @@ MIN_FUTURE_NS = 5 * NS_PER_MS
 PERSISTENT_NS = NS_PER_S  # a queue may be older for a moment
 MIN_OFF = 3
 AHEAD_FOR_NS = 3 * NS_PER_S // 10  # no queue makes a packet early; a step of this machine's clock is followed in 0.2 s
+BEHIND, MIN_BEHIND_NS, BEHIND_EACH_NS = "clock-behind", 50 * NS_PER_MS, 2 * NS_PER_S
 SHARED_FOR_NS = NS_PER_S  # how long a clock must agree before it is believed again
 # By how much other clocks are behind Unix time, s: TAI - UTC is 37 s since 2017 (IERS Bulletin C), GPS is 19 s behind TAI.
 OTHER_CLOCKS = {
@@ -300,6 +301,7 @@ class KnownClockFilter:
         self._shared_since_ns: int | None = None
         self._off = 0
         self._told = False
+        self._quickest: tuple[int, int] | None = None  # since when, and by how much the quickest packet since then was late
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
         """The sample itself, refused where its time is more than MAX_OFF_NS ahead of the clock's."""
@@ -308,6 +310,7 @@ class KnownClockFilter:
         if -MIN_FUTURE_NS <= late_ns <= MAX_OFF_NS:
             self._off_since_ns, self._off = None, 0
             self._shared(host_ns)
+            self._look_behind(late_ns, host_ns)
             return [arrival]
         self._shared_since_ns = None
         self._off_since_ns = host_ns if self._off_since_ns is None else self._off_since_ns
@@ -329,11 +332,30 @@ class KnownClockFilter:
             self._told = False
             self._notices.end(CLOCK, ENDS[CLOCK], f"t_ns agrees with {CLOCK_NAMES[self._clock.mode]} of this machine again")
 
+    def _look_behind(self, late_ns: int, host_ns: int) -> None:
+        """Say where even the quickest packet of some seconds comes late: times alone do not tell a link from a clock."""
+        if self._quickest is None or host_ns - self._quickest[0] > 2 * BEHIND_EACH_NS:
+            self._quickest = host_ns, late_ns
+            return
+        since_ns, quickest_ns = self._quickest
+        if host_ns - since_ns < BEHIND_EACH_NS:
+            self._quickest = since_ns, min(quickest_ns, late_ns)
+            return
+        self._quickest = host_ns, late_ns
+        if quickest_ns < MIN_BEHIND_NS:
+            self._notices.end(BEHIND, "clock-behind-no-more", "packets come soon after their t_ns again")
+            return
+        self._notices.begin(
+            BEHIND,
+            f'[attitude] clock = "{self._clock.mode}", and each packet comes {quickest_ns / NS_PER_MS:.0f} ms or more after its'
+            " t_ns: the link is as slow, or the sender's clock as far behind; then the sky is drawn as far ahead",
+        )
+
     def _line(self, t_ns: int, late_ns: int) -> str:
         mode = self._clock.mode
         where = f"{late_ns / NS_PER_S:.3f} s behind" if late_ns > 0 else f"{-late_ns / NS_PER_S:.3f} s ahead of"
         looks = "" if (other := clock_named(late_ns)) is None else f", as {other} is"
-        wrong = "" if late_ns > 0 else "; the sky that is drawn is as old"
+        wrong = "" if late_ns > 0 else f"; the sky drawn is {-late_ns / NS_PER_S:.3f} s old"
         return (
             f'[attitude] clock = "{mode}", but t_ns is {where} {CLOCK_NAMES[mode]} of this machine{looks}{wrong}:'
             ' stamp with that clock, or write clock = "estimated"'

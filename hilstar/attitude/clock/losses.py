@@ -57,7 +57,7 @@ class LossCount:
             self._begin(sequence)
             return
         step = (sequence - newest + U32 // 2) % U32 - U32 // 2
-        if step == 0 or sequence in self._recent or (sequence == 0 and not 0 < step <= RECENT):
+        if step == 0 or (step < 0 and sequence in self._recent) or (sequence == 0 and not 0 < step <= RECENT):
             return  # 0: a message that does not count, among others that do
         if not -RECENT * max(self._unit, 1) <= step <= MAX_GAP * max(self._unit, 1):
             self._closed = self.lost

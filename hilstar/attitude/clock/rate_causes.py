@@ -43,6 +43,21 @@ NOISE_RATIO = 2.0  # over ten and more turns a chance error is within 1.5 times 
 LAG_TIE = 0.02  # share of the range of errors
 
 
+@dataclass(frozen=True, slots=True)
+class ReadAs:
+    """How a sender's four numbers become the camera's attitude: as `[attitude] convention` says, then by `q_body_to_cam` (4,).
+
+    That is None where they are the camera's own.
+    """
+
+    scalar: str = "first"
+    direction: str = "icrs_to_cam"
+    q_body_to_cam: FloatArray | None = None
+
+
+AS_PACKETS = ReadAs()
+
+
 class Reading(NamedTuple):
     """Another reading of a quaternion's four numbers: what it is, the line that states it, and (n, 4) read by it."""
 
@@ -55,9 +70,9 @@ def _scalar_last(q: FloatArray) -> FloatArray:
     return np.asarray(q[..., [3, 0, 1, 2]])
 
 
-def readings(scalar: str = "first", direction: str = "icrs_to_cam") -> tuple[Reading, ...]:
-    """The other readings of quaternions that are read as this `[attitude] convention` says."""
-    found = []
+def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
+    """The other readings of quaternions that are read like this."""
+    found, scalar, direction, mounting = [], read_as.scalar, read_as.direction, read_as.q_body_to_cam
     for other_scalar, other_direction in itertools.product(("first", "last"), ("icrs_to_cam", "cam_to_icrs")):
         if (other_scalar, other_direction) == (scalar, direction):
             continue
@@ -68,10 +83,12 @@ def readings(scalar: str = "first", direction: str = "icrs_to_cam") -> tuple[Rea
             parts.append(f'direction = "{other_direction}"')
 
         def read(q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar) -> FloatArray:
-            sent = conjugate(q) if direction == "cam_to_icrs" else q
+            own = q if mounting is None else multiply(conjugate(mounting), q)
+            sent = conjugate(own) if direction == "cam_to_icrs" else own
             sent = np.roll(sent, -1, axis=-1) if scalar == "last" else sent
             sent = np.roll(sent, 1, axis=-1) if to == "last" else sent
-            return conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
+            own = conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
+            return own if mounting is None else multiply(mounting, own)
 
         found.append(Reading(text, f"{{ {', '.join(parts)} }}", read))
     return tuple(found)
@@ -82,7 +99,8 @@ class Stretch:
     """Some packets in a row: (3,) rates, rad/s, cam, and their standard errors, rad/s; times ns of the sender's clock.
 
     `turn` is that of the quaternions, `rate` the mean of the rates, and `rate_as_icrs` the same if they had ICRS components.
-    `turned_rad` and `summed_rad` (n, 3) are turn and rates summed up to the times `at_s` (n,) after `from_ns`.
+    `turned_rad` and `summed_rad` (n, 3) are turn and rates summed up to the times `at_s` (n,) after `from_ns`. `error` is how
+    far turn and rate are apart, rad/s, and `is_off` says that this is more than their noise and what rates may be off.
     """
 
     turn: FloatArray
@@ -97,12 +115,14 @@ class Stretch:
     at_s: FloatArray
     turned_rad: FloatArray
     summed_rad: FloatArray
+    error: float = 0.0
+    is_off: bool = False
     _read: dict[str, FloatArray] = field(default_factory=dict)
 
     @property
     def turns(self) -> bool:
         """Whether its attitude turns by more than its noise."""
-        return float(np.linalg.norm(self.turn)) > max(MIN_TURN_RAD_S, TURN_SIGMA * self.turn_sigma)
+        return _turning(self) > max(MIN_TURN_RAD_S, TURN_SIGMA * self.turn_sigma)
 
     def turn_as(self, reading: Reading) -> FloatArray:
         """The turn (3,) of its quaternions in another reading of their numbers."""
@@ -228,7 +248,7 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
     scatter = turned - turned.mean(axis=0) - weight[:, None] * turn
     turn_sigma = math.sqrt(float((scatter**2).sum()) / (3 * (count - 1)) / spread_s2)
     rate_sigma = WALK * math.sqrt(float((np.diff(rate, axis=0)[whole] ** 2).sum()) / (6 * count) / count)
-    return Stretch(
+    stretch = Stretch(
         turn,
         weight @ summed / spread_s2,
         weight @ as_icrs / spread_s2,
@@ -242,6 +262,10 @@ def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
         turned,
         summed,
     )
+    limit = max(MIN_OFF_RAD_S, OFF_SHARE * _turning(stretch), OFF_SIGMA * _noise_of(stretch))
+    stretch.error = _error(stretch, stretch.rate)
+    stretch.is_off = stretch.turns and stretch.error > limit
+    return stretch
 
 
 def cause_of(
@@ -255,10 +279,7 @@ def cause_of(
     `length_s` is how long a stretch is meant to be, `history_s` for how long `lag_of` could look already, and `others` are the
     other readings of the quaternions.
     """
-    off = [
-        s.turns and _error(s, s.rate) > max(MIN_OFF_RAD_S, OFF_SHARE * _turning(s), OFF_SIGMA * _noise_of(s)) for s in stretches
-    ]
-    if off.count(False) > len(stretches) // MORE_STRETCHES:
+    if sum(not stretch.is_off for stretch in stretches) > len(stretches) // MORE_STRETCHES:
         return None
     if not any(stretch.rate.any() for stretch in stretches):
         coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(np.linalg.norm(s.turn) for s in stretches)
@@ -348,15 +369,15 @@ def fits(stretch: Stretch, was_off: float) -> bool:
 
 
 def _error(stretch: Stretch, rate: FloatArray) -> float:
-    return float(np.linalg.norm(stretch.turn - rate))
+    return math.hypot(*(stretch.turn - rate).tolist())  # plain floats: each stretch passes here
 
 
 def _faster(stretch: Stretch) -> float:
-    return float(max(np.linalg.norm(stretch.turn), np.linalg.norm(stretch.rate)))
+    return max(_turning(stretch), math.hypot(*stretch.rate.tolist()))
 
 
 def _turning(stretch: Stretch) -> float:
-    return float(np.linalg.norm(stretch.turn))
+    return math.hypot(*stretch.turn.tolist())
 
 
 def _noise_of(stretch: Stretch) -> float:
@@ -365,7 +386,7 @@ def _noise_of(stretch: Stretch) -> float:
 
 def _limit(stretch: Stretch, share: float, sigma: float, scale: float = 1.0) -> float:
     """How far turn and rate may be apart: a share of the turn, and the noise of both."""
-    size = _faster(stretch) if scale == 1.0 else float(np.linalg.norm(stretch.turn))
+    size = _faster(stretch) if scale == 1.0 else _turning(stretch)
     return max(share * size, sigma * math.hypot(stretch.turn_sigma, scale * stretch.rate_sigma))
 
 
@@ -385,8 +406,12 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
 
     Medians: of a single jump a mean would be mended by any lag that moves it out of what is compared.
     """
-    if not stretches:
+    if not stretches or stretches[-1].to_ns - stretches[0].from_ns < MIN_HISTORY_S * NS_PER_S:
         return None
+    # The stretches' own figures say at little cost that there is nothing to look for.
+    fast, off = _turning_median(stretches), float(np.median([stretch.error for stretch in stretches]))
+    if off <= 0.5 * max(MIN_OFF_RAD_S, OFF_SHARE * fast):
+        return LagFit(fast, off, 0.0)
     zero_ns = stretches[0].from_ns
     parts = [(stretch.at_s + (stretch.from_ns - zero_ns) / NS_PER_S)[1:] for stretch in stretches]
     t_s = np.concatenate([[0.0], *parts])
@@ -402,8 +427,11 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
 
     turn = _between(t_s, turned, edges_s) / LAG_SPAN_S
     fast = max(float(np.median(np.linalg.norm(part, axis=1))) for part in (turn, rate))
-    off, noise = float(off_by(np.zeros(1))[0]), _noise(stretches)
-    if off <= max(MIN_OFF_RAD_S, OFF_SHARE * fast, NOISE_RATIO * noise):
+    off = float(off_by(np.zeros(1))[0])
+    if off <= max(MIN_OFF_RAD_S, OFF_SHARE * fast):
+        return LagFit(fast, off, 0.0)
+    noise = _noise(stretches)
+    if off <= NOISE_RATIO * noise:
         return LagFit(fast, off, 0.0)
     lags_s = np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEPS_S[0] / 2, LAG_STEPS_S[0])
     lag_s = _least(lags_s, off_by(lags_s))
@@ -414,6 +442,10 @@ def lag_of(stretches: Sequence[Stretch]) -> LagFit | None:
         float(left.min()) <= min(off / MIN_BETTER, max(FIT_SHARE * fast, NOISE_RATIO * noise)) and abs(lag_s) >= MIN_LAG_S
     )
     return LagFit(fast, off, float(near_s[left.argmin()]) if explained else 0.0)
+
+
+def _turning_median(stretches: Sequence[Stretch]) -> float:
+    return float(np.median([_faster(stretch) for stretch in stretches]))
 
 
 def _noise(stretches: Sequence[Stretch]) -> float:

@@ -19,6 +19,7 @@ from typing import Literal
 import numpy as np
 
 from hilstar.attitude.clock.rate_causes import (
+    AS_PACKETS,
     LONGEST_S,
     MANY_STRETCHES,
     MIN_INTERVALS,
@@ -29,6 +30,7 @@ from hilstar.attitude.clock.rate_causes import (
     SAME,
     Cause,
     LagFit,
+    ReadAs,
     Stretch,
     cause_of,
     fits,
@@ -135,7 +137,7 @@ class RateCheck:
     """Follows one sender: tells of wrong rates once, and of right ones after that.
 
     `wrong` says what is done with rates that are: "off" looks at nothing. `used` is False for a run that draws without rates.
-    `scalar` and `direction` are those of the convention by which quaternions are read.
+    `read_as` is how quaternions have been read.
     """
 
     def __init__(
@@ -144,10 +146,9 @@ class RateCheck:
         notices: Notices,
         *,
         used: bool = True,
-        scalar: str = "first",
-        direction: str = "icrs_to_cam",
+        read_as: ReadAs = AS_PACKETS,
     ) -> None:
-        self._others = tuple(read_otherwise(readings(scalar, direction)))
+        self._others = tuple(read_otherwise(readings(read_as)))
         self._use = wrong
         self._used = used
         self._notices = notices

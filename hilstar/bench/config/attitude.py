@@ -86,10 +86,11 @@ class AttitudeSettings(Table, frozen=True):
     #: amplifies jitter from about 0.3 / age on (15 Hz at 20 ms). `"auto"`: a steady turn as before, and of the jitter as much
     #: as the last second's samples show to go on ([On time](on-time.md#prediction-and-jitter)).
     prediction: Literal["rate", "auto"] = "rate"
-    #: Rates that are not those of the packets' own quaternions (in deg/s, of the wrong sign, axes or frame, or zero) are
-    #: reported (`rates-wrong`). `"use-quaternions"`: and the sky is drawn by the quaternions' own turn until the rates are
-    #: right. `"warn"`: they are used all the same. `"off"`: nothing is compared. At rest nothing can be told. A log's rates are
-    #: used only where they fit its attitudes.
+    #: Rates that are not those of the packets' own quaternions (in deg/s, of the wrong sign, axes or frame, by a factor, late,
+    #: or zero) are reported (`rates-wrong`), and quaternions that rates show to be of another convention (`convention-wrong`).
+    #: `"use-quaternions"`: and the sky is drawn by the quaternions' own turn until the rates are right. `"warn"`: they are used
+    #: all the same. `"off"`: nothing is compared. At rest nothing can be told. A log's rates are used only where they fit its
+    #: attitudes.
     check_rates: Literal["use-quaternions", "warn", "off"] = "use-quaternions"
 
     @property

@@ -532,6 +532,40 @@ def test_what_is_no_unix_time_is_said_once():
     assert run.counts.refused_by["time"] == 600
 
 
+@pytest.mark.parametrize(
+    ("ahead_s", "name"),
+    [
+        (37.0, "as TAI is"),
+        (18.0, "as GPS time counted from 1970 is"),
+        (7200.0, "local time of a zone 2 h east of UTC"),
+        (3.0, None),
+    ],
+)
+def test_another_clock_is_named_by_its_difference_from_unix_time(ahead_s, name, caplog):
+    ahead = Sender(offset_ns=UNIX_NOW_NS + round(ahead_s * NS_PER_S))
+    Run(lambda t0: ahead.packets(t0, seconds(0, 1)), UNIX, unix_offset=SteppingUnixTime(1000))
+    (line,) = [line for line in caplog.messages if 'clock = "unix"' in line]
+    assert f"{ahead_s:.3f} s ahead of CLOCK_REALTIME" in line
+    assert (", as " not in line) if name is None else (name in line)
+
+
+@pytest.mark.parametrize("ahead_s", [0.1, 0.999])
+def test_a_clock_ahead_is_a_wrong_sky_until_it_is_right_again(ahead_s):
+    def make(t0: int) -> list[Arrival]:
+        ahead = Sender(offset_ns=round(ahead_s * NS_PER_S)).packets(t0, seconds(0, 2))
+        return ahead + Sender(first=2000).packets(t0, seconds(3, 6))
+
+    run = Run(make, SHARED)
+    assert run.events == {"clock-not-shared": 1, "clock-shared": 1}
+    assert run.receiver.latency_ms.percentile(1) < 0
+
+
+def test_packets_that_are_always_late_by_a_known_clock_are_a_notice():
+    late = Run(lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=120_000_000), SHARED)
+    assert late.events == {"clock-behind": 1}
+    assert Run(lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=30_000_000), SHARED).events == {}
+
+
 def test_the_kernel_states_how_well_it_keeps_unix_time():
     offset = HOST_CLOCK.unix_offset()
     assert 0 <= offset.error_ns <= UNDISCIPLINED_NS

@@ -106,6 +106,35 @@ def test_the_verdict_names_everything_that_was_wrong():
     assert verdict(summarise(well), 0)["ok"]
 
 
+def event(k: int, kind: str, since: int | None = None) -> EventRecord:
+    since_ns = None if since is None else 10**12 + since * PERIOD_NS
+    return EventRecord(host_ns=10**12 + k * PERIOD_NS, kind=kind, detail="by a factor of 1.5", since_ns=since_ns)
+
+
+@pytest.mark.parametrize("block", [1, 7, 1000])
+def test_frames_of_a_wrong_sky_are_wrong_from_when_it_began(block):
+    """It is found at frame 50, and began at 20; the frames between are in blocks before it."""
+    records = [frame(k, stale=k == 30) for k in range(100)]
+    records[51:51] = [event(50, "rates-wrong", 20)]
+    records[71:71] = [event(70, "rates-right")]
+    figures = RunFigures({})
+    for begin in range(0, len(records), block):
+        figures.add(*records[begin : begin + block])
+    found = summarise(figures)
+    assert (found.wrong_frames, found.right_frames) == (50, 50)
+    assert found.wrong_sky.seconds == pytest.approx(50 * PERIOD_NS / 1e9, abs=1e-3)
+    told = verdict(found, figures.counted["late"])
+    assert "50 of 100 frames of a wrong sky" in told["reasons"]
+    assert any("by a factor of 1.5" in reason for reason in told["reasons"])
+
+
+def test_lost_packets_are_a_figure_of_their_own():
+    figures = RunFigures({})
+    figures.add(frame(0), CountRecord(host_ns=10**12, kind="lost", reason="sequence", count=3))
+    found = summarise(figures)
+    assert found.lost_packets == 3 and "lost" not in found.packets and "sequence" not in found.packets
+
+
 def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():
     rng = np.random.default_rng(5)
     for count in (1, 7, 1023, 1024, 5000, 20_001):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.clock.rate_causes import OTHER_AXES
+from hilstar.attitude.clock.rate_causes import OTHER_AXES, ReadAs
 from hilstar.attitude.clock.rate_check import RIGHT, WRONG, RateCheck
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.notices import Notices
-from hilstar.rotation import conjugate, from_radec_roll_deg, from_rotation_vectors, multiply
+from hilstar.rotation import conjugate, from_radec_roll_deg, from_rotation_vectors, multiply, rotate
 from hilstar.units import NS_PER_S
 from hilstar.wrong_sky import CONVENTION
 
@@ -289,7 +289,7 @@ def test_a_stated_convention_that_is_wrong_is_told_against_what_was_sent():
     t_ns, q, rates = steady()
     notices, told = Notices(), []
     notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
-    check = RateCheck("use-quaternions", notices, scalar="last")
+    check = RateCheck("use-quaternions", notices, read_as=ReadAs(scalar="last"))
     for sample in samples(t_ns, np.roll(q, 1, axis=1), rates):
         check.see(sample)
     assert [kind for kind, _ in told] == [CONVENTION] and '{ scalar = "first" }' in told[0][1]
@@ -313,3 +313,17 @@ def test_a_condition_says_since_when_it_holds():
     for sample in samples(t_ns, q, -rates):
         check.see(sample, sample.t_ns + 5 * NS_PER_S)
     assert [condition.since_ns for condition in notices.wrong_sky.now()] == [5 * NS_PER_S]
+
+
+@pytest.mark.parametrize(("scalar", "direction"), LINES)
+def test_attitudes_of_a_body_are_read_otherwise_before_they_are_mounted(scalar, direction):
+    """The body's attitude and rates as they are sent, and mounted as the link does it."""
+    mounting = from_radec_roll_deg(40.0, 20.0, 70.0)
+    t_ns, q, rates = steady()
+    sent = as_sent(q, scalar, direction)
+    stream = samples(t_ns, multiply(mounting, sent), rotate(mounting, rates))
+    notices = Notices()
+    check = RateCheck("use-quaternions", notices, read_as=ReadAs(q_body_to_cam=mounting))
+    for sample in stream:
+        check.see(sample)
+    assert LINES[scalar, direction] in notices.lasting[CONVENTION]

@@ -383,7 +383,7 @@ def own_answers(planted: Planted, share: float, seed: int = 6) -> list[AnswerRec
     for tau_s, q in zip(planted.tau_s.tolist(), planted.reported.tolist(), strict=True):
         middle_ns = round((tau_s + 5) * 1e9)
         overtaken = rng.random() < share and tau_s < planted.tau_s[-20]  # the ledger ends soon after its last frame
-        late_ns = 150_000_000 + overtaken * round(rng.uniform(0.11, 0.25) * 1e9)
+        late_ns = 150_000_000 + bool(overtaken) * round(rng.uniform(0.11, 0.25) * 1e9)
         records.append(
             AnswerRecord(host_ns=middle_ns + late_ns, raw="", t_ns=middle_ns + 10**15, q=tuple(q), verdict="right",
                          middle_ns=middle_ns, light_ns=middle_ns)

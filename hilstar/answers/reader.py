@@ -19,7 +19,15 @@ import numpy as np
 from hilstar.answers.answer import Answer
 from hilstar.answers.formats import AnswerDecoder, RefusedAnswer
 from hilstar.attitude.wire.apart import ReaderProcess
-from hilstar.attitude.wire.byte_links import ByteLink, FileBytes, SerialBytes, TcpBytes, UdpBytes, ZmqBytes
+from hilstar.attitude.wire.byte_links import (
+    ByteLink,
+    FileBytes,
+    SerialBytes,
+    TcpBytes,
+    UdpBytes,
+    ZmqBytes,
+    refuse_no_file,
+)
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.links import RawMessage
 from hilstar.attitude.wire.source import Components
@@ -89,6 +97,12 @@ class ReadPlan:
         else:
             place, allowed = answers_place(settings)
         return (TcpBytes if settings.source == "tcp" else UdpBytes)(place, allowed, notices)
+
+    def open_first(self, notices: Notices) -> ByteLink:
+        """The road, at a run's start: where a file is to come, nothing else may be there. Raises InputError as `open`."""
+        if self.settings.source == "file":
+            refuse_no_file(self.folder / str(self.settings.path))
+        return self.open(notices)
 
     def decoder(self, messages: bool) -> AnswerDecoder:
         """The decoder of what comes. Raises InputError."""
@@ -184,7 +198,7 @@ class AnswersApart(Closing):
     """
 
     def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
-        with plan.open(notices) as tried:
+        with plan.open_first(notices) as tried:
             self.endpoint, messages = tried.endpoint, tried.messages
         plan.decoder(messages)
         self._refused: Counter[str] = Counter()

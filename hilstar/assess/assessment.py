@@ -4,13 +4,14 @@ Lock is availability, acquisition and loss: which of the answers that were due c
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from hilstar.answers.answer import JUMP_NS
 from hilstar.answers.judge import TO_MIDDLE, AnswerRules, Stamp
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.assess.bench_effects import (
@@ -39,7 +40,7 @@ from hilstar.calibrate.attitude_pairs import COMMANDED, Pairs, refuse_convention
 from hilstar.errors import HilstarError, InputError
 from hilstar.rotation import from_rotation_vector, multiply, to_matrix, to_rotation_vector
 from hilstar.run.record.commanded import NOT_SHOWN, Commanded, CommandedRun, read_commanded
-from hilstar.run.record.ledger_records import answer_records, config_of, read_head
+from hilstar.run.record.ledger_records import AnswerRecord, answer_records, config_of, read_head
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 MISSED_CYCLES = 1.5  # a longer time between right answers is an outage
@@ -140,7 +141,8 @@ SEED = 0  # the bootstrap's seed: the same files give the same intervals
 SMALL = 0.3  # share of the noise above which the display's own error gets a note
 BENT_ARCSEC = 0.1
 TOGETHER, SLOW_SHARE = 20, 0.1  # noise that lasts for so many answers gets a note from this share of the variance on
-MAX_FALLING = 0.01  # share of answers whose own time may not rise: of more, the clock was set, and arrivals count
+CLOCK_SET = "the tracker's clock was set during the run: its answers are placed by their arrivals, not by their stamps"
+SET_BLOCK, MAX_CLOCK_DRIFT = 11, 2e-3  # answers whose median shift against their arrivals is compared with the next ones'
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +193,9 @@ def read_ledger(path: Path) -> RunLedger:
     config = config_of(head)
     if config is None:
         raise InputError(f"{path}: its head holds no bench file that can be read; give the ledger of serve or replay --ledger")
-    return RunLedger(path, head, config, run)
+    # A moment stands for an exposure about it; a refresh period more, for it is known to some milliseconds.
+    reach_s = config.tracker.exposure_s / 2 + 1 / config.monitor.refresh_hz
+    return RunLedger(path, head, config, replace(run, commanded=run.commanded.over_exposures(reach_s)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,18 +232,34 @@ class Assessment:
     t_s: FloatArray
     notes: tuple[str, ...]
     certificate: Certificate | None = None
+    out_of_order: int = 0
+
+    @property
+    def missed_line(self) -> str:
+        """The run's missed frames and what they do to the budget, in words."""
+        missed, held_s, hold_s = self.run.run.missed, self.run.commanded.held_s, self.run.commanded.hold_s
+        if not missed:
+            return "none"
+        share = 100 * missed / (missed + len(self.run.commanded.t_s))
+        longest = int(np.argmax(hold_s)) if len(hold_s) else -1
+        where = f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s" if longest >= 0 else ""
+        touched = f"{len(self.found.held)} answers looked while a frame was held for them"
+        return f"{missed} ({share:.2g} % of refresh periods{where}); {touched}, and are in no figure but the availability"
 
 
 class LedgerAnswers(NamedTuple):
     """A ledger's own answers: where in an exposure their times are, and how far these are ahead of the run's, as known live.
 
-    `centroids` are the stars that each of them holds.
+    `centroids` are the stars that each of them holds. They are sorted by their times; `out_of_order` counts those that came
+    after a later one. `clock_set` says that the tracker's clock was set in the run, and that arrivals count instead.
     """
 
     telemetry: Telemetry
     stamp: Stamp
     ahead_ns: int
     centroids: Sequence[Centroids]
+    out_of_order: int = 0
+    clock_set: bool = False
 
 
 def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
@@ -248,25 +268,42 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
     if not any(record.valid and record.q is not None for record in records):
         has = f"{len(records)} answers, none of them with an attitude" if records else "no answers of a tracker"
         raise InputError(f"{ledger}: has {has}; give its telemetry too, or the ledger of a bench file with [answers]")
-    middle_ns = np.array([record.middle_ns for record in records], dtype=np.int64)
-    to_light_ns = [record.light_ns - record.middle_ns for record in records if record.light_ns is not None]
-    on_run_ns = middle_ns + (int(np.median(to_light_ns)) if to_light_ns else 0)
-    own = [record.t_ns for record in records if record.t_ns is not None]
-    t_ns = np.array(own, dtype=np.int64)
-    if len(own) < len(records) or stamp == "arrival" or not _rising(t_ns).mean() > 1 - MAX_FALLING:
+    on_run_ns = _on_run_ns(records)
+    stamped = stamp != "arrival" and all(record.t_ns is not None for record in records)
+    t_ns = np.array([record.t_ns for record in records] if stamped else on_run_ns, dtype=np.int64)
+    clock_set = stamped and _clock_was_set(t_ns, np.array([record.host_ns for record in records], dtype=np.int64))
+    if clock_set or not stamped:
         t_ns, stamp = on_run_ns, "middle"
-    rising = _rising(t_ns)
-    kept = [record for record, later in zip(records, rising, strict=True) if later]
+    overtaken = int((t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]).sum()) if stamped and not clock_set else 0
+    # By their times, for a datagram may be overtaken; of one time the first that came.
+    rising_ns, order = np.unique(t_ns, return_index=True)
+    kept = [records[k] for k in order.tolist()]
     valid = np.array([record.valid and record.q is not None for record in kept], dtype=np.bool_)
     q = np.array([NOT_SHOWN if record.q is None else record.q for record in kept], dtype=np.float64)
-    numbers = np.flatnonzero(rising) + 1
+    telemetry = Telemetry(ledger, rising_ns, q, valid, order + 1, of_lines=False)
     ahead_ns, centroids = int(np.median(t_ns - on_run_ns)), [record.centroids for record in kept]
-    return LedgerAnswers(Telemetry(ledger, t_ns[rising], q, valid, numbers, of_lines=False), stamp, ahead_ns, centroids)
+    return LedgerAnswers(telemetry, stamp, ahead_ns, centroids, overtaken, clock_set)
 
 
-def _rising(t_ns: IntArray) -> BoolArray:
-    """Which times (n,) are later than all before them."""
-    return np.append(True, t_ns[1:] > np.maximum.accumulate(t_ns)[:-1])
+def _on_run_ns(records: Sequence[AnswerRecord]) -> IntArray:
+    """When each answer (n,) looked, on the run's clock, ns, as it was known live; of one not judged by the others' delay."""
+    judged = [record for record in records if record.verdict != "unjudged"]
+    late_ns = [record.host_ns - record.middle_ns for record in judged]
+    usual_ns = int(np.median(late_ns)) if late_ns else 0
+    to_light_ns = [record.light_ns - record.middle_ns for record in judged if record.light_ns is not None]
+    middle_ns = [record.host_ns - usual_ns if record.verdict == "unjudged" else record.middle_ns for record in records]
+    return np.array(middle_ns, dtype=np.int64) + (int(np.median(to_light_ns)) if to_light_ns else 0)
+
+
+def _clock_was_set(t_ns: IntArray, host_ns: IntArray) -> bool:
+    """Whether stamps (n,) step against arrivals (n,) for good; where an answer was overtaken the next one is as before."""
+    blocks = len(t_ns) // SET_BLOCK
+    if blocks < 2:
+        return False
+    rows = slice(0, blocks * SET_BLOCK)
+    ahead_ns = np.median((t_ns - host_ns)[rows].reshape(blocks, SET_BLOCK), axis=1)
+    passed_ns = np.diff(np.median(host_ns[rows].reshape(blocks, SET_BLOCK), axis=1))
+    return bool((np.abs(np.diff(ahead_ns)) > JUMP_NS + MAX_CLOCK_DRIFT * np.abs(passed_ns)).any())
 
 
 def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings) -> Assessment:
@@ -274,17 +311,18 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     run = read_ledger(ledger)
     zero_ns, start_s, end_s = run.run.zero_ns, float(run.commanded.t_s[0]), float(run.commanded.t_s[-1])
     centroids: Sequence[Centroids] = ()
-    overlap = True
+    overlap, out_of_order, clock_set = True, 0, False
     if telemetry is None:
-        answers, stamp, ahead_ns, centroids = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
+        own = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
+        answers, stamp, ahead_ns, centroids, out_of_order, clock_set = own
         base_ns, telemetry = zero_ns + ahead_ns, ledger
     else:
         answers, stamp = read_telemetry(telemetry), settings.stamp or "middle"
         # The telemetry's times from the run's zero where the two overlap, else from their own first.
         overlap = answers.t_ns[0] <= zero_ns + round(end_s * NS_PER_S) and answers.t_ns[-1] >= zero_ns
         base_ns = zero_ns if overlap else int(answers.t_ns[0])
-    tau_s, base_s = (answers.t_ns - base_ns) / NS_PER_S, (base_ns - zero_ns) / NS_PER_S
-    tau_s = tau_s + TO_MIDDLE[stamp] * run.config.tracker.exposure_s - settings.latency_s
+    base_s = (base_ns - zero_ns) / NS_PER_S
+    tau_s = (answers.t_ns - base_ns) / NS_PER_S + TO_MIDDLE[stamp] * run.config.tracker.exposure_s - settings.latency_s
     valid = np.flatnonzero(answers.valid)
     if len(valid) < MIN_ROWS:
         raise InputError(f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer telemetry")
@@ -295,9 +333,9 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         raise InputError(f"{telemetry}: {refusal}") from refusal
     t_s = start_s + (tau_s - found.clock.offset_s - start_s) / (1 + found.clock.drift)
     right, wrong = np.zeros(len(t_s), dtype=np.bool_), np.zeros(len(t_s), dtype=np.bool_)
-    right[valid[found.row]], wrong[valid[found.wrong]] = True, True
+    right[valid[found.row]], right[valid[found.held]], wrong[valid[found.wrong]] = True, True, True
     off_deg = np.degrees(np.linalg.norm(found.clock.residual_arcsec, axis=1) / ARCSEC_PER_RAD)
-    notes = _notes(run, found, 0.0 if overlap else base_s)
+    notes = [*_notes(run, found, 0.0 if overlap else base_s), *([CLOCK_SET] if clock_set else [])]
     # The error by rate and by magnitude, and the display's own.
     parts = found.components
     error = parts.fov.fitted + parts.pixel.fitted + parts.left
@@ -339,6 +377,7 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         t_s=t_s,
         notes=(*notes, *said),
         certificate=certificate,
+        out_of_order=out_of_order,
     )
 
 

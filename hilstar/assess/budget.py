@@ -63,9 +63,14 @@ class Decomposed:
 
 @dataclass(frozen=True)
 class DecomposedRun(Decomposed):
-    """The budget of a run, with the clock that was found together with the bias."""
+    """The budget of a run, with the clock that was found together with the bias.
+
+    `held` (h,) are the indices of answers that looked while a frame was held for missed ones. They are in no figure, and wrong
+    only where they are further off than the field turned meanwhile.
+    """
 
     clock: ClockFit
+    held: IntArray
 
 
 def assess_run(
@@ -77,21 +82,37 @@ def assess_run(
     MIN_ROWS answers while the sky was shown, and where half or more of them are wild.
     """
     clock = ClockSolver(commanded, tau_s, reported, scale).fit(coarse)
-    known = clock.moments.known
+    known, held = clock.moments.known, clock.moments.known & (clock.moments.held_s > 0)
+    free = known & ~held
     if known.sum() < MIN_ROWS:
         raise InputError(f"{int(known.sum())} answers fall into the run, and {MIN_ROWS} are needed; give longer telemetry")
-    if 2 * clock.used.sum() <= known.sum():
+    if free.sum() < MIN_ROWS:
         raise InputError(
-            f"half or more of the answers are wild: {int(clock.used.sum())} of {int(known.sum())} agree with one rotation"
+            f"the run missed so many frames that {int(held.sum())} of {int(known.sum())} answers looked while one was held,"
+            f" and {MIN_ROWS} others are needed; give a run that keeps its refresh rate, or a lower [monitor] refresh_hz"
         )
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(clock.residual_arcsec[clock.used][:, :2])))
+    if 2 * clock.used.sum() <= free.sum():
+        raise InputError(
+            f"half or more of the answers are wild: {int(clock.used.sum())} of {int(free.sum())} agree with one rotation"
+        )
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(clock.residual_arcsec[clock.used][:, :2]), axis=0).max())
     if spread > MAX_SPREAD_ARCSEC:
         raise InputError(f"the answers scatter by {spread:.4g} arcsec about the commanded attitudes: they are of another run")
     total = clock.residual_arcsec + ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
     right, parts = _right_answers(total, clock.moments.q, clock.used, scale)
     intervals = intervals_of(parts, rng, clock.sigma_bias_arcsec)
-    found = _decomposed(parts, intervals, known, right, clock.moments.q, clock.moments.rate_rad_s)
-    return DecomposedRun(**vars(found), clock=clock)
+    found = _decomposed(parts, intervals, free, right, clock.moments.q, clock.moments.rate_rad_s)
+    astray = held & _beyond_turn(clock, parts)
+    wrong = np.sort(np.append(found.wrong, np.flatnonzero(astray)))
+    return DecomposedRun(**{**vars(found), "wrong": wrong}, clock=clock, held=np.flatnonzero(held & ~astray))
+
+
+def _beyond_turn(clock: ClockFit, parts: Components) -> npt.NDArray[np.bool_]:
+    """Answers (n,) further off than noise and the field's turn while a frame was held explain."""
+    moments = clock.moments
+    turned = ARCSEC_PER_RAD * np.linalg.norm(moments.rate_rad_s, axis=1) * moments.held_s
+    noise = float(np.sqrt(np.maximum(parts.noise_variance, FLOOR_ARCSEC**2).sum()))
+    return np.asarray(np.linalg.norm(clock.residual_arcsec, axis=1) > turned + CUT_SIGMAS * noise)
 
 
 def assess_cases(

@@ -14,6 +14,8 @@ is linear in bias and clock. They are first fitted robustly without f (Tukey's w
 random function of the place, a sum of bumps of variance kappa sigma^2, with the kappa and the spacing under which the residuals
 are most likely. Bias and clock are the generalised least squares estimate (Aitken 1935) under its covariance. So an error that
 repeats with the place is not taken for a clock, and a clock not for such an error.
+
+An answer whose exposure touches a frame that was held for missed ones saw another sky than the commanded one. It is in no fit.
 """
 
 from dataclasses import dataclass
@@ -43,6 +45,7 @@ TURN_RAD = np.radians(0.5)  # a tracker reports nearly the commanded attitude; a
 CUT_SIGMAS = 8.0
 AGREE_ARCSEC = 3600.0  # an answer further from the others is of another sky, whatever their spread
 ROUNDS, REFINED = 40, 3
+MIN_USED = 5  # answers, as many as the fit has unknowns
 PART_PX = 150.0  # size of the parts of the field whose errors are compared for the clock's sigma
 # Prior sigmas of the clock; it is told once its sigma is below TOLD of them.
 OFFSET_PRIOR_S, DRIFT_PRIOR, TOLD = 10.0, 2e-3, 0.3
@@ -271,8 +274,11 @@ class ClockSolver:
         self.rotation, self.delay_s, self.stretch_s = coarse.rotation, -coarse.offset_s, 0.0
         self._align()
         used = self._robust(-coarse.offset_s)
+        covariance = np.linalg.inv(self._prior(0.0)[0] + np.diag([1.0, 1.0, 1.0, 0.0, 0.0]) / AGREE_ARCSEC**2)
         for _ in range(REFINED):
-            used = used & self.moments.known
+            used = used & self.free
+            if used.sum() < MIN_USED:
+                break
             covariance = self._refine(used, -coarse.offset_s)
         stretch = self.stretch_s / self.span_s
         sigma = np.sqrt(np.diag(covariance))
@@ -300,6 +306,7 @@ class ClockSolver:
         self.t_s = plain - self.stretch_s * self.share
         self.moments = self.commanded.at(self.t_s)
         known = self.moments.known
+        self.free = known & (self.moments.held_s == 0)
         turn = multiply(multiply(self.reported, conjugate(self.moments.q)), conjugate(self.rotation))
         self.residual = np.full((len(self.t_s), 3), np.nan)
         self.residual[known] = ARCSEC_PER_RAD * to_rotation_vector(turn[known])
@@ -322,8 +329,12 @@ class ClockSolver:
     def _robust(self, begun_s: float) -> BoolArray:
         """Bias and clock by Tukey's weights, scaled for each axis; which answers (n,) are not wild."""
         for _ in range(ROUNDS):
-            rows, residual = self.moments.known, self.residual[self.moments.known]
+            rows, residual = self.free, self.residual[self.free]
+            if rows.sum() < MIN_USED:
+                break
             sigma, weight = weights_of(residual)
+            if (weight > 0).sum() < MIN_USED:  # no one rotation: the caller refuses them
+                break
             design = self._design(rows)
             normal, right = self._prior(begun_s)
             for axis in range(3):
@@ -333,9 +344,9 @@ class ClockSolver:
             self._align(step)
             if max(np.abs(step[:3]).max(), 1e3 * np.abs(step[3:]).max()) < DONE_ARCSEC:
                 break
-        known = self.moments.known
-        used = known.copy()
-        used[known] = weights_of(self.residual[known])[1] > 0
+        used: BoolArray = self.free.copy()
+        if used.sum() >= MIN_USED:
+            used[self.free] = weights_of(self.residual[self.free])[1] > 0
         return used
 
     def _refine(self, used: BoolArray, begun_s: float) -> FloatArray:

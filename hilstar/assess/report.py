@@ -43,6 +43,8 @@ def budget_of(found: Assessment) -> dict[str, Any]:
         },
         "availability": found.lock.availability,
         "wrong": found.wrong,
+        "missed": {"frames": found.run.run.missed, "answers_left_out": len(parts.held)},
+        "out_of_order": found.out_of_order,
         "limit_arcsec": found.limit_arcsec,
         **({} if found.glass is None else {"glass": found.glass}),
         **({} if found.certificate is None else {"bench": bench_part(found.certificate, parts)}),
@@ -112,6 +114,9 @@ def rows_of(found: Assessment) -> Iterator[FigureRow]:
     yield FigureRow("answers due", "", lock.due)
     yield FigureRow("right answers", "", lock.right)
     yield FigureRow("wrong answers", "", len(found.wrong))
+    yield FigureRow("missed frames", "", found.run.run.missed)
+    yield FigureRow("answers left out for held frames", "", len(found.found.held))
+    yield FigureRow("answers out of order", "", found.out_of_order)
     yield FigureRow("lock lost", "", len(lock.lost))
     yield FigureRow("acquisition probability", "", lock.acquisition_probability)
     yield FigureRow("acquisition time, median", "", lock.acquisition_s, "s")
@@ -161,8 +166,11 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
     if display is not None:
         own = f"{display.cross_arcsec:.2g} arcsec across, {display.roll_arcsec:.2g} about the boresight,"
         own += f" at {display.attitudes} attitudes; {display.seen:.2f} +- {display.sigma_seen:.2f} of it in the answers"
+    answers = f"{len(parts.row)} right of {int(found.telemetry.valid.sum())} valid and {len(found.telemetry.t_ns)} rows"
+    answers += f"; {found.out_of_order} came out of order, sorted by their stamps" if found.out_of_order else ""
     return [
-        ("answers", f"{len(parts.row)} right of {int(found.telemetry.valid.sum())} valid and {len(found.telemetry.t_ns)} rows"),
+        ("answers", answers),
+        ("missed frames", found.missed_line),
         ("bias", f"x {x:.2f}, y {y:.2f}, about the boresight {z:.2f} arcsec"),
         ("field-of-view error", _text(parts.fov_arcsec, parts.intervals.fov)),
         ("pixel error", _text(parts.pixel_arcsec, parts.intervals.pixel)),

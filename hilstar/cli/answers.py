@@ -137,7 +137,7 @@ def _live(plan: "ReadPlan", seconds: float | None) -> "tuple[AnswerDecoder, Iter
     from hilstar.notices import Notices
     from hilstar.process.interrupts import stop_on_signal
 
-    link = plan.open(Notices())
+    link = plan.open_first(Notices())
     decoder, stop = plan.decoder(link.messages), threading.Event()
     say(f"listening at {link.endpoint}; Ctrl-C ends it")
 

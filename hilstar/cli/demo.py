@@ -15,7 +15,7 @@ from hilstar.cli import running
 from hilstar.cli.options import MAX_SEED, Json
 from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.terminal import progress, report, say
-from hilstar.errors import MachineError
+from hilstar.errors import InputError, MachineError
 from hilstar.files import check_directory, make_directory, temporary_folder
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
@@ -85,7 +85,7 @@ def demo(
         tracker.report(result.summary.answers, as_json)
         missed = result.summary.missed_frames
         if missed > MAX_MISSED * result.summary.frames:
-            line = f"the display missed {missed} frames, and what it held meanwhile counts as the tracker's error"
+            line = f"the display missed {missed} frames, and answers that looked while it held a frame are in no figure"
             say(f"hilstar: {line}; the machine is busy: close other programs, and run it again")
     if not as_json:
         typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
@@ -178,7 +178,10 @@ class TrackerBeside:
         from hilstar.assess.report import lines_of, write_page
         from hilstar.twin.tracker_process import ROLL
 
-        found = assess_files(self.ledger, None, AssessSettings(display_attitudes=0))
+        try:
+            found = assess_files(self.ledger, None, AssessSettings(display_attitudes=0))
+        except InputError as refusal:  # what is read here this machine has made
+            raise MachineError(f"the demo's run gives no budget: {refusal}") from refusal
         write_page(self._page, found)
         parts = found.found
         rows: list[tuple[str, float, float | None, str]] = [

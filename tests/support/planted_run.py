@@ -25,6 +25,7 @@ def write_ledger(
     start_ns: int = 5 * NS_PER_S,
     records: Sequence[AnswerRecord | FaultRecord] = (),
     bench: str = SMALL_BENCH,
+    missed_before: Sequence[int] = (),
 ) -> Path:
     """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the attitudes (n, 4), or none.
 
@@ -41,6 +42,7 @@ def write_ledger(
                 one = waiting.pop()
                 writer.add("answer" if isinstance(one, AnswerRecord) else "fault", one.host_ns, msgspec.json.encode(one), 0)
             record = FrameRecord(frame=number, t_ns=t_ns, light_ns=t_ns, draw_ns=t_ns, swap_ns=t_ns, q=q)
+            record.missed_before = missed_before[number] if missed_before else 0
             writer.add("frame", t_ns, msgspec.json.encode(record), number)
         writer.flush()
         writer.finish()

@@ -324,21 +324,28 @@ def no_file_kind(mode: int) -> str:
     return "" if stat.S_ISREG(mode) else KINDS.get(stat.S_IFMT(mode), "no file")
 
 
+def refuse_no_file(path: Path) -> None:
+    """Refuse (InputError) a path that names something other than a regular file; it may name nothing yet."""
+    try:
+        kind = no_file_kind(path.stat().st_mode)
+    except OSError:
+        return
+    if kind:
+        raise InputError(f"[answers] path = {path}: {kind}; write the file to which answers are appended")
+
+
 class FileBytes(ByteLink):
     """What is appended to a regular file after the start; one that is made anew or cut is read from its beginning.
 
     A path that comes to name something else (a device, a FIFO, a directory) is let go and told: a device may have bytes for
-    ever. It is looked at again until it names a file. Raises InputError where it names no regular file at the start.
+    ever. It is looked at again until it names a file.
     """
 
     def __init__(self, path: Path, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         super().__init__(str(path), notices, clock)
         self._path, self._file, self._trouble = path, -1, ""
         with contextlib.suppress(OSError):
-            kind = no_file_kind(path.stat().st_mode)
-            if kind:
-                raise InputError(f"[answers] path = {path}: {kind}; write the file to which answers are appended")
-            self._open()
+            self._follow()
         if self._file >= 0:
             os.lseek(self._file, 0, os.SEEK_END)
 
@@ -368,10 +375,15 @@ class FileBytes(ByteLink):
         """See `ByteLink.taken`."""
         end = self._clock.within(timeout_ms / 1000)
         while True:
+            data = b""
             with contextlib.suppress(OSError):
-                if self._file >= 0 and (data := os.read(self._file, MAX_READ_BYTES)):
-                    return self._chunk(data)
-                self._follow()
+                if self._file >= 0:
+                    data = os.read(self._file, MAX_READ_BYTES)
+                # One that has more than a tracker says in a look may never end, while another stands in its place.
+                if not data or len(data) == MAX_READ_BYTES:
+                    self._follow()
+            if data:
+                return self._chunk(data)
             if end.over:
                 return []
             self._clock.sleep(min(FILE_LOOK_S, end.left_s))

@@ -1,8 +1,9 @@
 """The frames that a display shows, sent to whoever watches: over ZeroMQ, each a message of three parts.
 
-1. A JSON object: `frame` (its number), `lit_ns` (when the middle row lights, `time.monotonic_ns()` of this machine), `q`
-   (q_icrs_to_cam, null for a blank frame), `width`, `height`, `bits`, `channels` (1, or 3 where the primaries are driven
-   apart), `bench_sha256`.
+1. A JSON object: `frame` (its number), `lit_ns` (when its light begins, `time.monotonic_ns()` of this machine: of a screen
+   when the middle row lights; without one half a refresh period before the moment of `q`, which then stands for the half
+   period before it and the one after it), `q` (q_icrs_to_cam, null for a blank frame), `width`, `height`, `bits`,
+   `channels` (1, or 3 where the primaries are driven apart), `bench_sha256`.
 2. The lit pixels, uint32, little-endian: row * width + column, rising. All others have code 0.
 3. Their codes: uint8, or uint16 little-endian above 8 bits; `channels` of each.
 

@@ -16,8 +16,8 @@ from hilstar.monitor.window.randr import Randr
 from hilstar.monitor.window.x11 import INT, POINTER, TEXT, Survival, load_library
 
 LOOK_S = 1.0
-RAMP_TOLERANCE = 1 / 512  # half a code of 8 bits
-FULL_RAMP = 65535
+FULL_RAMP, RAMP_BITS = 65535, 16
+COARSEST_BITS = 8
 XCB_LIBRARY, PRESENT_LIBRARY = "libxcb.so.1", "libxcb-present.so.0"
 GENERIC_EVENT, COMPLETE_NOTIFY, COMPLETE_MASK = 35, 1, 2  # xproto.h, present.h
 KIND_PIXMAP = 0
@@ -26,9 +26,27 @@ UNKNOWN = "unknown"
 
 
 def is_straight(ramp: bytes | FloatArray) -> bool:
-    """Whether a gamma ramp is the identity, to half a code of 8 bits: red, green and blue, in 16 bits a step or (3, steps)."""
+    """Whether a gamma ramp is the identity, to half a code of its own depth.
+
+    Red, green and blue, in 16 bits a step or (3, steps) from 0 to 1. A driver that keeps 8 bits rounds to them. In a finer
+    table half a code of 8 bits is a curve: a gamma of 1.005 has 6 % less light at the faintest code.
+    """
     parts = np.frombuffer(ramp, np.uint16).reshape(3, -1) / FULL_RAMP if isinstance(ramp, bytes) else ramp
-    return bool(parts.size and np.all(np.abs(parts - np.linspace(0, 1, parts.shape[1])) < RAMP_TOLERANCE))
+    if not parts.size:
+        return False
+    off = np.abs(parts - np.linspace(0, 1, parts.shape[1]))
+    # An entry of 16 bits is rounded itself.
+    return bool(np.all(off <= 0.5 / (2 ** ramp_bits(parts) - 1) + 0.5 / FULL_RAMP))
+
+
+def ramp_bits(parts: FloatArray) -> int:
+    """The depth in bits of a ramp's entries (3, steps) from 0 to 1: the coarsest, from 8, that holds each of them."""
+    for bits in range(COARSEST_BITS, RAMP_BITS):
+        full = 2**bits - 1
+        rounded = np.rint(parts * full) / full
+        if np.all(np.abs(parts - rounded) * FULL_RAMP <= 1.0):
+            return bits
+    return RAMP_BITS
 
 
 class PresentEvents:

@@ -116,8 +116,8 @@ def test_the_demo_can_be_watched_and_acted_on(tmp_path):
 def test_with_a_tracker_the_loop_is_closed_and_its_budget_stands_beside_what_was_planted(tmp_path):
     """Six seconds: the bias, with what the field-of-view error adds to it over so short a scan, and the live figures."""
     result = run_hilstar_here("demo", "--loop", "-o", tmp_path / "demo", "--duration", "6", "--json")
-    if "and 30 are needed" in result.stderr:
-        pytest.skip("the machine is too busy for three answers a second")
+    if "and 30 are needed" in result.stderr or "and 30 others are needed" in result.stderr:
+        pytest.skip("the machine is too busy for three answers a second, or for most of the frames")
     assert result.returncode in {0, 1}, result.stderr  # 1: a busy machine's sky stood still for a moment
     summary = json.loads(result.stdout)
     assert summary["answers"]["right"] > 10

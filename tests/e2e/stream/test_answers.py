@@ -163,6 +163,7 @@ def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
     path, notices = tmp_path / "tracker.bin", Notices()
     path.touch()
     with reading(tmp_path, 'source = "file"\npath = "tracker.bin"', notices) as source:
+        gathered(source, 3, lambda: path.write_bytes(STREAM))  # the reader has opened it
         path.unlink()
         if kind == "device":
             path.symlink_to("/dev/zero")

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from hilstar import charts, html_pages
+from hilstar.answers.pairing import LitFrame, LitFrames
 from hilstar.arrays import FloatArray
 from hilstar.assess import report
 from hilstar.assess.assessment import AssessSettings, assess_files, lock_of
@@ -32,7 +33,7 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
 from tests.support.glass import SIDE_PX, stack
 from tests.support.planted_run import write_ledger, write_run, write_telemetry
-from tests.support.planted_tracker import Planted, Sizes, plant, scalar_first, scan, still
+from tests.support.planted_tracker import Planted, Sizes, attitude, plant, scalar_first, scan, still
 
 SIZES = Sizes(wild=5, offset_s=0.02)
 
@@ -62,7 +63,8 @@ def budget(ledger: Path, telemetry: Path | None = None) -> tuple[dict[str, Any],
 
 def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(planted: Planted, by_file) -> None:
     found, out, drawn = by_file
-    keys = ["bias_arcsec", "fov_arcsec", "pixel_arcsec", "noise_arcsec", "clock", "availability", "wrong", "limit_arcsec"]
+    keys = ["bias_arcsec", "fov_arcsec", "pixel_arcsec", "noise_arcsec", "clock", "availability", "wrong", "missed"]
+    keys += ["out_of_order", "limit_arcsec"]
     assert list(found) == keys
     assert list(found["clock"]) == ["offset_ms", "drift_ppm", "sigma_ms"]
     assert found["noise_arcsec"]["cross"] == pytest.approx(1.0, rel=0.1)
@@ -297,3 +299,117 @@ def test_slices_by_rate_show_where_the_noise_grows() -> None:
     assert slices[0].noise_cross_arcsec == pytest.approx(1.1, rel=0.05)
     assert slices[-1].noise_cross_arcsec == pytest.approx(1.9, rel=0.05)
     assert sum(each.answers for each in slices) == 5000
+
+
+REFRESH_HZ, EXPOSURE_S, NOISE_ARCSEC = 60.0, 0.1, 2.0
+BENCH_60_HZ = bench_text({"monitor": {"refresh_hz": REFRESH_HZ}, "tracker": {"exposure_s": EXPOSURE_S}})
+
+
+def turning(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Up to 1 deg/s across and 0.5 about the boresight: a frame that is missed is up to 60 arcsec off."""
+    turn = 2 * np.pi * t_s
+    return 84 + 10 * np.sin(turn / 63), 5 * np.sin(turn / 41 + 0.4), 6 * np.sin(turn / 75)
+
+
+def missing_run(folder: Path, missed: int, seed: int, seconds: float = 150.0, wild: int = 0) -> tuple[Path, Path, FloatArray]:
+    """A run that misses frames, and a tracker that answers exactly what was lit, with noise: ledger, telemetry, wild rows."""
+    rng = np.random.default_rng(seed)
+    slots = np.arange(int(seconds * REFRESH_HZ))
+    left_out: set[int] = set()
+    while len(left_out) < missed:
+        first = int(rng.integers(5, len(slots) - 20))
+        left_out.update(range(first, first + int(rng.integers(1, 8))))
+    shown = np.array([slot for slot in slots.tolist() if slot not in left_out])
+    frames_s = shown / REFRESH_HZ
+    frames_q = scalar_first(attitude(turning, frames_s))
+    before = np.diff(shown, prepend=-1) - 1
+    ledger = write_ledger(folder / "run.mcap", frames_s, frames_q, bench=BENCH_60_HZ, missed_before=before.tolist())
+    frames = LitFrames(1e9 / REFRESH_HZ / 1000)  # so that none is forgotten
+    frames._early_ns = round(0.5e9 / REFRESH_HZ)
+    for number, (t_s, q) in enumerate(zip(frames_s.tolist(), frames_q, strict=True)):
+        frames.add(LitFrame(number, round(t_s * 1e9), round(t_s * 1e9), q))
+    at_s, reported = [], []
+    for t_s in np.arange(1.0, seconds - 1.0, 0.2).tolist():
+        half_s = EXPOSURE_S / 2
+        lit = frames.over(round((t_s - half_s) * 1e9), round((t_s + half_s) * 1e9))
+        if lit is not None:
+            at_s.append(t_s)
+            reported.append(lit.q)
+    noise = Rotation.from_rotvec(rng.normal(0, np.radians(NOISE_ARCSEC / 3600), (len(at_s), 3)))
+    answers = scalar_first(noise * Rotation.from_quat(np.roll(np.array(reported), -1, axis=1)))
+    wild_rows = np.sort(rng.choice(len(at_s), wild, replace=False))
+    turn = Rotation.from_rotvec(np.tile(np.radians([0.0, 3.0, 0.0]), (wild, 1)))
+    if wild:
+        answers[wild_rows] = scalar_first(turn * Rotation.from_quat(np.roll(answers[wild_rows], -1, axis=1)))
+    return ledger, write_telemetry(folder / "telemetry.csv", np.array(at_s), answers), wild_rows
+
+
+@pytest.mark.parametrize(("missed", "seed"), [(67, 1), (200, 2), (405, 3)])
+def test_missed_frames_are_not_the_trackers_errors(tmp_path: Path, missed: int, seed: int) -> None:
+    ledger, telemetry, wild = missing_run(tmp_path, missed, seed, wild=4)
+    found, _ = budget(ledger, telemetry)
+    rows = len(telemetry.read_text().splitlines()) - 1
+    # Held or not, an answer 3 degrees off is wrong, and no other is.
+    assert [each["row"] for each in found["wrong"]] == (wild + 2).tolist()
+    assert missed <= found["missed"]["frames"] <= missed + 7
+    assert 0 < found["missed"]["answers_left_out"] < rows
+    # Sigmas of n answers: noise / sqrt(2 n), and a clock by 0.5 deg/s over 150 s.
+    kept = rows - found["missed"]["answers_left_out"]
+    assert found["noise_arcsec"]["cross"] == pytest.approx(NOISE_ARCSEC, rel=4 / np.sqrt(4 * kept))
+    assert found["clock"]["offset_ms"] == pytest.approx(0.0, abs=4 * found["clock"]["sigma_ms"])
+    assert found["clock"]["drift_ppm"] == pytest.approx(0.0, abs=4.0)
+    assert found["availability"] == pytest.approx(1 - len(wild) / rows, abs=0.01)
+
+
+def test_missed_frames_are_named_on_the_terminal_and_on_the_page(tmp_path: Path) -> None:
+    ledger, telemetry, _ = missing_run(tmp_path, 30, 4, seconds=60.0)
+    run = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "out", "--display-attitudes", "0")
+    (line,) = [line for line in run.stdout.splitlines() if line.startswith("missed frames")]
+    said = re.search(r"(\d+) \(.*% of refresh periods, up to .* s\); (\d+) answers looked while a frame was held", line)
+    assert said is not None and 30 <= int(said[1]) <= 37 and int(said[2]) > 0
+    assert line.split(None, 2)[2] in (tmp_path / "out" / "budget.html").read_text()
+    assert f"answers left out for held frames,,{said[2]}," in (tmp_path / "out" / "budget.csv").read_text()
+
+
+def test_a_run_that_missed_too_many_frames_for_a_budget_is_refused(tmp_path: Path) -> None:
+    ledger, telemetry, _ = missing_run(tmp_path, 1200, 5, seconds=30.0)
+    check_refused(ledger, telemetry, "the run missed so many frames that")
+
+
+def own_answers(planted: Planted, share: float, seed: int = 6) -> list[AnswerRecord]:
+    """The planted answers as a ledger has them, a share of them overtaken by the next one or two."""
+    rng = np.random.default_rng(seed)
+    records = []
+    for tau_s, q in zip(planted.tau_s.tolist(), planted.reported.tolist(), strict=True):
+        middle_ns = round((tau_s + 5) * 1e9)
+        overtaken = rng.random() < share and tau_s < planted.tau_s[-20]  # the ledger ends soon after its last frame
+        late_ns = 150_000_000 + bool(overtaken) * round(rng.uniform(0.11, 0.25) * 1e9)
+        records.append(
+            AnswerRecord(host_ns=middle_ns + late_ns, raw="", t_ns=middle_ns + 10**15, q=tuple(q), verdict="right",
+                         middle_ns=middle_ns, light_ns=middle_ns)
+        )  # fmt: skip
+    return sorted(records, key=lambda each: each.host_ns)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.05])
+def test_answers_out_of_order_give_the_budget_of_those_in_order(tmp_path: Path, planted: Planted, share: float) -> None:
+    ordered = write_ledger(tmp_path / "a.mcap", planted.frames_s, planted.frames_q, records=own_answers(planted, 0.0))
+    overtaken = write_ledger(tmp_path / "b.mcap", planted.frames_s, planted.frames_q, records=own_answers(planted, share))
+    (first, _), (second, notes) = budget(ordered), budget(overtaken)
+    assert first["out_of_order"] == 0
+    assert second["out_of_order"] == pytest.approx(share * len(planted.tau_s), rel=0.5)
+    assert len(second["wrong"]) == len(first["wrong"]) == 5
+    for key in ("bias_arcsec", "noise_arcsec", "fov_arcsec", "availability"):
+        assert second[key] == pytest.approx(first[key], rel=1e-6)
+    assert second["clock"]["drift_ppm"] == pytest.approx(first["clock"]["drift_ppm"], abs=1e-3)
+    assert not any("clock was set" in note for note in notes)
+
+
+def test_a_trackers_clock_that_was_set_is_said_and_arrivals_count(tmp_path: Path, planted: Planted) -> None:
+    records = own_answers(planted, 0.02)
+    for record in records[1000:]:
+        record.t_ns += 5 * 10**12
+    ledger = write_ledger(tmp_path / "c.mcap", planted.frames_s, planted.frames_q, records=records)
+    found, notes = budget(ledger)
+    assert any("clock was set" in note for note in notes)
+    assert (found["out_of_order"], len(found["wrong"])) == (0, 5)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.attitude.wire.byte_links import ACCEPT_EACH_S, HELD_S, TOLD_S, FileBytes, TcpBytes
+from hilstar.attitude.wire.byte_links import ACCEPT_EACH_S, HELD_S, TOLD_S, FileBytes, TcpBytes, refuse_no_file
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -155,7 +155,10 @@ def test_a_file_that_becomes_something_else_is_let_go_told_once_and_taken_again(
 def test_a_path_that_names_no_regular_file_at_the_start_is_refused(tmp_path, kind):
     replaced(tmp_path / "t.bin", kind)
     with pytest.raises(InputError, match=f"path = .*t.bin: {kind}; write the file"):
-        FileBytes(tmp_path / "t.bin", Notices(), FakeClock())
+        refuse_no_file(tmp_path / "t.bin")
+    # A reader that is started again in a run waits for the file instead.
+    with FileBytes(tmp_path / "t.bin", Notices(), FakeClock()) as link:
+        assert taken(link) == b"" and kind in link.trouble()
 
 
 def test_a_path_that_names_nothing_yet_and_then_a_device_is_not_opened(tmp_path):

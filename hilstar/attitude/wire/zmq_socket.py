@@ -120,19 +120,27 @@ def _raise_file_limit() -> None:
 class _Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
-    `lost` says that a connection has ended; the code that acts on it resets it. `place` is the port or path that was bound.
+    `lost` says that a connection has ended, and `left` has its file, unless another connection has that number by now; the code
+    that acts on them resets them. `place` is the port or path that was bound.
     """
 
     def __init__(
         self, watched: zmq.Socket[bytes], *, bound: bool, counts: LinkCounts, notices: Notices, clock: HostClock = HOST_CLOCK
     ) -> None:
         self.lost = False
+        self.left: set[int] = set()
         self.place: int | str = ""
         self._watched, self._bound, self._counts, self._notices, self._clock = watched, bound, counts, notices, clock
         self._open: dict[int, str] = {}  # file descriptor: peer, in the order of arrival
         self._shut: set[int] = set()
         self._failure = ""
         self.monitor = watched.get_monitor_socket(EVENTS)
+
+    def is_open(self, file: int) -> bool:
+        """Whether a connection has this file, by the events so far."""
+        if file not in self._open:
+            self.tend()
+        return file in self._open
 
     def tend(self) -> None:
         events = 0
@@ -151,6 +159,7 @@ class _Doorkeeper:
             self._counts.connections += 1
             self._open.pop(value, None)
             self._open[value] = ""
+            self.left.discard(value)
             with _connection(value) as connection:
                 name = () if connection is None else connection.getpeername()
                 self._open[value] = f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
@@ -167,6 +176,8 @@ class _Doorkeeper:
 
     def _leave(self, file: int) -> None:
         self.lost = True
+        if self._bound:
+            self.left.add(file)
         who, failure = self._open.pop(file, ""), self._failure
         self._failure = ""
         if file in self._shut:

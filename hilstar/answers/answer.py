@@ -36,7 +36,14 @@ class Answer:
 
 
 class AnswerSource(Protocol):
-    """Where answers come from. Never waits, never raises for what a tracker sends."""
+    """Where answers come from. Never waits, never raises for what a tracker sends.
+
+    `trouble` says why nothing is read, "" while answers are.
+    """
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing is read now."""
 
     def take(self) -> list[Answer]:
         """The answers since the last call, oldest first."""

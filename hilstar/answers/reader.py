@@ -171,8 +171,16 @@ class AnswersApart(Closing):
         plan.decoder(messages)
         self._refused: Counter[str] = Counter()
         self.details: dict[str, str] = {}
-        self._process = ReaderProcess(notices, clock=clock, name="the reader of the tracker's answers")
-        self._process.read(stream=partial(DecodingLink, plan))
+        form = plan.settings.format
+        runs_user_code = form.startswith("python:")
+        name = f"the reader of the tracker's answers{f' ({form})' if runs_user_code else ''}"
+        self._process = ReaderProcess(notices, clock=clock, name=name)
+        self._process.read(stream=partial(DecodingLink, plan), runs_user_code=runs_user_code)
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing is read now, "" while answers are: then it is not the tracker that is silent."""
+        return self._process.trouble
 
     def await_ready(self) -> None:
         """Wait until the process reads; not for long."""

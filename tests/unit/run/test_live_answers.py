@@ -28,7 +28,9 @@ DRAWN = SimpleNamespace(rate_cam_rad_s=None)
 
 
 class Queued:
-    """Answers that wait, and what was refused."""
+    """Answers that wait, and what was refused; `trouble` says why nothing is read."""
+
+    trouble = ""
 
     def __init__(self) -> None:
         self.waiting: deque[Answer] = deque()
@@ -123,3 +125,20 @@ def test_a_source_that_fails_ends_neither_the_run_nor_what_comes_after():
     with answers.running():
         wait_for(lambda: answers.figures.right)
     assert notices.counts() == {"answers-failed": 1}
+
+
+def test_a_reader_that_does_not_read_is_told_in_the_tracker_s_place():
+    source, notices, clock = Queued(), Notices(), FakeClock(NS_PER_S)
+    answers = LiveAnswers(BENCH, RULES, source, notices, Kept(), clock=clock)
+
+    def told(words: str) -> bool:
+        clock.work(NS_PER_S // 5)
+        return words in answers.figures.silent
+
+    with answers.running():
+        second_of_frames(answers)
+        source.trouble = "the reader (python:a:b) does not return"
+        wait_for(lambda: told("no answer is read: the reader (python:a:b) does not return"))
+        source.trouble = ""
+        wait_for(lambda: told("the tracker has not answered"))
+    assert notices.counts() == {"answers-unread": 1, "answers-read": 1, "tracker-silent": 1}

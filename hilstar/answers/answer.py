@@ -55,7 +55,14 @@ class StampOrder:
 
 
 class AnswerSource(Protocol):
-    """Where answers come from. Never waits, never raises for what a tracker sends."""
+    """Where answers come from. Never waits, never raises for what a tracker sends.
+
+    `unread` says why nothing is read, "" while answers are: then it is not the tracker that is silent.
+    """
+
+    @property
+    def unread(self) -> str:
+        """Why nothing is read now."""
 
     def take(self) -> list[Answer]:
         """The answers since the last call, oldest first."""

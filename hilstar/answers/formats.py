@@ -9,10 +9,8 @@ Laws:
 """
 
 import binascii
-import importlib
 import math
 import struct
-import sys
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -31,6 +29,7 @@ from hilstar.attitude.wire.packet import INT64, AnswerPacket, Refusal, checked_s
 from hilstar.attitude.wire.source import Components, Mounting, SentAttitudes
 from hilstar.bench.config.answers import MAX_FRAME_BYTES, AnswersSettings, FrameField, FrameLength, field_format
 from hilstar.errors import InputError, one_line, printable, shortened
+from hilstar.process.user_code import PREFIX, UserCodeError, user_function
 from hilstar.units import NS_PER_S
 
 MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
@@ -335,7 +334,7 @@ class AnswerDecoder:
     """Bytes in, answers and refusals out, by the format that a bench file names.
 
     `messages` says that each chunk is whole by itself (UDP, ZeroMQ). Raises InputError where a Python function cannot be
-    loaded; `folder` is searched for its module first.
+    loaded, whose module stands in `folder` or in a package of `trust`.
     """
 
     def __init__(
@@ -345,7 +344,7 @@ class AnswerDecoder:
         self.sent = SentAttitudes(settings.convention, Mounting(q_body_to_cam))
         self._messages, self._last_ns = messages, 0
         self.frames = FrameDecoder(settings)
-        self._function = _load(settings.format, folder) if settings.format.startswith("python:") else None
+        self._function = _load(settings, folder) if settings.format.startswith(PREFIX) else None
         self._cutter = self._make_cutter()
 
     def _make_cutter(self) -> Delimited | Measured | None:
@@ -424,18 +423,12 @@ def _of_json(line: bytes) -> JsonAnswer | RefusedAnswer:
         return RefusedAnswer("format", f'{error}; write {{"t_ns":..., "q":[w,x,y,z]}}', line)
 
 
-def _load(form: str, folder: Path | None) -> Callable[[bytes], Any]:
-    _, module, name = form.split(":")
-    if folder is not None and str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))
+def _load(settings: AnswersSettings, folder: Path | None) -> Callable[[bytes], Any]:
     try:
-        function = getattr(importlib.import_module(module), name)
-    except Exception as error:  # whatever a user's module does
-        why = one_line(f"{type(error).__name__}: {error}")
-        raise InputError(f'[answers] format = "{form}": {why}; name a module beside the bench file and its function') from error
-    if not callable(function):
-        raise InputError(f'[answers] format = "{form}": {name} is no function; name one that takes bytes and gives answers')
-    return function  # type: ignore[no-any-return]
+        return user_function(settings.format, folder or Path(), settings.trust)
+    except UserCodeError as error:
+        said = f'[answers] format = "{settings.format}": {error}'
+        raise InputError(f"{one_line(said)}; name a module beside the bench file and its function") from error
 
 
 def _of_function(function: Callable[[bytes], Any], chunk: bytes) -> Iterator[JsonAnswer | RefusedAnswer]:

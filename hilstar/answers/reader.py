@@ -38,6 +38,7 @@ from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.process.closing import Closing
 from hilstar.process.scheduling import HOST_CLOCK, HostClock
+from hilstar.process.user_code import PREFIX
 from hilstar.reading import open_regular
 from hilstar.units import NS_PER_S
 
@@ -204,8 +205,16 @@ class AnswersApart(Closing):
         self._refused: Counter[str] = Counter()
         self.details: dict[str, str] = {}
         self._trouble = ""
-        self._process = ReaderProcess(notices, clock=clock, name="the reader of the tracker's answers")
-        self._process.read(stream=partial(DecodingLink, plan))
+        form = plan.settings.format
+        runs_user_code = form.startswith(PREFIX)
+        name = f"the reader of the tracker's answers{f' ({form})' if runs_user_code else ''}"
+        self._process = ReaderProcess(notices, clock=clock, name=name)
+        self._process.read(stream=partial(DecodingLink, plan), runs_user_code=runs_user_code)
+
+    @property
+    def unread(self) -> str:
+        """Why nothing is read now, "" while answers are: then it is not the tracker that is silent."""
+        return self._process.trouble
 
     def await_ready(self) -> None:
         """Wait until the process reads; not for long."""

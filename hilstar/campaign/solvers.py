@@ -5,15 +5,13 @@ command that gets an image and prints a quaternion.
 """
 
 import contextlib
-import importlib
 import json
 import math
 import re
 import shlex
 import signal
-import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -33,6 +31,7 @@ from hilstar.errors import InputError, did_you_mean, one_line, shortened
 from hilstar.files import temporary_folder
 from hilstar.optics.glass_psf import GlassPsf
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
+from hilstar.process.user_code import UserCodeError, user_function
 from hilstar.rotation import multiply, normalise
 from hilstar.scene.psf import GaussianPsf, Psf
 from hilstar.tracker.centroiders import Places, psf_places
@@ -193,26 +192,16 @@ class CentroidSolver:
 class FunctionSolver:
     """Calls `function(image, tracker)` with DN, uint16 (height, width), and the facts of the tracker's optics.
 
-    It returns q_icrs_to_cam (w, x, y, z), or None where it finds none. `folder` is searched for the module first.
+    It returns q_icrs_to_cam (w, x, y, z), or None where it finds none. The module stands in `folder`.
     Raises InputError where there is no such function.
     """
 
     def __init__(self, name: str, folder: Path, timeout_s: float) -> None:
         self.name, self._timeout_s = name, timeout_s
-        module, _, function = name.removeprefix("python:").partition(":")
-        if not module or not function:
-            raise InputError(f"--solver {name}: names no function; {FORM}")
-        sys.path.insert(0, str(folder))
         try:
-            found: Any = getattr(importlib.import_module(module), function, None)
-        except Exception as error:
-            reason = one_line(f"{type(error).__name__}: {error}")
-            raise InputError(f"--solver {name}: {module} cannot be imported ({reason}); {FORM}") from error
-        finally:
-            sys.path.remove(str(folder))
-        if not callable(found):
-            raise InputError(f"--solver {name}: {module} has no function {function}; {FORM}")
-        self._function: Callable[..., Any] = found
+            self._function = user_function(name, folder)
+        except UserCodeError as error:
+            raise InputError(f"--solver {name}: {one_line(str(error))}; {FORM}") from error
 
     def solve(self, exposure: Exposure, tracker: SolvedTracker) -> SolverAnswer:
         """The function's answer. Raises SolverFault where it raises, takes too long, or its answer is no attitude."""

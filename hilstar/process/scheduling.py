@@ -13,6 +13,7 @@ import ctypes
 import gc
 import os
 import platform
+import resource
 import struct
 import sys
 import threading
@@ -173,13 +174,19 @@ def steady_loop() -> Iterator[str]:
             gc.enable()
         sys.setswitchinterval(interval_s)
         if scheduling.startswith("SCHED_FIFO"):
-            os.sched_setscheduler(0, *policy)
+            try:
+                os.sched_setscheduler(0, *policy)
+            except PermissionError:  # the kernel lets nobody but an administrator take that flag back
+                os.sched_setscheduler(0, policy[0] | os.SCHED_RESET_ON_FORK, policy[1])
 
 
 def raise_priority() -> str:
-    """Give this thread real-time priority where that is allowed; the scheduling that it got."""
+    """Give this thread real-time priority where that is allowed; the scheduling that it got.
+
+    What it starts has the normal one: a process that runs a user's code would else keep a core from everything.
+    """
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(FIFO_PRIORITY))
     except (OSError, AttributeError) as error:
         return f"normal: SCHED_FIFO is not allowed ({getattr(error, 'strerror', error)}); give this user rtprio in limits.conf"
     return f"SCHED_FIFO {FIFO_PRIORITY}"
@@ -203,6 +210,13 @@ class PromptWhileLight:
         self._allowed = self._prompt
         self._wall_s, self._cpu_s = wall_s, cpu_s
         self._looked_s, self._used_s = wall_s(), cpu_s()
+
+    def give_up(self) -> None:
+        """Run this process as any other from now on, and whatever it starts: it is about to run a user's code."""
+        _set_all_threads(os.SCHED_OTHER, 0)
+        self._allowed = self._prompt = False
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 
     def tend(self) -> None:
         """Look how much the process has done; quick, so that it may be called often."""

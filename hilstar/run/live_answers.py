@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import msgspec
+
 from hilstar.answers.answer import Answer, AnswerSource
 from hilstar.answers.judge import AnswerJudge, AnswerRules, Judged, TrackerFigures, unjudged
 from hilstar.answers.pairing import LitFrame, LitFrames
@@ -29,6 +31,8 @@ MAX_JUDGED_HZ = 100
 REST_S = 0.002  # after each, so that Python's lock is free for the frame loop
 TOO_MANY = "too many"
 SILENT, WRONG = "tracker-silent", "wrong-answer"
+UNREAD = "answers-unread"
+AGAIN_NS = 3 * NS_PER_S  # after the reader is back, a tracker's answer may take so long
 
 
 class LiveAnswers:
@@ -57,6 +61,7 @@ class LiveAnswers:
         self._judge = AnswerJudge(rules, self._frames)
         self._allowance = Allowance(MAX_JUDGED_HZ, MAX_JUDGED_HZ)
         self._too_many, self._figures_ns, self._untold = 0, 0, False
+        self._unread, self._unread_ns = "", 0  # the reader's, the newest, and when it lasted still
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-answers", daemon=True)
 
@@ -102,14 +107,27 @@ class LiveAnswers:
         refused = dict(self._source.refusals())
         if self._too_many:
             refused[TOO_MANY] = refused.get(TOO_MANY, 0) + self._too_many
-        self.figures = self._judge.figures(now_ns, refused, self._source.trouble())
-        if self.figures.silent:
-            self._notices.begin(SILENT, self.figures.silent)
-        else:
-            self._notices.end(SILENT, "tracker-answers", "the tracker answers")
+        figures = self._judge.figures(now_ns, refused, self._source.trouble())
+        self.figures = self._told(figures, now_ns)
         if self._untold:
             self._untold = False
             self.heard(self)
+
+    def _told(self, figures: TrackerFigures, now_ns: int) -> TrackerFigures:
+        """The figures, once it is told who is silent where no answer comes: the tracker, or what reads it here."""
+        reason = self._source.unread
+        if reason:
+            self._unread, self._unread_ns = reason, now_ns
+        unread = bool(self._unread) and now_ns - self._unread_ns < AGAIN_NS
+        if figures.silent and unread:  # the tracker may well answer
+            figures = msgspec.structs.replace(figures, silent=f"no answer is read: {self._unread}")
+        if figures.silent:
+            self._notices.begin(UNREAD if unread else SILENT, figures.silent)
+        if not figures.silent or unread:
+            self._notices.end(SILENT, "tracker-answers", "the tracker answers")
+        if not figures.silent or not unread:
+            self._notices.end(UNREAD, "answers-read", "the tracker's answers are read again")
+        return figures
 
     def _judged(self, answer: Answer) -> Judged:
         try:

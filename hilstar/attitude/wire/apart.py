@@ -5,11 +5,14 @@ The contract:
    read any more. A new order replaces the last one.
 2. The other process (`apart_child`) stamps each message and hands it over in a record that carries the order's number. Records
    of an earlier order are dropped here.
-3. It sends a sign of life every 0.1 s. Where it ends or hangs, a notice says so, and it is restarted with the same order.
+3. It sends a sign of life every 0.1 s. Where it ends or hangs, a notice says so, and it is restarted with the same order,
+   however seldom or briefly it is looked at from here.
 4. It ends with this process, however this one ends.
+5. It has real-time priority where that is allowed, but never where it runs a user's code.
 """
 
 import contextlib
+import math
 import os
 import pickle
 import select
@@ -37,6 +40,9 @@ MAX_BACK_OFF_S = 1.0
 STEADY_S = 10 * MAX_BACK_OFF_S
 HUNG_S = 0.4  # a sleeping process without a sign of life for this long hangs
 STALLED_S = 3.0  # a runnable process may wait this long for a core
+LOOPS_S = 1.0  # CPU that a process takes without a sign of life: it had a core, and did not return
+MAX_LOOK_S = 0.1  # between two looks, of what counts as silence: this process may have been stopped itself
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 STARTS_S = 30.0  # to start, on a machine whose cores are all busy
 READY_WITHIN_S = 5.0
 ENDS_WITHIN_S = 0.3  # in order; a signal leaves a command a second for all its ends
@@ -66,6 +72,7 @@ class ReadOrder(NamedTuple):
     number: int
     stream: OpenStream | None = None
     device: bool = False
+    runs_user_code: bool = False
 
 
 class Record(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -142,14 +149,16 @@ class ReaderProcess:
         self._wire: socket.socket | None = None
         self._stream = RecordStream()
         self._why, self._ready = "", False
-        self._silent_s = 0.0
+        self._silent_s, self._looked_ns, self._busy_from_s = 0.0, clock.now_ns(), math.nan
+        self._trouble = ""
         self._again = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, clock)
         self._begin()
 
     def _begin(self) -> None:
         self.generation += 1
         self._steady, self._why, self._stream = self._clock.within(STEADY_S), "", RecordStream()
-        self._ready, self._silent_s = False, 0.0
+        self._ready, self._silent_s, self._looked_ns = False, 0.0, self._clock.now_ns()
+        self._opened, self._busy_from_s = 0, math.nan  # the number of the order that it carries out
         wire, its_wire = socket.socketpair()
         wire.setblocking(False)
         self._wire = wire
@@ -177,9 +186,9 @@ class ReaderProcess:
             with contextlib.suppress(OSError):
                 socket.send_fds(self._wire, [line], [self._file] if self._order.device else [])
 
-    def read(self, stream: OpenStream | None = None, device: int | None = None) -> None:
+    def read(self, stream: OpenStream | None = None, device: int | None = None, *, runs_user_code: bool = False) -> None:
         """Order a stream to be opened, or a device, whose descriptor this process keeps; with neither, the device is let go."""
-        self._order = ReadOrder(self._order.number + 1, stream, device is not None)
+        self._order = ReadOrder(self._order.number + 1, stream, device is not None, runs_user_code)
         self._file = -1 if device is None else device
         self._give()
 
@@ -192,21 +201,47 @@ class ReaderProcess:
             return False
         poll = select.poll()
         poll.register(self._wire, select.POLLIN)
-        begun_ns = self._clock.now_ns()
         said = bool(poll.poll(timeout_ms))
-        # Only what was waited here counts: this process may have been stopped itself.
-        waited_s = min((self._clock.now_ns() - begun_ns) / NS_PER_S, timeout_ms / 1000)
-        self._silent_s = 0.0 if said else self._silent_s + waited_s
-        limit_s = STARTS_S
-        if self._ready and self._silent_s > HUNG_S:
-            limit_s = STALLED_S  # it may run, or wait for a core; one that is stopped or asleep does neither
-            with contextlib.suppress(OSError, IndexError):
-                if self._process is not None:
-                    status = Path(f"/proc/{self._process.pid}/stat").read_text()
-                    limit_s = STALLED_S if status.rpartition(")")[2].split()[0] == "R" else HUNG_S
-        if self._silent_s > limit_s:
-            self._ended(f"no sign of life for {limit_s:g} s")
+        now_ns = self._clock.now_ns()
+        passed_s, self._looked_ns = (now_ns - self._looked_ns) / NS_PER_S, now_ns
+        self._silent_s = 0.0 if said else self._silent_s + min(passed_s, max(timeout_ms / 1000, MAX_LOOK_S))
+        if self._silent_s > (STARTS_S if self._starting else HUNG_S):
+            self._look_closely()
+        else:
+            self._busy_from_s = math.nan
         return said
+
+    def _look_closely(self) -> None:
+        """End a process that is silent, unless it may be waiting for a core."""
+        state, cpu_s = self._state()
+        if math.isnan(self._busy_from_s):
+            self._busy_from_s = cpu_s
+        used_s = cpu_s - self._busy_from_s
+        if not self._starting and state == "R" and used_s > LOOPS_S:
+            self._ended(f"it took {used_s:.1f} s of a core over one message, and did not return")
+        elif self._starting or state != "R" or self._silent_s > STALLED_S:
+            limit_s = STARTS_S if self._starting else STALLED_S if state == "R" else HUNG_S
+            self._ended(f"no sign of life for {limit_s:g} s")
+
+    def _state(self) -> tuple[str, float]:
+        """What Linux says that the process does ("R" runs or waits for a core), and its CPU time, s."""
+        with contextlib.suppress(OSError, IndexError, ValueError):
+            if self._process is not None:
+                fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+                return fields[0], (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+        return "", 0.0
+
+    @property
+    def _starting(self) -> bool:
+        """Whether it still imports what it needs: its own modules, or a user's, which its order names."""
+        return not self._ready or (self._order.runs_user_code and self._opened != self._order.number)
+
+    @property
+    def trouble(self) -> str:
+        """Why the process reads nothing now, or has just begun to again; "" while it reads."""
+        if self._silent_s > HUNG_S and not self._starting:
+            return f"{self._name} does not return"
+        return self._trouble
 
     def await_ready(self) -> None:
         """Wait until the process has imported what it needs; not for long, and not for one that failed."""
@@ -231,7 +266,9 @@ class ReaderProcess:
         taken: list[Record] = []
         try:
             for record in self._stream.feed(chunk):
-                self._ready = True
+                self._ready, self._opened = True, max(self._opened, record.order)
+                if not self._starting:
+                    self._trouble = ""
                 if record.end is not None:
                     self._why = record.end
                 elif record.order == self._order.number != 0 and not record.told_to(self._notices):
@@ -244,6 +281,7 @@ class ReaderProcess:
         code = self._stop(0.0)
         self._again.put_off(anew=self._steady.over)
         why = self._why or why or (f"signal {-code}" if code < 0 else f"exit code {code}")
+        self._trouble = f"{self._name} stopped ({why}) and is being restarted"
         self._notices.tell("receiver-failed", f"{self._name} stopped ({why}); restarting it")
 
     def _stop(self, patience_s: float) -> int:

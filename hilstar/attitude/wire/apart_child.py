@@ -166,7 +166,10 @@ def main() -> NoReturn:
             ordered = wire.order(LIFE_S * 1000 if reading.link is None else 0)
             if ordered is not None:
                 reading.close()
+                if ordered[0].runs_user_code:  # which may loop for ever, and is imported as the link is opened
+                    priority.give_up()
                 reading = _Reading(wire, *ordered)
+                wire.put(Record(ordered[0].number))  # a user's module may take seconds to import
             if reading.link is not None:
                 reading.hand_over(reading.link)
             priority.tend()

@@ -31,6 +31,10 @@ KEPT_FRAMES = 8  # at the sender for each watcher, an eighth of a second at 60 H
 WAITING_FRAMES = 64  # at the watcher, which reads between two answers
 MAX_FRAME_BYTES = 1 << 27  # every pixel of 4K, three channels of 16 bits
 MAX_SIDE_PX = 32_768
+HEAD_BEGINS = b'{"frame":'  # a topic asks for frames where it begins so, or this begins with it
+SUBSCRIBES, UNSUBSCRIBES = 1, 0  # the first byte of what a watcher sends
+MAX_TOPICS = 64  # of a connection; one with more counts as watching until it ends
+MAX_READ = 1000  # subscriptions in one look: one who floods delays no frame
 
 
 class FrameHead(msgspec.Struct, frozen=True):
@@ -92,21 +96,53 @@ def _checked(first: bytes, indices: bytes, values: bytes) -> ShownFrame:
 
 
 class FrameSender(ZmqSender):
-    """Sends frames to watchers; never waits for one."""
+    """Sends frames to watchers; never waits for one.
+
+    It counts who watches by connection. libzmq also passes an unsubscription on whose connection never subscribed, and one that
+    ends without a word it reports without saying whose it was: so each is taken from its own connection alone, and what a
+    connection has left is forgotten when the connection ends.
+    """
 
     LINGER_MS, STOPPED_LINGER_MS = 0, 0
-    watched = False
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
         super()._configure(made)
         made.setsockopt(zmq.SNDHWM, KEPT_FRAMES)
+        made.setsockopt(zmq.XPUB_VERBOSER, 1)  # every connection's, not only the first and the last of a topic
+        self._topics: dict[int, set[bytes]] = {}  # by the connection's file descriptor
 
     def look(self) -> bool:
         """Read who subscribes and who leaves; True while somebody watches."""
         self._tend()
-        while (message := self._take()) is not None:
-            self.watched = message[:1] == b"\x01"
-        return self.watched
+        if self._keeper is not None:
+            for file in self._keeper.left:
+                self._topics.pop(file, None)
+            self._keeper.left.clear()
+        for _ in range(MAX_READ):
+            try:
+                said = self._ready().recv(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                break
+            with contextlib.suppress(zmq.ZMQError):  # libzmq's own, of a connection that has ended
+                self._take_subscription(said.get(zmq.SRCFD), said.bytes)
+        return bool(self._topics)
+
+    def _take_subscription(self, file: int, said: bytes) -> None:
+        kind, topic = said[:1], said[1:]
+        if not (HEAD_BEGINS.startswith(topic) or topic.startswith(HEAD_BEGINS)):
+            return
+        if self._keeper is None or not self._keeper.is_open(file):  # what it sent is read after its end
+            return
+        if kind == bytes([SUBSCRIBES]):
+            topics = self._topics.setdefault(file, set())
+            if len(topics) < MAX_TOPICS:
+                topics.add(topic)
+        elif kind == bytes([UNSUBSCRIBES]) and file in self._topics:
+            topics = self._topics[file]
+            if len(topics) < MAX_TOPICS:
+                topics.discard(topic)
+            if not topics:
+                del self._topics[file]
 
     def put_frame(self, frame: ShownFrame) -> None:
         """Send one frame."""

@@ -127,8 +127,9 @@ def _raise_file_limit() -> None:
 class _Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
-    `lost` says that a connection has ended; the code that acts on it resets it. `place` is the port or path that was bound.
-    A connection that ends before its handshake was with no partner: `look` finds out what is there, None where we bind.
+    `lost` says that a connection has ended, and `left` has its file, unless another connection has that number by now; the
+    code that acts on them resets them. `place` is the port or path that was bound. A connection that ends before its
+    handshake was with no partner: `look` finds out what is there, None where we bind.
     """
 
     def __init__(
@@ -141,6 +142,7 @@ class _Doorkeeper:
         clock: HostClock = HOST_CLOCK,
     ) -> None:
         self.lost = False
+        self.left: set[int] = set()
         self.place: int | str = ""
         self._watched, self._look, self._counts, self._notices, self._clock = watched, look, counts, notices, clock
         self._bound = look is None
@@ -151,6 +153,12 @@ class _Doorkeeper:
         self._shut: set[int] = set()
         self._failure = ""
         self.monitor = watched.get_monitor_socket(EVENTS)
+
+    def is_open(self, file: int) -> bool:
+        """Whether a connection has this file, by the events so far."""
+        if file not in self._open:
+            self.tend()
+        return file in self._open
 
     def tend(self) -> None:
         events = 0
@@ -171,6 +179,7 @@ class _Doorkeeper:
             self._open.pop(value, None)
             self._open[value] = ""
             self._ungreeted[value] = self._clock.now_ns()
+            self.left.discard(value)
             with _connection(value) as connection:
                 name = () if connection is None else connection.getpeername()
                 self._open[value] = f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
@@ -190,6 +199,8 @@ class _Doorkeeper:
 
     def _leave(self, file: int) -> None:
         self.lost = True
+        if self._bound:
+            self.left.add(file)
         who, failure = self._open.pop(file, ""), self._failure
         greeted, self._failure, self._greeted = self._greeted, "", False
         accepted_ns = self._ungreeted.pop(file, None)

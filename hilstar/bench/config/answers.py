@@ -60,6 +60,9 @@ class AnswersSettings(Table, frozen=True):
     #: message. `"frame"`: the tracker's own telemetry, declared by the keys below. `"python:MODULE:FUNCTION"`: bytes in,
     #: answers out.
     format: Annotated[str, Meta(extra={"form": '"packet", "json", "frame" or "python:MODULE:FUNCTION"'})] = "packet"
+    #: `"python:..."`: installed packages that MODULE may belong to, as well as to the bench file's folder (see
+    #: [what runs](what-runs.md)).
+    trust: Annotated[tuple[str, ...], Meta(extra={"form": '["PACKAGE", ...]'})] = ()
     #: ZeroMQ: the address to which hilstar's SUB socket connects. UDP: `udp://ADDRESS:PORT`, another way to write `bind`.
     #: Default: `tcp://127.0.0.1:5562` for ZeroMQ
     endpoint: str | None = None
@@ -161,6 +164,12 @@ Faults = Iterator[tuple[bool, str]]  # what is wrong, and what is said of it
 def check_answers(settings: AnswersSettings) -> None:
     """Refuse (InputError) keys of another road or format, and what a road or a frame lacks."""
     of_frame = settings.format == "frame"
+    of_python = settings.format.startswith("python:")
+    if settings.trust and not of_python:
+        raise InputError(f'trust is for format = "python:MODULE:FUNCTION"; remove it (format = "{shortened(settings.format)}")')
+    for package in settings.trust:
+        if not package.isidentifier():
+            raise InputError(f'trust = ["{shortened(package)}"]: no name of a package; write what `import` takes')
     for wrong, said in chain(_road_faults(settings), _frame_faults(settings) if of_frame else _format_faults(settings)):
         if wrong:
             raise InputError(said)

@@ -286,3 +286,36 @@ def test_what_is_shown_now_is_asked_of_a_run_s_page(tmp_path, monkeypatch):
                 thread.join()
         assert "scalar first cam_to_icrs" in found
         assert ("> scalar first cam_to_icrs" in found) == marked
+
+
+LOOPING = """
+import os, pathlib, time
+pathlib.Path(__file__).with_name("class").write_text(str(os.sched_getscheduler(0)))
+def decode(data):
+    while data == b"loop": pass
+    while data == b"sleep": time.sleep(1)
+    if data == b"exit": os._exit(3)
+    return [{"t_ns": int(data), "q": [0.6, 0, 0.8, 0]}]
+"""
+
+
+@pytest.mark.parametrize("poison", [b"loop", b"sleep", b"exit"])
+def test_a_function_that_does_not_return_is_ended_and_named_and_the_next_answers_come(tmp_path, caplog, poison):
+    (tmp_path / "looping_tracker.py").write_text(LOOPING)
+    keys = f'source = "udp"\nbind = "127.0.0.1:{(port := free_port())}"\nformat = "python:looping_tracker:decode"'
+    to = ("127.0.0.1", port)
+    with reading(tmp_path, keys) as source, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        gathered(source, 1, lambda: sender.sendto(b"1", to))
+        reader = source._process._process
+        assert (tmp_path / "class").read_text() == str(os.SCHED_OTHER)
+        assert os.sched_getscheduler(reader.pid) == os.SCHED_OTHER
+        sender.sendto(poison, to)
+
+        def told() -> bool:  # as a run looks at it: fifty times a second, without waiting
+            source.take()
+            return "receiver-failed" in caplog.text or "python:looping_tracker:decode) stopped" in caplog.text
+
+        wait_for(told, "the reader is ended", poll_s=0.02)
+        assert source.trouble and reader.poll() is not None
+        gathered(source, 1, lambda: sender.sendto(b"2", to))
+        assert not source.trouble

@@ -231,6 +231,31 @@ def test_a_python_function_decodes_and_its_faults_are_counted(tmp_path: Path):
         AnswerDecoder(settings_of(format="python:no_such_module:decode", fields=[]), None, False, tmp_path)
 
 
+@pytest.mark.parametrize("name", ["os:system", "subprocess:run", "numpy:load", "os.path:join", "json:loads", "builtins:exec"])
+def test_a_function_of_a_module_that_is_not_beside_the_bench_file_is_refused(tmp_path: Path, name: str):
+    module, _, _ = name.partition(":")
+    with pytest.raises(InputError, match="stands in"):
+        AnswerDecoder(settings_of(format=f"python:{name}", fields=[]), None, False, tmp_path)
+    (tmp_path / f"{module.partition('.')[0]}.py").write_text("")  # nor does a file of that name let it in
+    with pytest.raises(InputError, match="is the name of a module of Python or of hilstar"):
+        AnswerDecoder(settings_of(format=f"python:{name}", fields=[]), None, False, tmp_path)
+
+
+def test_a_package_that_is_trusted_may_be_named_and_only_that(tmp_path: Path):
+    AnswerDecoder(settings_of(format="python:json:loads", fields=[], trust=["json"]), None, False, tmp_path)
+    with pytest.raises(InputError, match="stands in"):
+        AnswerDecoder(settings_of(format="python:os:system", fields=[], trust=["json"]), None, False, tmp_path)
+
+
+def test_modules_of_one_name_in_two_folders_are_two(tmp_path: Path):
+    for k in range(2):
+        (folder := tmp_path / str(k)).mkdir()
+        (folder / "same_name.py").write_text("import beside\ndef decode(data): return [{'t_ns': beside.T, 'q': [1, 0, 0, 0]}]")
+        (folder / "beside.py").write_text("T = 7")
+        decoder = AnswerDecoder(settings_of(format="python:same_name:decode", fields=[]), None, False, folder)
+        assert [each.t_ns for each in decoder.feed(0, b"")] == [7]
+
+
 WRONG = {
     "needs framing": {},
     "needs sync_hex": {"framing": "sync", "length": 39},

@@ -28,7 +28,9 @@ DRAWN = SimpleNamespace(rate_cam_rad_s=None)
 
 
 class Queued:
-    """Answers that wait, and what was refused."""
+    """Answers that wait, and what was refused; `unread` says why nothing is read."""
+
+    unread = ""
 
     def __init__(self) -> None:
         self.waiting: deque[Answer] = deque()
@@ -131,3 +133,20 @@ def test_a_source_that_fails_ends_neither_the_run_nor_what_comes_after():
     # The one that could not be judged is counted and recorded all the same.
     assert (answers.figures.answers, answers.figures.unjudged) == (2, 1)
     assert [(record.raw, record.verdict) for record in kept.records] == [("07", "unjudged"), ("", "right")]
+
+
+def test_a_reader_that_does_not_read_is_told_in_the_tracker_s_place():
+    source, notices, clock = Queued(), Notices(), FakeClock(NS_PER_S)
+    answers = LiveAnswers(BENCH, RULES, source, notices, Kept(), clock=clock)
+
+    def told(words: str) -> bool:
+        clock.work(NS_PER_S // 5)
+        return words in answers.figures.silent
+
+    with answers.running():
+        second_of_frames(answers)
+        source.unread = "the reader (python:a:b) does not return"
+        wait_for(lambda: told("no answer is read: the reader (python:a:b) does not return"))
+        source.unread = ""
+        wait_for(lambda: told("the tracker has not answered"))
+    assert notices.counts() == {"answers-unread": 1, "answers-read": 1, "tracker-silent": 1}

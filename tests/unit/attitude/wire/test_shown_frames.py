@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import socket
+from contextlib import closing
+
 import msgspec
 import numpy as np
 import pytest
 
-from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame, frame_parts, read_frame
+from hilstar.attitude.wire.shown_frames import (
+    MAX_TOPICS,
+    FrameHead,
+    FrameSender,
+    FrameWatch,
+    ShownFrame,
+    frame_parts,
+    read_frame,
+)
 from hilstar.run.frame_feed import lit_pixels
+from tests.support.waiting import PATIENCE_S, wait_for
 
 HEAD = FrameHead(frame=7, lit_ns=123, width=5, height=3, bits=8, q=(1.0, 0.0, 0.0, 0.0))
 LIT = np.array([2, 14], dtype=np.uint32)
@@ -49,3 +61,88 @@ def test_what_is_no_frame_is_refused(change):
 def test_lit_pixels_are_those_over_code_zero(kind, width, rng):
     levels = (rng.integers(0, 300, (7, width)) * (rng.random((7, width)) < 0.2)).astype(kind)
     assert np.array_equal(lit_pixels(levels), np.flatnonzero(levels))
+
+
+GREETING = bytes([0xFF, *7 * [0], 0x01, 0x7F, 3, 0]) + b"NULL".ljust(20, b"\0") + bytes(32)  # ZMTP 3.0 (RFC 23)
+READY = b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB"
+FRAME = ShownFrame(HEAD, LIT, np.array([9, 9], dtype=np.uint8))
+
+
+class RawWatcher:
+    """A subscriber that sends what it likes: libzmq's own leaves out what it never subscribed to."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", int(endpoint.rpartition(":")[2])), PATIENCE_S)
+        self.socket.sendall(GREETING + READY)
+        heard = b""
+        while b"READY" not in heard:  # a message before that would end the handshake
+            heard += self.socket.recv(4096)
+
+    def says(self, *bodies: bytes) -> None:
+        """Send messages of one part each: 1 or 0, and a topic."""
+        self.socket.sendall(b"".join(bytes([0, len(body)]) + body for body in bodies))
+
+    def crash(self) -> None:
+        self.socket.close()
+
+
+@pytest.fixture
+def sender():
+    with closing(FrameSender("tcp://127.0.0.1:*")) as opened:
+        yield opened
+
+
+def seen_by(watcher: FrameWatch, sender: FrameSender) -> None:
+    """Wait until a frame that the sender sends, while it believes to be watched, arrives."""
+
+    def arrives() -> bool:
+        if sender.look():
+            sender.put_frame(FRAME)
+        return bool(watcher.frames(10))
+
+    wait_for(arrives, "a frame")
+
+
+def settled(sender: FrameSender) -> None:
+    """Wait until what was sent before has been read: a further watcher, which subscribes last, is seen, and leaves."""
+    with closing(FrameWatch(sender.endpoint)) as last:
+        seen_by(last, sender)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        [b"\1other", b"\0other"],
+        [b"\0"],  # what it never subscribed to, and the watcher did
+        [b"\1", b"\0", b"\0", b"\0"],
+        [b"\1", b"\1", b"\0"],
+        [b"\1" + str(k).encode() for k in range(3000)],
+        [b'\1{"frame":' + str(k).encode() for k in range(3 * MAX_TOPICS)],
+        [b'\0{"frame":1', b"\0{", b"hello", b""],
+    ],
+)
+@pytest.mark.parametrize("crashes", [True, False])
+def test_a_watcher_goes_on_whatever_another_subscribes_to_and_however_it_leaves(sender, said, crashes):
+    with closing(FrameWatch(sender.endpoint)) as watcher:
+        seen_by(watcher, sender)
+        other = RawWatcher(sender.endpoint)
+        other.says(*said)
+        settled(sender)
+        if crashes:
+            other.crash()
+        assert sender.look()
+        seen_by(watcher, sender)
+        other.crash()
+    wait_for(lambda: not sender.look(), "nobody watches any more")
+
+
+def test_who_asks_for_another_topic_or_has_unsubscribed_does_not_watch(sender):
+    other = RawWatcher(sender.endpoint)
+    other.says(b"\1other")
+    settled(sender)
+    wait_for(lambda: not sender.look(), "it does not watch")
+    other.says(b"\1{")
+    wait_for(sender.look, "it watches")
+    other.says(b"\0{")
+    wait_for(lambda: not sender.look(), "it has unsubscribed")
+    other.crash()

@@ -17,10 +17,9 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.cameras import ideal_monitor, tracker_camera
-from hilstar.calibrate.geometric.calibration import MIN_DOTS, SEED, matched
+from hilstar.calibrate.geometric.calibration import MIN_DOTS, SEED, dot_sigma_px, matched, nominal_of
 from hilstar.calibrate.geometric.dots import DOT_PX, read_plan
-from hilstar.calibrate.geometric.fit import MatchedDots, Nominal
+from hilstar.calibrate.geometric.fit import MatchedDots
 from hilstar.calibrate.geometric.match import first_look
 from hilstar.calibrate.geometric.observed import measure_images, numbered, read_image
 from hilstar.charts import chart
@@ -151,11 +150,9 @@ def _functions(knots_px: FloatArray, offset_px: FloatArray, side_px: FloatArray)
 def effective_psf(file: BenchFile, images: Sequence[Path], plan: Path, dark: Path | None, per_px: int) -> "Found":
     """The effective PSF from a tracker's images of planned dots. Raises InputError."""
     config = file.config
-    nominal = Nominal(
-        ideal_monitor(config), np.array(config.collimator.q_cam_to_mon), tracker_camera(config.tracker, file.folder)
-    )
+    nominal = nominal_of(file)
     dots = read_plan(plan)
-    seen = measure_images(images, dark, config.tracker.resolution_px)
+    seen = measure_images(images, dark, config.tracker.resolution_px, dot_sigma_px(file))
     look = first_look(dots, nominal, seen, np.random.default_rng(SEED))
     _, data = matched(dots, nominal, seen, look)
     if len(np.unique(data.dot)) < MIN_DOTS:

@@ -17,7 +17,7 @@ from hilstar.bench.build import bench_calibration, calibration_source, open_benc
 from hilstar.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.calibrate.first_light import image_sources
 from hilstar.calibrate.first_light.context import StepContext
-from hilstar.calibrate.first_light.geometry import sharpness
+from hilstar.calibrate.first_light.focus import sharpness
 from hilstar.calibrate.first_light.photometry import Assumed, Photometer
 from hilstar.calibrate.geometric.dots import DOT_PX
 from hilstar.calibrate.latency import pair, swap_to_square_ms
@@ -28,7 +28,7 @@ from hilstar.monitor.identity import MonitorIdentity
 from hilstar.monitor.response import Response
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.twin.optics import BenchGeometry
-from hilstar.units import ERROR_OF_MEDIAN, NS_PER_MS, NS_PER_S
+from hilstar.units import NS_PER_MS, NS_PER_S
 
 APART_TRACKER_PX = 12.0  # from dot to dot: a dot that moved by half of it would be taken for its neighbour
 EDGE_TRACKER_PX = 8.0
@@ -235,8 +235,8 @@ class ImageReader:
             raise InputError(f"{int(kept.sum())} dots are where the bench file has them; run the geometry again (first-light)")
         ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
         sharp, at = sharpness(image, DOT_PX * ratio), near[kept]
-        psf_u = ERROR_OF_MEDIAN * float(sharp.each_psf_sigma_px.std()) / math.sqrt(len(sharp.x_px))
-        return DotReadings(x[kept], y[kept], found.x_px[at], found.y_px[at], found.flux[at], sharp.psf_sigma_px, psf_u)
+        places = x[kept], y[kept], found.x_px[at], found.y_px[at]
+        return DotReadings(*places, found.flux[at], sharp.psf_sigma_px, sharp.psf_sigma_error_px)
 
     def delays_ms(self) -> FloatArray:
         """The photodiode's edges, where there is one."""

@@ -3,12 +3,13 @@
 Before it the session's records: session.json, and the keys set in the bench file.
 """
 
+import dataclasses
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,10 +19,12 @@ from hilstar.bench.bench_file import BenchFile, read_bench_file, with_key
 from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera, tracker_psf
 from hilstar.bench.config import parse_config
 from hilstar.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, VirtualBench, black
+from hilstar.calibrate.geometric.dots import SeenScreen
 from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError, shortened
 from hilstar.files import make_directory, write_whole
 from hilstar.reading import NOT_JSON, exists, read_bytes
+from hilstar.rotation import to_matrix
 from hilstar.run.sync import BeatSummary
 from hilstar.scene.psf import Psf
 from hilstar.tracker.mosaic import software_image
@@ -31,6 +34,7 @@ Verdict = Literal["done", "skipped", "failed"]
 Figure = float | int | str
 TomlValue = float | int | str | bool | list[int]
 
+END_SHARE = 1e-3  # of an end: a figure so near to it was stopped by it
 MAX_SESSION_BYTES = 20_000_000
 MAX_FILE_BYTES = 2_000_000_000
 KIND = "hilstar first light 1"
@@ -62,9 +66,27 @@ class StepNumber(msgspec.Struct, frozen=True):
     of: str
 
 
+class FittedFigure(NamedTuple):
+    """A figure of a fit, and the ends of its model: a figure at an end was not found there, the model stopped it."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+
+    @property
+    def is_at_end(self) -> bool:
+        """Whether the figure is at an end of its model."""
+        below, above = END_SHARE * abs(self.low), END_SHARE * abs(self.high)
+        return not self.low + below < self.value < self.high - above
+
+
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """The result of a step: one line, figures, files made, pictures for the page, keys to set, and its one figure."""
+    """The result of a step: one line, figures, files made, pictures for the page, keys to set, and its one figure.
+
+    `fitted` has the figures of its fits whose models have ends; a step with one at an end is never done (see `checked`).
+    """
 
     verdict: Verdict
     line: str
@@ -73,6 +95,18 @@ class StepOutcome:
     pictures: tuple[Path, ...] = ()
     changes: tuple[KeyChange, ...] = ()
     number: StepNumber | None = None
+    fitted: tuple[FittedFigure, ...] = ()
+
+    def checked(self) -> "StepOutcome":
+        """This outcome; failed, and without its changes, where a figure is at an end of its model."""
+        at_end = [each for each in self.fitted if each.is_at_end]
+        if self.verdict != "done" or not at_end:
+            return self
+        ends = ", ".join(
+            f"{each.name} {each.value:.4g} is at an end of its model ({each.low:g} to {each.high:g})" for each in at_end
+        )
+        line = f"{self.line}; but {ends}, so it was not measured and nothing was changed"
+        return dataclasses.replace(self, verdict="failed", line=line, changes=(), number=None)
 
 
 class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -159,6 +193,8 @@ def rewrite(file: BenchFile, changes: Sequence[KeyChange]) -> BenchFile:
     return read_bench_file(file.path)
 
 
+# Figures of the step `orientation`: the monitor's camera as the figure was seen, with its q_cam_to_mon.
+SEEN_FOCAL, SEEN_Q = "seen_focal_length_px", ("seen_qw", "seen_qx", "seen_qy", "seen_qz")
 MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
 HOT_FILL = 0.5  # a pixel above this in the dark frame is hot, and is not used
 LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
@@ -223,6 +259,22 @@ class StepContext:
     def real_geometry(self) -> BenchGeometry:
         """Monitor and tracker with the measured lens."""
         return BenchGeometry(bench_camera(self.file.config, self.file.folder), self.geometry().tracker)
+
+    @property
+    def seen_screen(self) -> SeenScreen:
+        """The part of the screen that the tracker sees, by the figure of the step `orientation` where it was measured."""
+        geometry = self.geometry()
+        focal_px = self.known.get(f"orientation.{SEEN_FOCAL}")
+        if focal_px is None:
+            return SeenScreen(geometry.monitor, geometry.tracker, is_sure=False)
+        turn = np.array([float(self.known[f"orientation.{name}"]) for name in SEEN_Q])
+        monitor = dataclasses.replace(geometry.monitor, focal_length_px=float(focal_px), cam_to_image=to_matrix(turn))
+        return SeenScreen(monitor, geometry.tracker, is_sure=True)
+
+    @property
+    def psf_sigma_px(self) -> float:
+        """The sigma of the tracker's PSF: that of the step `focus` where it is done, else the bench file's."""
+        return float(self.known.get("focus.psf_sigma_px", np.mean(self.tracker_psf.width_px)))
 
     def names(self, table: str, key: str, path: Path) -> tuple[KeyChange, ...]:
         """The change of a key of the bench file that names a file of the session; none where it does already."""

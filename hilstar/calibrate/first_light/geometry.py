@@ -5,31 +5,43 @@ import math
 from dataclasses import astuple, dataclass, replace
 from operator import ne
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.spatial.transform import Rotation
 
 from hilstar.arrays import FloatArray
-from hilstar.calibrate.effective_psf import dots_of_image, draw_effective, fit_effective
 from hilstar.calibrate.first_light.context import (
+    SEEN_FOCAL,
+    SEEN_Q,
     DarkSubtracted,
     Figure,
+    FittedFigure,
     KeyChange,
     StepContext,
     StepNumber,
     StepOutcome,
     with_changes,
 )
+from hilstar.calibrate.first_light.focus import PLAN_SEED, dot_code, first_dots
 from hilstar.calibrate.first_light.image_sources import Pattern, black
-from hilstar.calibrate.geometric.calibration import calibrate_files, notes_for_a_person, parameters_of, write_calibrated
-from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, dot_image, plan_dots, write_plan
+from hilstar.calibrate.geometric.calibration import (
+    Calibrated,
+    calibrate_seen,
+    dot_sigma_px,
+    notes_for_a_person,
+    parameters_of,
+    rough_geometry,
+    write_calibrated,
+)
+from hilstar.calibrate.geometric.dots import DotPlan, dot_image, joined, lit_for, plan_seen_dots, write_plan
+from hilstar.calibrate.geometric.fit import FIELD_DEGREES
+from hilstar.calibrate.geometric.observed import Observed, measure_images
 from hilstar.charts import DARK, ORANGE, TEXT_PT, chart
 from hilstar.errors import InputError
 from hilstar.files import make_directory
+from hilstar.rotation import from_matrix
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.twin.optics import BenchGeometry
-from hilstar.units import ERROR_OF_MEDIAN
 
 FIGURE_REACH = 0.25  # half the figure's side, relative to the smaller side of what both screen and tracker have
 SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
@@ -72,10 +84,13 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
 
 THRESHOLD_SIGMA = 8.0
 MIN_PIXELS = 3
-MAX_MISFIT = 0.5  # from the nearest of the eight orientations; half way to another one is 1
+MAX_STRETCH = 1.25  # of the figure's one side to its other: a tilt of 35 degrees
+SPOT_ERROR_PX = 0.1  # of a square's centroid in the tracker's image, by its threshold and the lens
 MAX_SCALE = 2.0
 MIN_SIZE_STEP = 1.3  # between the pixels of one square and the next
 UPRIGHT = (1, 0, 0, 1)
+QUARTER_TURNS = ((0, -1, 1, 0), (0, 1, -1, 0))
+OBLIQUE_DEG = 40.0  # from the nearest right angle
 WAYS = {
     UPRIGHT: "upright",
     (-1, 0, 0, 1): "mirrored left to right",
@@ -95,7 +110,8 @@ NOT_SEEN = "show the monitor to the whole of the tracker's field, expose longer,
 class SeenFigure:
     """The figure in the tracker's image: its orientation (a 2 x 2 matrix, row by row), scale, remaining turn and squares.
 
-    The turn's error is half of what the figure's two sides disagree by.
+    The turn's error is half of what the figure's two sides disagree by, and that of the spots. `focal_length_px` of the monitor
+    and `q_cam_to_mon` (4,) are those that put the figure where it is seen.
     """
 
     way: tuple[int, int, int, int]
@@ -104,6 +120,8 @@ class SeenFigure:
     turn_error_deg: float
     x_px: FloatArray
     y_px: FloatArray
+    focal_length_px: float
+    q_cam_to_mon: FloatArray
 
 
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
@@ -123,6 +141,7 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
             f"the three largest spots have {counts} pixels and cannot be told apart; look at focus and stray light"
         )
     x_px, y_px = found.x_px[largest], found.y_px[largest]
+    monitor_px = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
     shown_x, shown_y = geometry.to_monitor(x_px, y_px)
     corner, right, below = np.stack([shown_x, shown_y], axis=1)
     seen = np.column_stack([right - corner, below - corner]) / (2 * figure.reach_px)
@@ -132,11 +151,27 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     ways = {way: np.array(way, dtype=np.float64).reshape(2, 2) for way in WAYS}
     way = max(ways, key=lambda each: float((ways[each] * seen).sum()))
     left = np.linalg.inv(ways[way]) @ seen / scale
-    if np.linalg.norm(left - np.eye(2)) > MAX_MISFIT:
-        raise InputError("the figure is turned by no right angle; turn the tracker or the screen to within 15 degrees")
+    longest, shortest = np.linalg.svd(left, compute_uv=False)
+    if longest > MAX_STRETCH * shortest:
+        raise InputError(
+            f"the figure is no square: {longest / shortest:.2f} times as long one way as the other; look at stray light, and at"
+            " how far the screen is tilted"
+        )
     turn = float(np.degrees(np.arctan2(left[1, 0] - left[0, 1], left[0, 0] + left[1, 1])))
     sides = np.degrees([np.arctan2(left[1, 0], left[0, 0]), np.arctan2(-left[0, 1], left[1, 1])])
-    return SeenFigure(way, scale, turn, abs(float(sides[0] - sides[1])) / 2, x_px, y_px)
+    by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / (2 * figure.reach_px))
+    turn_error = math.hypot(float(sides[0] - sides[1]) / 2, by_spots)
+    # The rotation that takes the spots' directions to the figure's, on a monitor as far away as the figure is large.
+    focal_length_px = geometry.monitor.focal_length_px / scale
+    camera = replace(geometry.monitor, focal_length_px=focal_length_px)
+    shown_rays = np.column_stack([*camera.tangents(figure.x_px, figure.y_px), np.ones(3)])
+    aligned, _ = Rotation.align_vectors(_unit(shown_rays), _unit(geometry.tracker.rays(x_px, y_px)))
+    q_cam_to_mon = from_matrix(aligned.as_matrix())
+    return SeenFigure(way, scale, turn, turn_error, x_px, y_px, focal_length_px, q_cam_to_mon)
+
+
+def _unit(rays: FloatArray) -> FloatArray:
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def keys_of_ways() -> dict[str, tuple[int, int, int, int]]:
@@ -175,89 +210,9 @@ def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> Scree
     return min(right, key=lambda each: (sum(map(ne, astuple(each), astuple(mounting))), each.flip_y, each.rotate_deg))
 
 
-MIN_DOTS = 5
-ROUNDS = 40
-RADIUS_PX = 10
-START_SIGMA_PX = 1.5
-MIN_SIGMA_PX, MAX_SIGMA_PX = 0.25, 5.0
-MODEL_SIGMAS_PX = np.geomspace(0.15, 6.0, 28)
-MODEL_PHASES = 4  # places of a dot within a tracker pixel, along each axis
-MODEL_POINTS = 9  # in a dot, along each axis
-
-
-@dataclass(frozen=True, slots=True)
-class Sharpness:
-    """Dots in the tracker's image: places (n,), the sigma of each (n,), and the PSF's sigma by each (n,), tracker px.
-
-    The dot's own width is removed from the PSF's sigma; `psf_sigma_px` is the median.
-    """
-
-    x_px: FloatArray
-    y_px: FloatArray
-    sigma_px: FloatArray
-    each_psf_sigma_px: FloatArray
-    psf_sigma_px: float
-    dot_side_px: float
-
-
-def sharpness(image: FloatArray, dot_side_px: float) -> Sharpness:
-    """Measure the sharpness of dots in an image (h, w) above its dark frame; a dot is a square of `dot_side_px` tracker px.
-
-    Raises InputError where too few dots are there.
-    """
-    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
-    found = find_stars(image, settings, noisiest_background(image))
-    kept = ~found.at_edge
-    x_px, y_px = found.x_px[kept], found.y_px[kept]
-    if len(x_px) < MIN_DOTS:
-        raise InputError(f"{len(x_px)} dots are in the image and {MIN_DOTS} are needed; expose longer, or look at the focus")
-    level = float(np.median(image))
-    sigma_px = _sigmas(np.pad(image - level, RADIUS_PX), x_px, y_px)
-    expected = [_model_sigma(float(psf), dot_side_px) for psf in MODEL_SIGMAS_PX]
-    each = np.interp(sigma_px, np.maximum.accumulate(expected), MODEL_SIGMAS_PX)
-    return Sharpness(x_px, y_px, sigma_px, each, float(np.median(each)), dot_side_px)
-
-
-def _model_sigma(psf_sigma_px: float, dot_side_px: float) -> float:
-    """The sigma measured of a square dot under a PSF of `psf_sigma_px`, averaged over places within a pixel."""
-    side = 4 * RADIUS_PX + 1
-    phase = (np.arange(MODEL_PHASES) + 0.5) / MODEL_PHASES - 0.5
-    point = ((np.arange(MODEL_POINTS) + 0.5) / MODEL_POINTS - 0.5) * dot_side_px
-    edge = np.arange(side + 1) - 2 * RADIUS_PX - 0.5 - phase[:, None, None] - point[:, None]
-    profile = np.diff(ndtr(edge / psf_sigma_px), axis=2).mean(axis=1)  # (phases, side)
-    tiles = profile[:, None, :, None] * profile[None, :, None, :]
-    strip = tiles.reshape(-1, side, side).transpose(1, 0, 2).reshape(side, -1)
-    down, right = (part.ravel() for part in np.meshgrid(phase, phase, indexing="ij"))
-    x_px = np.arange(MODEL_PHASES**2) * side + 2 * RADIUS_PX + right
-    return float(np.median(_sigmas(np.pad(strip, RADIUS_PX), x_px, 2 * RADIUS_PX + down)))
-
-
-def _sigmas(padded: FloatArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """The sigma (n,) of each spot by its second moment under a Gaussian window of that same sigma, found by repetition.
-
-    Under a window of its own width a Gaussian's moment is half of its variance (Bernstein and Jarvis 2002, section 3).
-    """
-    reach = np.arange(-RADIUS_PX, RADIUS_PX + 1)
-    column, row = (np.rint(place).astype(np.intp)[:, None] + reach for place in (x_px, y_px))
-    values = padded[row[:, :, None] + RADIUS_PX, column[:, None, :] + RADIUS_PX]
-    r2 = (column - x_px[:, None])[:, None, :] ** 2 + (row - y_px[:, None])[:, :, None] ** 2
-    variance = np.full(len(x_px), START_SIGMA_PX**2)
-    for _ in range(ROUNDS):
-        weighted = values * np.exp(-0.5 * r2 / variance[:, None, None])
-        total = np.maximum(weighted.sum(axis=(1, 2)), 1e-9)
-        # The windowed moment over both axes is twice that of one axis, which is half of the variance.
-        found = (weighted * r2).sum(axis=(1, 2)) / total
-        variance = np.clip(found, MIN_SIGMA_PX**2, MAX_SIGMA_PX**2)
-    return np.asarray(np.sqrt(variance))
-
-
-PLAN_SEED = 0
-FRAMES = 20
-MIN_LIT, MAX_LIT = 12, 60  # dots in a frame
-TRACKER_PX_A_DOT = 40.0  # tracker px between neighbouring dots of a frame
-OVERSAMPLING = 4  # for the effective PSF
-BLURRED = 1.3  # times the bench file's sigma
-BLURRED_BY_PX = 0.1
+FRAMES = 16  # of dots where the fit to the first ones says that the tracker looks
+MAX_TILT_DEG = 60.0  # of a geometry file
+FAR = 1.5  # times the noise of held-out dots: a lens that leaves more is not followed
 
 
 def orientation(context: StepContext) -> StepOutcome:
@@ -273,7 +228,8 @@ def orientation(context: StepContext) -> StepOutcome:
         changes += (KeyChange(table="monitor", key="resolution_px", before=[width, height], after=[height, width]),)
     if changes:
         now, measured = _way(replace(context, file=with_changes(context.file, changes)), "figure_001")
-        if now != UPRIGHT:
+        # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit takes either.
+        if now not in (UPRIGHT, *QUARTER_TURNS) or (now != UPRIGHT and not _is_oblique(measured)):
             made = "; ".join(change.line for change in changes)
             raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
     way = f"first {WAYS[first]}, now upright" if changes else "upright"
@@ -284,9 +240,14 @@ def orientation(context: StepContext) -> StepOutcome:
     picture = context.session / "orientation.svg"
     draw_spots(picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}")
     figures = {"seen": WAYS[first], "scale": found.scale, "turn_deg": found.turn_deg, "turn_error_deg": found.turn_error_deg}
+    figures |= {SEEN_FOCAL: found.focal_length_px, **dict(zip(SEEN_Q, found.q_cam_to_mon.tolist(), strict=True))}
     line = f"{way}, {found.scale:.4f} of the expected size, turned by {found.turn_deg:+.2f} deg"
     number = StepNumber(found.turn_deg, found.turn_error_deg, "deg", "turn of the figure that is left")
     return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes, number)
+
+
+def _is_oblique(measured: tuple[SeenFigure, DarkSubtracted] | None) -> bool:
+    return measured is not None and abs(measured[0].turn_deg) > OBLIQUE_DEG
 
 
 def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
@@ -300,75 +261,6 @@ def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tu
     looked = context.looked(told, context.read(context.dark()))
     found = see_figure(looked.image, figure, geometry)
     return found.way, (found, looked)
-
-
-def dots_for(context: StepContext) -> DotPlan:
-    """Plan as many dots as this tracker can tell apart on this screen. Raises InputError."""
-    geometry = context.geometry()
-    ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    seen = [min(ratio * wide, size) for wide, size in zip(context.resolution_px, geometry.tracker.resolution_px, strict=True)]
-    lit = int(np.clip(seen[0] * seen[1] / TRACKER_PX_A_DOT**2, MIN_LIT, MAX_LIT))
-    return plan_dots(context.resolution_px, FRAMES, lit, np.random.default_rng(PLAN_SEED))
-
-
-def focus(context: StepContext) -> StepOutcome:
-    """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises InputError."""
-    code, found, looked = sharp_dots(context)
-    wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
-    picture, sigma = context.session / "focus.svg", found.psf_sigma_px
-    finding = f"PSF sigma {sigma:.3f} px (median of {len(found.x_px)} dots), [tracker] psf_sigma_px is {wanted:g}"
-    with chart(picture, finding, height_inch=6.0) as (axes,):
-        dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
-        axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
-        axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
-        axes.invert_yaxis()
-    figures: dict[str, Figure] = {
-        "psf_sigma_px": sigma,
-        "psf_sigma_error_px": ERROR_OF_MEDIAN * float(np.std(found.each_psf_sigma_px)) / math.sqrt(len(found.x_px)),
-        "dot_sigma_px": float(np.median(found.sigma_px)),
-        "dots": len(found.x_px),
-        "dot_code": code,
-    }
-    files: tuple[Path, ...] = looked.path, picture
-    pictures: tuple[Path, ...] = (picture,)
-    line = f"PSF sigma {sigma:.3f} px, the bench file says {wanted:g}; dots at code {code}"
-    try:
-        effective = fit_effective(dots_of_image(looked.image, found.x_px, found.y_px, found.dot_side_px), OVERSAMPLING)
-    except InputError:  # too few dots stand alone: the width alone is known
-        pass
-    else:
-        drawn = context.session / "psf.svg"
-        draw_effective(drawn, effective)
-        files, pictures = (*files, drawn), (picture, drawn)
-        figures["effective_psf_rms"] = effective.chosen.rms
-        line += f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the field"
-    number = StepNumber(sigma, float(figures["psf_sigma_error_px"]), "px", f"PSF sigma; the bench file says {wanted:g}")
-    if sigma > BLURRED * wanted + BLURRED_BY_PX:
-        cure = "turn the focus until this figure is smallest (--again focus), or write [tracker] psf_sigma_px as it is"
-        return StepOutcome("failed", f"{line}: {cure}", figures, files, pictures, number=number)
-    return StepOutcome("done", line, figures, files, pictures, number=number)
-
-
-class SharpDots(NamedTuple):
-    """The brightest code that does not saturate the tracker, how sharp dots of it are, and their image."""
-
-    code: int
-    sharpness: Sharpness
-    looked: DarkSubtracted
-
-
-def sharp_dots(context: StepContext) -> SharpDots:
-    """Lower the dots' code until they do not saturate the tracker, and measure them. Raises InputError."""
-    geometry, plan, code = context.geometry(), dots_for(context), context.white
-    dark = context.read(context.dark())
-    for number in range(context.file.config.monitor.bits * 2):
-        codes = dot_image(plan, 0, context.resolution_px, code)
-        looked = context.look(Pattern(f"dots_{number:03}", codes), dark)
-        if not context.is_too_bright(looked):
-            break
-        code = context.darker(code)
-    side = DOT_PX * geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    return SharpDots(code, sharpness(looked.image, side), looked)
 
 
 SQUARE_NAMES = ("corner", "right", "below")
@@ -393,17 +285,18 @@ def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray
 
 def geometry(context: StepContext) -> StepOutcome:
     """Fit lens, tilt and alignment to dots, and name the geometry file in the bench file. Raises InputError."""
-    code = int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
-    plan = dots_for(context)
+    code = dot_code(context)
     make_directory(context.folder)
-    write_plan(context.folder / "plan.csv", plan)
     dark = context.dark()
-    paths = [
-        context.take(Pattern(f"frame_{frame:03}", dot_image(plan, frame, context.resolution_px, code)))
-        for frame in range(plan.frames)
-    ]
+    first = first_dots(context.seen_screen)
+    paths, seen = _frames_of(context, first, 0, code, dark)
+    rough = rough_geometry(context.file, first, seen)
+    second = plan_seen_dots(rough, FRAMES, lit_for(rough), np.random.default_rng(PLAN_SEED))
+    more_paths, more_seen = _frames_of(context, second, first.frames, code, dark)
+    plan, paths = joined(first, second), [*paths, *more_paths]
+    write_plan(context.folder / "plan.csv", plan)
     ideal = context.file.config.tracker.distortion is None
-    found = calibrate_files(context.file, paths, context.folder / "plan.csv", dark, tracker_is_ideal=ideal)
+    found = calibrate_seen(context.file, plan, seen.joined(more_seen), tracker_is_ideal=ideal)
     output, picture = context.session / "geometry.toml", context.session / "geometry.svg"
     write_calibrated(output, found, picture, context.source.monitor)
     chosen, error = found.chosen, found.uncertainty
@@ -428,4 +321,26 @@ def geometry(context: StepContext) -> StepOutcome:
     files = (output, picture, context.folder / "plan.csv", dark, *paths)
     rms, points = chosen.rms_arcsec, len(found.data)
     number = StepNumber(rms, rms / math.sqrt(4 * points), "arcsec", "rms distance of held-out dots from where the fit has them")
-    return StepOutcome("done", line, figures, files, (picture,), context.names("collimator", "geometry", output), number)
+    changes = context.names("collimator", "geometry", output)
+    return StepOutcome("done", line, figures, files, (picture,), changes, number, _ends_of(found))
+
+
+def _frames_of(context: StepContext, plan: DotPlan, first: int, code: int, dark: Path) -> tuple[list[Path], Observed]:
+    """Images of a plan's frames, numbered from `first`, and the centroids in them. Raises InputError."""
+    paths = [
+        context.take(Pattern(f"frame_{first + frame:03}", dot_image(plan, frame, context.resolution_px, code)))
+        for frame in range(plan.frames)
+    ]
+    size_px = context.file.config.tracker.resolution_px
+    return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
+
+
+def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:
+    """The tilts, and where dots are farther off than their noise the degree of the field: a larger one was not tried."""
+    tilts = [
+        FittedFigure(name, parameters_of(found)[name].value, -MAX_TILT_DEG, MAX_TILT_DEG)
+        for name in ("tilt_x_deg", "tilt_y_deg")
+    ]
+    if found.chosen.rms_arcsec > FAR * found.held_out_noise_arcsec:
+        tilts.append(FittedFigure("the degree of the lens's field", found.chosen.field_degree, -1.0, max(FIELD_DEGREES)))
+    return tuple(tilts)

@@ -309,7 +309,6 @@ def photometry(context: StepContext) -> StepOutcome:
         how = "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar calibrate photometric`)"
         return StepOutcome("skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}")
     assumed = calibration_of(context)
-    sigma_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.tracker_psf.width_px)))
     apart = drives_apart(context.file.config)
     channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing or apart else "w"
     planned = plan_for(monitor.bits, context.patches, channels)
@@ -322,7 +321,7 @@ def photometry(context: StepContext) -> StepOutcome:
         by_channel = dict(
             zip(channels, primary_lights(calibration_source(monitor, context.file.folder), monitor.bits), strict=True)
         )
-    readings = Photometer(context, sigma_px, Assumed(by_channel, assumed.response.black)).read(planned)
+    readings = Photometer(context, context.psf_sigma_px, Assumed(by_channel, assumed.response.black)).read(planned)
     measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
     readings.write(measured)
     instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"

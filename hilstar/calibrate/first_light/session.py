@@ -27,7 +27,8 @@ from hilstar.calibrate.first_light.context import (
     sha256_of,
     write_session,
 )
-from hilstar.calibrate.first_light.geometry import focus, geometry, orientation
+from hilstar.calibrate.first_light.focus import focus
+from hilstar.calibrate.first_light.geometry import geometry, orientation
 from hilstar.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
 from hilstar.calibrate.first_light.photometry import photometry
 from hilstar.calibrate.first_light.stars import scale, verify
@@ -241,7 +242,7 @@ class FirstLightSession:
 
     def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
         try:
-            outcome = RUNS[step.name](context)
+            outcome = RUNS[step.name](context).checked()
             self.file = rewrite(self.file, outcome.changes)
         except Stopped:
             raise
@@ -263,7 +264,10 @@ class FirstLightSession:
         number = sum(1 for path in attempts.glob(f"{step.name}-*") if path.is_dir())
         folder = attempts / f"{step.name}-{number if goes_on and number else number + 1}"
         known: dict[str, Figure] = {
-            f"{name}.{key}": value for name, record in self.records.items() for key, value in record.figures.items()
+            f"{name}.{key}": value
+            for name, record in self.records.items()
+            if record.verdict == "done"
+            for key, value in record.figures.items()
         }
         kept = complete_images(folder)
         return StepContext(self.file, self.folder, folder, self.source, known, kept, self.patches, self._watch, self._watched_s)

@@ -21,7 +21,7 @@ from hilstar.calibrate.first_light.context import (
     StepOutcome,
     Verdict,
 )
-from hilstar.calibrate.first_light.geometry import sharp_dots
+from hilstar.calibrate.first_light.focus import dot_code
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
 from hilstar.calibrate.first_light.photometry import calibration_of
 from hilstar.calibrate.geometric.dots import DOT_PX
@@ -184,11 +184,6 @@ def warm_up(context: StepContext) -> StepOutcome:
     )
 
 
-def dot_code(context: StepContext) -> int:
-    """The brightest code whose dots do not saturate the tracker. Raises InputError."""
-    return int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
-
-
 class DotSpacing(NamedTuple):
     """The sigma of a dot in the tracker's image, tracker px; period and reach of a lattice of dots, monitor px."""
 
@@ -200,8 +195,7 @@ class DotSpacing(NamedTuple):
 def _spacing(context: StepContext) -> DotSpacing:
     geometry = context.real_geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    psf_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.tracker_psf.width_px)))
-    sigma_px = math.hypot(psf_px, DOT_PX * ratio / math.sqrt(12))
+    sigma_px = math.hypot(context.psf_sigma_px, DOT_PX * ratio / math.sqrt(12))
     apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
     period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(context.resolution_px) / MAX_DOTS / 2) * 2)
     return DotSpacing(sigma_px, period, min(REACH * period, REACH_SIGMAS * sigma_px / ratio))

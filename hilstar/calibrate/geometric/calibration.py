@@ -12,10 +12,10 @@ import numpy as np
 import hilstar
 from hilstar.arrays import BoolArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.cameras import ideal_monitor, tracker_camera
+from hilstar.bench.cameras import ideal_monitor, tracker_camera, tracker_psf
 from hilstar.calibrate.geometric import fit as fits
-from hilstar.calibrate.geometric.dots import DotPlan, read_plan
-from hilstar.calibrate.geometric.match import FirstLook, first_look, match_by_geometry, match_by_maps, refuse_motion
+from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, SeenScreen, read_plan
+from hilstar.calibrate.geometric.match import FirstLook, first_look, match_by_geometry, match_by_maps, refuse_motion, turned
 from hilstar.calibrate.geometric.observed import Observed, measure_images, read_observed
 from hilstar.charts import BLUE, SMALL_PT, chart
 from hilstar.errors import InputError
@@ -90,10 +90,8 @@ def calibrate_files(
 ) -> Calibrated:
     """Fit the geometry of a bench file to a table of centroids, or to the tracker's images. Raises InputError."""
     config = file.config
-    monitor = ideal_monitor(config)
-    nominal = fits.Nominal(monitor, np.array(config.collimator.q_cam_to_mon), tracker_camera(config.tracker, file.folder))
     dots = read_plan(plan)
-    width, height = monitor.resolution_px
+    width, height = config.monitor.resolution_px
     if dots.x_px.max() > width - 1 or dots.y_px.max() > height - 1:
         raise InputError(f"{plan}: has dots off this monitor of {width} x {height} px; plan them anew")
     if observed[0].suffix.lower() == ".csv":
@@ -101,9 +99,47 @@ def calibrate_files(
             raise InputError(f"{observed[1]}: one table is read; write all centroids into {observed[0]}")
         seen = read_observed(observed[0])
     else:
-        seen = measure_images(observed, dark, config.tracker.resolution_px)
-    known = tracker_is_ideal or config.tracker.distortion is not None
-    return calibrate_geometry(dots, nominal, seen, np.random.default_rng(SEED), tracker_known=known)
+        seen = measure_images(observed, dark, config.tracker.resolution_px, dot_sigma_px(file))
+    return calibrate_seen(file, dots, seen, tracker_is_ideal=tracker_is_ideal)
+
+
+def calibrate_seen(file: BenchFile, plan: DotPlan, seen: Observed, *, tracker_is_ideal: bool) -> Calibrated:
+    """Fit the geometry of a bench file to centroids of planned dots. Raises InputError."""
+    known = tracker_is_ideal or file.config.tracker.distortion is not None
+    return calibrate_geometry(plan, nominal_of(file), seen, np.random.default_rng(SEED), tracker_known=known)
+
+
+def nominal_of(file: BenchFile) -> fits.Nominal:
+    """The geometry that a bench file has without its geometry file. Raises InputError."""
+    config = file.config
+    q_cam_to_mon = np.array(config.collimator.q_cam_to_mon)
+    return fits.Nominal(ideal_monitor(config), q_cam_to_mon, tracker_camera(config.tracker, file.folder))
+
+
+def dot_sigma_px(file: BenchFile) -> float:
+    """The sigma of a dot in the tracker's image by the bench file, tracker px: the PSF's and a square's. Raises InputError."""
+    nominal = nominal_of(file)
+    side_px = DOT_PX * nominal.tracker.focal_length_px / nominal.monitor.focal_length_px
+    psf_px = float(np.mean(tracker_psf(file.config.tracker, file.folder).width_px))
+    return math.hypot(psf_px, side_px / math.sqrt(12))
+
+
+def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen:
+    """Which part of the screen the tracker sees, by a few dots: enough to put the others there. Raises InputError."""
+    nominal = nominal_of(file)
+    look = first_look(plan, nominal, seen, np.random.default_rng(SEED))
+    problem, data = matched(plan, nominal, seen, look)
+    if len(np.unique(data.dot)) < MIN_DOTS:
+        raise _too_few(data)
+    rough = fits.fit(problem, fits.Model(fits.RADIAL), 0, data).geometry
+    return SeenScreen(rough.monitor, rough.tracker, is_sure=True)
+
+
+def _too_few(data: fits.MatchedDots) -> InputError:
+    return InputError(
+        f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed: look at focus, exposure and stray light,"
+        " and at whether the tracker sees the part of the screen where the dots are (plan.csv)"
+    )
 
 
 def calibrate_geometry(
@@ -125,9 +161,8 @@ def calibrate_geometry(
     tracker_names = () if tracker_known else tuple(fits.TRACKER_STEPS)
     look = first_look(plan, nominal, seen, rng)
     problem, data = matched(plan, nominal, seen, look, tracker_names)
-    found = len(np.unique(data.dot))
-    if found < MIN_DOTS:
-        raise InputError(f"{found} dots were recognised and {MIN_DOTS} are needed; show more --dots or more --frames")
+    if len(np.unique(data.dot)) < MIN_DOTS:
+        raise _too_few(data)
     models = fits.candidates(problem, data, tracker_names)
     chosen = fits.best_of(models)
     final = bounded_to_field(problem, fits.fit(problem, chosen.model, chosen.field_degree, data))
@@ -167,6 +202,7 @@ def matched(
     """
     data = match_by_maps(plan, nominal, seen, look)
     refuse_motion(data)
+    nominal = turned(plan, nominal, look)
     for _ in range(MATCH_ROUNDS):
         problem = fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX)
         # The largest model that these centroids can determine.

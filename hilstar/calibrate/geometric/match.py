@@ -20,7 +20,7 @@ from hilstar.calibrate.geometric.dots import DotPlan
 from hilstar.calibrate.geometric.fit import Geometry, MatchedDots, Nominal, directions_in_cam
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.errors import InputError
-from hilstar.rotation import from_matrix
+from hilstar.rotation import from_matrix, to_matrix
 from hilstar.units import MAD_TO_SIGMA
 
 MAX_LINK_PX = 3.0  # a dot's centroids lie closer together than this in the tracker's image
@@ -28,7 +28,9 @@ LINK_SHARE = 0.2  # relative to the distance between dots, if that is less
 CODE_LEAD = 2  # by how many frames the next code must be farther than the best
 MAX_CODE_ERRORS = 3
 TRIALS = 600  # samples of four dots each
-INLIER_SHARE = 0.03  # relative to the screen's width: a lens may bend a homography by this
+# Four places along each side of the dots' part, from a fifth to four fifths of it: (2, 4) weights of its two ends.
+MIDDLE = np.stack([np.linspace(0.8, 0.2, 4), np.linspace(0.2, 0.8, 4)])
+INLIER_SHARE = 0.03  # relative to the extent of the dots: a lens may bend a homography by this
 MIN_DECODED = 6
 
 
@@ -104,7 +106,8 @@ def mapped(matrix: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray
         return x / w, y / w
 
 
-FIRST_REACH = 0.03  # relative to the screen's width; the first map knows no lens
+FIRST_REACH = 0.03  # relative to the extent of the dots; the first map knows no lens
+MAX_TURN_DEG = 60.0  # a turn that the fit finds by itself: beyond 45 deg another way round is nearer, within noise
 MIN_MOTION_PX = 0.05  # tracker px
 POLISH_ROUNDS = 10
 MAX_CHANCE = 12.0  # sigmas of a frame's mean: the largest of some 30 differences of medians, with room
@@ -145,15 +148,35 @@ def first_look(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.G
             raise InputError(_why_no_map(plan, nominal, part, pose, rng))
         maps.append(found)
     _refuse_orientation(nominal, maps[0])
-    width, height = nominal.monitor.resolution_px
-    x, y = np.meshgrid(np.linspace(0.2, 0.8, 4) * width, np.linspace(0.2, 0.8, 4) * height)
-    rays = []
-    for matrix in maps:
-        u, v = mapped(np.asarray(np.linalg.inv(matrix), dtype=np.float64), x.ravel(), y.ravel())
-        ray = np.column_stack([u, v, np.ones_like(u)])
-        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    x_px, y_px = _middle_places(plan)
+    rays = [_rays_of(matrix, x_px, y_px) for matrix in maps]
     turns = [Rotation.align_vectors(each, rays[0])[0] for each in rays]
     return FirstLook(tuple(maps), np.array([from_matrix(turn.as_matrix()) for turn in turns]))
+
+
+def _middle_places(plan: DotPlan) -> tuple[FloatArray, FloatArray]:
+    """Places (n,) on the monitor, px, over the middle of the part that the dots stand on."""
+    along_x, along_y = (np.quantile(part, [0.0, 1.0]) @ MIDDLE for part in (plan.x_px, plan.y_px))
+    x_px, y_px = np.meshgrid(along_x, along_y)
+    return x_px.ravel(), y_px.ravel()
+
+
+def _rays_of(matrix: FloatArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """Unit directions (n, 3) in the tracker's axes of monitor pixels (n,), by a first map (3, 3)."""
+    u, v = mapped(np.asarray(np.linalg.inv(matrix), dtype=np.float64), x_px, y_px)
+    rays = np.column_stack([u, v, np.ones_like(u)])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def turned(plan: DotPlan, nominal: Nominal, look: FirstLook) -> Nominal:
+    """The bench file's geometry with the rotation of the first map: where a fit starts, whatever the screen is turned by."""
+    x_px, y_px = _middle_places(plan)
+    monitor = nominal.monitor
+    seen = np.column_stack((*monitor.tangents(x_px, y_px), np.ones_like(x_px)))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    turn, _ = Rotation.align_vectors(seen, _rays_of(look.maps[0], x_px, y_px))
+    q_cam_to_mon = from_matrix(turn.as_matrix())
+    return Nominal(replace(monitor, cam_to_image=to_matrix(q_cam_to_mon)), q_cam_to_mon, nominal.tracker)
 
 
 def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FloatArray | None:
@@ -170,7 +193,7 @@ def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Gene
     for trial in homography(u[fours], v[fours], x[fours], y[fours]):
         seen_x, seen_y = mapped(trial, u, v)
         with np.errstate(invalid="ignore"):
-            inlier = np.hypot(seen_x - x, seen_y - y) < INLIER_SHARE * nominal.monitor.resolution_px[0]
+            inlier = np.hypot(seen_x - x, seen_y - y) < INLIER_SHARE * plan.extent_px
         if inlier.sum() > best.sum():
             best = inlier
     if best.sum() < max(MIN_DECODED, len(u) / 3):
@@ -198,6 +221,9 @@ def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
     seen, told = np.stack(mapped(matrix, u, v)), np.stack(nominal.monitor.project(rays))
     relative = (seen[:, 1:] - seen[:, :1]) @ np.linalg.inv(told[:, 1:] - told[:, :1])
     relative /= np.sqrt(abs(np.linalg.det(relative)))
+    turn_deg = float(np.degrees(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1])))
+    if np.linalg.det(relative) > 0 and abs(turn_deg) < MAX_TURN_DEG:
+        return
     nearest = max(ORIENTATIONS, key=lambda o: float(np.dot(o, relative.ravel())))
     words = ORIENTATIONS[nearest]
     if words is not None:
@@ -211,7 +237,7 @@ def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLo
     for pose, matrix in enumerate(look.maps):
         here = seen.pose == pose
         x_px[here], y_px[here] = mapped(matrix, u[here], v[here])
-    return _nearest(plan, seen, x_px, y_px, FIRST_REACH * nominal.monitor.resolution_px[0])
+    return _nearest(plan, seen, x_px, y_px, FIRST_REACH * plan.extent_px)
 
 
 def match_by_geometry(plan: DotPlan, seen: Observed, geometry: Geometry, reach_px: float) -> MatchedDots:

@@ -43,6 +43,11 @@ class Observed:
         """The centroids at indices `chosen`."""
         return Observed(self.frame[chosen], self.pose[chosen], self.x_px[chosen], self.y_px[chosen], self.sigma_px[chosen])
 
+    def joined(self, other: "Observed") -> "Observed":
+        """These centroids and others, of other frames."""
+        names = ("frame", "pose", "x_px", "y_px", "sigma_px")
+        return Observed(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+
 
 def read_observed(path: Path) -> Observed:
     """Read a table of centroids. Raises InputError with the line that is wrong."""
@@ -72,19 +77,24 @@ MAX_IMAGE_BYTES = 500_000_000
 SATURATED_SHARE = 1e-5  # share of pixels at the image's largest possible value: a few hot pixels do not matter
 FULL_DN = {2.0**bits - 1 for bits in (8, 10, 12, 14, 16)}
 THRESHOLD_SIGMA = 8.0
+# A narrower window than the dot sees noise alone where the dot is flat: 12.6 px wide dots scatter by 0.4 px in one of 1.5 px.
+MIN_WINDOW_SIGMA_PX = 1.5
 IMAGE_ADVICE = "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
 NUMBER = re.compile(r"(\d+)(?!.*\d)")
 POSE = re.compile(r"pose_?(\d+)", re.IGNORECASE)
 
 
-def measure_images(paths: Sequence[Path], dark: Path | None, resolution_px: tuple[int, int]) -> Observed:
-    """Centroids of all images. The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0.
+def measure_images(
+    paths: Sequence[Path], dark: Path | None, resolution_px: tuple[int, int], dot_sigma_px: float = MIN_WINDOW_SIGMA_PX
+) -> Observed:
+    """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image. The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0.
 
     Raises InputError for an image that cannot be read, has another size than the tracker's, or is saturated.
     """
     paths_of = numbered(paths)
     under = None if dark is None else read_image(dark, resolution_px)
-    places = [_centroids(path, resolution_px, under) for path in paths_of.values()]
+    window_sigma_px = max(dot_sigma_px, MIN_WINDOW_SIGMA_PX)
+    places = [_centroids(path, resolution_px, under, window_sigma_px) for path in paths_of.values()]
     count = [len(x) for x, _ in places]
     if not sum(count):
         raise InputError(f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer")
@@ -107,14 +117,16 @@ def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
     return found
 
 
-def _centroids(path: Path, resolution_px: tuple[int, int], under: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+def _centroids(
+    path: Path, resolution_px: tuple[int, int], under: FloatArray | None, window_sigma_px: float
+) -> tuple[FloatArray, FloatArray]:
     image = read_image(path, resolution_px)
     top = float(image.max())
     saturated = int((image == top).sum())
     if top in FULL_DN and saturated > max(20, SATURATED_SHARE * image.size):
         raise InputError(f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker")
     above = image if under is None else image - under
-    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
+    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=window_sigma_px)
     found = find_stars(above, settings, noisiest_background(above))
     kept = ~found.at_edge
     return found.x_px[kept], found.y_px[kept]

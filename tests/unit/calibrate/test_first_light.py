@@ -12,6 +12,7 @@ from scipy.special import ndtr
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
 from hilstar.calibrate.first_light.context import KeyChange, StepOutcome, rewrite
+from hilstar.calibrate.first_light.focus import sharpness
 from hilstar.calibrate.first_light.geometry import (
     UPRIGHT,
     WAYS,
@@ -21,7 +22,6 @@ from hilstar.calibrate.first_light.geometry import (
     keys_of_ways,
     look_of,
     see_figure,
-    sharpness,
 )
 from hilstar.calibrate.first_light.image_sources import GrabCommand, ImageSource, NoImage, Pattern, black, off_screen, on_screen
 from hilstar.calibrate.first_light.session import FirstLightSession, SessionStep

@@ -241,8 +241,8 @@ class GlowFit:
 class Measured:
     """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are drawn as discs.
 
-    `stars_a_field` is how many stars of the bench are in the tracker's
-    field on average. `calibration` is the one that the bench assumes; `true_calibration` is the monitor's own, where it is another.
+    `stars_a_field` is how many stars of the bench are in the tracker's field on average. `calibration` is the one that the
+    bench assumes; `true_calibration` is the monitor's own, where it is another.
     """
 
     field_count: int

@@ -1,5 +1,6 @@
 """Full scale of the light by the tracker: stars shown, their DN read, and the light of white that follows."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,35 +14,66 @@ from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.units import ERROR_OF_MEDIAN, MAG_PER_RELATIVE, magnitude
 
+STAR_MAG = 0.004  # error of a star's light beside its noise: what window, response and uniformity leave on a good bench
 UNSURE_MAG = 0.05  # readings that disagree by more are wrong for another reason than the scale
 
 
 @dataclass(frozen=True, slots=True)
 class StarReading:
-    """A star shown, and the sum of its DN above background."""
+    """A star shown, the sum of its DN above background, and the noise of that sum, DN; 0 where it is not known."""
 
     hip: int
     dn: float
+    sigma_dn: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredScale:
-    """The light of white by the tracker, and the ratio of measured to wanted light of each reading (n,)."""
+    """The light of white by the tracker; of each reading (n,) the ratio of measured to wanted light, and its weight.
+
+    `noise_mag` is the error that the readings' own noise leaves, 0 where it is not known.
+    """
 
     flux_at_white_e_per_s: float
     assumed_e_per_s: float
     ratios: FloatArray
+    weights: FloatArray
+    noise_mag: float
 
     @property
     def scatter_mag(self) -> float:
-        """Standard deviation of the readings, magnitudes; 0 for one."""
-        return float(np.std(magnitude(self.ratios), ddof=1)) if len(self.ratios) > 1 else 0.0
+        """Standard deviation of the readings, by their weights, magnitudes; 0 for one."""
+        count = len(self.ratios)
+        if count < 2:
+            return 0.0
+        off = magnitude(self.ratios)
+        shares = self.weights / self.weights.sum()
+        variance = float((shares * (off - float((shares * off).sum())) ** 2).sum())
+        return float(np.sqrt(variance * count / (count - 1)))
 
     @property
     def relative_error(self) -> float | None:
-        """The relative standard error of the light of white, by the readings' scatter; None for one."""
+        """The relative standard error of the light of white, by the readings' scatter and noise; None for one."""
         count = len(self.ratios)
-        return ERROR_OF_MEDIAN * self.scatter_mag / MAG_PER_RELATIVE / count**0.5 if count > 1 else None
+        if count < 2:
+            return None
+        alike = float(self.weights.sum() ** 2 / (self.weights**2).sum())  # as many readings of one weight
+        by_scatter = ERROR_OF_MEDIAN * self.scatter_mag / math.sqrt(alike)
+        return max(by_scatter, self.noise_mag) / MAG_PER_RELATIVE
+
+
+def scale_of(white_e_per_s: float, ratios: FloatArray, noise_mag: FloatArray) -> MeasuredScale:
+    """The light of white by the ratios of measured to wanted light (n,): their weighted median.
+
+    `noise_mag` (n,) is the noise of each, 0 where it is not known, and then all have one weight.
+    """
+    is_known = bool((noise_mag > 0).all())
+    weights = 1 / (noise_mag**2 + STAR_MAG**2) if is_known else np.ones_like(ratios)
+    order = np.argsort(ratios, kind="stable")
+    below = np.cumsum(weights[order]) - weights[order] / 2
+    median = float(np.interp(weights.sum() / 2, below, ratios[order]))
+    noise = float(weights.sum() ** -0.5) if is_known else 0.0
+    return MeasuredScale(white_e_per_s * median, white_e_per_s, ratios, weights, noise)
 
 
 def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: float) -> MeasuredScale:
@@ -64,8 +96,8 @@ def scale_by_tracker(bench: Bench, readings: list[StarReading], exposure_s: floa
         if rate < bench.faintest_shown_e_per_s:
             raise InputError(f"{named}: the star is too faint for the monitor to show; take a brighter one")
         ratios.append(reading.dn * detector.gain_e_per_dn / (rate * exposure_s))
-    median = float(np.median(ratios))
-    return MeasuredScale(bench.flux_at_white_e_per_s * median, bench.flux_at_white_e_per_s, np.array(ratios))
+    noise_mag = np.array([MAG_PER_RELATIVE * reading.sigma_dn / max(reading.dn, 1e-9) for reading in readings])
+    return scale_of(bench.flux_at_white_e_per_s, np.array(ratios), noise_mag)
 
 
 def with_flux_at_white(file: BenchFile, found: MeasuredScale, output: Path) -> None:

@@ -258,7 +258,10 @@ def photometric(
 
 def scale(
     bench_file: BenchFile,
-    reading: Annotated[list[str], Option(metavar="HIP,DN", help="A star, and the sum of its DN above the background.")],
+    reading: Annotated[
+        list[str],
+        Option(metavar="HIP,DN[,SIGMA]", help="A star, the sum of its DN above the background, and the noise of that sum."),
+    ],
     exposure: Annotated[float | None, Option(metavar="S", help="The tracker's exposure; by default the bench file's.")] = None,
     output: Annotated[
         Path | None, Option("-o", "--output", metavar="OUT.toml", help="A copy of the bench file with the key set.")

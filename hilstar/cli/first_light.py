@@ -68,6 +68,15 @@ def first_light(
             max=1440,
         ),
     ] = None,
+    frames: Annotated[
+        int | None,
+        Option(
+            metavar="N",
+            help="Images of each field of stars that verify averages. [as many as their noise asks for, 25 at most; by hand 1]",
+            min=1,
+            max=1000,
+        ),
+    ] = None,
     again: Annotated[list[str] | None, Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
     seed: Annotated[int, Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
     force: Force = False,
@@ -108,7 +117,9 @@ def first_light(
         source.find_monitor(file, datetime.now(UTC).date(), force=force)
         for line in source.forced:
             tell(f"{FORCED:12} {line}")
-        session = FirstLightSession(output, file, source, readings, watch, watched_s)
+        session = FirstLightSession(
+            output, file, source, readings, watch, watched_s=watched_s, frames=frames or 0, progress=say
+        )
         code = session.run(frozenset(again or []), tell)
         beats = beat_line(session.beat())
         if beats is not None:

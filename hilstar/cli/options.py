@@ -59,7 +59,9 @@ SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axe
 SPEED_FORM = "write --speed realtime, max, or a number such as 2 or 0.5"
 SPLIT_FORM = "write a size or a time, such as 1GB, 200MB, 1h or 30min; 1 MB or 10 s at minimum"
 SPLIT_UNITS = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "s": 1.0, "min": 60.0, "h": 3600.0}
-READING_FORM = "write --reading HIP,DN: a star's Hipparcos number, and the sum of its DN over the background"
+READING_FORM = (
+    "write --reading HIP,DN or HIP,DN,SIGMA: a star's Hipparcos number, the sum of its DN over the background, and its noise"
+)
 MIN_SPLIT_BYTES, MIN_SPLIT_S = 1e6, 10.0
 MAX_SIZE_PX = 32768
 MAX_AT_S = 1e10
@@ -249,15 +251,15 @@ def parse_memory(text: str) -> int:
 
 
 def parse_reading(text: str) -> "StarReading":
-    """A reading from "HIP,DN". Raises InputError."""
+    """A reading from "HIP,DN" or "HIP,DN,SIGMA_DN". Raises InputError."""
     from hilstar.calibrate.scale import StarReading
 
     parts = text.split(",")
     try:
-        reading = StarReading(int(parts[0]), float(parts[1]))
-    except (ValueError, IndexError) as error:
+        reading = StarReading(int(parts[0]), *map(float, parts[1:]))
+    except (ValueError, TypeError) as error:
         raise InputError(f"--reading {text}: {READING_FORM}") from error
-    if len(parts) != 2 or not 0 < reading.dn < math.inf:
+    if not 0 < reading.dn < math.inf or not 0 <= reading.sigma_dn < math.inf:
         raise InputError(f"--reading {text}: {READING_FORM}")
     return reading
 

@@ -220,6 +220,7 @@ class StepContext:
     Images go to `folder`, results to `session`. `kept` has the images of an interrupted attempt, which are not taken again.
     `known` has the figures of earlier steps; `patches` is the maximum number of readings of the response. `watch` is called
     with each pattern before it is shown. White is watched for `watched_s` at most, 0 for not at all.
+    `frames` images of each field of stars are averaged, 0: as many as their noise asks for. `stage` is told what begins.
     """
 
     file: BenchFile
@@ -231,6 +232,8 @@ class StepContext:
     patches: int
     watch: Callable[[Pattern], object] = lambda pattern: None
     watched_s: float = 0.0
+    frames: int = 0
+    stage: Callable[[str], object] = lambda words: None
 
     @property
     def resolution_px(self) -> tuple[int, int]:
@@ -312,9 +315,9 @@ class StepContext:
         name = "unlit_000"
         return self.kept[name] if name in self.kept else self.source.unlit(make_directory(self.folder) / name)
 
-    def dark(self) -> Path:
-        """Take the tracker's image of a black screen."""
-        return self.take(Pattern("dark_000", black(self.resolution_px)))
+    def dark(self, number: int = 0) -> Path:
+        """Take the tracker's image of a black screen, the first or a further one."""
+        return self.take(Pattern(f"dark_{number:03}", black(self.resolution_px)))
 
     def look(self, pattern: Pattern, dark: FloatArray) -> DarkSubtracted:
         """The tracker's image of a pattern, above its dark frame. Raises InputError for one that cannot be read."""

@@ -296,6 +296,7 @@ def geometry(context: StepContext) -> StepOutcome:
     plan, paths = joined(first, second), [*paths, *more_paths]
     write_plan(context.folder / "plan.csv", plan)
     ideal = context.file.config.tracker.distortion is None
+    context.stage(f"fits lenses to {len(seen) + len(more_seen)} centroids")
     found = calibrate_seen(context.file, plan, seen.joined(more_seen), tracker_is_ideal=ideal)
     output, picture = context.session / "geometry.toml", context.session / "geometry.svg"
     write_calibrated(output, found, picture, context.source.monitor)

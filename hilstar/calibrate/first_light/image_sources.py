@@ -99,12 +99,13 @@ class ImageSource:
     """Shows patterns to the tracker and returns its images; by default without a display, a dark image or a photodiode.
 
     `identity` is a text that changes when the source does; `sets_exposure` says whether `look` may ask for another exposure
-    than the bench file's. `monitor` is the display's before its window was on it, None where this program has no display, and
-    `forced` what is wrong with it and was shown by --force.
+    than the bench file's, `by_hand` whether a person saves each image. `monitor` is the display's before its window was on it,
+    None where this program has no display, and `forced` what is wrong with it and was shown by --force.
     """
 
     identity: str
     sets_exposure: bool
+    by_hand = False
     monitor: MonitorIdentity | None = None
     forced: Sequence[str] = ()
 
@@ -421,6 +422,7 @@ class ByHand(_ShownHere):
     """Images that a person saves. Each pattern stays on the display until its file is complete."""
 
     identity = "by hand"
+    by_hand = True
     sets_exposure = True
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:

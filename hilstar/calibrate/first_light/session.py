@@ -5,6 +5,7 @@ import hashlib
 import math
 import os
 import platform
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -120,6 +121,7 @@ def display(context: StepContext) -> StepOutcome:
     return StepOutcome("done", line, figures, number=number)
 
 
+PROGRESS_S = 3.0
 BEFORE_FILE = "bench-before.toml"
 LOCK_FILE = ".lock"
 
@@ -152,10 +154,46 @@ RUNS: dict[str, Callable[[StepContext], StepOutcome]] = {
 }
 
 
+class Progress:
+    """Tells every PROGRESS_S what a step is at, from a thread of its own: a fit takes as long as an image."""
+
+    def __init__(self, tell: Callable[[str], object]) -> None:
+        self._tell, self._stage, self._images = tell, "", 0
+
+    def shows(self, pattern: Pattern) -> None:
+        """A pattern is shown, and its image taken."""
+        self._images += 1
+        self._stage = f"image {self._images}, {pattern.name}"
+
+    def stage(self, words: str) -> None:
+        """Something begins that may take long."""
+        self._stage = words
+
+    @contextmanager
+    def of(self, step: str) -> Iterator[None]:
+        """Tell of a step while this is open."""
+        self._stage, self._images = "begins", 0
+        begun_s, ended = time.monotonic(), threading.Event()
+
+        def tell() -> None:
+            while not ended.wait(PROGRESS_S):
+                self._tell(f"{step:12} {time.monotonic() - begun_s:.0f} s: {self._stage}")
+
+        thread = threading.Thread(target=tell, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+
 class FirstLightSession:
     """A session in a directory, with at most `patches` readings of the response; `watch` is called with each pattern.
 
-    White is watched for `watched_s` at most, 0 for not at all. Raises InputError for a directory with another bench's session.
+    White is watched for `watched_s` at most, 0 for not at all; `frames` images of each field of stars are averaged, 0: as many
+    as it takes. `progress` is called with a line every few seconds while a step runs, from a thread of its own.
+    Raises InputError for a directory with another bench's session.
     """
 
     def __init__(
@@ -165,9 +203,12 @@ class FirstLightSession:
         source: ImageSource,
         patches: int,
         watch: Callable[[Pattern], object] = lambda pattern: None,
+        *,
         watched_s: float = 0.0,
+        frames: int = 0,
+        progress: Callable[[str], object] = lambda line: None,
     ) -> None:
-        self._watch, self._watched_s = watch, watched_s
+        self._watch, self._watched_s, self._frames, self._progress = watch, watched_s, frames, Progress(progress)
         self.folder, self.file, self.source, self.patches = folder, file, source, patches
         bench = str(file.path.resolve())
         found = read_session(folder)
@@ -242,7 +283,8 @@ class FirstLightSession:
 
     def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
         try:
-            outcome = RUNS[step.name](context).checked()
+            with self._progress.of(step.name):
+                outcome = RUNS[step.name](context).checked()
             self.file = rewrite(self.file, outcome.changes)
         except Stopped:
             raise
@@ -270,7 +312,23 @@ class FirstLightSession:
             for key, value in record.figures.items()
         }
         kept = complete_images(folder)
-        return StepContext(self.file, self.folder, folder, self.source, known, kept, self.patches, self._watch, self._watched_s)
+        return StepContext(
+            self.file,
+            self.folder,
+            folder,
+            self.source,
+            known,
+            kept,
+            self.patches,
+            watch=self._shows,
+            stage=self._progress.stage,
+            watched_s=self._watched_s,
+            frames=self._frames,
+        )
+
+    def _shows(self, pattern: Pattern) -> None:
+        self._progress.shows(pattern)
+        self._watch(pattern)
 
     def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
         """The SHA-256 of what a step depends on: its tables without later steps' keys, files they name, the source."""

@@ -3,7 +3,7 @@
 Each bench is drawn over what labs have, with a truth of which its bench file knows nothing (tests/support/any_bench).
 It goes through `first-light --virtual`, `verify`, `certify --quick`, 20 seconds of `serve --headless` with a stream,
 and `assess` of the virtual tracker's answers. DIR has a folder of each bench, any_bench.csv with a row of each, and the
-chart. The same command goes on where it was stopped; a larger N adds benches.
+chart. The smallest benches come first. The same command goes on where it was stopped; a larger N adds benches.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from hilstar.charts import BLUE, GREEN, MUTED, ORANGE, PURPLE, RED, TEAL, chart, write_csv
+from tests.support.any_bench.draw import DrawnBench, drawn_bench
 from tests.support.any_bench.judge import (
     FAILED,
     GOOD_OUTCOMES,
@@ -60,15 +61,22 @@ def main() -> None:
     output.mkdir(parents=True, exist_ok=True)
     check_head(output / HEAD, given.seed)
     rows: list[dict[str, Any]] = []
-    for number in range(given.benches):
+    for number in sorted(range(given.benches), key=lambda number: pixels(drawn_bench(given.seed, number))):
         row = run_bench(given.seed, number, output / f"{number:04}", given.limit, keep=given.keep)
         rows.append(row)
+        rows.sort(key=lambda one: int(one["bench"]))
         write_table(output / TABLE, rows)
         print(f"{number:4}  {row['outcome']}: {row['words']}"[:200], flush=True)
     draw(output / CHART, rows)
     for outcome in OUTCOMES:
         count = sum(row["outcome"] == outcome for row in rows)
         print(f"{outcome:28}{count}")
+
+
+def pixels(bench: DrawnBench) -> int:
+    """How many pixels a bench's commands go through: the smallest benches are run first."""
+    (screen_w, screen_h), (width, height) = bench.panel.size_px, bench.detector.size_px
+    return screen_w * screen_h + width * height
 
 
 def check_head(path: Path, seed: int) -> None:

@@ -25,13 +25,13 @@ from hilstar.scene.psf import GaussianPsf, Psf, SampledPsf, read_psf
 
 NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
 # Share of the screen that the tracker sees, and of the tracker's field that the screen fills. A bench may have 2 % of the one,
-# or a field of three screens; a length in another unit changes them a hundred times.
-MIN_SEEN, MIN_FILLED = 0.015, 0.3
+# or a field of ten screens; a length in another unit changes them a hundred times.
+MIN_SEEN, MIN_FILLED = 0.015, 0.08
 MAX_PIXELS = 10.0  # tracker pixels to a monitor pixel, or the reverse
 # Limits of any bench: lenses are f/0.5 to f/21 (a factor of ten in one length mostly leaves this), the widest sees 100 degrees,
 # collimators are not shorter than a microscope's objective and not longer than a room, pixels are those of the smallest
 # sensors and of LED walls.
-F_NUMBERS, MAX_FIELD_DEG, APERTURES_MM, COLLIMATORS_MM = (0.5, 21.0), 100.0, (1.0, 2000.0), (2.0, 50_000.0)
+F_NUMBERS, MAX_FIELD_DEG, APERTURES_MM, COLLIMATORS_MM = (0.5, 21.0), 100.0, (0.3, 2000.0), (2.0, 50_000.0)
 TRACKER_PITCHES_UM, MONITOR_PITCHES_UM = (0.5, 100.0), (1.0, 10_000.0)
 TRUE_RATIOS = (0.5, 2.0)  # a length of [verify] to the same length elsewhere in the file
 LENGTHS = (

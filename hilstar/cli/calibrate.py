@@ -22,24 +22,33 @@ def dots(
     bench_file: BenchFile,
     output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")],
     frames: Annotated[int, Option(help="Number of frames.", min=1, max=1000)] = 20,
-    dots_per_frame: Annotated[int, Option("--dots", help="About how many dots are lit in each.", min=1, max=5000)] = 60,
+    dots_per_frame: Annotated[
+        int | None,
+        Option("--dots", help="About how many dots are lit in each. [as many as the field holds, 60 at most]", min=1, max=5000),
+    ] = None,
     show: Annotated[bool, Option("--show", help="Show the frames on the display: space for the next, q to quit.")] = False,
     seconds: Annotated[float | None, Option(metavar="S", help="With --show: time for each frame, without keys.", min=0)] = None,
     windowed: Windowed = False,
     seed: Annotated[int, Option(help="Seed of the dots' codes.", min=0, max=MAX_SEED)] = 0,
     as_json: Json = False,
 ) -> None:
-    """Make frames of dots for `calibrate geometric`: each dot blinks its own code."""
+    """Make frames of dots for `calibrate geometric`: each dot blinks its own code.
+
+    They stand where the tracker sees the screen, by the bench file's lens, or by its geometry file once it has one.
+    """
     import numpy as np
 
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.bench.frame_files import write_codes_png
-    from hilstar.calibrate.geometric.dots import dot_image, plan_dots, show_dots, write_plan
+    from hilstar.calibrate.geometric.calibration import seen_screen_of
+    from hilstar.calibrate.geometric.dots import dot_image, lit_for, plan_seen_dots, show_dots, write_plan
 
     check_directory("-o", output)
     file = read_bench_file(bench_file)
     monitor = file.config.monitor
-    plan = plan_dots(monitor.resolution_px, frames, dots_per_frame, np.random.default_rng(seed))
+    seen = seen_screen_of(file)
+    lit = lit_for(seen) if dots_per_frame is None else dots_per_frame
+    plan = plan_seen_dots(seen, frames, lit, np.random.default_rng(seed))
     check_files([], [output / "plan.csv"], file)
     make_directory(output)
     write_plan(output / "plan.csv", plan)

@@ -52,13 +52,10 @@ MIN_WIDTH_PX, WIDTH_ROUNDS = 0.05, 60  # the Gaussian nearest to a sampled PSF; 
 # 1e-5 px with a PSF of 0.3, by 1e-4 px with monitor pixels of 2.7 tracker pixels. Two are off by 3e-6 px on the demo's bench
 # too, for their fourth moment is near the square's; by 5e-5 where a side is 2 sigmas of the PSF.
 TWO, TWO_UP_TO_SIGMAS = np.array([-0.2525, 0.2525]), 1.7
-MIN_PARTS, MAX_PARTS = 3, 16
-# Sides of a part, in sigmas of a Gaussian PSF: a wide square's edge is then softer than the PSF's by 2 % of sigma. Thirds of
-# 4.2 pixels before a sigma of 0.55 soften it by 24 %, which a fit of the PSF to dots takes for the PSF's own.
-FINE_SIGMAS = 0.7
-# Other PSFs may have finer parts than their width, so that no share of it bounds what parts do: there ripples do.
-# Gaussians d apart ripple by 0.4 exp(-19.7 (sigma / d)^2): 1e-3 at 1.8 sigmas, where sigma has the pixel that sees them in it.
-PART_SIGMAS = 1.8
+# A Gaussian's side of a wide square: its edge is then softer than the PSF's by 2 % of sigma. By thirds of 4.2 tracker pixels
+# before a PSF of 0.55 it is softer by 24 %, which a fit of the PSF to dots takes for the PSF's own. What is sharper than
+# SHARPEST_PX is summed up by pixels anyway.
+FINE_SIGMAS, MIN_PARTS, MAX_PARTS, SHARPEST_PX = 0.7, 3, 16, 0.2
 
 
 class ShareShader(NamedTuple):
@@ -471,10 +468,8 @@ def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
     if isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * narrow_px:
         points = TWO
     else:
-        longest_px = PART_SIGMAS * math.sqrt(narrow_px**2 + PIXEL_VARIANCE)
-        if isinstance(psf, GaussianPsf):
-            longest_px = FINE_SIGMAS * narrow_px
-        parts = min(max(math.ceil(side_px / longest_px), MIN_PARTS), MAX_PARTS)
+        wanted = math.ceil(side_px / (FINE_SIGMAS * max(narrow_px, SHARPEST_PX)))
+        parts = min(max(wanted, MIN_PARTS), MAX_PARTS)
         points = (np.arange(parts) + 0.5) / parts - 0.5
     return points, psf.blurred(side_px * math.sqrt(PIXEL_VARIANCE - float(np.mean(points**2))))
 

@@ -27,6 +27,7 @@ from hilstar.tracker.mosaic import in_pixels
 
 Mirror = Literal["none", "x", "y", "swap"]
 POINTS_AT_ONCE = 400_000
+PIXELS_AT_ONCE = 500_000  # of a glow, whose dozen arrays would take 2 GB of a detector of 4096 x 4096 px
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +134,8 @@ class TwinOptics(Closing):
         self.geometry = geometry
         side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
         self._steps, self._psf = square_points(side_px, psf)
+        # A pixel farther than this from the detector lights none of it, though it be twice as large there as on the axis.
+        self._reach_px = 2 * side_px + self._psf.footprint_px / 2 + 1
         self._renderer = open_backend(Target(geometry.tracker.resolution_px, self._psf), headless_context())
 
     def images_e_per_s(self, lights_e_per_s: Iterable[FloatArray | LitLight], primaries: Sequence[Primary]) -> FloatArray:
@@ -143,11 +146,21 @@ class TwinOptics(Closing):
     def image_e_per_s(self, light_e_per_s: FloatArray | Float32Array | LitLight, primary: Primary = ALL_ALIKE[0]) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of monitor pixels, lit ones or all (H, W), float64."""
         lit = light_e_per_s if isinstance(light_e_per_s, LitLight) else LitLight.of(light_e_per_s)
+        lit = self._near_the_detector(lit, primary)
         at_once = POINTS_AT_ONCE // len(self._steps) ** 2
         total = self._points(lit.part(0, at_once), primary)
         for begin in range(at_once, len(lit.place), at_once):
             total += self._points(lit.part(begin, begin + at_once), primary)
         return np.maximum(total, 0.0) if isinstance(self._psf, GlassPsf) else total  # a measured PSF may be negative somewhere
+
+    def _near_the_detector(self, lit: LitLight, primary: Primary) -> LitLight:
+        """The lit pixels that may light the detector, of a screen that it may see a small part of."""
+        rows, columns = np.divmod(lit.place, self.geometry.monitor.resolution_px[0])
+        x_px, y_px = self.geometry.to_tracker(columns.astype(np.float64), rows.astype(np.float64), primary.place_px)
+        width, height = self.geometry.tracker.resolution_px
+        near = (x_px >= -self._reach_px) & (x_px < width + self._reach_px)
+        near &= (y_px >= -self._reach_px) & (y_px < height + self._reach_px)
+        return LitLight(lit.place[near], lit.e_per_s[near])
 
     def _points(self, lit: LitLight, primary: Primary) -> FloatArray:
         dx, dy = (step.ravel() for step in np.meshgrid(self._steps, self._steps))
@@ -168,10 +181,22 @@ class TwinOptics(Closing):
         The density of monitor pixels is that at a tracker pixel's centre; its edge is cut at the pixel, not within it.
         """
         width, height = self.geometry.tracker.resolution_px
+        glow = np.zeros((height, width))
         if not panel.response.black:
-            return np.zeros((height, width))
-        y, x = np.mgrid[0:height, 0:width].astype(np.float64)
-        seen_x, seen_y = (part.reshape(height, width) for part in self.geometry.to_monitor(x.ravel(), y.ravel()))
+            return glow
+        rows = max(1, PIXELS_AT_ONCE // width)
+        for top in range(0, height, rows):
+            below = min(top + rows, height)
+            # A density is a slope: of a band's first and last row, too, it needs the rows beside them.
+            first, last = max(top - 1, 0), min(below + 1, height)
+            glow[top:below] = self._glow_of_rows(panel, first, last)[top - first : below - first]
+        return glow
+
+    def _glow_of_rows(self, panel: Panel, first: int, last: int) -> FloatArray:
+        """The glow of the detector's rows from `first` to before `last`."""
+        width, _ = self.geometry.tracker.resolution_px
+        y, x = np.mgrid[first:last, 0:width].astype(np.float64)
+        seen_x, seen_y = (part.reshape(y.shape) for part in self.geometry.to_monitor(x.ravel(), y.ravel()))
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
         # Beyond a lens there is no place: a pixel whose neighbour looks there has no density either.
         density = np.nan_to_num(np.abs(x_right * y_down - x_down * y_right))
@@ -183,7 +208,7 @@ class TwinOptics(Closing):
             column = np.clip(np.rint(np.where(on_screen, seen_x, 0)), 0, screen_w - 1).astype(np.intp)
             row = np.clip(np.rint(np.where(on_screen, seen_y, 0)), 0, screen_h - 1).astype(np.intp)
             light = light * panel.uniformity[row, column]
-        return np.where(on_screen, light * density, 0.0)
+        return np.asarray(np.where(on_screen, light * density, 0.0))
 
     def close(self) -> None:
         """Free the GL context."""

@@ -19,6 +19,8 @@ from hilstar.charts import BLUE, INK, MUTED, SMALL_PT, chart, write_csv
 from hilstar.errors import InputError
 from hilstar.twin.verify.summary import summarise
 from hilstar.twin.verify.summary import verify as run_twin
+from hilstar.twin.verify.verdict import Verdict as TwinVerdict
+from hilstar.twin.verify.verdict import judge
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 
 VERIFY_FIELDS, VERIFY_SEED = 3, 0
@@ -64,7 +66,7 @@ def verify(context: StepContext) -> StepOutcome:
         line += f"; the light of {int(seen.sure.sum())} can be read, too few to judge it"
     reasons += _place_reasons(context, seen) + _star_reasons(context, figures)
     context.stage(f"the twin looks at {VERIFY_FIELDS} fields")
-    twin = summarise(run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED)))
+    twin = summarise(_twin(context))
     reasons += [f"the twin: {reason}" for reason in twin["reasons"]]
     figures |= {
         "twin_passed": str(twin["passed"]).lower(),
@@ -120,6 +122,15 @@ def _place_reasons(context: StepContext, seen: StarsSeen) -> list[str]:
         f"noise hides whether stars are within {limit_px:g} px: they may be {at_most:.3f} px off at 95 %;"
         f" {wanted} frames of each field would tell (--frames {wanted}), or a longer [tracker] exposure_s"
     ]
+
+
+def _twin(context: StepContext) -> TwinVerdict:
+    """The twin's verdict; its black level is judged no closer than the session knows the light of white, by which it glows."""
+    found = run_twin(_twin_file(context), VERIFY_FIELDS, np.random.default_rng(VERIFY_SEED))
+    glow = found.measured.glow
+    known = float(context.known.get("scale.error_mag", 0.0)) / MAG_PER_RELATIVE
+    limit = max(glow.limit_e_per_s_px, AGREE_SIGMAS * known * glow.assumed_e_per_s_px)
+    return judge(dataclasses.replace(found.measured, glow=dataclasses.replace(glow, limit_e_per_s_px=limit)))
 
 
 def _twin_file(context: StepContext) -> BenchFile:

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import hilstar
-from hilstar.arrays import BoolArray
+from hilstar.arrays import BoolArray, FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.cameras import ideal_monitor, tracker_camera, tracker_psf
+from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera, tracker_psf
 from hilstar.calibrate.geometric import fit as fits
 from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, SeenScreen, read_plan
 from hilstar.calibrate.geometric.match import FirstLook, first_look, match_by_geometry, match_by_maps, refuse_motion, turned
@@ -30,6 +30,7 @@ MIN_DOTS = 12
 KNOWN_MARGIN = 1.01  # relative to the angle to the corner of the tracker's field
 MIN_CELL_SHARE = 0.33  # share of the dots that should be seen in a part of the screen
 CELLS = (("left", "middle", "right"), ("upper", "middle", "lower"))
+SCREEN_PLACES = 17  # along each side of the screen, by which it is known whether the tracker sees all of it
 REACH_PX = 0.5  # tracker px: a centroid this close to a dot's fitted place is that dot
 REACH_SIGMAS = 8.0
 MATCH_ROUNDS = 2
@@ -65,7 +66,7 @@ class Calibrated:
     @property
     def lost(self) -> int:
         """Lit dots in the tracker's field that have no centroid."""
-        expected = sum(int(self.plan.lit[inside].sum()) for inside in _in_view(self.problem, self.fit))
+        expected = sum(int(self.plan.lit[inside].sum()) for inside in _in_view(self.fit, self.plan.x_px, self.plan.y_px))
         return expected - len(self.data)
 
     @property
@@ -114,6 +115,12 @@ def nominal_of(file: BenchFile) -> fits.Nominal:
     config = file.config
     q_cam_to_mon = np.array(config.collimator.q_cam_to_mon)
     return fits.Nominal(ideal_monitor(config), q_cam_to_mon, tracker_camera(config.tracker, file.folder))
+
+
+def seen_screen_of(file: BenchFile) -> SeenScreen:
+    """What the tracker sees of the screen by a bench file: surely by its geometry file, else about. Raises InputError."""
+    tracker = tracker_camera(file.config.tracker, file.folder)
+    return SeenScreen(bench_camera(file.config, file.folder), tracker, is_sure=file.config.collimator.geometry is not None)
 
 
 def dot_sigma_px(file: BenchFile) -> float:
@@ -181,7 +188,10 @@ def calibrate_geometry(
 def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     """The fit with its lens limited to the tracker's field, where part of the screen lies outside of it."""
     geometry, monitor = fit.geometry, fit.geometry.monitor
-    if monitor.lens is None or all(inside.all() for inside in _in_view(problem, fit)):
+    # By places over the whole screen, not by the dots: those stand where the tracker sees it.
+    sides = (np.linspace(-0.5, size - 0.5, SCREEN_PLACES) for size in monitor.resolution_px)
+    x_px, y_px = (part.ravel() for part in np.meshgrid(*sides))
+    if monitor.lens is None or all(inside.all() for inside in _in_view(fit, x_px, y_px)):
         return fit
     width, height = geometry.tracker.resolution_px
     corners = np.array([-0.5, width - 0.5, -0.5, width - 0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
@@ -216,10 +226,10 @@ def matched(
     return fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX), data
 
 
-def _in_view(problem: fits.Problem, fit: fits.Fit) -> list[BoolArray]:
-    """For each pose, a mask of the dots (n,) in the tracker's field."""
+def _in_view(fit: fits.Fit, x_px: FloatArray, y_px: FloatArray) -> list[BoolArray]:
+    """For each pose, a mask of the monitor's pixels (n,) in the tracker's field."""
     geometry = fit.geometry
-    directions = geometry.monitor.rays(problem.plan.x_px, problem.plan.y_px)
+    directions = geometry.monitor.rays(x_px, y_px)
     width, height = geometry.tracker.resolution_px
     found = []
     for q in geometry.q_poses:
@@ -231,7 +241,7 @@ def _in_view(problem: fits.Problem, fit: fits.Fit) -> list[BoolArray]:
 def _refuse_gaps(calibrated: Calibrated) -> None:
     """Refuse (InputError) a part of the screen in the tracker's field whose dots were not seen."""
     plan, problem = calibrated.plan, calibrated.problem
-    wanted = np.any(_in_view(problem, calibrated.fit), axis=0)
+    wanted = np.any(_in_view(calibrated.fit, plan.x_px, plan.y_px), axis=0)
     found = np.zeros(len(plan), dtype=bool)
     found[np.unique(calibrated.data.dot)] = True
     width, height = problem.nominal.monitor.resolution_px

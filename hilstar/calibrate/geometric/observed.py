@@ -89,7 +89,8 @@ def measure_images(
 ) -> Observed:
     """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image.
 
-    The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0. Raises InputError for an image that cannot be read, has another size than the tracker's, or is saturated.
+    The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0. Raises InputError for an
+    image that cannot be read, has another size than the tracker's, or is saturated.
     """
     paths_of = numbered(paths)
     under = None if dark is None else read_image(dark, resolution_px)

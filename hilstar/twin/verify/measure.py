@@ -241,7 +241,8 @@ class GlowFit:
 class Measured:
     """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are drawn as discs.
 
-    `calibration` is the one that the bench assumes; `true_calibration` is the monitor's own, where it is another.
+    `stars_a_field` is how many stars of the bench are in the tracker's field on average. `calibration` is the one that the
+    bench assumes; `true_calibration` is the monitor's own, where it is another.
     """
 
     field_count: int
@@ -254,6 +255,7 @@ class Measured:
     gl_renderer: str
     wide_bodies: list[str]
     star: StarSize
+    stars_a_field: float
     glass: "GlassEffect | None" = None
 
 
@@ -380,8 +382,16 @@ class Comparison:
             gl_renderer=bench.renderer.gl_renderer,
             wide_bodies=wide_bodies(bench.moving, bench.camera),
             star=star_size(self.twin.config, bench.file.folder, self.twin.true_camera),
+            stars_a_field=self._stars_a_field(),
             glass=glass_effect(bench.tracker_psf, self.tally.stars),
         )
+
+    def _stars_a_field(self) -> float:
+        """The bench's stars over the whole sky by the solid angle of the tracker's field."""
+        camera = self.twin.camera
+        right, down = (size / 2 / camera.focal_length_px for size in camera.resolution_px)
+        field_sr = 4 * math.atan(right * down / math.sqrt(1 + right**2 + down**2))
+        return len(self.twin.bench.stars) * field_sr / (4 * math.pi)
 
     def _glow(self) -> GlowFit:
         given = self.twin.config.verify.black_e_per_s_px

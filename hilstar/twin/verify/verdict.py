@@ -15,6 +15,7 @@ from hilstar.twin.verify.measure import GeometryFit, Measured, Star, fit_geometr
 MAX_LEFT = 0.5
 # A cause is named where it accounts for more than this share of the stars.
 MIN_SHARE = 0.5
+MIN_EXPECTED = 10.0  # stars over all fields: with fewer, that none can be measured is chance or an empty sky
 CURE = '; [verify] centroider = "psf" fits it, hilstar assess says which correction takes how much'
 MIRROR_WORDS = {"x": "its columns reversed", "y": "its rows reversed", "swap": "its axes swapped"}
 
@@ -71,7 +72,7 @@ def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
     """The reasons against a bench; none where it passes."""
     too_wide = _too_wide(measured)
     if not errors.looked_for:
-        return ["no star could be measured: no field has one that is shown, unclipped and alone", *too_wide]
+        return [_none(measured), *too_wide]
     lost = _lost(measured, errors)
     centroid = _centroids(measured, errors)
     geometry = _geometry(measured, errors) if lost or centroid else []
@@ -79,6 +80,19 @@ def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
     mostly_lost = len(errors.lost) > MIN_SHARE * errors.looked_for
     light = [] if mostly_lost else [*_light(measured, errors), *_codes(measured, errors)]
     return [*lost, *centroid, *geometry, *light, *_black(measured), *_floor(measured, errors), *too_wide]
+
+
+def _none(measured: Measured) -> str:
+    """Why no star could be measured: too few in view, or none that can be."""
+    few, fields = measured.stars_a_field, measured.field_count
+    faintest = measured.config.sky.faintest_v_mag
+    text = f"no star could be measured: none of {fields} fields has one that is shown, unclipped and alone"
+    if few * fields > MIN_EXPECTED:
+        return text
+    return (
+        f"{text}; {few:.2g} stars to V = {faintest:g} are in the tracker's field on average: take a larger faintest_v_mag,"
+        " a [sky] catalogue with fainter stars, or more --fields"
+    )
 
 
 def _too_wide(measured: Measured) -> list[str]:

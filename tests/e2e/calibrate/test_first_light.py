@@ -56,6 +56,7 @@ SCALE_MAG = 0.005  # 20 stars or more, each within 0.01 mag
 # The tracker's pixel is 107 arcsec. Held-out dots of this bench are 0.2 arcsec rms off; outside the tracker's field, which is
 # a third of the screen, nothing is measured and the lens is extrapolated.
 PLACES_ARCSEC = 3.0
+SAME = 1e-6  # figures are written with six digits
 SEEN_SHARE = 0.6  # of the screen's width and height, about its middle: what the tracker surely sees
 
 
@@ -170,6 +171,37 @@ def test_a_whole_virtual_session_finds_mirror_and_lens(whole):
     assert places_off_arcsec(folder) < PLACES_ARCSEC
     assert steps["verify"]["figures"]["truth_rms_arcsec"] < 2 * PLACES_ARCSEC
     assert (folder / "s" / "bench-before.toml").read_text() == bench_text(TWIN, GAMMA_22)
+
+
+def again_by_hand(folder, *words):
+    result = run_hilstar_here("calibrate", *words, "--json")
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def test_the_commands_of_calibrate_give_the_figures_of_the_steps(whole, tmp_path):
+    """One code, two entrances: the step's own files through `calibrate geometric`, `photometric` and `scale`."""
+    folder, found, _ = whole
+    steps = {step["name"]: step["figures"] for step in found["steps"]}
+    images = folder / "s" / "images" / "geometry-1"
+    frames = sorted(images.glob("frame_*.png"))
+    words = ["--plan", images, "--dark", images / "dark_000.png", "--tracker-is-ideal", "-o", tmp_path / "geometry.toml"]
+    geometry = again_by_hand(folder, "geometric", folder / "bench.toml", *frames, *words)
+    assert geometry["model"] == steps["geometry"]["model"]
+    assert geometry["held_out"]["rms_arcsec"] == pytest.approx(steps["geometry"]["held_out_rms_arcsec"], rel=SAME)
+    focal = geometry["parameters"]["focal_length_px"]["value"]
+    assert focal == pytest.approx(steps["geometry"]["focal_length_px"], rel=SAME)
+    light = again_by_hand(folder, "photometric", folder / "s" / "measured.csv", "--bits", 10, "-o", tmp_path / "response.toml")
+    assert light["holdout"]["rms_mag"] == pytest.approx(steps["photometry"]["held_out_rms_mag"], rel=SAME)
+    assert light["black_level"]["relative"] == pytest.approx(steps["photometry"]["black_level"], rel=SAME)
+    # As the bench file was before the step: white as it had it.
+    text = (folder / "bench.toml").read_text()
+    before = folder / "before-scale.toml"
+    now, then = (steps["scale"][name] for name in ("flux_at_white_e_per_s", "in_bench_file_e_per_s"))
+    before.write_text(re.sub(r"flux_at_white_e_per_s = .*", f"flux_at_white_e_per_s = {then!r}", text))
+    readings = (folder / "s" / "readings.csv").read_text().splitlines()[1:]
+    scale = again_by_hand(folder, "scale", before, *(word for line in readings for word in ("--reading", line)))
+    assert scale["flux_at_white_e_per_s"] == pytest.approx(now, rel=SAME)
 
 
 def test_the_page_needs_nothing_beside_it(whole):

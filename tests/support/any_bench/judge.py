@@ -163,7 +163,6 @@ def _light(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
 def comparisons(drawn: DrawnBench, folder: Path, steps: Mapping[str, Any]) -> dict[str, Comparison]:
     """Each figure of the steps that are done against the plant."""
     done = {name: step["figures"] for name, step in steps.items() if step["verdict"] == "done"}
-    bench, truth = read_bench_file(folder / "bench.toml"), read_bench_file(folder / "truth.toml")
     compared: dict[str, Comparison] = {}
     if "focus" in done:
         found, error = done["focus"]["psf_sigma_px"], done["focus"]["psf_sigma_error_px"]
@@ -178,6 +177,7 @@ def comparisons(drawn: DrawnBench, folder: Path, steps: Mapping[str, Any]) -> di
         compared |= _response(drawn, folder, done["photometry"])
     if not {"geometry", "uniformity", "scale"} & done.keys():
         return compared
+    bench, truth = read_bench_file(folder / "bench.toml"), read_bench_file(folder / "truth.toml")
     screen = SeenScreen.of(bench, truth)
     if "geometry" in done:
         arcsec_a_px = ARCSEC_PER_RAD / tracker_camera(truth.config.tracker, truth.folder).focal_length_px

@@ -89,7 +89,7 @@ def test_a_length_in_another_unit_is_named_with_what_was_meant(tmp_path, key, va
         ([("= 13\n", "= 1000\n"), ("= 57.65\n", "= 4434\n")], r"\[tracker\] pixel_pitch_um is 1000"),
         ([("= 13\n", "= 0.13\n"), ("= 57.65\n", "= 0.5765\n")], r"\[tracker\] pixel_pitch_um is 0.13"),
         ([("[1024, 1024]", "[150, 150]")], "the tracker sees .* % of the screen"),
-        ([("[1920, 1080]", "[640, 480]")], "the tracker sees past the screen"),
+        ([("[1920, 1080]", "[320, 240]")], "the tracker sees past the screen"),
         ([("[background]\n", "[verify]\ntrue_focal_length_mm = 35\n[background]\n")], r"\[verify\] true_focal_length_mm is 35"),
     ],
 )
@@ -125,7 +125,7 @@ def test_a_small_part_of_the_screen_and_a_fine_tracker_are_no_units(tmp_path):
         (("= 50\n", "= 0.05\n"), "[tracker] focal_length_mm = 0.05 in m, which is 50"),
     ],
 )
-@pytest.mark.parametrize("odd", [None, ("= 30\n", "= 1.9\n"), ("[2560, 1440]", "[250, 200]")], ids=["", "f/26", "past"])
+@pytest.mark.parametrize("odd", [None, ("= 30\n", "= 1.9\n"), ("[2560, 1440]", "[160, 120]")], ids=["", "f/26", "past"])
 def test_a_unit_is_named_on_a_bench_that_is_odd_in_other_ways(tmp_path, change, meant, odd):
     text = BENCH
     for old, new in [*NEWCOMER, change, *([] if odd is None else [odd])]:
@@ -138,7 +138,7 @@ def test_a_unit_is_named_on_a_bench_that_is_odd_in_other_ways(tmp_path, change, 
 
 
 @pytest.mark.parametrize("f_number", [0.7, 1.4, 8.0, 20.0])
-@pytest.mark.parametrize("share", [0.02, 0.3, 3.0])
+@pytest.mark.parametrize("share", [0.02, 0.3, 3.0, 10.0])
 def test_a_bench_that_a_lab_may_have_is_not_warned_of(tmp_path, f_number, share):
     side_mm = 1024 * 0.013
     focal_mm = 70.0

@@ -15,6 +15,7 @@ from hilstar.monitor.response import gamma_response, table_response
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Lens, bounded
 from hilstar.scene.psf import GaussianPsf, SampledPsf
+from hilstar.twin import optics as twin_optics
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.verify.measure import on_screen_median
 from tests.support.psfs import gaussian, sampled
@@ -137,3 +138,35 @@ def test_a_glow_beyond_a_lens_is_nothing_and_never_nan(geometry):
     assert np.isfinite(glow).all()
     assert (glow > 0).sum() > 100
     assert np.median(glow) == 0
+
+
+def test_a_glow_is_the_same_in_bands_of_rows(geometry, monkeypatch):
+    """A detector of 4096 x 4096 px would take 2.7 GB at once."""
+    panel = Panel(table_response(8, gamma_response(8).light, black=1e-3), 1e6)
+    with TwinOptics(geometry, GaussianPsf(PSF_PX)) as optics:
+        whole = optics.glow_e_per_s(panel)
+        monkeypatch.setattr(twin_optics, "PIXELS_AT_ONCE", 7 * TRACKER_PX[0])
+        bands = optics.glow_e_per_s(panel)
+    assert np.array_equal(bands, whole)
+
+
+def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry):
+    """A monitor pixel of 9 tracker pixels whose middle is 4 px off the detector, against the integral over its square."""
+    wide = replace(geometry, monitor=monitor_camera((64, 48), 576.5, 120.0, np.array([1.0, 0.0, 0.0, 0.0])))
+    x_px, y_px = (part.ravel() for part in np.meshgrid(np.arange(64.0), np.arange(48.0)))
+    seen_x, seen_y = wide.to_tracker(x_px, y_px)
+    beside = int(np.argmin(np.hypot(seen_x + 4.0, seen_y - 25.0)))
+    light = np.zeros((48, 64))
+    light.ravel()[beside] = 1.0
+    with TwinOptics(wide, GaussianPsf(PSF_PX)) as optics:
+        image = optics.image_e_per_s(light)
+    side = (576.5e-3 / 120) / (13e-3 / 25)
+    shares = []
+    for at, sigma, count in ((seen_x[beside], PSF_PX[0], TRACKER_PX[0]), (seen_y[beside], PSF_PX[1], TRACKER_PX[1])):
+        edges = at + side * (np.arange(SIDE * 8) + 0.5) / (SIDE * 8) - side / 2
+        pixels = np.arange(count)[:, None]
+        inside = ndtr((pixels + 0.5 - edges) / sigma) - ndtr((pixels - 0.5 - edges) / sigma)
+        shares.append(inside.mean(axis=1))
+    expected = shares[1][:, None] * shares[0]
+    assert expected.sum() > 0.02  # some of it is on the detector
+    assert np.abs(image - expected).max() < NINE_FOR_A_SQUARE * expected.max() * 10

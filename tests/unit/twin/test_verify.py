@@ -174,3 +174,13 @@ def test_a_true_monitor_that_is_known_in_grey_alone_refuses_bit_stealing_too(tmp
     verdict, _ = verified(path, 2, np.random.default_rng(1))
     assert not any("bit_stealing" in reason for reason in verdict.reasons)
     assert any(reason.startswith("the codes alone") for reason in verdict.reasons)
+
+
+def test_a_field_without_a_star_says_how_many_the_catalogue_has_there(tmp_path):
+    narrow = {"tracker": {"focal_length_mm": 150, "resolution_px": [128, 128]}, "collimator": {"focal_length_mm": 720}}
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(TWIN, narrow))
+    verdict = verify(read_bench_file(path), 2, np.random.default_rng(3))
+    # 0.64 degrees, and 2900 stars to V = 5.5 over 41 253 square degrees
+    assert "0.028 stars to V = 5.5 are in the tracker's field on average" in verdict.reasons[0]
+    assert "[sky] catalogue with fainter stars" in verdict.reasons[0]

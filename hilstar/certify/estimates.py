@@ -1,12 +1,12 @@
 """Readings to a bench's deviations from its file, with their covariances: light by code and place, places, delay.
 
 All fits are linear least squares without a prior, so that their intervals hold by Student's t: a smoother curve would be
-nearer to the truth on the whole, and not hold it where its bias is larger than its scatter.
+nearer to the truth on the whole, and not hold it where its bias is larger than its scatter. What their residuals have of
+structure (structure.py) counts beside their noise. Places are lens.py's.
 
     light      read / expected at each code read, above black, joined by a cubic spline in log light; a drift in time.
                Scatter relative to light and scatter in the dark are two estimates, each with its own freedom
     evenness   log(light of a dot / expected) over the screen, Chebyshev polynomials, relative to the middle
-    place      direction of a dot by the tracker less that by the bench file, arcsec, Chebyshev polynomials
 
 A polynomial's degree rises from its first one as long as the next is better by an F test.
 """
@@ -256,7 +256,7 @@ def evenness(file: BenchFile, read: DotReadings) -> "Evenness":
     fit = surface(read.x_px, read.y_px, off[:, None], EVEN_DEGREES, size)
     left = off - (fit.terms(read.x_px, read.y_px) @ fit.value)[:, 0]
     kept = np.isfinite(left)
-    kept &= np.abs(left) < WILD_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(left[kept]))
+    kept &= np.abs(left) <= WILD_SIGMAS * max(MAD_TO_SIGMA * float(np.median(np.abs(left[kept]))), 1e-12)
     x, y = read.x_px[kept], read.y_px[kept]
     terms = fit.terms(x, y)
     found = in_place(x, y, left[None, kept], terms[None])

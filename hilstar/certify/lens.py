@@ -124,7 +124,8 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
         mix = across[told].T / size[told]
         dof = float(2 * len(x) - told.sum())
         fit = LensFit(geometry, flat, found, degree, mix, coefficients, basis, Cells(x, y), structure, dof)
-        if structure.total <= DOT_VARIANCE * structure.noise_variance:
+        # By what the residuals show: the variance of a structure as long as the field is hardly known.
+        if float((rest**2).sum()) / dof <= (1 + DOT_VARIANCE) * structure.noise_variance:
             break
     assert fit is not None
     return fit

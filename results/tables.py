@@ -3,6 +3,7 @@
 bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv, timing.csv and those of colour by
 `hilstar study NAME -o`, quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on
 which machine; bench_h100.csv on an NVIDIA H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200.
+certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine changes it.
 """
 
@@ -270,7 +271,35 @@ def confronted_table() -> str:
     return table(head, body)
 
 
+CERTIFIED = (
+    ("flux", ("flux",)),
+    ("places", ("place_along", "place_across")),
+    ("attitude across", ("attitude_x", "attitude_y")),
+    ("about the boresight", ("attitude_z",)),
+    ("latency", ("latency",)),
+)
+
+
+def certify_table() -> str:
+    """How often certificates' intervals held the truth of planted benches, by kind and figure: the mean over regions."""
+    rows = [row for row in rows_of("certify.csv") if row["held_percent"]]
+    head, body = ["kind", "benches", *(name for name, _ in CERTIFIED)], []
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        of_kind = [row for row in rows if row["kind"] == kind]
+        cells = [kind, of_kind[0]["benches"]]
+        for _, quantities in CERTIFIED:
+            members = [row for row in of_kind if row["quantity"] in quantities]
+            held, low, high, ratio = (
+                sum(float(row[key]) for row in members) / len(members)
+                for key in ("held_percent", "low_percent", "high_percent", "ratio")
+            )
+            cells.append(f"{held:.1f} % ({low:.0f} to {high:.0f}), {ratio:.2f}")
+        body.append(cells)
+    return table(head, body)
+
+
 TABLES = {
+    "certify": certify_table,
     "colour": colour_table,
     "colour_gamut": gamut_table,
     "colour_red": red_table,

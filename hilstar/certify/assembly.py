@@ -15,9 +15,11 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_calibration, catalogue_choice, star_flux, star_kinds, star_rates
 from hilstar.bench.catalogue import sigma_instrument_mag
 from hilstar.certify.budget import Distribution, Input, Model
-from hilstar.certify.estimates import LightDeviation, Surface, evenness, light_deviation, places
+from hilstar.certify.estimates import Evenness, LightDeviation, evenness, light_deviation, place_errors
+from hilstar.certify.lens import LensFit, lens_fit
 from hilstar.certify.model import Deviations, Figures, reference_stars
 from hilstar.certify.readings import Reader, dot_places, geometry_of
+from hilstar.certify.structure import in_time, lasting_root
 from hilstar.monitor.calibration import BUILT_IN, read_toml, weights_of_grid
 from hilstar.monitor.geometry import load_notes
 from hilstar.sky.facts import errors_of, motion_at
@@ -26,6 +28,7 @@ from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 
 SEED = 5  # for the order of readings
 DOT_IMAGES = 4
+PLACES_IN_SQUARE = 7  # along each side
 READINGS_A_ROUND = 8  # between one black and white and the next
 LIBRARY_MAG = 0.013  # stars' light by library spectra of their V-I: results/tradeoff.csv, 0.026 mag at 95 %
 SKY = (("star_flux", "mag"), ("star_place_along", "arcsec"), ("star_place_across", "arcsec"))
@@ -51,10 +54,9 @@ class Read:
     """A bench's readings, fitted; what could not be read is None."""
 
     light: LightDeviation
-    even: Surface
-    place: Surface
+    even: Evenness
+    place: LensFit
     delays_ms: FloatArray
-    centroid_px: float = 0.0
 
 
 def read_bench(file: BenchFile, reader: Reader) -> Read:
@@ -63,7 +65,8 @@ def read_bench(file: BenchFile, reader: Reader) -> Read:
     codes = planned_codes(2**file.config.monitor.bits - 1, certify.levels, certify.repeats, rng)
     light = light_deviation(file, reader.light(codes))
     dots = reader.dots(*dot_places(geometry_of(file)), DOT_IMAGES)
-    return Read(light, evenness(file, dots), places(file, dots), reader.delays_ms(), reader.centroid_px)
+    place = lens_fit(file, dots, place_errors(file, dots))
+    return Read(light, evenness(file, dots), place, reader.delays_ms())
 
 
 def planned_codes(white: int, levels: int, repeats: int, rng: np.random.Generator) -> IntArray:
@@ -133,24 +136,23 @@ KINDS = (("levels", "levels"), ("even", "even"), ("place_arcsec", "place"), ("de
 
 
 def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[str]) -> tuple[Deviations, list[Effect]]:
-    light, size = read.light, file.config.monitor.resolution_px
+    light = read.light
     join = light.weights(figures.log_light)
-    dark = (join @ light.dark_factors).T
-    middle = read.even.terms(np.array([size[0] // 2]) * 1.0, np.array([size[1] // 2]) * 1.0)
-    even = read.even.terms(figures.x_px, figures.y_px) - middle
-    place = read.place.terms(figures.x_px, figures.y_px)
-    form = read.even.bowed(figures.x_px, figures.y_px) - read.even.bowed(*(np.array([side // 2]) * 1.0 for side in size))
+    dark, lasting = (join @ light.dark_factors).T, (join @ light.lasting_factors).T
+    fit = read.even.fit
+    read_px = _places_in(light.square_px)
+    even = fit.terms(figures.x_px, figures.y_px) - fit.terms(*read_px).mean(axis=0)
+    place = read.place.at(figures.x_px, figures.y_px)
+    form = fit.bowed(figures.x_px, figures.y_px) - fit.bowed(*read_px).mean()
     half = np.abs(form) / 2 / math.sqrt(3)
     bent = light.bent(figures.log_light) / 2 / math.sqrt(6)  # the spline is the more likely of both
+    rough = light.rough(figures.log_light)
     late_ms = read.delays_ms
     delay = float(late_ms.mean()) if len(late_ms) > 1 else file.config.monitor.panel_delay_ms
     value = Deviations(
-        (join @ light.value)[None], (even @ read.even.value[:, 0] - form / 2)[None], (place @ read.place.value)[None],
-        np.array([delay]), np.zeros(1),
-    )  # fmt: skip
-    by_place = np.zeros((2, place.shape[1], len(figures.stars), 2))
-    for axis in (0, 1):
-        by_place[axis, :, :, axis] = (place @ read.place.factors).T
+        (join @ light.value)[None], (even @ fit.value[:, 0] - form / 2)[None], place.value[None], np.array([delay]), np.zeros(1)
+    )
+    white = math.sqrt(read.even.found.noise_variance) / fit.noise if read.even.found.total else 1.0
     found = [
         Effect(
             Input("response", "Student t", "patches of light", light.factors.shape[1], light.noise, "relative", light.dof),
@@ -165,8 +167,8 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
             levels=bent[None],
         ),
         Effect(
-            Input("evenness", "Student t", "light of dots", even.shape[1], read.even.noise, "relative", read.even.dof),
-            even=(even @ read.even.factors).T,
+            Input("evenness", "Student t", "light of dots", even.shape[1], white * fit.noise, "relative", fit.dof),
+            even=white * (even @ fit.factors).T,
         ),
         Effect(
             Input(
@@ -175,23 +177,75 @@ def _of_readings(file: BenchFile, figures: Figures, read: Read, missing: list[st
             even=half[None],
         ),
         Effect(
-            Input("geometry", "Student t", "places of dots", 2 * place.shape[1], read.place.noise, "arcsec", read.place.dof),
-            place=by_place.reshape(-1, len(figures.stars), 2),
+            Input(
+                "geometry", "Student t", "places of dots", len(place.noise), math.sqrt(place.found.noise_variance), "arcsec",
+                place.noise_dof,
+            ),
+            place=place.noise,
         ),
-    ]
-    if read.centroid_px:
-        count, arcsec = len(figures.stars), read.centroid_px / geometry_of(file).tracker.focal_length_px * ARCSEC_PER_RAD
-        own = np.zeros((2, count, count, 2))
-        own[0, range(count), range(count), 0] = own[1, range(count), range(count), 1] = arcsec
-        centroids = Input("centroids", "normal", "what the pattern of pixels does to them", 2 * count, arcsec, "arcsec")
-        found.append(Effect(centroids, place=own.reshape(2 * count, count, 2)))
+    ]  # fmt: skip
+    found += _of_structure(figures, read, lasting, rough)
     if len(late_ms) > 1:
-        error = float(late_ms.std(ddof=1)) / math.sqrt(len(late_ms))
-        source = f"{len(late_ms)} edges of a photodiode"
-        found.append(Effect(Input("delay", "Student t", source, 1, error, "ms", len(late_ms) - 1.0), delay=np.array([error])))
+        found += _of_delays(late_ms)
     else:
         found += _stated_delay(file, missing)
     return value, found
+
+
+def _of_delays(late_ms: FloatArray) -> Iterator[Effect]:
+    """The effects of edges (n,) that a photodiode saw: of each by itself, and of what correlates from one to the next."""
+    count, order = len(late_ms), np.arange(len(late_ms), dtype=np.float64)
+    lasts, source = in_time(order, late_ms - late_ms.mean(), np.ones((count, 1))), f"{count} edges of a photodiode"
+    error = math.sqrt(lasts.noise_variance / count)
+    yield Effect(Input("delay", "Student t", source, 1, error, "ms", count - 1.0), delay=np.array([error]))
+    if lasts.total:
+        error = float(np.linalg.norm(lasting_root(order, lasts).mean(axis=0)))
+        several = Input("delay that lasts", "Student t", f"{source}, which correlate", 1, error, "ms", lasts.dof)
+        yield Effect(several, delay=np.array([error]))
+
+
+def _places_in(square_px: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
+    """Places (n,) all over a square of the screen, left, top and side, px."""
+    left, top, side = square_px
+    along = (np.arange(PLACES_IN_SQUARE) + 0.5) / PLACES_IN_SQUARE * side - 0.5 if side > 1 else np.zeros(1)
+    x, y = np.meshgrid(left + along, top + along)
+    return x.ravel(), y.ravel()
+
+
+def _of_structure(figures: Figures, read: Read, lasting: FloatArray, rough: FloatArray) -> Iterator[Effect]:
+    """The effects of what the residuals have left of structure, where they have it: in time, of codes, of light, of places."""
+    light, even, place = read.light, read.even, read.place.at(figures.x_px, figures.y_px)
+    if light.lasting.total:
+        error, source = light.noise * math.sqrt(light.lasting.total), "readings that correlate from one to the next"
+        yield Effect(
+            Input("noise that lasts", "Student t", source, len(lasting), error, "relative", light.lasting.dof), levels=lasting
+        )
+    if light.common_factors.size:
+        common = (light.weights(figures.log_light) @ light.common_factors).T
+        error, source = float(np.abs(light.common_factors).max()), "pairs of images of one code on two lattices"
+        ratios = Input("ratios of lattices", "Student t", source, len(common), error, "relative", light.common_dof)
+        yield Effect(ratios, levels=common)
+    if rough.any():
+        source = "codes read, each foretold by the others: those not read"
+        yield Effect(
+            Input("roughness of the response", "normal", source, len(rough), _rms(rough[rough > 0]), "relative"),
+            levels=np.diag(rough),
+        )
+    if even.found.total:
+        count, read_px = len(figures.stars), _places_in(light.square_px)
+        shares = np.concatenate([np.eye(count), np.full((count, len(read_px[0])), -1 / len(read_px[0]))], axis=1)
+        x, y = np.append(figures.x_px, read_px[0]), np.append(figures.y_px, read_px[1])
+        scatter = even.scatter(x, y, shares)
+        error, length = math.sqrt(even.found.total), even.found.mean_length
+        source = f"light of dots about its map, over {length:.0f} px: the screen's, at each star's place"
+        yield Effect(Input("uneven light", "Student t", source, len(scatter), error, "relative", even.found.dof), even=scatter)
+    if place.found.total:
+        error, length = math.sqrt(place.found.total), place.found.mean_length
+        source = f"places of dots about the lens, which correlate over {length:.0f} px"
+        yield Effect(
+            Input("dots that correlate", "Student t", source, len(place.structure), error, "arcsec", place.found.dof),
+            place=place.structure,
+        )
 
 
 def _of_files(file: BenchFile, figures: Figures, value: Deviations, missing: list[str]) -> Iterator[Effect]:
@@ -312,6 +366,7 @@ def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
         yield Effect(Input("instrument", "normal", source, 1, scale, "relative"), even=scale * one)
     else:
         missing.append("absolute scale of the light: no [certify.instrument]; light is in the tracker's own electrons")
+    yield from _of_tracker(file, figures, missing)
     if certify.temperature_k and (certify.flux_mag_per_k or certify.place_arcsec_per_k):
         kelvin = certify.temperature_k / math.sqrt(3)
         flux, place = certify.flux_mag_per_k * kelvin / MAG_PER_RELATIVE, certify.place_arcsec_per_k * kelvin
@@ -331,6 +386,50 @@ def _of_settings(file: BenchFile, figures: Figures, missing: list[str]) -> Itera
                 yield Effect(Input(name, "normal", source, 1, error, "ms"), late=np.array([error]))
     else:
         missing.append("motion: [certify] rate_deg_s is 0, so clock and prediction move no star")
+
+
+def _of_tracker(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:
+    """The tracker itself, by whose lens and detector all is read, as [certify.tracker] states how well it is known.
+
+    Its errors of direction and of evenness are taken as smooth: correlated over half of its field.
+    """
+    stated, count = file.config.certify.tracker, len(figures.stars)
+    of = ", ".join(each for each in (stated.name, stated.date) if each)
+    source = f"[certify.tracker] {of or 'without a name'}, k = {stated.k:g}"
+    tracker = geometry_of(file).tracker
+    half = min(tracker.resolution_px) / 2 / tracker.focal_length_px
+    at = np.concatenate([figures.tangent, np.zeros((1, 2))])  # the last is the middle of the field
+    apart = ((at[:, None] - at) ** 2).sum(axis=2)
+    size, vectors = np.linalg.eigh(np.exp(-apart / (2 * half**2)))
+    smooth = (vectors * np.sqrt(np.maximum(size, 0.0))).T
+    if (direction := stated.direction_expanded_arcsec) is None:
+        missing.append(
+            "place and attitude: they are seen through the tracker's own lens, taken as [tracker] has it, and how well that is"
+            " known is not written ([certify.tracker] direction_expanded_arcsec)"
+        )
+    elif direction:
+        place = np.zeros((2, len(at), count, 2))
+        place[0, :, :, 0] = place[1, :, :, 1] = direction / stated.k * smooth[:, :count]
+        lens = Input("tracker's lens", "normal", source, 2 * len(at), direction / stated.k, "arcsec")
+        yield Effect(lens, place=place.reshape(-1, count, 2))
+    if (even := stated.evenness_expanded_relative) is None:
+        missing.append(
+            "vignetting: light over the field is as the tracker itself collects it, which counts as the screen's"
+            " ([certify.tracker] evenness_expanded_relative is not written)"
+        )
+    elif even:
+        # Relative to the middle two places are off by a half each, in variance, where they are far apart.
+        from_middle = even / stated.k * (smooth[:, :count] - smooth[:, count:])
+        vignetting = Input("tracker's evenness", "normal", source, len(at), even / stated.k, "relative")
+        yield Effect(vignetting, even=from_middle)
+    if (linear := stated.linearity_expanded_relative) is None:
+        missing.append(
+            "linearity: light is in the scale of what reads it, taken as linear ([certify.tracker] linearity_expanded_relative"
+            " is not written)"
+        )
+    elif linear:
+        scale = Input("tracker's linearity", "normal", source, 1, linear / stated.k, "relative")
+        yield Effect(scale, even=np.full((1, count), linear / stated.k))
 
 
 def _of_sky(file: BenchFile, figures: Figures, missing: list[str]) -> Iterator[Effect]:

@@ -18,7 +18,7 @@ from hilstar.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.calibrate.first_light import image_sources
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.focus import sharpness
-from hilstar.calibrate.first_light.photometry import Assumed, Photometer
+from hilstar.calibrate.first_light.photometry import Assumed, Photometer, Readings
 from hilstar.calibrate.geometric.dots import DOT_PX
 from hilstar.calibrate.latency import pair, swap_to_square_ms
 from hilstar.calibrate.plan import Patch
@@ -34,7 +34,7 @@ APART_TRACKER_PX = 12.0  # from dot to dot: a dot that moved by half of it would
 EDGE_TRACKER_PX = 8.0
 MAX_DOTS = 4000
 MIN_DOTS = 60
-CENTROID_PX = 0.003  # 36 stars of a virtual bench by its images were 0.002 px rms from its truth beyond noise
+PAIRS = 4  # of images, for each ratio of two lattices
 DOT_LIGHT = 0.25  # relative to white: a dot of nine pixels at white could saturate the tracker
 WATCHED_S = 5.0
 THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
@@ -42,11 +42,18 @@ THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
 
 @dataclass(frozen=True, slots=True)
 class LightReadings:
-    """Light (n,) of one monitor pixel at the middle of the screen, black included, e-/s, by code (n,), at t_s (n,)."""
+    """Light (n,) of one monitor pixel at the middle of the screen, black included, e-/s, by code (n,), at t_s (n,).
+
+    It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings have in common, as the
+    ratios of lattices, is in `common` (n, inputs), one sigma relative to light, with its freedom.
+    """
 
     code: IntArray
     light: FloatArray
     t_s: FloatArray
+    square_px: tuple[int, int, int] | None = None
+    common: FloatArray | None = None
+    common_dof: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +108,10 @@ def delays_of(recording: image_sources.DiodeRecording | None, file: BenchFile) -
 class VirtualReader:
     """Readings of a virtual bench by its truth file, drawing no image; each `turn` has its own noise. Raises InputError.
 
-    `identity` says it in words, and `centroid_px` is what the pattern of pixels does to a centroid, one sigma along an axis.
+    `identity` says it in words.
     """
 
     monitor: MonitorIdentity | None = None
-    centroid_px = 0.0
 
     def __init__(self, file: BenchFile, truth: BenchFile, seed: int, turn: int = 0) -> None:
         image_sources.refuse_other_bench(file, truth)
@@ -179,7 +185,6 @@ class ImageReader:
     source: image_sources.ImageSource
     folder: Path
     truth: BenchFile | None = None
-    centroid_px: float = CENTROID_PX
     _context: StepContext = field(init=False)
 
     def __post_init__(self) -> None:
@@ -198,12 +203,14 @@ class ImageReader:
         """Lattices of dots that do not saturate the tracker, read by the tracker as a photometer."""
         sigma_px = float(np.mean(self._context.tracker_psf.width_px))
         grey = grey_response(self.file)
-        meter = Photometer(self._context, sigma_px, Assumed({"w": grey.light}, grey.black))
+        meter = Photometer(self._context, sigma_px, Assumed({"w": grey.light}, grey.black), PAIRS)
         start_ns, gain = self.now_ns(), self.file.config.tracker.detector.gain_e_per_dn
         found = meter.read([Patch(int(code), "w") for code in codes])
         level = found.light[codes == 0].mean()
         t_s = np.linspace(0.0, (self.now_ns() - start_ns) / NS_PER_S, len(codes))  # patches take the same time each
-        return LightReadings(codes, (found.above_black + level) * gain, t_s)
+        common, dof = _of_ratios(found)
+        square = meter.field.left, meter.field.top, meter.field.side
+        return LightReadings(codes, (found.above_black + level) * gain, t_s, square, common, dof)
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
         """One image of dots, each found near where the bench file has it."""
@@ -243,6 +250,17 @@ class ImageReader:
         if not self.file.config.monitor.photodiode_px:
             return np.zeros(0)
         return delays_of(self.source.diode(self.file, WATCHED_S), self.file)
+
+
+def _of_ratios(found: Readings) -> tuple[FloatArray | None, float]:
+    """What the errors of the lattices' ratios do to readings: (n, ratios), relative, by their scatter; and its freedom."""
+    if not found.links:
+        return None, math.inf
+    ratios = np.log([link.pairs for link in found.links])
+    error = float(np.sqrt(ratios.var(axis=1, ddof=1).mean() / ratios.shape[1]))
+    # Light of a lattice is divided by the ratios of all that are sparser.
+    divided = found.period[:, None] <= np.array([link.dense for link in found.links])
+    return np.asarray(-error * divided), float(len(ratios) * (ratios.shape[1] - 1))
 
 
 Reader = VirtualReader | ImageReader

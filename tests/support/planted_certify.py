@@ -4,17 +4,35 @@ from __future__ import annotations
 
 import datetime
 from collections import defaultdict
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.calibrate.first_light.image_sources import VirtualBench
 from hilstar.certify import assembly, certificate
 from hilstar.certify.budget import BATCH
-from hilstar.certify.readings import VirtualReader
+from hilstar.certify.readings import ImageReader
+from tests.support.planted_readings import (
+    ARCSEC,
+    DELAY_MS,
+    SEEN_TANGENT,
+    TRACKER_K1,
+    WHITE_E_PER_S,
+    PlantedReader,
+    Truth,
+    true_figures,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hilstar.bench.certificate import Certificate
 
 NOW = datetime.datetime(2026, 11, 26, tzinfo=datetime.UTC)
 
@@ -117,22 +135,92 @@ def plant(folder: Path, one: Plant, bench_keys: str = "", truth_keys: str = "") 
     return folder / "bench.toml", folder / "truth.toml"
 
 
-def coverage(benches: int, seed: int, keys: str = "") -> dict[tuple[str, str], list[bool]]:
-    """By quantity and region, whether each stated interval holds the truth."""
-    rng, held = np.random.default_rng(seed), defaultdict(list)
+@dataclass
+class Counted:
+    """A figure of a kind and region over many benches: whether each interval held the truth, its error and its uncertainty.
+
+    `absent` counts the benches whose certificate did not assess it.
+    """
+
+    held: list[bool] = field(default_factory=list)
+    error: list[float] = field(default_factory=list)
+    standard: list[float] = field(default_factory=list)
+    absent: int = 0
+
+    @property
+    def ratio(self) -> float:
+        """The stated uncertainty over the true error, by the median of their ratios: 1 where errors are as large as stated."""
+        return NORMAL_MEDIAN / float(np.median(np.abs(self.error) / np.maximum(self.standard, 1e-300)))
+
+
+NORMAL_MEDIAN = 0.6745  # of the size of a normal error, in sigmas
+REGIONS = ("left third", "middle third", "right third")
+QUANTITIES = ("flux", "place_along", "place_across", "attitude_x", "attitude_y", "attitude_z", "latency")
+EXACT_LENS = "[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = 0.0\n"
+
+
+def stated_lens() -> str:
+    """A statement of the tracker's lens as it is planted in `own_lens`: the largest of its field, k = 2."""
+    largest_arcsec = TRACKER_K1 * SEEN_TANGENT**3 * ARCSEC
+    return f"[certify.tracker]\nname = 'planted'\ndirection_expanded_arcsec = {2 * largest_arcsec!r}\n"
+
+
+def coverage(
+    draw: Callable[[np.random.Generator], Truth], benches: int, seed: int, keys: str = "", tables: str = EXACT_LENS
+) -> dict[tuple[str, str], Counted]:
+    """Certify planted benches of a kind by their readings and count, by quantity and region."""
+    found: dict[tuple[str, str], Counted] = defaultdict(Counted)
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        path = Path(folder) / "bench.toml"
+        bench = BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
+        path.write_text(f"{bench}[certify]\nfields = 1\n{keys}{tables}")
+        file = read_bench_file(path)
         # Every bench file is the same, so that its stars are; one batch of trials knows an end within 2 % of the half width.
-        first = read_bench_file(plant(Path(folder), drawn(np.random.default_rng(0)), f"[certify]\nfields = 1\n{keys}")[0])
-        stars = assembly.reference_stars(first)
+        stars = assembly.reference_stars(file)
         patch.setattr(assembly, "reference_stars", lambda file: stars)
         patch.setattr(certificate, "QUICK_TRIALS", BATCH)
         for number in range(benches):
-            paths = plant(Path(folder), drawn(rng), f"[certify]\nfields = 1\n{keys}")
-            bench, truth = (read_bench_file(path) for path in paths)
-            assert bench.sha256 == first.sha256
-            found, _ = certificate.certify(bench, VirtualReader(bench, truth, 1_000_003 * seed + number), NOW, quick=True)
-            for each in found.figures:
-                if each.truth is not None:
-                    region = "field" if each.region.startswith("field") else each.region
-                    held[each.quantity, region].append(each.lower <= each.truth <= each.upper)
-    return dict(held)
+            rng = np.random.default_rng((seed, number))
+            one = draw(rng)
+            certified, _ = certificate.certify(file, PlantedReader(one, rng), NOW, quick=True)
+            count(certified, true_figures(one, stars), found)
+    return dict(found)
+
+
+DETECTOR = "[tracker.detector]\nread_noise_e = 15\n"
+
+
+def coverage_by_images(benches: int, seed: int) -> dict[tuple[str, str], Counted]:
+    """The same by images of the tracker, each drawn: the truth is a file, and hilstar's own twin draws it."""
+    found: dict[tuple[str, str], Counted] = defaultdict(Counted)
+    with pytest.MonkeyPatch.context() as patch:
+        stars = None
+        for number in range(benches):
+            with TemporaryDirectory() as name:
+                folder, keys = Path(name), f"[certify]\nfields = 1\n{EXACT_LENS}{DETECTOR}"
+                one = drawn(np.random.default_rng((seed, number)))
+                bench, truth = (read_bench_file(path) for path in plant(folder, one, keys, DETECTOR))
+                if stars is None:
+                    stars = assembly.reference_stars(bench)
+                    patch.setattr(assembly, "reference_stars", lambda file, stars=stars: stars)
+                images = folder / "images"
+                images.mkdir()
+                with closing(VirtualBench(bench, truth, number)) as source:
+                    certified, _ = certificate.certify(bench, ImageReader(bench, source, images, truth), NOW, quick=True)
+            figures = [each for each in certified.figures if each.truth is not None]
+            count(certified, {(each.quantity, each.star): each.truth for each in figures}, found)
+    return dict(found)
+
+
+def count(certified: Certificate, truth: dict[tuple[str, int | None], float], found: dict[tuple[str, str], Counted]) -> None:
+    """Add one certificate to the counts."""
+    stated = [each for each in certified.figures if each.quantity in QUANTITIES]
+    for each in stated:
+        region = "field" if each.region.startswith("field") else each.region
+        one, true = found[each.quantity, region], truth[each.quantity, each.star]
+        one.held.append(each.lower <= true <= each.upper)
+        one.error.append(each.value - true)
+        one.standard.append(each.standard_uncertainty)
+    for quantity in {name for name, _ in truth} - {each.quantity for each in stated}:
+        for region in REGIONS if quantity in QUANTITIES[:3] else ("screen" if quantity == "latency" else "field",):
+            found[quantity, region].absent += 1

@@ -19,6 +19,25 @@ class InstrumentSettings(Table, frozen=True):
     date: str = ""  #: The day of its certificate.
 
 
+class TrackerReferenceSettings(Table, frozen=True):
+    """How well the tracker is known through which all is read, from its own calibration: the reference of angles and of light.
+
+    What is not written is not assessed; without `direction_expanded_arcsec` no place and no attitude is certified.
+    """
+
+    name: str = ""  #: What calibrated it: laboratory, report and serial number.
+    #: Expanded uncertainty of a direction by the lens of `[tracker]`, along each axis, anywhere in its field; 0 where it is the
+    #: measure of all angles. Default: not assessed
+    direction_expanded_arcsec: NotNegative | None = None
+    #: Expanded uncertainty of the light that it collects at a place over that in the middle of its field (vignetting, flat
+    #: field), relative. Default: not assessed
+    evenness_expanded_relative: Relative | None = None
+    #: Expanded uncertainty of the ratio of two lights that it reads, relative: its linearity. Default: not assessed
+    linearity_expanded_relative: Relative | None = None
+    k: Annotated[float, Meta(ge=1, le=10)] = 2.0  #: The coverage factor of these.
+    date: str = ""  #: The day of its calibration.
+
+
 class VirtualSettings(Table, frozen=True):
     """In a truth file alone: how the instruments of a virtual bench read (`hilstar certify --virtual TRUTH.toml`)."""
 
@@ -69,4 +88,5 @@ class CertifySettings(Table, frozen=True):
     flux_mag_per_k: Annotated[float, Meta(ge=-1, le=1)] = 0.0  #: Change of the light by temperature.
     place_arcsec_per_k: Annotated[float, Meta(ge=-100, le=100)] = 0.0  #: Change of the alignment by temperature, about x and y.
     instrument: InstrumentSettings = InstrumentSettings()
+    tracker: TrackerReferenceSettings = TrackerReferenceSettings()
     virtual: VirtualSettings = VirtualSettings()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_calibration, bench_primaries, calibration_source, named_channels
 from hilstar.bench.config.bench_config import drives_apart
@@ -133,19 +133,23 @@ BLACK = Patch(0, "w")
 
 @dataclass(frozen=True, slots=True)
 class LatticeRatio:
-    """A lit pixel's light on a dense lattice relative to a sparse one, both of one code: 1 where light is additive."""
+    """A lit pixel's light on a dense lattice relative to a sparse one, both of one code: 1 where light is additive.
+
+    `ratio` is the mean of `pairs`, of one pair of images each.
+    """
 
     patch: Patch
     dense: int
     sparse: int
     ratio: float
+    pairs: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Readings:
     """Light (n,) of a lit pixel for each patch, black level included, DN/s; the exposure; how lattices agree.
 
-    `above_black` (n,) is without it, and may be negative by noise, which `light` is not.
+    `above_black` (n,) is without it, and may be negative by noise, which `light` is not. `period` (n,) is each one's lattice.
     `black_known` says whether the black level was measured; else it is the bench file's.
     """
 
@@ -156,6 +160,7 @@ class Readings:
     black_known: bool
     images: tuple[Path, ...]
     above_black: FloatArray
+    period: IntArray
 
     def write(self, path: Path) -> None:
         """MEASURED.csv, as `calibrate photometric` reads it. Raises InputError."""
@@ -183,9 +188,9 @@ class Assumed:
 class Photometer:
     """The tracker as a photometer. Raises InputError where the lattices are not whole in its field."""
 
-    def __init__(self, context: StepContext, sigma_px: float, assumed: Assumed) -> None:
+    def __init__(self, context: StepContext, sigma_px: float, assumed: Assumed, pairs: int = 1) -> None:
         geometry = context.real_geometry()
-        self.context, self.assumed = context, assumed
+        self.context, self.assumed, self.pairs = context, assumed, pairs
         self.field, self.periods = field_for(geometry, sigma_px)
         self.shares = peak_shares(self.periods, geometry.tracker.focal_length_px / geometry.monitor.focal_length_px, sigma_px)
         self.exposure_s = context.exposure_s
@@ -209,7 +214,8 @@ class Photometer:
         links = [link for channel in self.assumed.light for link in self._links(channel, chosen)]
         above = self._above_black(planned, np.array(sums), chosen, links)
         light, black_known = self._with_black(planned, above)
-        return Readings(planned, light, self.exposure_s, links, black_known, tuple(self.images), above)
+        periods = np.array([chosen.get(patch, self.periods[-1]) for patch in planned], dtype=np.intp)
+        return Readings(planned, light, self.exposure_s, links, black_known, tuple(self.images), above, periods)
 
     def _expose(self) -> float:
         """Choose an exposure in which white does not saturate, first the bench file's; returns a white dot's peak, DN."""
@@ -246,13 +252,17 @@ class Photometer:
         dark = self._look(f"black_link_{channel}", 1, BLACK)[0]
         for dense, sparse in itertools.pairwise(sorted({*periods.values(), self.periods[-1]})):
             patch = max(patch for patch, period in periods.items() if period == dense)
-            dots = [
-                (self._look(f"link_{channel}_{sparse}_{period}", period, patch)[0] - dark) / self.field.lit(period)
-                for period in (dense, sparse)
-            ]
-            if dots[1] <= 0:
-                raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
-            yield LatticeRatio(patch, dense, sparse, dots[0] / dots[1])
+            ratios = []
+            for pair in range(self.pairs):
+                name = f"link_{channel}_{sparse}" + (f"_{pair}" if pair else "")
+                dots = [
+                    (self._look(f"{name}_{period}", period, patch)[0] - dark) / self.field.lit(period)
+                    for period in (dense, sparse)
+                ]
+                if dots[1] <= 0:
+                    raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
+                ratios.append(dots[0] / dots[1])
+            yield LatticeRatio(patch, dense, sparse, float(np.mean(ratios)), tuple(ratios))
 
     def _above_black(
         self, planned: list[Patch], sums: FloatArray, chosen: dict[Patch, int], links: list[LatticeRatio]

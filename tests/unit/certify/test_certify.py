@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -14,10 +16,13 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.certify.budget import Input, by_trials, first_order, why_they_differ
 from hilstar.certify.check import compare, take_check
 from hilstar.certify.readings import VirtualReader
+from hilstar.certify.structure import in_place
 from hilstar.run.record.ledger_records import read_head
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
-from tests.support.planted_certify import coverage, drawn, plant
+from tests.support.planted_certify import REGIONS, coverage, coverage_by_images, drawn, plant, stated_lens
+from tests.support.planted_readings import KINDS, SmoothField, Truth, supposed, uneven
+from tests.support.planted_readings import in_place as dots_in_place
 from tests.support.planted_run import write_run
 from tests.support.planted_tracker import Planted, Sizes, scan
 from tests.support.planted_tracker import plant as plant_tracker
@@ -25,14 +30,88 @@ from tests.support.planted_tracker import plant as plant_tracker
 BENCHES = 40
 FAR = 4 * math.sqrt(0.05 * 0.95 / BENCHES)  # the figures of one bench's third go nearly together
 UNCHANGED = 20
+FEW = 8
+MIN_HELD = 0.95 - 3 * math.sqrt(0.05 * 0.95 / FEW)  # of figures that go together in each of FEW benches
+LONGEST = 2.5  # stated over true errors, by the median of FEW benches
+DIRECTION = "[certify.tracker]\ndirection_expanded_arcsec = 0.0\n"
 
 
 def test_intervals_hold_the_truth_of_planted_benches() -> None:
-    held = coverage(BENCHES, 7)
+    held = coverage(KINDS["as supposed"], BENCHES, 7)
     assert {quantity for quantity, _ in held} >= {"flux", "place_along", "place_across", "attitude_x", "attitude_z", "latency"}
     assert {region for quantity, region in held if quantity == "flux"} == {"left third", "middle third", "right third"}
-    for where, hits in held.items():
-        assert abs(np.mean(hits) - 0.95) < FAR, (where, np.mean(hits))
+    for where, counted in held.items():
+        assert abs(np.mean(counted.held) - 0.95) < FAR, (where, np.mean(counted.held))
+        assert 1 / LONGEST < counted.ratio < LONGEST, where
+
+
+# What each has wrong where it is hard, and the figures that it moves.
+HARD: dict[str, tuple[Callable[[np.random.Generator], Truth], tuple[str, ...]]] = {
+    "readings in time": (lambda rng: replace(supposed(rng), lasts_readings=20.0), ("latency", "flux")),
+    "dots over 60 px": (lambda rng: dots_in_place(rng, 60, 0.5), ("place_along", "place_across", "attitude_x", "attitude_y")),
+    "dots over 200 px": (lambda rng: dots_in_place(rng, 200, 0.5), ("place_along", "place_across", "attitude_x", "attitude_y")),
+    "light over 30 px": (lambda rng: uneven(rng, 30, 0.01), ("flux",)),
+}
+
+
+@pytest.mark.parametrize("kind", HARD)
+def test_intervals_hold_the_truth_of_benches_whose_errors_correlate(kind: str) -> None:
+    draw, moved = HARD[kind]
+    held = coverage(draw, FEW, 3)
+    for (quantity, region), counted in held.items():
+        if quantity in moved:
+            assert np.mean(counted.held) > MIN_HELD, (quantity, region)
+            assert counted.ratio < 2 * LONGEST, (quantity, region)
+
+
+def test_codes_that_are_off_by_themselves_widen_the_response_between_those_read() -> None:
+    def rough(rng: np.random.Generator) -> Truth:
+        one = replace(supposed(rng), reading_noise=0.001)
+        light = one.light * (1 + 0.005 * rng.standard_normal(256))
+        return replace(one, light=light / light[-1])
+
+    for (quantity, region), counted in coverage(rough, FEW, 4).items():
+        if quantity == "flux":
+            assert np.mean(counted.held) > MIN_HELD, region
+
+
+def test_places_seen_through_an_unstated_lens_are_not_assessed_and_a_stated_one_counts() -> None:
+    own_lens = KINDS["tracker's own lens"]
+    unstated = coverage(own_lens, 2, 5, tables="")
+    assert {where for where, counted in unstated.items() if not counted.held} == {
+        *((f"place_{axis}", region) for axis in ("along", "across") for region in REGIONS),
+        *((f"attitude_{axis}", "field") for axis in "xyz"),
+    }
+    for where, counted in coverage(own_lens, FEW, 5, tables=stated_lens()).items():
+        assert np.mean(counted.held) > MIN_HELD, where
+
+
+def test_structure_is_found_where_it_is_and_not_where_it_is_not() -> None:
+    rng = np.random.default_rng(8)
+    x, y = (part.ravel() * 20.0 for part in np.meshgrid(np.arange(50.0), np.arange(40.0)))
+    terms = np.stack([np.ones_like(x), x / 500 - 1, y / 400 - 1], axis=1)[None]
+    noise = rng.standard_normal((1, len(x)))
+    found = in_place(x, y, noise, terms)
+    assert found.total == 0
+    assert found.noise_variance == pytest.approx(1, abs=4 * math.sqrt(2 / len(x)))
+    more = noise + math.sqrt(0.3) * SmoothField(80.0, rng)(x, y)
+    found = in_place(x, y, more, terms)
+    # A field of 1000 x 800 px has some thirty places that far apart: their variance is known to a quarter.
+    assert found.total == pytest.approx(0.3, rel=0.75)
+    assert found.mean_length == pytest.approx(80, rel=0.3)
+    # An oblique field fills half of its box.
+    oblique = np.abs(x - 490) / 490 + np.abs(y - 390) / 390 < 1
+    found = in_place(x[oblique], y[oblique], more[:, oblique], terms[:, oblique])
+    assert found.mean_length == pytest.approx(80, rel=0.6)
+
+
+def test_images_give_places_as_well_as_thousands_of_dots_know_them() -> None:
+    found = coverage_by_images(1, 3)
+    for axis in ("along", "across"):
+        for region in REGIONS:
+            assert np.median(found[f"place_{axis}", region].standard) < 0.02  # 0.003 px a star were 0.11 arcsec
+    for where, counted in found.items():
+        assert max(abs(np.array(counted.error)) / np.array(counted.standard)) < 5, where
 
 
 def test_three_readings_hold_the_truth_by_their_t() -> None:
@@ -120,7 +199,9 @@ def test_a_check_is_quiet_where_nothing_moved(checked) -> None:
 
 def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
     bench, truth = plant(
-        tmp_path, drawn(np.random.default_rng(5)), '[certify]\nfields = 1\nmax_latency_ms = 1.0\nwho = "A. Tester"\n'
+        tmp_path,
+        drawn(np.random.default_rng(5)),
+        '[certify]\nfields = 1\nmax_latency_ms = 1.0\nwho = "A. Tester"\n' + DIRECTION,
     )
     words = ["certify", str(bench), "-o", str(tmp_path / "out"), "--virtual", str(truth)]
     done = run_hilstar_here(*words, "--quick", "--json")
@@ -145,10 +226,10 @@ def test_the_command_certifies_checks_and_refuses(tmp_path) -> None:
 
 @pytest.mark.usefixtures("without_charts")
 def test_runs_frames_and_assessments_name_the_certificate(tmp_path, planted_run: Planted) -> None:
-    bench, truth = plant(tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n")
+    bench, truth = plant(tmp_path, drawn(np.random.default_rng(5)), "[certify]\nfields = 1\n" + DIRECTION)
     words = ("certify", bench, "-o", tmp_path / "out", "--virtual", truth, "--quick", "--json")
     number = msgspec.json.decode(run_hilstar_here(*words).stdout)["number"]
-    bench.write_text(bench.read_text() + 'certificate = "out/certificate.json"\n')
+    bench.write_text(bench.read_text().replace("fields = 1", 'fields = 1\ncertificate = "out/certificate.json"'))
     assert run_hilstar_here("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "a.fits").returncode == 0
     assert fits.getheader(tmp_path / "a.fits")["CERTIF"] == number
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0.0,1,0,0,0\n0.1,1,0,0,0\n")

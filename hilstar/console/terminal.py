@@ -77,6 +77,7 @@ def report(summary: "RunSummary", as_json: bool) -> None:
     refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
     flooded = summary.link["flooded"] if summary.link else 0
     turned_away = (f" ({refused})" if refused else "") + (f"; {flooded} more passed over unread" if flooded else "")
+    lost = f", {packets.lost} lost" if packets.lost else ""
     lines = {
         "frames": f"{summary.frames} in {summary.duration_s:.2f} s ({figure(summary.fps, 1)} fps)"
         f", {summary.missed_frames} missed, {summary.stale_frames} stale",
@@ -84,7 +85,7 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         "attitude age": f"{spread(summary.attitude_age_ms)} ms (p50 / p99 / max) at render",
         "stars drawn": f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
         + "".join(f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]),
-        "packets": f"{packets.received} received, {packets.refused} refused{turned_away}, {packets.lost} lost",
+        "packets": f"{packets.received} received, {packets.refused} refused{turned_away}{lost}",
     }
     if summary.clock:
         from hilstar.attitude.clock.sender_clock import KNOWN_MODES  # brings NumPy, which Tab and --help do not need

@@ -27,7 +27,7 @@ SIDE_PX = 13_000  # 1.4 GB as float64
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\n(x) run\n%%EOF\n"
 READERS = [read_image, lambda path: read_photographs(path, None), read_map]
 OPENERS = {("Image", "open"), ("fits", "open"), ("fits", "getdata"), ("np", "load"), ("plt", "imread")}
-# Of hilstar's own files (`compare` takes frames that hilstar wrote), of a table of stars that is read by its columns, and of what its own process hands over.
+# Of hilstar's own files, such as the frames that `compare` takes, of tables that are read by columns, and of its own process.
 OWN = {
     "image_files.py",
     "compare_skies.py",

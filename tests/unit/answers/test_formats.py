@@ -250,9 +250,7 @@ def test_a_package_that_is_trusted_may_be_named_and_only_that(tmp_path: Path):
 def test_modules_of_one_name_in_two_folders_are_two(tmp_path: Path):
     for k in range(2):
         (folder := tmp_path / str(k)).mkdir()
-        (folder / "same_name.py").write_text(
-            "import beside\ndef decode(data): return [{'t_ns': beside.T, 'q': [1, 0, 0, 0]}]"
-        )
+        (folder / "same_name.py").write_text("import beside\ndef decode(data): return [{'t_ns': beside.T, 'q': [1, 0, 0, 0]}]")
         (folder / "beside.py").write_text("T = 7")
         decoder = AnswerDecoder(settings_of(format="python:same_name:decode", fields=[]), None, False, folder)
         assert [each.t_ns for each in decoder.feed(0, b"")] == [7]

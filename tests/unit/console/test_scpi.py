@@ -182,7 +182,7 @@ def test_whatever_bytes_come_give_units_or_a_standard_error():
             lines = list(LineBuffer().feed(data + b"\n"))
         except NotScpi:
             closed += 1
-            assert any(byte < 32 and byte not in b"\t\r\n" or byte == 127 for byte in data)
+            assert any((byte < 32 and byte not in b"\t\r\n") or byte == 127 for byte in data)
             continue
         for line in lines:
             try:

@@ -2,10 +2,8 @@
 
 import math
 import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -15,6 +13,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, one_line, shortened
+from hilstar.image_files import ImageSizeError, opened_fits, opened_picture
 from hilstar.reading import read_bytes
 from hilstar.units import NS_PER_S
 
@@ -75,7 +74,7 @@ def read_photographs(path: Path, resolution_px: tuple[int, int] | None, at_ns: i
     """The image of a file, or the planes of a mosaic, of this (width, height). Raises InputError: what and what to do."""
     data = read_bytes(path, ADVICE, MAX_BYTES)
     is_fits = data.startswith(FITS_MAGIC)
-    pixels, facts = _fits(path, data) if is_fits else _picture(path, data)
+    pixels, facts = _fits(path, data, resolution_px) if is_fits else _picture(path, data, resolution_px)
     dn = _grey(path, pixels, facts)
     size = dn.shape[1], dn.shape[0]
     if min(size) < MIN_SIDE_PX:
@@ -153,26 +152,26 @@ def _planes(found: Photograph, pattern: str) -> Iterator[Photograph]:
         yield replace(found, dn=found.dn[number // 2 :: 2, number % 2 :: 2].copy(), plane=name)
 
 
-def _fits(path: Path, data: bytes) -> tuple[npt.NDArray[Any], _Facts]:
+def _fits(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tuple[npt.NDArray[Any], _Facts]:
     from astropy.io import fits
 
     kinds = fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy warns about a cut file; one line says so
-            with fits.open(BytesIO(data)) as hdus:
-                images = [hdu for hdu in hdus if isinstance(hdu, kinds) and hdu.data is not None]
-                if not images:
-                    raise InputError(f"{path}: has no image; {ADVICE}")
-                pixels, header = np.asarray(images[0].data), images[0].header
-                if set(header) >= MAP_KEYS:
-                    raise InputError(
-                        f"{path}: has the direction of each pixel of an all-sky camera ({', '.join(sorted(MAP_KEYS))}), and"
-                        " is no photograph; leave it out"
-                    )
-                facts = _fits_facts(header)
+        with opened_fits(data, resolution_px) as hdus:
+            images = [hdu for hdu in hdus if isinstance(hdu, kinds) and hdu.data is not None]
+            if not images:
+                raise InputError(f"{path}: has no image; {ADVICE}")
+            pixels, header = np.asarray(images[0].data), images[0].header
+            if set(header) >= MAP_KEYS:
+                raise InputError(
+                    f"{path}: has the direction of each pixel of an all-sky camera ({', '.join(sorted(MAP_KEYS))}), and"
+                    " is no photograph; leave it out"
+                )
+            facts = _fits_facts(header)
     except InputError:
         raise
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}") from error
     except Exception as error:  # whatever a damaged file makes astropy raise
         raise InputError(f"{path}: cannot be read as FITS ({one_line(str(error))}); {ADVICE}") from error
     return pixels, facts
@@ -190,12 +189,11 @@ def _fits_facts(header: Any) -> _Facts:
     return _Facts(t_ns, exposure_s, bayer)
 
 
-def _picture(path: Path, data: bytes) -> tuple[npt.NDArray[Any], _Facts]:
-    from PIL import Image, UnidentifiedImageError
+def _picture(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tuple[npt.NDArray[Any], _Facts]:
+    from PIL import UnidentifiedImageError
 
     try:
-        with warnings.catch_warnings(), Image.open(BytesIO(data)) as picture:
-            warnings.simplefilter("ignore")
+        with opened_picture(data, resolution_px) as picture:
             notes: tuple[str, ...] = ()
             if picture.format in {"JPEG", "MPO", "WEBP"}:
                 notes = ("a JPEG: its tone curve is not known, and compression moves faint stars; a raw frame is better",)
@@ -206,6 +204,8 @@ def _picture(path: Path, data: bytes) -> tuple[npt.NDArray[Any], _Facts]:
             return np.asarray(picture), _Facts(t_ns, exposure_s, "", notes)
     except InputError:
         raise
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}") from error
     except UnidentifiedImageError as error:
         raise InputError(f"{path}: is no image; {ADVICE}") from error
     except Exception as error:  # whatever a damaged file makes Pillow raise

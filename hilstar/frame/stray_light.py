@@ -4,9 +4,7 @@ Both are computed once, in the camera's own pixels: what each collects of the li
 """
 
 import hashlib
-import io
 import math
-import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +14,7 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, cannot_read
 from hilstar.frame.fault_kinds import Gradient, MeasuredMap
+from hilstar.image_files import ImageSizeError, npy_array, opened_fits, opened_picture
 from hilstar.reading import read_bytes
 from hilstar.scene.camera import Camera
 
@@ -109,19 +108,15 @@ def read_map(path: Path) -> FloatArray:
 def _decoded(path: Path, raw: bytes) -> npt.NDArray[Any]:
     try:
         if raw.startswith(b"\x93NUMPY"):
-            return np.asarray(np.load(io.BytesIO(raw), allow_pickle=False))
+            return npy_array(raw)
         if raw.startswith(b"\x89PNG"):
-            from PIL import Image
-
-            with Image.open(io.BytesIO(raw)) as picture:
+            with opened_picture(raw, formats=("PNG",)) as picture:
                 return np.asarray(picture)
         if raw.startswith(b"SIMPLE  ="):
-            from astropy.io import fits
-
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # astropy's about a cut file, which gets one line from us
-                units = fits.open(io.BytesIO(raw), memmap=False)
+            with opened_fits(raw) as units:
                 return next(np.asarray(unit.data) for unit in units if getattr(unit, "data", None) is not None)
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}; {MAP_ADVICE}") from error
     except Exception as error:  # each library raises its own for a damaged file
         raise cannot_read(path, f"{type(error).__name__}: {error}", MAP_ADVICE) from error
     raise cannot_read(path, "it is neither FITS, PNG nor npy", MAP_ADVICE)

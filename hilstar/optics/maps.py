@@ -1,7 +1,5 @@
 """A map of PSF images, measured or simulated, with a table of where each belongs, as a tracker's glass."""
 
-import warnings
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +7,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.csv_tables import finite_numbers, read_rows
 from hilstar.errors import InputError
+from hilstar.image_files import ImageSizeError, opened_fits
 from hilstar.optics.psf_file import AXES, FACTS, MAX_FILE_BYTES, Glass, Stack, facts_of, glass_of
 from hilstar.reading import read_bytes
 
@@ -29,14 +28,12 @@ def glass_of_map(stack: Path, points: Path, per_px: int, pixel_integrated: bool,
 
 
 def _images(path: Path) -> FloatArray:
-    from astropy.io import fits  # 0.3 s of every command that needs none of it
-
     content = read_bytes(path, STACK_ADVICE, MAX_FILE_BYTES)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy warns about cards, which nothing here needs
-            images = fits.getdata(BytesIO(content), 0)
-        found: FloatArray = np.asarray(images, dtype=np.float64)
+        with opened_fits(content) as hdus:
+            found: FloatArray = np.asarray(hdus[0].data, dtype=np.float64)
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}; {STACK_ADVICE}") from error
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: not a FITS image; {STACK_ADVICE}") from error
     if found.ndim == 2:

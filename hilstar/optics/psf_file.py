@@ -10,11 +10,9 @@ The layout is one FITS file. docs/optics.md states it for writers; `read_glass` 
 - the table TRANSMISSION (`wavelength_nm`, `transmission`) and the keys `K1` to `P2` are there where they are known.
 """
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +21,7 @@ import numpy as np
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.files import written
+from hilstar.image_files import opened_fits
 from hilstar.reading import read_bytes
 from hilstar.scene.camera import Lens
 from hilstar.scene.psf import SampledPsf, read_psf
@@ -331,25 +330,25 @@ def read_glass(path: Path) -> SampledPsf | Glass:
 @lru_cache(maxsize=4)
 def _glass_in(path: Path, content: bytes) -> Glass | None:
     """The glass in a file's bytes; None where they are an image or no FITS file."""
-    from astropy.io import fits  # as in `write_glass`
+    try:
+        with opened_fits(content) as hdus:
+            return _checked_glass(path, hdus) if POINTS in hdus else None
+    except InputError:
+        raise
+    except Exception:  # astropy raises whatever a broken header causes in its layers; `read_psf` says it
+        return None
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # astropy warns about cards; what matters is checked below
-        try:
-            hdus = fits.open(BytesIO(content), memmap=False)
-            if POINTS not in hdus:
-                return None
-        except Exception:  # astropy raises whatever a broken header causes in its layers; `read_psf` says it
-            return None
-        try:
-            found = _parsed(hdus)
-            _check(found)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-        except Exception as error:
-            raise InputError(
-                f"{path}: its tables cannot be read ({type(error).__name__}); make it with `hilstar optics`"
-            ) from error
+
+def _checked_glass(path: Path, hdus: "fits.HDUList") -> Glass:
+    try:
+        found = _parsed(hdus)
+        _check(found)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except Exception as error:
+        raise InputError(
+            f"{path}: its tables cannot be read ({type(error).__name__}); make it with `hilstar optics`"
+        ) from error
     return found
 
 

@@ -7,7 +7,6 @@ middle, or a HEALPix map, becomes the six faces of a cube. Between pixels all ar
 import gzip
 import io
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, MachineError, cannot_read
+from hilstar.image_files import ImageSizeError, opened_fits
 from hilstar.reading import read_bytes
 from hilstar.sky.electrons import VEGA_V0_W_M2_M
 
@@ -85,15 +85,11 @@ def block_means(image: Any, count: int) -> Any:
 
 def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
     """The map in a FITS file. Raises InputError, and MachineError where a HEALPix map needs its library."""
-    from astropy.io import fits
-
     raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
     try:
         if raw[:2] == b"\x1f\x8b":
             raw = _unzipped(path, raw)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy's about keywords of older standards; what matters is refused
-            units = fits.open(io.BytesIO(raw), memmap=False)
+        with opened_fits(raw) as units:
             table = next((unit for unit in units if unit.header.get("PIXTYPE") == "HEALPIX"), None)
             images = [unit for unit in units if unit.is_image and unit.data is not None]
             if table is not None:
@@ -102,6 +98,8 @@ def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
                 return tuple(face for image in images for face in _of_image(path, image))
     except (InputError, MachineError):
         raise
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}; {MAP_ADVICE}") from error
     except Exception as error:  # each library raises its own for a damaged file
         raise cannot_read(path, f"{type(error).__name__}: {error}", MAP_ADVICE) from error
     raise InputError(f"{path}: has neither an image nor a HEALPix table; {MAP_ADVICE}")

@@ -2,7 +2,6 @@
 
 import math
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError
+from hilstar.image_files import ImageSizeError, opened_fits, opened_picture
 from hilstar.reading import read_bytes
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
@@ -138,7 +138,7 @@ def read_image(path: Path, resolution_px: tuple[int, int] | None = None, advice:
     data = read_bytes(path, advice, MAX_IMAGE_BYTES)
     # A grabbing script may write FITS under any name.
     is_fits = path.suffix.lower() in FITS_ENDINGS or data.startswith(FITS_MAGIC)
-    image = _fits(path, data, advice) if is_fits else _picture(path, data, advice)
+    image = _fits(path, data, advice, resolution_px) if is_fits else _picture(path, data, advice, resolution_px)
     if image.ndim != 2:
         raise InputError(f"{path}: is no grey image of one plane; {advice}")
     if resolution_px is not None and (image.shape[1], image.shape[0]) != resolution_px:
@@ -147,16 +147,14 @@ def read_image(path: Path, resolution_px: tuple[int, int] | None = None, advice:
     return np.asarray(image, dtype=np.float64)
 
 
-def _fits(path: Path, data: bytes, advice: str) -> npt.NDArray[Any]:
-    from io import BytesIO
-
+def _fits(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None) -> npt.NDArray[Any]:
     from astropy.io import fits
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy warns about a cut file; one line says so
-            hdus = fits.open(BytesIO(data))
+        with opened_fits(data, size_px) as hdus:
             planes = [hdu.data for hdu in hdus if isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU) and hdu.data is not None]
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}") from error
     except (OSError, ValueError, TypeError, IndexError) as error:
         raise InputError(f"{path}: cannot be read as FITS ({error}); {advice}") from error
     if not planes:
@@ -164,13 +162,13 @@ def _fits(path: Path, data: bytes, advice: str) -> npt.NDArray[Any]:
     return np.asarray(planes[0])
 
 
-def _picture(path: Path, data: bytes, advice: str) -> npt.NDArray[Any]:
-    from io import BytesIO
-
+def _picture(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None) -> npt.NDArray[Any]:
     from PIL import Image
 
     try:
-        with Image.open(BytesIO(data)) as picture:
+        with opened_picture(data, size_px) as picture:
             return np.asarray(picture)
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}") from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: cannot be read as a picture ({error}); {advice}") from error

@@ -11,7 +11,7 @@ from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
 from hilstar.answers.answer import Answer
-from hilstar.attitude.clock.rate_causes import AS_PACKETS, ReadAs
+from hilstar.attitude.clock.rate_causes import ReadAs
 from hilstar.attitude.clock.rate_check import RateCheck
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Attitude, Timeline
@@ -130,9 +130,13 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
 
 def _read_as(bench: Bench, link: AnyLink) -> ReadAs:
     """How a link's quaternions become the camera's."""
-    if not link.conventions.of_body:
-        return AS_PACKETS
-    return ReadAs(q_body_to_cam=np.asarray(Mounting(bench.config.tracker.q_body_to_cam).q_body_to_cam))
+    mounting = None
+    if link.conventions.of_body:
+        mounting = np.asarray(Mounting(bench.config.tracker.q_body_to_cam).q_body_to_cam)
+    if not link.conventions.of_packets:
+        return ReadAs(q_body_to_cam=mounting, has_key=False)
+    convention = bench.config.attitude.convention
+    return ReadAs(convention.scalar, convention.direction, mounting)
 
 
 def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:

@@ -47,22 +47,27 @@ LAG_TIE = 0.02  # share of the range of errors
 class ReadAs:
     """How a sender's four numbers become the camera's attitude: as `[attitude] convention` says, then by `q_body_to_cam` (4,).
 
-    That is None where they are the camera's own.
+    That is None where they are the camera's own. `has_key` says whether the key states how the source is read; a source
+    with a convention of its own refuses it.
     """
 
     scalar: str = "first"
     direction: str = "icrs_to_cam"
     q_body_to_cam: FloatArray | None = None
+    has_key: bool = True
 
 
 AS_PACKETS = ReadAs()
 
 
+HOW_IT_SENDS = "look at what the simulator puts into its quaternion"
+
+
 class Reading(NamedTuple):
-    """Another reading of a quaternion's four numbers: what it is, the line that states it, and (n, 4) read by it."""
+    """Another reading of a quaternion's four numbers: what it is, what to write for it, and (n, 4) read by it."""
 
     text: str
-    line: str
+    advice: str
     read: Callable[[FloatArray], FloatArray]
 
 
@@ -81,6 +86,9 @@ def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
         parts = [f'scalar = "{other_scalar}"'] if other_scalar != "first" or scalar != "first" else []
         if other_direction != "icrs_to_cam" or direction != "icrs_to_cam":
             parts.append(f'direction = "{other_direction}"')
+        if mounting is not None:
+            parts.append('frame = "body"')
+        advice = f"write [attitude] convention = {{ {', '.join(parts)} }}"
 
         def read(q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar) -> FloatArray:
             own = q if mounting is None else multiply(conjugate(mounting), q)
@@ -90,7 +98,7 @@ def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
             own = conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
             return own if mounting is None else multiply(mounting, own)
 
-        found.append(Reading(text, f"{{ {', '.join(parts)} }}", read))
+        found.append(Reading(text, advice if read_as.has_key else HOW_IT_SENDS, read))
     return tuple(found)
 
 
@@ -126,11 +134,11 @@ class Stretch:
 
     def turn_as(self, reading: Reading) -> FloatArray:
         """The turn (3,) of its quaternions in another reading of their numbers."""
-        found = self._read.get(reading.line)
+        found = self._read.get(reading.text)
         if found is None:
             turned = np.cumsum(_turns_rad(reading.read(self.q))[self.whole], axis=0)
             weight = self.at_s - self.at_s.mean()
-            found = self._read[reading.line] = np.asarray(weight[1:] @ turned / float(weight @ weight))
+            found = self._read[reading.text] = np.asarray(weight[1:] @ turned / float(weight @ weight))
         return found
 
 
@@ -319,7 +327,7 @@ def _definite(stretches: Sequence[Stretch], read: Cause | None, sharp: bool) -> 
 
 
 def _stated(reading: Reading) -> str:
-    return f"they are right and fit the {reading.text}: [attitude] convention = {reading.line}"
+    return f"they are right and fit the {reading.text}: {reading.advice}"
 
 
 def _indefinite(stretches: Sequence[Stretch], length_s: float, history_s: float) -> Cause | None:

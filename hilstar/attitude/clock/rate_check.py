@@ -235,7 +235,7 @@ class RateCheck:
         if cause.reading is not None:
             return (
                 f"the packets' rates do not fit their quaternions as they are read; {cause.text}: the sky is drawn at another"
-                f" place; write [attitude] convention = {cause.reading.line} (both turn at {turn_deg_s:.3g} deg/s)"
+                f" place; {cause.reading.advice} (both turn at {turn_deg_s:.3g} deg/s)"
             )
         done = "the sky is drawn by the quaternions' own turn" if self.distrusts else "they are used all the same"
         if not self._used:

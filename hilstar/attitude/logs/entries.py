@@ -189,8 +189,8 @@ class LogJoins:
             misfits = f"in {self.misfits} intervals the log's rates do not fit its attitudes"
             why = f"; probably {self.cause.text}" if self.cause is not None else ""
             if self.cause is not None and self.cause.reading is not None:
-                stated = f"write [attitude] convention = {self.cause.reading.line}"
-                lines.append((self.cause.kind, f"{misfits}{why}: the sky is drawn at another place; {stated}"))
+                advice = self.cause.reading.advice
+                lines.append((self.cause.kind, f"{misfits}{why}: the sky is drawn at another place; {advice}"))
             lines.append(("log-rates", f"{misfits}, and are ignored there{why}"))
         return lines
 

@@ -326,4 +326,15 @@ def test_attitudes_of_a_body_are_read_otherwise_before_they_are_mounted(scalar, 
     check = RateCheck("use-quaternions", notices, read_as=ReadAs(q_body_to_cam=mounting))
     for sample in stream:
         check.see(sample)
-    assert LINES[scalar, direction] in notices.lasting[CONVENTION]
+    line = LINES[scalar, direction].replace(" }", ', frame = "body" }')
+    assert f"write [attitude] convention = {line}" in notices.lasting[CONVENTION]
+
+
+def test_a_source_with_a_convention_of_its_own_is_told_no_key():
+    t_ns, q, rates = steady()
+    notices = Notices()
+    check = RateCheck("use-quaternions", notices, read_as=ReadAs(has_key=False))
+    for sample in samples(t_ns, as_sent(q, "last", "icrs_to_cam"), rates):
+        check.see(sample)
+    assert "[attitude] convention" not in notices.lasting[CONVENTION]
+    assert "look at what the simulator puts into its quaternion" in notices.lasting[CONVENTION]

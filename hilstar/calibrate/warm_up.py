@@ -31,6 +31,7 @@ CONFIDENCE = 0.975  # one-sided bound: both sides together leave 5 %
 FLOOR = 1e-6  # relative: an instrument's rounding, below which residuals say nothing
 LIKELY = 6.0  # Akaike's criterion above the best law's: one in twenty as likely
 TAUS, MAX_TAU = 12, 3.0  # time constants that are tried, from a step between readings to 3 times their span
+END_SHARE = 0.01  # of the step between two time constants: nearer to the last one is at the end
 S_PER_H = 3600.0
 
 
@@ -87,12 +88,16 @@ class WarmUp:
 
 @dataclass(frozen=True, slots=True)
 class _Law:
-    """A law's parameters (w, s) or (w, a, tau), their covariance, and relative residuals (n,)."""
+    """A law's parameters (w, s) or (w, a, tau), their covariance, and relative residuals (n,).
+
+    `at_end` says that the time constant is at an end of those that are tried: the readings do not have it.
+    """
 
     parameters: FloatArray
     covariance: FloatArray
     residual: FloatArray
     dof: int
+    at_end: bool = False
 
     @property
     def criterion(self) -> float:
@@ -100,6 +105,8 @@ class _Law:
 
     @property
     def is_refused(self) -> bool:
+        if self.at_end:
+            return True
         steps, n = np.diff(self.residual), len(self.residual)
         scatter = MAD_TO_SIGMA * float(np.median(np.abs(steps)))
         ratio = (float(np.mean(steps**2)) / 2 + FLOOR**2) / (float(self.residual @ self.residual) / self.dof + FLOOR**2)
@@ -216,8 +223,10 @@ def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
     tried = np.linspace(math.log(float(np.median(np.diff(time)))), math.log(MAX_TAU * float(time[-1])), TAUS)
     best = int(np.argmin([misfit(each) for each in tried]))
     bounds = tried[max(best - 1, 0)], tried[min(best + 1, TAUS - 1)]
-    tau = math.exp(float(minimize_scalar(misfit, bounds=bounds, method="bounded").x))
-    return _line(t_s, light), _law(time, value, tau)
+    log_tau = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
+    margin = END_SHARE * (tried[1] - tried[0])
+    at_end = not tried[0] + margin < log_tau < tried[-1] - margin
+    return _line(t_s, light), replace(_law(time, value, math.exp(log_tau)), at_end=at_end)
 
 
 def _line(t_s: FloatArray, light: FloatArray) -> _Law:

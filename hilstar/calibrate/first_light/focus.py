@@ -33,6 +33,7 @@ from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_bac
 
 THRESHOLD_SIGMA = 8.0
 MIN_DOTS, MAX_DOTS = 5, 40  # of which the brightest are fitted: 40 leave 0.2 % of error where a dot leaves 1 %
+MIN_ALONE_DOTS, MIN_WINGS_PX = 8, 2.0  # with fewer alone, a dot's square of pixels is made smaller, to so much about its side
 MAX_ALL_POINTS = 24_000  # of all dots together: fewer dots where each has many points
 SIGMAS_PX = (0.1, 12.0)  # ends of the model
 STARTS_PX = np.geomspace(0.2, 8.0, 12)
@@ -103,7 +104,17 @@ def sharpness(image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, nois
     # The wings of a first look at the dots: the blob's pixels are those above the threshold.
     blob_px = math.sqrt(float(np.median(found.pixels)) / math.pi)
     half = int(np.clip(math.ceil(max(half_side + START_SIGMAS, 1.5 * blob_px + 2)), MIN_HALF_PX, MAX_HALF_PX))
-    dots = _alone(image, background.level, found.x_px, found.y_px, half)
+    # Where dots stand closer together, smaller squares hold less of the wings and the fit's error says so.
+    smallest = math.ceil(half_side + MIN_WINGS_PX)
+    while True:
+        dots = _alone(image, background.level, found.x_px, found.y_px, half)
+        if len(dots.values) >= MIN_ALONE_DOTS or half <= smallest:
+            break
+        half -= 1
+    if len(dots.values) < MIN_DOTS:
+        raise InputError(
+            f"{len(dots.values)} dots stand alone and whole in the image and {MIN_DOTS} are needed; look at the focus"
+        )
     noise = noise or DotNoise()
     shape = _started(dots, dot_side_px, turn)
     dots = _first(dots, max(MAX_ALL_POINTS // len(shape.points), MIN_DOTS + 3))
@@ -127,10 +138,6 @@ def _alone(image: FloatArray, level: float, x_px: FloatArray, y_px: FloatArray, 
     column, row = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)
     whole = (column >= half) & (column < width - half) & (row >= half) & (row < height - half)
     kept = np.flatnonzero(whole & (apart.min(axis=1, initial=np.inf) > 2 * half))[:MAX_DOTS]
-    if len(kept) < MIN_DOTS:
-        raise InputError(
-            f"{len(kept)} dots stand alone and whole in the image and {MIN_DOTS} are needed; look at focus and stray light"
-        )
     steps = np.arange(-half, half + 1)
     values = image[(row[kept, None] + steps)[:, :, None], (column[kept, None] + steps)[:, None, :]] - level
     return _Dots(np.asarray(values, dtype=np.float64), x_px[kept], y_px[kept], half)

@@ -282,3 +282,18 @@ def test_a_noisy_reading_counts_less_and_equal_ones_are_their_median():
     assert weighed.flux_at_white_e_per_s == pytest.approx(10.0, abs=0.06)
     assert weighed.relative_error is not None
     assert StarReading(1, 5.0).sigma_dn == 0.0
+
+
+def test_dots_of_a_certificate_stand_close_and_are_measured_all_the_same():
+    """They are 12 tracker px apart, so none stood alone in a square of 13."""
+    rng, sigma_px = np.random.default_rng(6), 0.6
+    image, edges = rng.normal(0, 3.0, (120, 120)), np.arange(121) - 0.5
+    steps = ((np.arange(30) + 0.5) / 30 - 0.5) * 2.7
+    for place_x in np.arange(12, 110, 12) + 0.3:
+        for place_y in np.arange(12, 110, 12) - 0.2:
+            across, down = (
+                np.diff(ndtr((edges - place - steps[:, None]) / sigma_px), axis=1).mean(axis=0) for place in (place_x, place_y)
+            )
+            image += 30_000 * np.outer(down, across)
+    found = sharpness(image, 2.7)
+    assert abs(found.psf_sigma_px - sigma_px) < 4 * found.psf_sigma_error_px < 0.05

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.arrays import FloatArray
-from hilstar.calibrate.warm_up import STABLE, WarmUp, judge_warm_up, watch_white
+from hilstar.calibrate.warm_up import MAX_TAU, STABLE, WarmUp, judge_warm_up, watch_white
 from hilstar.errors import InputError
 from tests.support.fake_clock import FakeClock
 
@@ -109,3 +109,13 @@ def test_watching_ends_at_the_longest_time_and_refuses_a_dark_reading() -> None:
         watch_white(lambda: 0.0, clock.now_ns, clock.sleep)
     with pytest.raises(InputError, match="12 or more"):
         judge_warm_up(np.arange(5.0), np.ones(5))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_time_constant_is_one_that_ends_what_is_tried(seed: int) -> None:
+    """A curve that still bends at the end fits an exponential without end: that law is no finding."""
+    t_s = np.arange(60) * 10.0
+    bent = 1 + 1e-5 * t_s - 2e-9 * t_s**2
+    scattered = bent * (1 + 1e-4 * np.random.default_rng(seed).standard_normal(len(t_s)))
+    found = judge_warm_up(t_s, np.asarray(scattered, dtype=np.float64))
+    assert found.law != "exponential" or found.tau_s < 0.98 * MAX_TAU * float(t_s[-1])

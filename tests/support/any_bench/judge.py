@@ -25,6 +25,7 @@ from tests.support.any_bench.draw import DrawnBench, true_light
 
 STEPS = ("orientation", "focus", "warm-up", "geometry", "uniformity", "photometry", "scale", "latency", "verify")
 MAX_SIGMAS = 4.0
+REFUSED_CODE = 2  # the file was wrong: any other end without a step is a fault of the program or the machine
 MAX_MEMORY_MB = 2048.0
 PLACES = 41  # along each side of the screen
 DECADES = (1e-1, 1e-2, 1e-3)
@@ -259,8 +260,10 @@ def _first_day(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
     if session.code is None:
         return FAILED, f"stopped after {session.seconds:.0f} s: {session.last_line}"
     steps = {step["name"]: step for step in session.found.get("steps", [])}
-    if session.code and not steps:
-        return REFUSED, session.last_line
+    if not steps:
+        if session.code == REFUSED_CODE:
+            return REFUSED, session.last_line
+        return FAILED, f"ended with {session.code}: {session.last_line}"
     reasons = _reasons(results)
     failed = next((step for step in steps.values() if step["verdict"] == "failed"), None)
     if failed is not None and not (failed["name"] == "verify" and only_wide(reasons)):

@@ -257,13 +257,9 @@ def _fault(results: Mapping[str, CommandResult], compared: Mapping[str, Comparis
 def _first_day(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
     """A session that is refused or fails, and a bench that its twin does not pass; None where all is well."""
     session = results[FIRST_LIGHT]
-    if session.code is None:
-        return FAILED, f"stopped after {session.seconds:.0f} s: {session.last_line}"
     steps = {step["name"]: step for step in session.found.get("steps", [])}
     if not steps:
-        if session.code == REFUSED_CODE:
-            return REFUSED, session.last_line
-        return FAILED, f"ended with {session.code}: {session.last_line}"
+        return _without_steps(session)
     reasons = _reasons(results)
     failed = next((step for step in steps.values() if step["verdict"] == "failed"), None)
     if failed is not None and not (failed["name"] == "verify" and only_wide(reasons)):
@@ -274,6 +270,14 @@ def _first_day(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
     if reasons and not only_wide(reasons):
         return NOT_VERIFIED, "; ".join(reasons)
     return None
+
+
+def _without_steps(session: CommandResult) -> tuple[str, str]:
+    """A session that ended before its first step was recorded."""
+    if session.code == REFUSED_CODE:
+        return REFUSED, session.last_line
+    end = f"stopped after {session.seconds:.0f} s" if session.code is None else f"ended with {session.code}"
+    return FAILED, f"{end}: {session.last_line}"
 
 
 def _afterwards(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:

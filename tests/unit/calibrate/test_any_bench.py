@@ -222,7 +222,7 @@ def test_a_step_tells_of_itself_while_it_runs(monkeypatch):
     assert lines[-1].startswith("geometry")
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 25.0, 44.0, -40.0])
+@pytest.mark.parametrize("turn_deg", [0.0, 25.0, 44.0, -40.0, 47.0, -48.0])
 def test_a_figure_that_is_turned_by_any_angle_is_seen_with_its_turn(turn_deg):
     turn = np.array([1.0, 0.0, 0.0, 0.0])
     geometry = BenchGeometry(monitor_camera((640, 480), 57.65, 120, turn), monitor_camera((400, 400), 13, 25, turn))
@@ -235,8 +235,8 @@ def test_a_figure_that_is_turned_by_any_angle_is_seen_with_its_turn(turn_deg):
         top = round(199.5 + ratio * (sin * right + cos * down) - 1.4 * sides)
         image[top : top + round(2.8 * sides), left : left + round(2.8 * sides)] += 500
     found = see_figure(image, figure, geometry)
-    assert found.way == UPRIGHT
-    assert abs(found.turn_deg - turn_deg) < 4 * found.turn_error_deg < 4.0
+    assert (found.way == UPRIGHT) == (abs(turn_deg) < 45)
+    assert abs(found.whole_turn_deg - turn_deg) < 4 * found.turn_error_deg < 4.0
 
 
 def wide_star(spot, dn, noise_dn, rng):

@@ -339,6 +339,7 @@ def _frames_of(context: StepContext, plan: DotPlan, first: int, code: int, dark:
         for frame in range(plan.frames)
     ]
     size_px = context.file.config.tracker.resolution_px
+    context.stage(f"measures the dots of {len(paths)} images")
     return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
 
 

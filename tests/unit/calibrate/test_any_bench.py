@@ -16,9 +16,10 @@ from hilstar.calibrate.first_light.context import FittedFigure, StepOutcome
 from hilstar.calibrate.first_light.focus import seen_sharpness, sharpness
 from hilstar.calibrate.first_light.geometry import UPRIGHT, figure_for, see_figure
 from hilstar.calibrate.first_light.image_sources import ImageSource
+from hilstar.calibrate.first_light.photometry import rounds_alike
 from hilstar.calibrate.first_light.seen_stars import Beyond, StarSpot
 from hilstar.calibrate.first_light.session import FirstLightSession, Progress
-from hilstar.calibrate.first_light.stars import P95_OF_TWO, frames_for
+from hilstar.calibrate.first_light.stars import P95_OF_TWO, frames_for, place_reasons
 from hilstar.calibrate.geometric.calibration import calibrate_seen, nominal_of, rough_geometry, seen_screen_of
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen, joined, lit_for, plan_seen_dots
 from hilstar.calibrate.geometric.observed import Observed
@@ -290,6 +291,15 @@ def test_frames_are_asked_for_where_noise_hides_the_places():
     assert frames_for(Places(Beyond(0.0, 0.0, 3 * sigma)), limit_px) == 9
 
 
+@pytest.mark.parametrize(("high", "advised"), [(2.9, "(--frames 9)"), (28.99, "(--frames 841)"), (60.0, "")])
+def test_no_more_frames_are_advised_than_the_option_takes(high, advised):
+    limit_px = 0.1
+    (reason,) = place_reasons(Places(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO)), limit_px)
+    assert advised in reason
+    assert ("--frames" in reason) == bool(advised)
+    assert "a longer [tracker] exposure_s" in reason
+
+
 def test_a_noisy_reading_counts_less_and_equal_ones_are_their_median():
     ratios = np.array([1.0, 1.02, 0.98, 2.0])
     assert scale_of(10.0, ratios, np.zeros(4)).flux_at_white_e_per_s == pytest.approx(10.1)
@@ -312,3 +322,13 @@ def test_dots_of_a_certificate_stand_close_and_are_measured_all_the_same():
             image += 30_000 * np.outer(down, across)
     found = sharpness(image, 2.7)
     assert abs(found.psf_sigma_px - sigma_px) < 4 * found.psf_sigma_error_px < 0.05
+
+
+@pytest.mark.parametrize(("read_noise_e", "alike"), [(0.0, True), (5.0, True), (12.0, False)])
+def test_an_adc_rounds_alike_where_read_noise_is_under_its_steps(read_noise_e, alike):
+    """A session by a detector without read noise said that stray light or a cold monitor may be why levels were not smooth."""
+    detector = DetectorSettings(read_noise_e=read_noise_e, gain_e_per_dn=24.0)
+    light_dn = np.linspace(0.0, 1.0, 101)
+    noise_dn = np.random.default_rng(2).normal(0, read_noise_e / 24.0, (20_000, 1))
+    lost_dn = np.abs(np.rint(light_dn + noise_dn).mean(axis=0) - light_dn).max()
+    assert rounds_alike(detector) == alike == (lost_dn > 0.03)

@@ -33,9 +33,10 @@ is stdout, for CSV and TOML alone; what the command says then goes to stderr.
 |---|---|
 | 0 | Done. |
 | 1 | `compare`: not the same sky; `verify --strict`: not passed; `first-light`: a failed step; \
-`serve` and `replay`: the ledger failed. |
+`serve` and `replay`: the ledger failed, or with `--strict` the sky was late or wrong. |
 | {InputError.exit_code} | The command line or a file was wrong. |
-| {MachineError.exit_code} | The machine lacks something, such as OpenGL, or a display or port that a file names, or its display went away. |
+| {MachineError.exit_code} | The machine lacks something, such as OpenGL, or a display or port that a file names, \
+or its display went away. |
 | 4 | `serve`: the run ended without ever having had an attitude. |
 | 128 + N | Ended by signal N: 130 for Ctrl-C. |
 

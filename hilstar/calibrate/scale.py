@@ -14,7 +14,9 @@ from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.units import ERROR_OF_MEDIAN, MAG_PER_RELATIVE, magnitude
 
-STAR_MAG = 0.004  # error of a star's light beside its noise: what window, response and uniformity leave on a good bench
+# Error of a star's light beside its noise and its codes: what the window's sum, the response and the uniformity map leave on a
+# well measured bench.
+STAR_MAG = 0.004
 UNSURE_MAG = 0.05  # readings that disagree by more are wrong for another reason than the scale
 
 

@@ -17,9 +17,9 @@ from hilstar.bench.build import bench_calibration, calibration_source, open_benc
 from hilstar.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.calibrate.first_light import image_sources
 from hilstar.calibrate.first_light.context import StepContext
-from hilstar.calibrate.first_light.focus import sharpness
+from hilstar.calibrate.first_light.focus import seen_sharpness
 from hilstar.calibrate.first_light.photometry import Assumed, Photometer, Readings
-from hilstar.calibrate.geometric.dots import DOT_PX
+from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen
 from hilstar.calibrate.latency import pair, swap_to_square_ms
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
@@ -240,8 +240,9 @@ class ImageReader:
         kept = far < APART_TRACKER_PX / 2
         if kept.sum() < MIN_DOTS:
             raise InputError(f"{int(kept.sum())} dots are where the bench file has them; run the geometry again (first-light)")
-        ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-        sharp, at = sharpness(image, DOT_PX * ratio), near[kept]
+        seen = SeenScreen(geometry.monitor, geometry.tracker, is_sure=True)
+        sharp = seen_sharpness(image, seen, self.file.config.tracker.detector, len(looked))
+        at = near[kept]
         places = x[kept], y[kept], found.x_px[at], found.y_px[at]
         return DotReadings(*places, found.flux[at], sharp.psf_sigma_px, sharp.psf_sigma_error_px)
 

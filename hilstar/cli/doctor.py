@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from hilstar.cli.options import Json
-from hilstar.cli.running import say_optics
+from hilstar.cli.running import say_units
 from hilstar.console.terminal import print_found
 
 OwnBench = Annotated[
@@ -35,7 +35,7 @@ def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = 
     benches = examine_bench(bench_file, datetime.now(UTC).date())
     result = examine()
     for bench in benches.values():
-        say_optics(bench.fields, bench.star)
+        say_units(bench.fields)  # a star that is too wide is on the page, with its panels
     named = {"benches": {name: bench.keys() for name, bench in benches.items()}} if benches else {}
     lines = [check.line() for check in result.checks]
     lines += [line for output in result.outputs for line in output.lines()]

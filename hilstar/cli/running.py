@@ -153,9 +153,9 @@ def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
     """Warn of a length in the bench file that is probably in another unit than its key; else of a star that is too wide."""
     fault = star.fault()
     if fields.warning is not None:
-        say(f"check the units: {fields.warning}")
+        say_units(fields)
     elif fault is not None:
-        say(f"{fault}; hilstar doctor lists panels")
+        say(f"{fault}; hilstar doctor BENCH lists panels")
 
 
 def say_seen(bench: Any) -> dict[str, Any]:
@@ -175,9 +175,13 @@ def say_units_of(file: "BenchFile") -> None:
     """Warn of a length of a bench file that is probably another quantity, or in another unit than its key."""
     from hilstar.bench.cameras import fields_of_view
 
-    warning = fields_of_view(file.config, file.folder).warning
-    if warning is not None:
-        say(f"check the units: {warning}")
+    say_units(fields_of_view(file.config, file.folder))
+
+
+def say_units(fields: "FieldsOfView") -> None:
+    """The same, of fields of view that are at hand."""
+    if fields.warning is not None:
+        say(f"check the units: {fields.warning}")
 
 
 def say_beat(bench: Any, screen: Any) -> "BeatSummary":

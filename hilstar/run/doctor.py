@@ -120,8 +120,9 @@ class BenchReport:
         state = "ok" if self.fields.warning is None else "check"
         yield f"{state:8}{name + ' ':12}{self.fields.line()}"  # a name of any length stands apart from the text
         yield f"{'check' if self.star.too_wide else 'ok':8}{'star':12}{self.star.line()}"
-        if self.star.would_do is not None:
-            yield from (f"{'':20}{line}" for line in (self.star.would_do.text(), *self.star.would_do.lines()))
+        fault, remedy = self.star.fault(), self.star.would_do
+        if fault is not None and remedy is not None:
+            yield from (f"{'':20}{line}" for line in (fault, *remedy.lines()))
         if self.monitor.now is not None:
             yield f"{'CHANGED' if self.monitor.fault else 'ok':8}{'monitor':12}{self.monitor.now.name()}"
             yield from [f"{'':20}{self.monitor.notice}"] * bool(self.monitor.notice)

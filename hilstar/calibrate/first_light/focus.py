@@ -30,6 +30,7 @@ from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, SeenScreen, dot_im
 from hilstar.charts import chart
 from hilstar.errors import InputError
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
+from hilstar.tracker.settings import DetectorSettings
 
 THRESHOLD_SIGMA = 8.0
 MIN_DOTS, MAX_DOTS = 5, 40  # of which the brightest are fitted: 40 leave 0.2 % of error where a dot leaves 1 %
@@ -357,11 +358,16 @@ def sharp_dots(context: StepContext) -> SharpDots:
         if not context.is_too_bright(looked):
             break
         code = context.darker(code)
-    side_px = DOT_PX * seen.tracker_px_a_monitor_px
-    detector = context.file.config.tracker.detector
-    noise = DotNoise(detector.gain_e_per_dn, detector.prnu)
-    turn_deg = float(context.known.get("orientation.turn_deg", 0.0))
-    return SharpDots(code, sharpness(looked.image, side_px, turn_deg, noise), looked)
+    return SharpDots(code, seen_sharpness(looked.image, seen, context.file.config.tracker.detector), looked)
+
+
+def seen_sharpness(image: FloatArray, seen: SeenScreen, detector: DetectorSettings, images: int = 1) -> Sharpness:
+    """Measure the sharpness of dots of DOT_PX in the mean (h, w) of some images, above their dark frame.
+
+    The squares are as large, and turned, as `seen` has the screen's pixels. Raises InputError as `sharpness` does.
+    """
+    noise = DotNoise(images * detector.gain_e_per_dn, detector.prnu)
+    return sharpness(image, DOT_PX * seen.tracker_px_a_monitor_px, seen.turn_deg, noise)
 
 
 def dot_code(context: StepContext) -> int:

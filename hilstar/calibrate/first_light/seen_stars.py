@@ -22,6 +22,7 @@ from hilstar.bench.cameras import display_psf, tracker_camera
 from hilstar.bench.frame import Bench, Frame
 from hilstar.calibrate.first_light.context import MAX_FILL, DarkSubtracted, StepContext
 from hilstar.calibrate.first_light.image_sources import Pattern
+from hilstar.calibrate.scale import STAR_MAG
 from hilstar.errors import InputError
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import Levels
@@ -38,8 +39,6 @@ ALONE_RADII, BESIDE_SHARE = 2.0, 1e-3  # stars within so many windows have toget
 THRESHOLD_SIGMA = 8.0
 READ_MAG, SURE_MAG = 0.1, 0.01  # noise of a star that can be read, and of one whose light is judged by itself
 SURE_STARS = 10  # the stars with the least noise that are judged where few are sure
-# Error beside noise and codes: what the window's sum, the response and the uniformity map leave on a well measured bench.
-KNOWN_TO_MAG = 0.004
 LOST_MARGIN = 3.0  # times the threshold: a star whose peak should be so high and is not there is lost
 MOST = 0.5  # a share of the variance this large is named as its cause
 FAR = 3.0  # times their errors: more scatter than this has another cause
@@ -197,7 +196,7 @@ class StarsSeen:
         """The scatter of the used stars' light, `off_mag` (used,) fainter than asked for, and its errors."""
         left = off_mag - self.codes_mag[used]
         left = left - np.median(left)
-        error = np.sqrt(self.noise_mag[used] ** 2 + KNOWN_TO_MAG**2)
+        error = np.sqrt(self.noise_mag[used] ** 2 + STAR_MAG**2)
         x, y = self.screen[used].T
         return Scatter(
             rms_mag=float(np.sqrt((left**2).mean())),

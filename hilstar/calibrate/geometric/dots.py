@@ -108,6 +108,15 @@ class SeenScreen:
         """Tracker pixels per monitor pixel, on the axis."""
         return self.tracker.focal_length_px / self.monitor.focal_length_px
 
+    @property
+    def turn_deg(self) -> float:
+        """By how much a monitor pixel is turned in the tracker's image, in the middle of what is seen. Raises InputError."""
+        low, high = self.box()
+        x_px, y_px = (low + high) / 2
+        rays = self.monitor.rays(np.array([x_px, x_px + 1]), np.array([y_px, y_px]))
+        u, v = self.tracker.project(rays @ self.tracker.cam_to_image.T)
+        return math.degrees(math.atan2(v[1] - v[0], u[1] - u[0]))
+
     def shows(self, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
         """Whether a whole dot at monitor pixels (n,) is on the screen and in the tracker's field (n,)."""
         width, height = self.monitor.resolution_px

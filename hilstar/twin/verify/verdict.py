@@ -90,8 +90,8 @@ def _none(measured: Measured) -> str:
     if few * fields > MIN_EXPECTED:
         return text
     return (
-        f"{text}; {few:.2g} stars to V = {faintest:g} are in the tracker's field on average: take a larger faintest_v_mag,"
-        " a [sky] catalogue with fainter stars, or more --fields"
+        f"{text}; {few:.2g} stars to V = {faintest:g} are in the tracker's field on average: write a larger"
+        " [sky] faintest_v_mag, or a [sky] catalogue with fainter stars, or let `hilstar verify` look at more --fields"
     )
 
 

@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
 from hilstar.calibrate.first_light.context import FittedFigure, StepOutcome
-from hilstar.calibrate.first_light.focus import sharpness
+from hilstar.calibrate.first_light.focus import seen_sharpness, sharpness
 from hilstar.calibrate.first_light.geometry import UPRIGHT, figure_for, see_figure
 from hilstar.calibrate.first_light.image_sources import ImageSource
 from hilstar.calibrate.first_light.seen_stars import Beyond, StarSpot
@@ -28,6 +28,7 @@ from hilstar.rotation import from_rotation_vector, multiply, to_matrix
 from hilstar.scene.camera import Lens
 from hilstar.scene.psf import GaussianPsf
 from hilstar.tracker.centroids import find_stars, noisiest_background
+from hilstar.tracker.settings import DetectorSettings
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.benches import bench_text
@@ -147,6 +148,20 @@ def test_psf_and_pixel_are_fitted_together(sigma_px, side_px, turn_deg):
     found = sharpness(image, 1.005 * side_px, turn_deg)
     assert abs(found.psf_sigma_px - sigma_px) < 3 * found.psf_sigma_error_px < 0.1 * sigma_px
     assert abs(found.dot_side_px - side_px) < 3 * found.dot_side_error_px + 0.01 * side_px
+
+
+@pytest.mark.parametrize("turn_deg", [30.0, -20.0])
+def test_dots_of_a_turned_screen_are_as_sharp_whoever_says_the_turn(turn_deg):
+    """A bench file that states the turn leaves orientation none to find, and a certificate has it from the geometry file."""
+    turned = from_rotation_vector(np.radians([0.0, 0.0, turn_deg]))
+    monitor = monitor_camera((640, 480), 57.65, 30, turned)
+    seen = SeenScreen(monitor, monitor_camera((500, 500), 13, 25, np.array([1.0, 0.0, 0.0, 0.0])), is_sure=True)
+    assert seen.turn_deg == pytest.approx(-turn_deg, abs=0.01)
+    side_px = DOT_PX * seen.tracker_px_a_monitor_px
+    image = dots_image(0.6, side_px, seen.turn_deg, np.random.default_rng(4))
+    found = seen_sharpness(image, seen, DetectorSettings(gain_e_per_dn=25.0))
+    assert abs(found.psf_sigma_px - 0.6) < 4 * found.psf_sigma_error_px < 0.1
+    assert abs(sharpness(image, side_px).psf_sigma_px - 0.6) > 0.1
 
 
 def test_the_virtual_tracker_s_wide_pixel_is_as_sharp_as_its_psf():

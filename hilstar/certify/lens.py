@@ -104,8 +104,11 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     found = _fitted(geometry, flat, wanted, read, kept)
     left = seen_off - (_tangents(found.geometry.monitor, flat, wanted) - wanted) * ARCSEC_PER_RAD
     for _ in range(3):
-        spread = MAD_TO_SIGMA * np.median(np.abs(left[kept]), axis=0)
-        within = kept & (np.abs(left) < WILD_SIGMAS * np.maximum(spread, 1e-12)).all(axis=1)
+        # About the polynomials, too: the lens alone may be off by more than noise, and a dot that it misses is not wild.
+        rough = field_terms(read.x_px, read.y_px, monitor.resolution_px, DEGREES[0])
+        off = left - rough @ np.linalg.lstsq(rough[kept], left[kept], rcond=None)[0]
+        spread = MAD_TO_SIGMA * np.median(np.abs(off[kept]), axis=0)
+        within = kept & (np.abs(off) < WILD_SIGMAS * np.maximum(spread, 1e-12)).all(axis=1)
         if within.sum() == kept.sum():
             break
         kept = within
@@ -114,14 +117,15 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     fit = None
     for degree in (0, *DEGREES):
         terms = np.concatenate([_terms(found, flat, wanted[kept], (x, y), degree), phases], axis=2)
-        vectors, size, across = np.linalg.svd(terms.reshape(2 * len(x), -1), full_matrices=False)
+        scale = np.maximum(np.linalg.norm(terms.reshape(2 * len(x), -1), axis=0), TINY)
+        vectors, size, across = np.linalg.svd(terms.reshape(2 * len(x), -1) / scale, full_matrices=False)
         told = size > SAME * size[0]
         own = vectors[:, told]
         coefficients = own.T @ left[kept].T.ravel()
         rest = (left[kept].T.ravel() - own @ coefficients).reshape(2, -1)
         basis = own.reshape(2, len(x), -1)
         structure = in_place(x, y, rest, basis)
-        mix = across[told].T / size[told]
+        mix = across[told].T / size[told] / scale[:, None]
         dof = float(2 * len(x) - told.sum())
         fit = LensFit(geometry, flat, found, degree, mix, coefficients, basis, Cells(x, y), structure, dof)
         # By what the residuals show: the variance of a structure as long as the field is hardly known.

@@ -191,7 +191,7 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     # By places over the whole screen, not by the dots: those stand where the tracker sees it.
     sides = (np.linspace(-0.5, size - 0.5, SCREEN_PLACES) for size in monitor.resolution_px)
     x_px, y_px = (part.ravel() for part in np.meshgrid(*sides))
-    if monitor.lens is None or all(inside.all() for inside in _in_view(fit, x_px, y_px)):
+    if all(inside.all() for inside in _in_view(fit, x_px, y_px)):
         return fit
     width, height = geometry.tracker.resolution_px
     corners = np.array([-0.5, width - 0.5, -0.5, width - 0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
@@ -199,7 +199,8 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     for pose in range(len(geometry.q_poses)):
         rays = fits.directions_in_cam(geometry, np.full(4, pose), *corners) @ monitor.cam_to_image.T
         reach = max(reach, float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2])))
-    lens = replace(monitor.lens, max_tangent=KNOWN_MARGIN * reach)
+    # A pinhole is bounded, too: a tilt that it could not see within the field is 23 arcsec off at the screen's far end.
+    lens = replace(monitor.lens or Lens(), max_tangent=KNOWN_MARGIN * reach)
     return replace(fit, geometry=replace(geometry, monitor=replace(monitor, lens=lens)))
 
 

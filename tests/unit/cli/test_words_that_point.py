@@ -183,11 +183,14 @@ def test_certify_finds_the_example_of_the_truth(tmp_path: Path, monkeypatch: pyt
 
 
 def test_doctor_keeps_a_long_name_apart_from_its_text() -> None:
+    from hilstar.bench.cameras import bench_camera
     from hilstar.bench.measured_on import MonitorCheck
+    from hilstar.bench.star_size import star_size
 
     file = read_bench_file(DEMO)
-    report = BenchReport(fields_of_view(file.config, file.folder), MonitorCheck(None))
-    (line,) = report.lines("truth-example.toml")
+    star = star_size(file.config, file.folder, bench_camera(file.config, file.folder))
+    report = BenchReport(fields_of_view(file.config, file.folder), star, MonitorCheck(None))
+    line = next(report.lines("truth-example.toml"))
     assert "truth-example.toml screen" in line
 
 

@@ -24,6 +24,7 @@ from hilstar.calibrate.geometric.calibration import calibrate_seen, nominal_of, 
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen, joined, lit_for, plan_seen_dots
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.calibrate.scale import StarReading, scale_of
+from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_rotation_vector, multiply, to_matrix
 from hilstar.scene.camera import Lens
@@ -113,6 +114,11 @@ def test_dots_are_within_the_field_of_a_tracker_that_sees_any_share_of_the_scree
     # The part that the dots stand on is nearly all that is seen.
     low, high = seen.box()
     assert (np.ptp(np.stack([plan.x_px, plan.y_px]), axis=1) > 0.95 * (high - low)).all()
+
+
+def test_too_few_dots_are_laid_to_who_asked_for_them(tmp_path):
+    with pytest.raises(InputError, match=r"--dots 1: 20 frames then hold 2 dots, and 12 are needed; write more --dots"):
+        plan_seen_dots(seen_screen_of(large_screen(tmp_path)), 20, 1, np.random.default_rng(0))
 
 
 def test_a_bench_file_that_may_be_wrong_gets_dots_beyond_the_field(tmp_path):

@@ -447,7 +447,7 @@ def _judged(
     if float(figures["held_out_p95_mag"]) > limit_mag:
         why = "take more readings (--patches), look at stray light, and at whether the monitor was warm"
         if context.truth is not None and rounds_alike(context.truth.config.tracker.detector):
-            why = "the virtual tracker's ADC rounds faint codes alike: write the truth's [tracker.detector] read_noise_e"
+            why += "; the virtual tracker's ADC rounds faint codes alike: write the truth's [tracker.detector] read_noise_e"
         line = f"{line}: the levels do not make one smooth response; {why}"
         return StepOutcome("failed", line, figures, files, pictures, number=number)
     changes = context.names("monitor", "calibration", context.session / "response.toml")

@@ -24,6 +24,7 @@ from hilstar.calibrate.geometric.calibration import calibrate_seen, nominal_of, 
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen, joined, lit_for, plan_seen_dots
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.calibrate.scale import StarReading, scale_of
+from hilstar.certify.readings import dot_settings
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_rotation_vector, multiply, to_matrix
@@ -338,3 +339,20 @@ def test_an_adc_rounds_alike_where_read_noise_is_under_its_steps(read_noise_e, a
     noise_dn = np.random.default_rng(2).normal(0, read_noise_e / 24.0, (20_000, 1))
     lost_dn = np.abs(np.rint(light_dn + noise_dn).mean(axis=0) - light_dn).max()
     assert rounds_alike(detector) == alike == (lost_dn > 0.03)
+
+
+def test_a_certificate_s_dots_of_wide_pixels_are_measured_whole(tmp_path):
+    """In a window of 1 px a dot of 12.6 px had its place to 0.18 px and half its light."""
+    file, rng = large_screen(tmp_path), np.random.default_rng(7)
+    side_px, edges = DOT_PX * seen_screen_of(file).tracker_px_a_monitor_px, np.arange(81) - 0.5
+    steps = ((np.arange(60) + 0.5) / 60 - 0.5) * side_px
+    light, off_px = 1000 * side_px**2, []
+    for place_x, place_y in 40 + rng.uniform(-0.5, 0.5, (10, 2)):
+        across, down = (
+            np.diff(ndtr((edges - place - steps[:, None]) / 0.5), axis=1).mean(axis=0) for place in (place_x, place_y)
+        )
+        image = rng.normal(0, 3.0, (80, 80)) + light * np.outer(down, across)
+        found = find_stars(image, dot_settings(file), noisiest_background(image))
+        off_px.append(float(found.x_px[0]) - place_x)
+        assert found.flux[0] == pytest.approx(light, rel=0.005)
+    assert float(np.std(off_px)) < 0.01

@@ -12,7 +12,7 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
-from hilstar.calibrate.first_light.context import FittedFigure, StepOutcome
+from hilstar.calibrate.first_light.context import FittedFigure, StepContext, StepOutcome
 from hilstar.calibrate.first_light.focus import seen_sharpness, sharpness
 from hilstar.calibrate.first_light.geometry import UPRIGHT, figure_for, see_figure
 from hilstar.calibrate.first_light.image_sources import ImageSource
@@ -356,3 +356,12 @@ def test_a_certificate_s_dots_of_wide_pixels_are_measured_whole(tmp_path):
         off_px.append(float(found.x_px[0]) - place_x)
         assert found.flux[0] == pytest.approx(light, rel=0.005)
     assert float(np.std(off_px)) < 0.01
+
+
+def test_a_stated_blur_of_the_collimator_is_no_bad_focus(tmp_path):
+    """Dots are seen through the collimator: with a blur that the file states, `focus` asked to turn the focus."""
+    (tmp_path / "bench.toml").write_text(bench_text(LARGE_SCREEN, {"collimator": {"psf_sigma_px": 0.5}}))
+    file = read_bench_file(tmp_path / "bench.toml")
+    context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 0)
+    ratio = seen_screen_of(file).tracker_px_a_monitor_px
+    assert context.psf_sigma_px == pytest.approx(math.hypot(0.5, 0.5 * ratio))

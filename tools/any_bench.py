@@ -56,6 +56,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--limit", type=float, default=LIMIT_S, metavar="SECONDS", help="a command is stopped after so long")
     parser.add_argument("--keep", action="store_true", help="keep the sessions' images and the ledgers")
+    parser.add_argument("--note", default="", metavar="TEXT", help="a sentence under the chart, such as what was tried")
     given = parser.parse_args()
     output = given.output
     output.mkdir(parents=True, exist_ok=True)
@@ -67,7 +68,7 @@ def main() -> None:
         rows.sort(key=lambda one: int(one["bench"]))
         write_table(output / TABLE, rows)
         print(f"{number:4}  {row['outcome']}: {row['words']}"[:200], flush=True)
-    draw(output / CHART, rows)
+    draw(output / CHART, rows, given.note)
     for outcome in OUTCOMES:
         count = sum(row["outcome"] == outcome for row in rows)
         print(f"{outcome:28}{count}")
@@ -92,11 +93,11 @@ def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
     write_csv(path, columns, [[row.get(key) for key in columns] for row in rows])
 
 
-def draw(path: Path, rows: list[dict[str, Any]]) -> None:
+def draw(path: Path, rows: list[dict[str, Any]], note: str = "") -> None:
     """Ratio of pixels against the share of the screen that is seen, coloured by outcome."""
     good = sum(row["outcome"] in GOOD_OUTCOMES for row in rows)
     finding = f"{good} of {len(rows)} benches by chance are calibrated and verified, or are refused for a reason"
-    note = "A share above 100 %: the tracker's field is larger than the screen."
+    note = f"{note} A share above 100 %: the tracker's field is larger than the screen.".strip()
     with chart(path, finding, height_inch=4.6, note=note) as (axes,):
         for outcome in OUTCOMES:
             those = [row for row in rows if row["outcome"] == outcome]
@@ -107,8 +108,8 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> None:
                 axes.plot(shares, ratios, marker, color=COLOURS[outcome], label=label, linestyle="none", markersize=6)
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.set_xlabel("tracker's field of the screen's [%]")
-        axes.set_ylabel("tracker px to a monitor px")
+        axes.set_xlabel("tracker's field, relative to the screen's [%]")
+        axes.set_ylabel("side of a monitor pixel [tracker px]")
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 

@@ -50,6 +50,11 @@ MOST = 0.5  # a pixel is a disc's if more than this share of its light is the di
 NAMED_STARS = 5
 
 
+def without_errors(rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+    """The rows as they are: of a frame whose stars have no errors at hand."""
+    return rows
+
+
 @dataclass(frozen=True)
 class Frame:
     """One frame: what each monitor pixel should cause, the codes that ask for it, and the stars behind it.
@@ -70,7 +75,7 @@ class Frame:
     rows: npt.NDArray[np.void]
     star: IntArray
     t_ns: int | None = None
-    errors: Callable[[npt.NDArray[np.void]], npt.NDArray[np.void]] = lambda rows: rows
+    errors: Callable[[npt.NDArray[np.void]], npt.NDArray[np.void]] = without_errors
 
     @cached_property
     def truth(self) -> npt.NDArray[np.void]:

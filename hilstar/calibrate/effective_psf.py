@@ -17,8 +17,8 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.calibrate.geometric.calibration import MIN_DOTS, SEED, dot_sigma_px, matched, nominal_of
-from hilstar.calibrate.geometric.dots import DOT_PX, read_plan
+from hilstar.calibrate.geometric.calibration import SEED, dot_sigma_px, matched, nominal_of
+from hilstar.calibrate.geometric.dots import DOT_PX, MIN_DOTS, read_plan
 from hilstar.calibrate.geometric.fit import MatchedDots
 from hilstar.calibrate.geometric.match import first_look
 from hilstar.calibrate.geometric.observed import measure_images, numbered, read_image

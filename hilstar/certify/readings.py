@@ -6,7 +6,7 @@ image. `ImageReader` shows the patterns by a first-light image source and measur
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from hilstar.calibrate.first_light import image_sources
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.focus import seen_sharpness
 from hilstar.calibrate.first_light.photometry import Assumed, Photometer, Readings
+from hilstar.calibrate.geometric.calibration import dot_sigma_px
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen
 from hilstar.calibrate.latency import pair, swap_to_square_ms
 from hilstar.calibrate.plan import Patch
@@ -177,6 +178,12 @@ def white_of(file: BenchFile) -> float:
         return bench.flux_at_white_e_per_s
 
 
+def dot_settings(file: BenchFile) -> CentroidSettings:
+    """How dots are measured in the tracker's image: in a window no narrower than they are. Raises InputError."""
+    default = CentroidSettings(THRESHOLD_SIGMA, MIN_PIXELS)
+    return replace(default, window_sigma_px=max(default.window_sigma_px, dot_sigma_px(file)))
+
+
 @dataclass
 class ImageReader:
     """Readings by the tracker's images of an image source, which go to `folder`."""
@@ -227,7 +234,7 @@ class ImageReader:
                 break
             code = context.darker(code)
         image = np.mean([each.image for each in looked], axis=0)
-        found = find_stars(image, CentroidSettings(THRESHOLD_SIGMA, MIN_PIXELS), noisiest_background(image))
+        found = find_stars(image, dot_settings(self.file), noisiest_background(image))
         from scipy.spatial import cKDTree
 
         x, y = x_px.astype(np.float64), y_px.astype(np.float64)
@@ -237,7 +244,7 @@ class ImageReader:
                 f"{len(found)} dots are in the image and {MIN_DOTS} are needed; look at the focus and the exposure"
             )
         far, near = (np.asarray(part) for part in cKDTree(np.stack([found.x_px, found.y_px], axis=1)).query(expected))
-        kept = far < APART_TRACKER_PX / 2
+        kept = (far < APART_TRACKER_PX / 2) & ~found.at_edge[near]
         if kept.sum() < MIN_DOTS:
             raise InputError(f"{int(kept.sum())} dots are where the bench file has them; run the geometry again (first-light)")
         seen = SeenScreen(geometry.monitor, geometry.tracker, is_sure=True)

@@ -116,6 +116,7 @@ PASSED = {"passed": True, "reasons": []}
     [
         ({FIRST_LIGHT: result(DONE), VERIFY: result(PASSED)}, {}, judge.VERIFIED, ""),
         ({FIRST_LIGHT: result(code=2, stderr="hilstar: no such lens\n")}, {}, judge.REFUSED, "no such lens"),
+        ({FIRST_LIGHT: result(code=-9, stderr="hilstar: 3 s: begins\n")}, {}, judge.FAILED, "ended with -9"),
         ({FIRST_LIGHT: result(code=1, stderr="Traceback (most recent call last):\nValueError: x\n")}, {}, judge.TRACEBACK, "x"),
         ({FIRST_LIGHT: result(session(focus="failed"), 1)}, {}, judge.FAILED, "focus said so"),
         (

@@ -16,7 +16,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file, with_key
-from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera, tracker_psf
+from hilstar.bench.cameras import before_detector, bench_camera, ideal_monitor, tracker_camera
 from hilstar.bench.config import parse_config
 from hilstar.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, VirtualBench, black
 from hilstar.calibrate.geometric.dots import SeenScreen
@@ -252,8 +252,8 @@ class StepContext:
 
     @property
     def tracker_psf(self) -> Psf:
-        """The tracker's PSF, as the bench file has it. Raises InputError."""
-        return tracker_psf(self.file.config.tracker, self.file.folder)
+        """How collimator and tracker spread a monitor's point, as the bench file has it. Raises InputError."""
+        return before_detector(self.file.config, self.file.folder, self.geometry().monitor)
 
     def geometry(self) -> BenchGeometry:
         """Monitor and tracker as the bench file has them, with an ideal collimator."""

@@ -301,7 +301,7 @@ def focus(context: StepContext) -> StepOutcome:
     wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
     sigma, error = found.psf_sigma_px, found.psf_sigma_error_px
     picture = context.session / "focus.svg"
-    finding = f"PSF sigma {sigma:.3f} px (by {len(found.x_px)} dots), [tracker] psf_sigma_px is {wanted:g}"
+    finding = f"PSF sigma {sigma:.3f} px (by {len(found.x_px)} dots), the bench file has {wanted:.4g}"
     with chart(picture, finding, height_inch=6.0) as (axes,):
         dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
         axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
@@ -318,7 +318,7 @@ def focus(context: StepContext) -> StepOutcome:
     }
     files: tuple[Path, ...] = looked.path, picture
     pictures: tuple[Path, ...] = (picture,)
-    line = f"PSF sigma {sigma:.3f} +- {error:.3f} px, the bench file says {wanted:g}; dots at code {code}"
+    line = f"PSF sigma {sigma:.3f} +- {error:.3f} px, the bench file says {wanted:.4g}; dots at code {code}"
     line += f", a monitor pixel is {pixel_px:.3f} px"
     effective = _effective(looked, found)
     if effective is not None:
@@ -327,7 +327,7 @@ def focus(context: StepContext) -> StepOutcome:
         files, pictures = (*files, drawn), (picture, drawn)
         figures["effective_psf_rms"] = effective.chosen.rms
         line += f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the field"
-    number = StepNumber(sigma, error, "px", f"PSF sigma; the bench file says {wanted:g}")
+    number = StepNumber(sigma, error, "px", f"PSF sigma; the bench file says {wanted:.4g}")
     verdict: Verdict = "done"
     if error > MAX_ERROR_SHARE * sigma:
         why = f"the PSF cannot be told from a monitor pixel of {pixel_px:.2f} px: take a longer [tracker] exposure_s"

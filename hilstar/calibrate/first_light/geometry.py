@@ -89,7 +89,7 @@ SPOT_ERROR_PX = 0.1  # of a square's centroid in the tracker's image, by its thr
 MAX_SCALE = 2.0
 MIN_SIZE_STEP = 1.3  # between the pixels of one square and the next
 UPRIGHT = (1, 0, 0, 1)
-QUARTER_TURNS = ((0, -1, 1, 0), (0, 1, -1, 0))
+QUARTER_TURNS_DEG = {(0, -1, 1, 0): 90.0, (0, 1, -1, 0): -90.0}
 OBLIQUE_DEG = 40.0  # from the nearest right angle
 WAYS = {
     UPRIGHT: "upright",
@@ -122,6 +122,11 @@ class SeenFigure:
     y_px: FloatArray
     focal_length_px: float
     q_cam_to_mon: FloatArray
+
+    @property
+    def whole_turn_deg(self) -> float:
+        """The turn that is left, with the quarter turn of an orientation that is not upright."""
+        return self.turn_deg + QUARTER_TURNS_DEG.get(self.way, 0.0)
 
 
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
@@ -229,7 +234,7 @@ def orientation(context: StepContext) -> StepOutcome:
     if changes:
         now, measured = _way(replace(context, file=with_changes(context.file, changes)), "figure_001")
         # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit takes either.
-        if now not in (UPRIGHT, *QUARTER_TURNS) or (now != UPRIGHT and not _is_oblique(measured)):
+        if now not in (UPRIGHT, *QUARTER_TURNS_DEG) or (now != UPRIGHT and not _is_oblique(measured)):
             made = "; ".join(change.line for change in changes)
             raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
     way = f"first {WAYS[first]}, now upright" if changes else "upright"
@@ -237,12 +242,13 @@ def orientation(context: StepContext) -> StepOutcome:
         figures: dict[str, Figure] = {"seen": WAYS[first], "told_by": "a key"}
         return StepOutcome("done", f"{way}, as a person saw it", figures, changes=changes)
     found, looked = measured
+    turn_deg = found.whole_turn_deg
     picture = context.session / "orientation.svg"
     draw_spots(picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}")
-    figures = {"seen": WAYS[first], "scale": found.scale, "turn_deg": found.turn_deg, "turn_error_deg": found.turn_error_deg}
+    figures = {"seen": WAYS[first], "scale": found.scale, "turn_deg": turn_deg, "turn_error_deg": found.turn_error_deg}
     figures |= {SEEN_FOCAL: found.focal_length_px, **dict(zip(SEEN_Q, found.q_cam_to_mon.tolist(), strict=True))}
-    line = f"{way}, {found.scale:.4f} of the expected size, turned by {found.turn_deg:+.2f} deg"
-    number = StepNumber(found.turn_deg, found.turn_error_deg, "deg", "turn of the figure that is left")
+    line = f"{way}, {found.scale:.4f} of the expected size, turned by {turn_deg:+.2f} deg"
+    number = StepNumber(turn_deg, found.turn_error_deg, "deg", "turn of the figure that is left")
     return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes, number)
 
 
@@ -333,6 +339,7 @@ def _frames_of(context: StepContext, plan: DotPlan, first: int, code: int, dark:
         for frame in range(plan.frames)
     ]
     size_px = context.file.config.tracker.resolution_px
+    context.stage(f"measures the dots of {len(paths)} images")
     return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
 
 

@@ -28,6 +28,7 @@ LOST_SHARE = 0.1
 LIMITS = ("flux_mag", "centroid_px", "lost_share", "black_e_per_s_px")  # keys of [verify], also before a truth
 P95_OF_TWO, P95_OF_ONE = 2.4477, 1.9600  # sigmas that 95 % of distances in two axes, and in one, are within
 MAX_FRAMES = 25  # of a field that are taken without being asked for
+MAX_ASKED_FRAMES = 1000  # of a field: the most that first-light --frames takes
 GRID = 21  # places along each side of the screen at which a truth is compared
 
 
@@ -64,7 +65,7 @@ def verify(context: StepContext) -> StepOutcome:
         reasons += [finding] if finding else []
     else:
         line += f"; the light of {int(seen.sure.sum())} can be read, too few to judge it"
-    reasons += _place_reasons(context, seen) + _star_reasons(context, figures)
+    reasons += place_reasons(seen, context.file.config.verify.centroid_px) + _star_reasons(context, figures)
     context.stage(f"the twin looks at {VERIFY_FIELDS} fields")
     twin = summarise(_twin(context))
     reasons += [f"the twin: {reason}" for reason in twin["reasons"]]
@@ -108,9 +109,9 @@ def frames_for(seen: StarsSeen, limit_px: float) -> int:
     return max(math.ceil(seen.frames * doubt / max(room, limit**2 / 4)), seen.frames + 1)
 
 
-def _place_reasons(context: StepContext, seen: StarsSeen) -> list[str]:
+def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
     """What speaks against the stars' places: geometry where they are off beyond their noise, or noise that hides it."""
-    limit_px, beyond = context.file.config.verify.centroid_px, seen.beyond_px
+    beyond = seen.beyond_px
     at_least, at_most = P95_OF_TWO * beyond.low, P95_OF_TWO * beyond.high
     if at_least > limit_px:
         off = f"beyond their noise stars are {P95_OF_TWO * beyond.sigma:.3f} px off at 95 % (limit {limit_px:g})"
@@ -118,10 +119,10 @@ def _place_reasons(context: StepContext, seen: StarsSeen) -> list[str]:
     wanted = frames_for(seen, limit_px)
     if at_most <= limit_px or wanted == seen.frames:
         return []
-    return [
-        f"noise hides whether stars are within {limit_px:g} px: they may be {at_most:.3f} px off at 95 %;"
-        f" {wanted} frames of each field would tell (--frames {wanted}), or a longer [tracker] exposure_s"
-    ]
+    cure = "write a longer [tracker] exposure_s"
+    if wanted <= MAX_ASKED_FRAMES:
+        cure = f"{wanted} frames of each field would tell (--frames {wanted}), or a longer [tracker] exposure_s"
+    return [f"noise hides whether stars are within {limit_px:g} px: they may be {at_most:.3f} px off at 95 %; {cure}"]
 
 
 def _twin(context: StepContext) -> TwinVerdict:

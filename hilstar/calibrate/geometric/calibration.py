@@ -14,7 +14,7 @@ from hilstar.arrays import BoolArray, FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera, tracker_psf
 from hilstar.calibrate.geometric import fit as fits
-from hilstar.calibrate.geometric.dots import DOT_PX, DotPlan, SeenScreen, read_plan
+from hilstar.calibrate.geometric.dots import DOT_PX, MIN_DOTS, DotPlan, SeenScreen, read_plan
 from hilstar.calibrate.geometric.match import FirstLook, first_look, match_by_geometry, match_by_maps, refuse_motion, turned
 from hilstar.calibrate.geometric.observed import Observed, measure_images, read_observed
 from hilstar.charts import BLUE, SMALL_PT, chart
@@ -26,7 +26,6 @@ from hilstar.scene.camera import Lens
 from hilstar.units import ARCSEC_PER_RAD
 
 SEED = 1  # for the random samples of dots: one calibration gives one file
-MIN_DOTS = 12
 KNOWN_MARGIN = 1.01  # relative to the angle to the corner of the tracker's field
 MIN_CELL_SHARE = 0.33  # share of the dots that should be seen in a part of the screen
 CELLS = (("left", "middle", "right"), ("upper", "middle", "lower"))

@@ -31,7 +31,8 @@ GOLDEN = 1.32471795724474602596  # the plastic number: its powers spread points 
 PLAN_ADVICE = "give the plan.csv that `hilstar calibrate dots` wrote"
 # Tracker px between neighbouring dots of a frame: the dots' own side so many times, and room for their wings.
 MIN_APART_PX, APART_SIDES, WINGS_PX = 40.0, 2.5, 20.0
-MIN_LIT_DOTS, MAX_LIT_DOTS = 8, 60  # in a frame: three frames in eight light 21 dots or more, of which a fit needs 12
+MIN_DOTS = 12  # that the fit of a geometry needs
+MIN_LIT_DOTS, MAX_LIT_DOTS = 8, 60  # in a frame: three frames in eight light 21 dots or more
 # A geometry that was not measured: the bench file's lens may look past the screen's middle by so much of the tracker's field.
 UNSURE_SHARE = 0.15
 GRID = 65  # places along each side of the screen and of the tracker, by which the part that is seen is found
@@ -164,6 +165,11 @@ def lit_for(seen: SeenScreen) -> int:
 def plan_seen_dots(seen: SeenScreen, frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
     """Plan dots over the part of the screen that the tracker sees. Raises InputError where that is impossible."""
     count = dots_of_frames(frames, dots_per_frame)
+    if count < MIN_DOTS:
+        raise InputError(
+            f"--dots {dots_per_frame}: {frames} frames then hold {count} dots, and {MIN_DOTS} are needed; write more --dots or"
+            " --frames, or no --dots for as many as the field holds"
+        )
     lit = _codes(count, frames, rng)
     x_px, y_px = _seen_places(seen, count)
     return DotPlan(x_px, y_px, lit[: len(x_px)])
@@ -189,9 +195,9 @@ def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
     apart_px = 0.5 * math.sqrt(area_px / count)
     far = np.hypot(*(inside[:, None] - chosen[None]).transpose(2, 0, 1)).min(axis=1) > apart_px
     chosen = np.concatenate([chosen, inside[far]])[:count]
-    if len(chosen) < MIN_LIT_DOTS:
+    if len(chosen) < MIN_DOTS:
         raise InputError(
-            f"the part of the screen that the tracker sees holds {len(chosen)} dots and {MIN_LIT_DOTS} are needed:"
+            f"the part of the screen that the tracker sees holds {len(chosen)} dots and {MIN_DOTS} are needed:"
             " a shorter [tracker] or a longer [collimator] focal length shows it more"
         )
     return chosen[:, 0], chosen[:, 1]

@@ -25,6 +25,7 @@ from tests.support.any_bench.draw import DrawnBench, true_light
 
 STEPS = ("orientation", "focus", "warm-up", "geometry", "uniformity", "photometry", "scale", "latency", "verify")
 MAX_SIGMAS = 4.0
+REFUSED_CODE = 2  # the file was wrong: any other end without a step is a fault of the program or the machine
 MAX_MEMORY_MB = 2048.0
 PLACES = 41  # along each side of the screen
 DECADES = (1e-1, 1e-2, 1e-3)
@@ -256,11 +257,9 @@ def _fault(results: Mapping[str, CommandResult], compared: Mapping[str, Comparis
 def _first_day(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
     """A session that is refused or fails, and a bench that its twin does not pass; None where all is well."""
     session = results[FIRST_LIGHT]
-    if session.code is None:
-        return FAILED, f"stopped after {session.seconds:.0f} s: {session.last_line}"
     steps = {step["name"]: step for step in session.found.get("steps", [])}
-    if session.code and not steps:
-        return REFUSED, session.last_line
+    if not steps:
+        return _without_steps(session)
     reasons = _reasons(results)
     failed = next((step for step in steps.values() if step["verdict"] == "failed"), None)
     if failed is not None and not (failed["name"] == "verify" and only_wide(reasons)):
@@ -271,6 +270,14 @@ def _first_day(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
     if reasons and not only_wide(reasons):
         return NOT_VERIFIED, "; ".join(reasons)
     return None
+
+
+def _without_steps(session: CommandResult) -> tuple[str, str]:
+    """A session that ended before its first step was recorded."""
+    if session.code == REFUSED_CODE:
+        return REFUSED, session.last_line
+    end = f"stopped after {session.seconds:.0f} s" if session.code is None else f"ended with {session.code}"
+    return FAILED, f"{end}: {session.last_line}"
 
 
 def _afterwards(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:

@@ -12,17 +12,20 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
-from hilstar.calibrate.first_light.context import FittedFigure, StepOutcome
+from hilstar.calibrate.first_light.context import FittedFigure, StepContext, StepOutcome
 from hilstar.calibrate.first_light.focus import seen_sharpness, sharpness
 from hilstar.calibrate.first_light.geometry import UPRIGHT, figure_for, see_figure
 from hilstar.calibrate.first_light.image_sources import ImageSource
+from hilstar.calibrate.first_light.photometry import rounds_alike
 from hilstar.calibrate.first_light.seen_stars import Beyond, StarSpot
 from hilstar.calibrate.first_light.session import FirstLightSession, Progress
-from hilstar.calibrate.first_light.stars import P95_OF_TWO, frames_for
+from hilstar.calibrate.first_light.stars import P95_OF_TWO, frames_for, place_reasons
 from hilstar.calibrate.geometric.calibration import calibrate_seen, nominal_of, rough_geometry, seen_screen_of
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen, joined, lit_for, plan_seen_dots
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.calibrate.scale import StarReading, scale_of
+from hilstar.certify.readings import dot_settings
+from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_rotation_vector, multiply, to_matrix
 from hilstar.scene.camera import Lens
@@ -112,6 +115,11 @@ def test_dots_are_within_the_field_of_a_tracker_that_sees_any_share_of_the_scree
     # The part that the dots stand on is nearly all that is seen.
     low, high = seen.box()
     assert (np.ptp(np.stack([plan.x_px, plan.y_px]), axis=1) > 0.95 * (high - low)).all()
+
+
+def test_too_few_dots_are_laid_to_who_asked_for_them(tmp_path):
+    with pytest.raises(InputError, match=r"--dots 1: 20 frames then hold 2 dots, and 12 are needed; write more --dots"):
+        plan_seen_dots(seen_screen_of(large_screen(tmp_path)), 20, 1, np.random.default_rng(0))
 
 
 def test_a_bench_file_that_may_be_wrong_gets_dots_beyond_the_field(tmp_path):
@@ -222,7 +230,7 @@ def test_a_step_tells_of_itself_while_it_runs(monkeypatch):
     assert lines[-1].startswith("geometry")
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 25.0, 44.0, -40.0])
+@pytest.mark.parametrize("turn_deg", [0.0, 25.0, 44.0, -40.0, 47.0, -48.0])
 def test_a_figure_that_is_turned_by_any_angle_is_seen_with_its_turn(turn_deg):
     turn = np.array([1.0, 0.0, 0.0, 0.0])
     geometry = BenchGeometry(monitor_camera((640, 480), 57.65, 120, turn), monitor_camera((400, 400), 13, 25, turn))
@@ -235,8 +243,8 @@ def test_a_figure_that_is_turned_by_any_angle_is_seen_with_its_turn(turn_deg):
         top = round(199.5 + ratio * (sin * right + cos * down) - 1.4 * sides)
         image[top : top + round(2.8 * sides), left : left + round(2.8 * sides)] += 500
     found = see_figure(image, figure, geometry)
-    assert found.way == UPRIGHT
-    assert abs(found.turn_deg - turn_deg) < 4 * found.turn_error_deg < 4.0
+    assert (found.way == UPRIGHT) == (abs(turn_deg) < 45)
+    assert abs(found.whole_turn_deg - turn_deg) < 4 * found.turn_error_deg < 4.0
 
 
 def wide_star(spot, dn, noise_dn, rng):
@@ -290,6 +298,15 @@ def test_frames_are_asked_for_where_noise_hides_the_places():
     assert frames_for(Places(Beyond(0.0, 0.0, 3 * sigma)), limit_px) == 9
 
 
+@pytest.mark.parametrize(("high", "advised"), [(2.9, "(--frames 9)"), (28.99, "(--frames 841)"), (60.0, "")])
+def test_no_more_frames_are_advised_than_the_option_takes(high, advised):
+    limit_px = 0.1
+    (reason,) = place_reasons(Places(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO)), limit_px)
+    assert advised in reason
+    assert ("--frames" in reason) == bool(advised)
+    assert "a longer [tracker] exposure_s" in reason
+
+
 def test_a_noisy_reading_counts_less_and_equal_ones_are_their_median():
     ratios = np.array([1.0, 1.02, 0.98, 2.0])
     assert scale_of(10.0, ratios, np.zeros(4)).flux_at_white_e_per_s == pytest.approx(10.1)
@@ -312,3 +329,39 @@ def test_dots_of_a_certificate_stand_close_and_are_measured_all_the_same():
             image += 30_000 * np.outer(down, across)
     found = sharpness(image, 2.7)
     assert abs(found.psf_sigma_px - sigma_px) < 4 * found.psf_sigma_error_px < 0.05
+
+
+@pytest.mark.parametrize(("read_noise_e", "alike"), [(0.0, True), (5.0, True), (12.0, False)])
+def test_an_adc_rounds_alike_where_read_noise_is_under_its_steps(read_noise_e, alike):
+    """A session by a detector without read noise said that stray light or a cold monitor may be why levels were not smooth."""
+    detector = DetectorSettings(read_noise_e=read_noise_e, gain_e_per_dn=24.0)
+    light_dn = np.linspace(0.0, 1.0, 101)
+    noise_dn = np.random.default_rng(2).normal(0, read_noise_e / 24.0, (20_000, 1))
+    lost_dn = np.abs(np.rint(light_dn + noise_dn).mean(axis=0) - light_dn).max()
+    assert rounds_alike(detector) == alike == (lost_dn > 0.03)
+
+
+def test_a_certificate_s_dots_of_wide_pixels_are_measured_whole(tmp_path):
+    """In a window of 1 px a dot of 12.6 px had its place to 0.18 px and half its light."""
+    file, rng = large_screen(tmp_path), np.random.default_rng(7)
+    side_px, edges = DOT_PX * seen_screen_of(file).tracker_px_a_monitor_px, np.arange(81) - 0.5
+    steps = ((np.arange(60) + 0.5) / 60 - 0.5) * side_px
+    light, off_px = 1000 * side_px**2, []
+    for place_x, place_y in 40 + rng.uniform(-0.5, 0.5, (10, 2)):
+        across, down = (
+            np.diff(ndtr((edges - place - steps[:, None]) / 0.5), axis=1).mean(axis=0) for place in (place_x, place_y)
+        )
+        image = rng.normal(0, 3.0, (80, 80)) + light * np.outer(down, across)
+        found = find_stars(image, dot_settings(file), noisiest_background(image))
+        off_px.append(float(found.x_px[0]) - place_x)
+        assert found.flux[0] == pytest.approx(light, rel=0.005)
+    assert float(np.std(off_px)) < 0.01
+
+
+def test_a_stated_blur_of_the_collimator_is_no_bad_focus(tmp_path):
+    """Dots are seen through the collimator: with a blur that the file states, `focus` asked to turn the focus."""
+    (tmp_path / "bench.toml").write_text(bench_text(LARGE_SCREEN, {"collimator": {"psf_sigma_px": 0.5}}))
+    file = read_bench_file(tmp_path / "bench.toml")
+    context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 0)
+    ratio = seen_screen_of(file).tracker_px_a_monitor_px
+    assert context.psf_sigma_px == pytest.approx(math.hypot(0.5, 0.5 * ratio))

@@ -180,6 +180,11 @@ def _turn_deg(angle_rad: float) -> float:
     return 0.0 if turn == 360.0 else turn
 
 
+def turn_text(turn_deg: float, decimals: int = 4) -> str:
+    """An angle in degrees for a person, in [0, 360) as it is written: 359.99999 is "0.0000"."""
+    return f"{round(turn_deg, decimals) % 360:.{decimals}f}"
+
+
 def _about_x(angle_rad: float) -> FloatArray:
     return np.array([np.cos(angle_rad / 2), np.sin(angle_rad / 2), 0.0, 0.0])
 

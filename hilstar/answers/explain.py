@@ -12,7 +12,7 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.source import Convention, Mounting, SentAttitudes
 from hilstar.bench.config.answers import field_format
 from hilstar.errors import printable, shortened
-from hilstar.rotation import angle_between_rad, to_radec_roll_deg
+from hilstar.rotation import angle_between_rad, to_radec_roll_deg, turn_text
 from hilstar.units import ARCSEC_PER_RAD
 
 MAX_SHOWN_BYTES = 96
@@ -33,9 +33,8 @@ class UnderConvention:
         """For a person."""
         c = self.convention
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(self.q_icrs_to_cam)
-        said = (
-            f"scalar {c.scalar:<5} {c.direction:<11} {c.frame:<4}  RA {ra_deg:8.4f}  Dec {dec_deg:+8.4f}  roll {roll_deg:8.4f}"
-        )
+        ra, roll = turn_text(ra_deg), turn_text(roll_deg)
+        said = f"scalar {c.scalar:<5} {c.direction:<11} {c.frame:<4}  RA {ra:>8}  Dec {dec_deg:+8.4f}  roll {roll:>8}"
         off = "" if self.off_rad is None else f"  {_angle(self.off_rad)} from what is shown"
         return f"{'>' if self.matches else ' '} {said}{off}"
 

@@ -154,13 +154,13 @@ def _row(found: "Answer") -> dict[str, Any]:
 
 
 def _line(found: "Answer") -> str:
-    from hilstar.rotation import to_radec_roll_deg
+    from hilstar.rotation import to_radec_roll_deg, turn_text
 
     words = [f"t {'-' if found.t_ns is None else f'{found.t_ns / 1e9:.6f}'} s"]
     if found.q_icrs_to_cam is not None:
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(found.q_icrs_to_cam)
         words.append("q " + " ".join(f"{part:+.7f}" for part in found.q_icrs_to_cam))
-        words.append(f"RA {ra_deg:.4f} Dec {dec_deg:+.4f} roll {roll_deg:.4f}")
+        words.append(f"RA {turn_text(ra_deg)} Dec {dec_deg:+.4f} roll {turn_text(roll_deg)}")
     words += [] if found.valid else ["not valid"]
     words += [found.mode] if found.mode else []
     words += [] if found.star_count is None else [f"{found.star_count} stars"]

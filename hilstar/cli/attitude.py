@@ -127,11 +127,13 @@ def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
 
 
 def _lines(told: dict[str, Any]) -> list[str]:
+    from hilstar.rotation import turn_text
+
     q = ", ".join(f"{c:.7f}" for c in told["q_icrs_to_cam"])
     width, height = told["tracker"]["resolution_px"]
     lines = [
         f"q_icrs_to_cam {q}, t_ns {told['t_ns']}" + (" (held: in a gap of the log)" if told["held"] else ""),
-        f"RA {_turn(told['ra_deg'])}, Dec {told['dec_deg']:.4f}, roll {_turn(told['roll_deg'])} deg",
+        f"RA {turn_text(told['ra_deg'])}, Dec {told['dec_deg']:.4f}, roll {turn_text(told['roll_deg'])} deg",
     ]
     if told["rate_deg_s"] is not None:
         lines.append("rate " + ", ".join(f"{c:z.6f}" for c in told["rate_deg_s"]) + " deg/s about x, y, z of the camera")
@@ -143,7 +145,3 @@ def _lines(told: dict[str, Any]) -> list[str]:
         )
         lines.append(f"{star.name or f'HIP {star.hip}'}, V {star.v_mag:.2f}, in {star.constellation}: {where}")
     return lines
-
-
-def _turn(angle_deg: float) -> str:
-    return f"{round(angle_deg, 4) % 360:.4f}"

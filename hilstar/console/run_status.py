@@ -132,10 +132,10 @@ def _attitude_line(shown: "Shown") -> StatusLine:
     attitude = shown.attitude
     if attitude is None:
         return StatusLine("attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False)
-    from hilstar.rotation import to_radec_roll_deg  # with NumPy 0.1 s, which Tab and --help do not need
+    from hilstar.rotation import to_radec_roll_deg, turn_text  # with NumPy 0.1 s, which Tab and --help do not need
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
-    text = f"RA {ra_deg:.4f}, Dec {dec_deg:.4f}, roll {roll_deg:.4f} deg"
+    text = f"RA {turn_text(ra_deg)}, Dec {dec_deg:.4f}, roll {turn_text(roll_deg)} deg"
     rate = attitude.rate_cam_rad_s
     if rate is not None:
         text += f", {math.degrees(math.hypot(*rate)):.4g} deg/s"

@@ -14,7 +14,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.frame import Bench
 from hilstar.errors import printable
 from hilstar.notices import Notices
-from hilstar.rotation import to_matrix, to_radec_roll_deg
+from hilstar.rotation import to_matrix, to_radec_roll_deg, turn_text
 from hilstar.run.pacer import Shown
 from hilstar.sky.catalog import star_names
 from hilstar.sky.constellations import constellation_of
@@ -56,7 +56,8 @@ class Pointing:
 def pointing_text(bench: Bench, q_icrs_to_cam: FloatArray) -> str:
     """Right ascension, declination and roll of an attitude (4,), and the brightest star in the tracker's field."""
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q_icrs_to_cam)
-    text = f"the first attitude points at RA {ra_deg:.3f}, Dec {dec_deg:+.3f}, roll {roll_deg:.3f} deg"
+    ra, roll = turn_text(ra_deg, 3), turn_text(roll_deg, 3)
+    text = f"the first attitude points at RA {ra}, Dec {dec_deg:+.3f}, roll {roll} deg"
     matrix = to_matrix(q_icrs_to_cam)
     star = _brightest_in_view(bench, matrix)
     if star is None:

@@ -17,6 +17,7 @@ from hilstar.rotation import (
     slerp,
     to_matrix,
     to_radec_roll_deg,
+    turn_text,
 )
 
 # The check values are printed with seven decimals.
@@ -70,6 +71,14 @@ def test_right_ascension_and_roll_never_reach_360():
         ra, _, roll = to_radec_roll_deg(from_radec_roll_deg(angle, 10.0, angle))
         assert 0 <= ra < 360
         assert 0 <= roll < 360
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "decimals", "text"),
+    [(359.99996, 4, "0.0000"), (359.9996, 3, "0.000"), (359.9994, 3, "359.999"), (0.0, 4, "0.0000"), (84.057, 3, "84.057")],
+)
+def test_no_turn_is_written_as_360(turn_deg, decimals, text):
+    assert turn_text(turn_deg, decimals) == text
 
 
 def test_the_product_turns_vectors_one_after_the_other(rng):

@@ -209,7 +209,10 @@ class TcpBytes(ByteLink):
             self._connect()
         waited_for = self._listener if self._accepts.over else None
         ends = [end for end in (waited_for, self._connection) if end is not None]
-        ready = select.select(ends, [], [], timeout_ms / 1000)[0] if ends else []
+        if not ends:  # a connection was refused a moment ago
+            self._clock.sleep(min(self._accepts.left_s, timeout_ms / 1000))
+            return []
+        ready = select.select(ends, [], [], timeout_ms / 1000)[0]
         # The tracker's own bytes first: they hold the line, and its end lets a new connection in.
         chunks = self._read(self._connection) if self._connection in ready else []
         if self._listener in ready:

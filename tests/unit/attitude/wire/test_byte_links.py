@@ -22,12 +22,12 @@ SOON_MS = 20
 
 
 @contextlib.contextmanager
-def listening(clock: FakeClock, notices: Notices) -> Iterator[tuple[TcpBytes, int]]:
+def listening(clock: FakeClock, notices: Notices, allow: tuple[str, ...] = ()) -> Iterator[tuple[TcpBytes, int]]:
     with socket.socket() as made:
         made.bind(("127.0.0.1", 0))
         port = made.getsockname()[1]
     place = UdpPlace(ip_address("127.0.0.1"), port)
-    with TcpBytes(place, AllowedSenders(), notices, clock) as link:
+    with TcpBytes(place, AllowedSenders(allow), notices, clock) as link:
         yield link, port
 
 
@@ -59,6 +59,20 @@ def hold(link: TcpBytes, port: int, clock: FakeClock) -> socket.socket:
     wait_for(lambda: taken(link) == b"a", "the first bytes")
     clock.work(1e9 * ACCEPT_EACH_S)
     return made
+
+
+def test_a_link_without_a_tracker_rests_after_a_stranger_that_it_refused():
+    """Whoever connects again and again from a place that is not allowed keeps no core busy."""
+    clock, notices = FakeClock(), Notices()
+    with listening(clock, notices, ("192.0.2.0/24",)) as (link, port), connect(port) as stranger:
+        wait_for(lambda: closed(link, stranger), "the refusal")
+        looks = 0
+        begun_ns = clock.now_ns()
+        while clock.now_ns() - begun_ns < 1e9 and looks < 1000:
+            connect(port).close()
+            link.taken(SOON_MS)
+            looks += 1
+    assert looks <= 2.5 / ACCEPT_EACH_S  # a connection, and the rest after it
 
 
 def test_a_second_connection_is_refused_and_named_while_the_first_sends():

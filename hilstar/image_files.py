@@ -31,11 +31,9 @@ class ImageSizeError(Exception):
 
 def _check_size(size_px: tuple[int, int], wanted_px: tuple[int, int] | None) -> None:
     if wanted_px is not None and size_px != tuple(wanted_px):
-        raise ImageSizeError(
-            "is {} x {} px, and [tracker] resolution_px is {} x {}; give whole images, or write the key".format(
-                *size_px, *wanted_px
-            )
-        )
+        size, wanted = (f"{width} x {height} px" for width, height in (size_px, wanted_px))
+        key = f"resolution_px = [{size_px[0]}, {size_px[1]}]"
+        raise ImageSizeError(f"is {size}, and [tracker] resolution_px is {wanted}; give whole images, or write {key}")
     if wanted_px is None and math.prod(size_px) > MAX_PIXELS:
         raise ImageSizeError(f"is {size_px[0]} x {size_px[1]} px, and at most {MAX_PIXELS} pixels are decoded")
 
@@ -63,7 +61,7 @@ def opened_fits(data: bytes, size_px: tuple[int, int] | None = None) -> Iterator
     from astropy.io import fits
 
     if not data.startswith(FITS_MAGIC):
-        raise ImageSizeError("does not begin as FITS does; unpack it first, if it is a compressed one")
+        raise ImageSizeError("is not a FITS image: it does not begin as FITS does; unpack it first, if it is a compressed one")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # astropy's about a cut file or keywords of older standards
         with fits.open(io.BytesIO(data), memmap=False) as hdus:

@@ -133,7 +133,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, small_bench_file):
     assert_refused(run_hilstar_here("latency", ledger), 2, "--edges", "--diode")
     assert_refused(run_hilstar_here("latency", edges, "--edges", edges), 2, "edges.csv")
     assert_refused(run_hilstar_here("latency", ledger, "--edges", log), 2, "host_ns")
-    assert_refused(run_hilstar_here("latency", ledger, "--diode", "serial:/dev/nothing@9600"), 2, "/dev/nothing")
+    assert_refused(run_hilstar_here("latency", ledger, "--diode", "serial:/dev/nothing@9600"), 3, "/dev/nothing")
     assert_refused(run_hilstar_here("latency", ledger, "--diode", "tcp://x"), 2, "--diode")
     assert_refused(run_hilstar_here("report", log, "-o", tmp_path / "r"), 2, "log.csv")
     assert_refused(run_hilstar_here("report", tmp_path / "no.mcap", "-o", tmp_path / "r"), 2, "no.mcap")

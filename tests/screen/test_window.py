@@ -151,7 +151,7 @@ def test_without_a_refresh_of_its_own_the_display_is_paced_by_software_and_that_
 def test_a_display_that_is_not_there_gets_one_line(screen, bench_file):
     bench_file.write_text(SCREEN_BENCH.replace("[collimator]", 'display = "DELL"\n[collimator]'))
     code, said = refused(screen, bench_file)
-    assert code == 2
+    assert code == 3
     assert "DELL" in said and "640 x 480" in said
     bench_file.write_text(SCREEN_BENCH)
     code, said = refused(screen, bench_file, display=":99999")

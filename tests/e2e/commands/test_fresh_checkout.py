@@ -29,7 +29,7 @@ def clean_environment() -> dict[str, str]:
 
 def shape(text: str) -> str:
     """The lines with every figure and name that differs from machine to machine made alike."""
-    text = re.sub(r"(?m)^renderer .*$", "renderer", text)
+    text = re.sub(r"(?m)^(renderer|verdict) .*$", r"\1", text)
     return re.sub(r"-?\d+(\.\d+)?", "N", text)
 
 

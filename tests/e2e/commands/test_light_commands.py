@@ -90,7 +90,8 @@ def test_a_formula_s_shares_of_white_are_said_to_be_assumed(tmp_path):
         told = run_hilstar_here("budget", path)
         assert told.returncode == 0, told.stderr
         assert ("as 0.2126, 0.7152, 0.0722 of red, green and blue" in told.stderr) is assumed
-        assert len(told.stderr.splitlines()) == assumed
+        lines = [line for line in told.stderr.splitlines() if "star_sigma_ratio" not in line]
+        assert len(lines) == assumed
 
 
 @pytest.mark.usefixtures("without_charts")
@@ -277,7 +278,6 @@ def test_the_words_of_a_calibration_say_what_to_write(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["calibrate"], "hilstar"),
         (["calibrate", "photometric", "none.csv", "-o", "m.toml"], "none.csv"),
         (["calibrate", "plan", "-o", "p.csv", "--channels", "x"], "channels"),
         (["calibrate", "plan", "-o", "p.csv", "--resolution", "10"], "--resolution"),

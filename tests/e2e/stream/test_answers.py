@@ -23,7 +23,7 @@ from hilstar.answers.answer import Answer
 from hilstar.answers.reader import AnswersApart, open_answers
 from hilstar.attitude.wire.packet import AnswerPacket, encode, framed
 from hilstar.bench.config import parse_config
-from hilstar.errors import InputError
+from hilstar.errors import HilstarError
 from hilstar.notices import Notices
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -167,8 +167,8 @@ def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
         path.unlink()
         if kind == "device":
             path.symlink_to("/dev/zero")
-            wait_for(lambda: source.take(20) == [] and source.trouble(), "the trouble")
-            assert source.trouble() == "it is a device now, and no regular file"
+            wait_for(lambda: source.take(20) == [] and source.unread(), "the trouble")
+            assert source.unread() == "it is a device now, and no regular file"
             assert notices.counts() == {"answers-lost": 1}
         else:
             with path.open("wb") as file:
@@ -181,7 +181,7 @@ def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
         path.unlink()
         path.write_bytes(STREAM)
         assert_answers(gathered(source, 3))
-        assert source.trouble() == ""
+        assert source.unread() == ""
 
 
 def cpu_s(source: AnswersApart) -> float:
@@ -228,7 +228,7 @@ def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(
 
 def test_a_road_that_is_not_there_is_refused_before_the_run(tmp_path):
     for keys in ('source = "serial"\nport = "/dev/no-such-port"', f'source = "file"\npath = "{tmp_path}"'):
-        with pytest.raises(InputError, match=r"\[answers\]"), reading(tmp_path, keys):
+        with pytest.raises(HilstarError, match=r"\[answers\]"), reading(tmp_path, keys):
             pass
     (tmp_path / "bench.toml").write_text(SMALL_BENCH)
     assert_refused(run_hilstar_here("answers", tmp_path / "bench.toml"), 2, "has no [answers]", "bench.toml")
@@ -316,6 +316,6 @@ def test_a_function_that_does_not_return_is_ended_and_named_and_the_next_answers
             return "receiver-failed" in caplog.text or "python:looping_tracker:decode) stopped" in caplog.text
 
         wait_for(told, "the reader is ended", poll_s=0.02)
-        assert source.trouble and reader.poll() is not None
+        assert source.unread and reader.poll() is not None
         gathered(source, 1, lambda: sender.sendto(b"2", to))
-        assert not source.trouble
+        assert not source.unread

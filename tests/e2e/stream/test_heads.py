@@ -45,14 +45,14 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
         command = [*HILSTAR, "serve", str(path), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
         with Started(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
             try:
-                wait_for(lambda: lines.read_text().count("first attitude") == 3)
+                wait_for(lambda: lines.read_text().count("the first attitude has come") == 3)
                 ledgers = [tmp_path / f"run.{name}.mcap" for name in MOUNTINGS]
                 wait_for(lambda: all(len(recorded(ledger)) > BEGUN_FRAMES for ledger in ledgers))
                 heads = children(process.pid)
                 os.kill(heads["b"], signal.SIGKILL)
                 os.kill(heads["c"], signal.SIGSTOP)
                 wait_for(lambda: lines.read_text().count("it is started again") == 2)
-                wait_for(lambda: lines.read_text().count("first attitude") == 5)
+                wait_for(lambda: lines.read_text().count("the first attitude has come") == 5)
                 assert children(process.pid)["a"] == heads["a"]
             finally:
                 process.send_signal(signal.SIGINT)
@@ -87,7 +87,7 @@ def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):
         command = [*HILSTAR, "serve", str(heads_file(tmp_path, port)), "--headless"]
         with Started(command, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
             try:
-                wait_for(lambda: lines.read_text().count("first attitude") == 3)
+                wait_for(lambda: lines.read_text().count("the first attitude has come") == 3)
             finally:
                 process.kill()
         assert list(place.glob("hilstar-head*"))

@@ -38,6 +38,9 @@ SUMMARY_KEYS |= {
     "events",
     "link",
     "beat",
+    "blank_frames",
+    "wrong_sky",
+    "verdict",
 }
 
 

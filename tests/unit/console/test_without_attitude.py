@@ -12,7 +12,7 @@ def summary_of(*refusals: Refusal) -> PacketSummary:
     counts = PacketCounts()
     for refusal in refusals:
         counts.refuse(refusal)
-    return PacketSummary(len(refusals), 0, counts.refused, counts.refused_by, counts.shown)
+    return PacketSummary(len(refusals), 0, counts.refused, counts.refused_by, shown=counts.shown)
 
 
 def test_what_the_first_refused_packet_showed_is_said_and_not_the_cable() -> None:

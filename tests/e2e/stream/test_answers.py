@@ -167,8 +167,8 @@ def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
         path.unlink()
         if kind == "device":
             path.symlink_to("/dev/zero")
-            wait_for(lambda: source.take(20) == [] and source.unread(), "the trouble")
-            assert source.unread() == "it is a device now, and no regular file"
+            wait_for(lambda: source.take(20) == [] and source.trouble(), "the trouble")
+            assert source.trouble() == "it is a device now, and no regular file"
             assert notices.counts() == {"answers-lost": 1}
         else:
             with path.open("wb") as file:
@@ -181,7 +181,7 @@ def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
         path.unlink()
         path.write_bytes(STREAM)
         assert_answers(gathered(source, 3))
-        assert source.unread() == ""
+        assert source.trouble() == ""
 
 
 def cpu_s(source: AnswersApart) -> float:

@@ -87,12 +87,11 @@ def _live(file: "BenchFile", at: str | None, patience_s: float) -> _Found:
 
 def _of_log(path: Path, at: str | None, stated: "Stated") -> _Found:
     from hilstar.attitude.clock.timeline import Policy
-    from hilstar.attitude.logs.entries import log_joins
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
     from hilstar.attitude.wire.packet import AttitudeSample
 
     log = open_log(path, stated)
-    joins = log_joins(log.samples, log.told)
+    joins = log.joins()
     for _, line in [*log.told, *joins.told]:
         say(line)
     t_ns = time_in_log(path, log.samples, at)

@@ -96,7 +96,6 @@ def wanted_samples(
     log: Path | None, spin: str | None, rate: float | None, radec: str | None, statements: options.LogStatements
 ) -> tuple[Any, float]:
     """The samples to send, and their number (infinite if unknown)."""
-    from hilstar.attitude.logs.entries import log_joins
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.run.send_log import log_samples, spin_samples
 
@@ -109,7 +108,7 @@ def wanted_samples(
         return spin_samples(options.parse_spin(spin), rate or 100.0, options.parse_radec(radec or "84.057,-1.2,0")), math.inf
     read = open_log(log or Path(), statements.stated())
     recorded = read.samples
-    for _, line in [*read.told, *log_joins(recorded, read.told).told]:
+    for _, line in [*read.told, *read.joins().told]:
         say(line)
     return log_samples(recorded, rate), len(recorded) if rate is None else math.inf
 

@@ -104,7 +104,6 @@ def simulate_log(
     statements: options.LogStatements,
 ) -> None:
     """The virtual tracker along a log."""
-    from hilstar.attitude.logs.entries import log_joins
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.bench.bench_file import dated, read_bench_file
     from hilstar.twin.batch import LogFaults, log_views, simulate_views
@@ -115,7 +114,7 @@ def simulate_log(
     read = open_log(log, statements.stated(config))
     samples = read.samples
     file = dated(file, read.conventions.scale, samples[0].t_ns)
-    for _, line in [*read.told, *log_joins(samples, read.told).told]:
+    for _, line in [*read.told, *read.joins().told]:
         say(line)
     max_rate_rad_s = math.radians(config.attitude.max_rate_deg_s)
     views = log_views(samples, frames, config.tracker.exposure_s, max_rate_rad_s)

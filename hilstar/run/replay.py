@@ -13,7 +13,7 @@ from msgspec.structs import replace as replaced
 
 from hilstar.attitude.clock.resolution import coarse_lines
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.attitude.logs.entries import Stated, log_joins
+from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import NOTHING_STATED, check_stated, log_timeline, open_log
 from hilstar.attitude.logs.log_times import span_line
 from hilstar.attitude.logs.mcap_log import holds_ros, is_mcap, read_attitudes
@@ -176,7 +176,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     if count > MAX_FRAMES:
         raise InputError(f"{log}: gives {count:.3g} frames; write a longer --step, or --start and --stop")
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
-    joins = log_joins(samples, read.told)
+    joins = read.joins()
     timeline = log_timeline(samples, policy_of(config.attitude), joins)
 
     def frame(slot: int) -> PlayedFrame:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
 from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
@@ -130,13 +129,8 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
 
 def _read_as(bench: Bench, link: AnyLink) -> ReadAs:
     """How a link's quaternions become the camera's."""
-    mounting = None
-    if link.conventions.of_body:
-        mounting = np.asarray(Mounting(bench.config.tracker.q_body_to_cam).q_body_to_cam)
-    if not link.conventions.of_packets:
-        return ReadAs(q_body_to_cam=mounting, has_key=False)
-    convention = bench.config.attitude.convention
-    return ReadAs(convention.scalar, convention.direction, mounting)
+    config = bench.config
+    return ReadAs.of(link.conventions, config.attitude.convention, Mounting(config.tracker.q_body_to_cam))
 
 
 def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:

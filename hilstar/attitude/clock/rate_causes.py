@@ -16,6 +16,7 @@ import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.attitude.wire.source import Convention, Conventions, Mounting
 from hilstar.rotation import conjugate, multiply, rotate, to_rotation_vector
 from hilstar.units import NS_PER_S
 from hilstar.wrong_sky import CONVENTION, RATES
@@ -41,6 +42,8 @@ MIN_LAG_S = 0.02
 MIN_TURNS = 5
 NOISE_RATIO = 2.0  # over ten and more turns a chance error is within 1.5 times the noise
 LAG_TIE = 0.02  # share of the range of errors
+KEY = "[attitude] convention"
+HOW_IT_SENDS = "look at what the simulator puts into its quaternion"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,19 +51,34 @@ class ReadAs:
     """How a sender's four numbers become the camera's attitude: as `[attitude] convention` says, then by `q_body_to_cam` (4,).
 
     That is None where they are the camera's own. `has_key` says whether the key states how the source is read; a source
-    with a convention of its own refuses it.
+    with a convention of its own refuses it. `stated_by` is what states it: that key, or a command's option.
     """
 
     scalar: str = "first"
     direction: str = "icrs_to_cam"
     q_body_to_cam: FloatArray | None = None
     has_key: bool = True
+    stated_by: str = KEY
+
+    @classmethod
+    def of(cls, conventions: Conventions, convention: Convention, mounting: Mounting, stated_by: str = KEY) -> "ReadAs":
+        """How a source of these conventions is read, where `convention` and `mounting` are stated."""
+        q_body_to_cam = mounting.q_body_to_cam if conventions.of_body else None
+        if not conventions.of_packets:
+            return cls(q_body_to_cam=q_body_to_cam, has_key=False)
+        return cls(convention.scalar, convention.direction, q_body_to_cam, stated_by=stated_by)
+
+    def advice(self, parts: Sequence[tuple[str, str]]) -> str:
+        """What to write for another reading, by its keys and their values."""
+        if not self.has_key:
+            return HOW_IT_SENDS
+        if self.stated_by != KEY:
+            return f"write {self.stated_by} {','.join(f'{key}={value}' for key, value in parts)}"
+        keys = ", ".join(f'{key} = "{value}"' for key, value in parts)
+        return f"write {KEY} = {{ {keys} }}"
 
 
 AS_PACKETS = ReadAs()
-
-
-HOW_IT_SENDS = "look at what the simulator puts into its quaternion"
 
 
 class Reading(NamedTuple):
@@ -83,12 +101,11 @@ def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
             continue
         text = "quaternions" if other_direction == direction else "conjugate of the quaternions"
         text += "" if other_scalar == scalar else f" read with the scalar {other_scalar}"
-        parts = [f'scalar = "{other_scalar}"'] if other_scalar != "first" or scalar != "first" else []
+        parts = [("scalar", other_scalar)] if other_scalar != "first" or scalar != "first" else []
         if other_direction != "icrs_to_cam" or direction != "icrs_to_cam":
-            parts.append(f'direction = "{other_direction}"')
+            parts.append(("direction", other_direction))
         if mounting is not None:
-            parts.append('frame = "body"')
-        advice = f"write [attitude] convention = {{ {', '.join(parts)} }}"
+            parts.append(("frame", "body"))
 
         def read(q: FloatArray, turned: bool = other_direction != direction, to: str = other_scalar) -> FloatArray:
             own = q if mounting is None else multiply(conjugate(mounting), q)
@@ -98,7 +115,7 @@ def readings(read_as: ReadAs = AS_PACKETS) -> tuple[Reading, ...]:
             own = conjugate(sent) if turned != (direction == "cam_to_icrs") else np.asarray(sent)
             return own if mounting is None else multiply(mounting, own)
 
-        found.append(Reading(text, advice if read_as.has_key else HOW_IT_SENDS, read))
+        found.append(Reading(text, read_as.advice(parts), read))
     return tuple(found)
 
 

@@ -26,7 +26,6 @@ from hilstar.attitude.clock.rate_causes import (
     MIN_STRETCHES,
     MORE_STRETCHES,
     MUCH_LESS,
-    READ_OTHERWISE,
     SAME,
     Cause,
     LagFit,
@@ -57,16 +56,16 @@ LAG_EACH_NS = NS_PER_S // 2
 LATE_NO_MORE = 8  # comparisons in a row by which late rates are right again: a slow swing has times without an error
 
 
-def cause_in(samples: Sequence[AttitudeSample]) -> Cause | None:
+def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) -> Cause | None:
     """The first cause that a log's samples show, all of which have rates; None where they show none."""
-    length = _Length(0.0)
+    length, others = _Length(0.0), tuple(read_otherwise(readings(read_as)))
     for sample in samples:
-        if length.add(sample) and (cause := _first_cause(length)) is not None:
+        if length.add(sample) and (cause := _first_cause(length, math.inf, others)) is not None:
             return cause
     return None
 
 
-def _first_cause(length: "_Length", history_s: float = math.inf, others: Sequence[Cause] = READ_OTHERWISE) -> Cause | None:
+def _first_cause(length: "_Length", history_s: float, others: Sequence[Cause]) -> Cause | None:
     """What the newest stretches of a length show, few of them first."""
     for count in (MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES):
         newest = length.newest(count)

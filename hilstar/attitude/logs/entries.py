@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.clock.rate_causes import Cause
+from hilstar.attitude.clock.rate_causes import AS_PACKETS, Cause, ReadAs
 from hilstar.attitude.clock.rate_check import cause_in
 from hilstar.attitude.clock.timeline import Join
 from hilstar.attitude.logs.log_times import TIMES
@@ -115,11 +115,19 @@ class LogReading:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeLog:
-    """A log as read: samples of the camera's attitude in order of time, what the file means by its numbers, and notices."""
+    """A log as read: samples of the camera's attitude in order of time, what the file means by its numbers, and notices.
+
+    `read_as` is how its quaternions have become the camera's.
+    """
 
     samples: list[AttitudeSample]
     conventions: Conventions
     told: list[tuple[str, str]]
+    read_as: ReadAs = AS_PACKETS
+
+    def joins(self) -> "LogJoins":
+        """How its samples join (see `log_joins`)."""
+        return log_joins(self.samples, self.told, self.read_as)
 
 
 def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterator[LogEntry]:
@@ -195,9 +203,11 @@ class LogJoins:
         return lines
 
 
-def log_joins(samples: Sequence[AttitudeSample], told: Iterable[tuple[str, str]] = ()) -> LogJoins:
+def log_joins(
+    samples: Sequence[AttitudeSample], told: Iterable[tuple[str, str]] = (), read_as: ReadAs = AS_PACKETS
+) -> LogJoins:
     """How the samples of a log join; their times must increase. `told` are notices that may explain
-    rates that do not fit.
+    rates that do not fit, `read_as` is how quaternions have become the camera's.
     """
     if len(samples) < 2:
         return LogJoins()
@@ -212,7 +222,8 @@ def log_joins(samples: Sequence[AttitudeSample], told: Iterable[tuple[str, str]]
     cause: Cause | None = None
     if misfit.any() and TIMES not in dict(told):  # what is probably wrong from the first rate on that does not fit
         first = int(misfit.argmax())
-        cause = cause_in([sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None])
+        with_rates = [sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None]
+        cause = cause_in(with_rates, read_as)
     return LogJoins(
         frozenset(t_ns[:-1][fits & ~broken].tolist()),
         frozenset(t_ns[:-1][held].tolist()),

@@ -24,6 +24,7 @@ from typing import IO, TYPE_CHECKING, Literal, NamedTuple
 import msgspec
 from msgspec import structs
 
+from hilstar.attitude.clock.rate_causes import ReadAs
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
 from hilstar.attitude.logs.entries import (
@@ -190,7 +191,8 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
     told = [*reading.told, *conventions.mounting_notices(mounting)]
     if conventions.of_packets:  # other formats say themselves what their times are
         told += time_notices(samples, conventions.time_unit)
-    return AttitudeLog(samples, conventions, told)
+    read_as = ReadAs.of(conventions, stated.convention or HILSTARS, mounting, stated.convention_by)
+    return AttitudeLog(samples, conventions, told, read_as)
 
 
 def _refuse_other_topics(path: Path) -> None:

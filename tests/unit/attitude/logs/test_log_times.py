@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilstar.attitude.logs.entries import log_joins
 from hilstar.attitude.logs.log_file import open_log
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import run_hilstar_here
@@ -42,7 +41,7 @@ def written(tmp_path, kind: str, unit_s: float, step_s: float, rates: bool, scal
 
 def notices(path) -> tuple[str, str]:
     log = open_log(path)
-    return dict(log.told).get("log-times", ""), dict(log_joins(log.samples, log.told).told).get("log-rates", "")
+    return dict(log.told).get("log-times", ""), dict(log.joins().told).get("log-rates", "")
 
 
 @pytest.mark.parametrize("step_s", [0.005, 0.02, 0.1])

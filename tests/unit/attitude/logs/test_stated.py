@@ -18,6 +18,7 @@ from hilstar.attitude.logs.mcap_log import attitude_message, register_attitudes
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Convention, Mounting
 from hilstar.errors import InputError
+from hilstar.rotation import propagate
 from tests.support.sources import ros_bags
 from tests.support.sources import spice_kernels as ck
 from tests.support.sources.aem_messages import kvn
@@ -212,3 +213,50 @@ def test_json_lines_of_each_convention(tmp_path, scalar, direction, frame):
     (sample,) = open_log(path, Stated(Mounting(MOUNTING), convention=convention)).samples
     assert (Rotation.from_quat(sample.q_icrs_to_cam, scalar_first=True) * TURNS[0].inv()).magnitude() < ROUNDING
     assert sample.rate_cam_rad_s == pytest.approx(rate, abs=ROUNDING)
+
+
+def turning(folder: Path, sent: Convention) -> Path:
+    """A log of a steady turn with rates, its quaternions sent in a convention."""
+    path, rate_rad_s = folder / "turning.jsonl", np.array([0.02, 0.05, -0.03])
+    lines = []
+    for k in range(100):
+        q = propagate(QUATERNIONS[0], rate_rad_s, 0.05 * k)
+        message = {"t_ns": k * 50_000_000, "q": sent.as_sent(q).tolist(), "rate": rate_rad_s.tolist()}
+        lines.append(json.dumps(message))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("stated", "advice"),
+    [
+        (Stated(), "write --convention scalar=last,direction=cam_to_icrs"),
+        (Stated(convention=Convention(scalar="last")), "write --convention scalar=last,direction=cam_to_icrs"),
+        (
+            Stated(Mounting(MOUNTING, by_option=True)),
+            "write --convention scalar=last,direction=cam_to_icrs,frame=body",
+        ),
+        (
+            Stated(convention_by="[attitude] convention"),
+            'write [attitude] convention = { scalar = "last", direction = "cam_to_icrs" }',
+        ),
+    ],
+)
+def test_a_log_that_is_read_otherwise_is_told_what_to_state_in_place_of_what_is(tmp_path, stated, advice):
+    sent = Convention(scalar="last", direction="cam_to_icrs")
+    told = dict(open_log(turning(tmp_path, sent), stated).joins().told)
+    assert told["convention-wrong"].endswith(advice)
+
+
+def test_a_log_that_is_read_as_it_was_sent_is_told_nothing(tmp_path):
+    sent = Convention(scalar="last", direction="cam_to_icrs")
+    assert open_log(turning(tmp_path, sent), Stated(convention=sent)).joins().told == []
+
+
+def test_a_log_with_a_convention_of_its_own_is_told_no_statement_that_it_refuses(tmp_path):
+    log = open_log(turning(tmp_path, Convention(direction="cam_to_icrs")))
+    path = tmp_path / "conjugates.aem"
+    write_log(path, log.samples)
+    told = dict(open_log(path).joins().told)
+    assert "look at what the simulator puts into its quaternion" in told["convention-wrong"]
+    assert "convention =" not in told["convention-wrong"] and "--convention" not in told["convention-wrong"]

@@ -93,12 +93,15 @@ def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
     """A head's link to the process that has the source, with which it ends; `fed_by` is that one's endpoint and process id."""
     from hilstar.attitude.wire.source import Mounting, SentAttitudes
     from hilstar.attitude.wire.zmq_links import FedDecoder, ZmqReceiver
+    from hilstar.bench.config.attitude import PACKET_SOURCES
 
     endpoint, _, parent = fed_by.rpartition(",")
     end_with_parent(int(parent))
     sent = SentAttitudes(file.config.attitude.convention, Mounting(file.config.tracker.q_body_to_cam))
     decoder = FedDecoder(sent)
-    decoder.conventions = replace(decoder.conventions, source="the source of several heads")
+    # Only packets have the key of a convention; the other sources have one of their own, and refuse it.
+    of_packets = file.config.attitude.source in PACKET_SOURCES
+    decoder.conventions = replace(decoder.conventions, source="the source of several heads", of_packets=of_packets)
     return ZmqReceiver(endpoint, notices=notices, decoder=decoder)
 
 

@@ -123,7 +123,8 @@ class LiveAnswers:
             figures = msgspec.structs.replace(figures, silent=f"no answer is read: {self._unread}")
         if figures.silent:
             self._notices.begin(UNREAD if unread else SILENT, figures.silent)
-        if not figures.silent or unread:
+        # A tracker that was silent before nothing was read is not known to answer yet.
+        if not figures.silent:
             self._notices.end(SILENT, "tracker-answers", "the tracker answers")
         if not figures.silent or not unread:
             self._notices.end(UNREAD, "answers-read", "the tracker's answers are read again")

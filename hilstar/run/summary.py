@@ -67,7 +67,7 @@ def verdict_of(summary: "RunSummary") -> RunVerdict:
     good = not (stale or summary.missed_frames or wrong.seconds) and due > 0
     head = f"the sky was right in all {due} frames" if good else "the sky was not right throughout"
     line = "; ".join([head, *reasons])
-    strict = late_share <= MAX_LATE_SHARE and not wrong.seconds
+    strict = due > 0 and late_share <= MAX_LATE_SHARE and not wrong.seconds
     return RunVerdict(good, strict, round(late_share, 4), wrong.seconds, line)
 
 

@@ -113,7 +113,9 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
             break
         kept = within
     x, y = read.x_px[kept], read.y_px[kept]
-    phases = _phases(read.seen_x_px[kept], read.seen_y_px[kept])
+    # Where the fit shows the dots: waves at the places as read would hold each dot's own noise, and fit it.
+    shown_px = geometry.tracker.places_px(*_tangents(found.geometry.monitor, flat, wanted[kept]).T)
+    phases = _phases(*shown_px)
     fit = None
     for degree in (0, *DEGREES):
         terms = np.concatenate([_terms(found, flat, wanted[kept], (x, y), degree), phases], axis=2)

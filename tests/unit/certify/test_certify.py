@@ -13,15 +13,28 @@ import pytest
 from astropy.io import fits
 
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.certify.assembly import DOT_IMAGES
 from hilstar.certify.budget import Input, by_trials, first_order, why_they_differ
 from hilstar.certify.check import compare, take_check
-from hilstar.certify.readings import VirtualReader
+from hilstar.certify.estimates import place_errors
+from hilstar.certify.lens import lens_fit
+from hilstar.certify.readings import VirtualReader, dot_places, geometry_of
 from hilstar.certify.structure import in_place
 from hilstar.run.record.ledger_records import read_head
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
-from tests.support.planted_certify import REGIONS, coverage, coverage_by_images, drawn, plant, stated_lens
-from tests.support.planted_readings import KINDS, SmoothField, Truth, supposed, uneven
+from tests.support.planted_certify import BENCH, REGIONS, coverage, coverage_by_images, drawn, plant, stated_lens
+from tests.support.planted_readings import (
+    ARCSEC,
+    DELAY_MS,
+    KINDS,
+    WHITE_E_PER_S,
+    PlantedReader,
+    SmoothField,
+    Truth,
+    supposed,
+    uneven,
+)
 from tests.support.planted_readings import in_place as dots_in_place
 from tests.support.planted_run import write_run
 from tests.support.planted_tracker import Planted, Sizes, scan
@@ -103,6 +116,25 @@ def test_structure_is_found_where_it_is_and_not_where_it_is_not() -> None:
     oblique = np.abs(x - 490) / 490 + np.abs(y - 390) / 390 < 1
     found = in_place(x[oblique], y[oblique], more[:, oblique], terms[:, oblique])
     assert found.mean_length == pytest.approx(80, rel=0.6)
+
+
+# Of seed 32: their dots are a whole number of tracker pixels apart, nearly, so that all have one phase in a pixel.
+IN_PHASE = (29, 66, 72, 85)
+
+
+@pytest.mark.parametrize("number", IN_PHASE)
+def test_waves_of_the_trackers_pixels_do_not_fit_the_noise_of_dots(tmp_path, number: int) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S))
+    file = read_bench_file(path)
+    one = supposed(np.random.default_rng((32, number)))
+    x_px, y_px = dot_places(geometry_of(file))
+    dots = PlantedReader(one, np.random.default_rng((32, number, 2))).dots(x_px, y_px, DOT_IMAGES)
+    places = lens_fit(file, dots, place_errors(file, dots)).at(dots.x_px, dots.y_px)
+    wanted = geometry_of(file).monitor.rays(dots.x_px, dots.y_px)
+    true = (one.tangents(dots.x_px, dots.y_px) - wanted[:, :2] / wanted[:, 2:]) * ARCSEC
+    off = (places.value - true) / np.sqrt((places.noise**2).sum(axis=0))
+    assert np.sqrt((off**2).mean()) < 1.6
 
 
 def test_images_give_places_as_well_as_thousands_of_dots_know_them() -> None:

@@ -3,15 +3,14 @@
 import base64
 import html
 import math
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from hilstar.charts import svg
+from hilstar.palette import declarations
 
 DIGITS = 4
-COLOURS = Path(__file__).resolve().parent / "console" / "page" / "page.css"  # their one place
 STYLE = Path(__file__).with_suffix(".css")
 
 
@@ -23,11 +22,12 @@ class Markup(str):
 
 def page_of(title: str, body: Iterable[str]) -> bytes:
     """A whole page."""
-    dark, light = (
-        found.group(1) for found in re.finditer(r"^:root[^{]*\{(.*?)\}", COLOURS.read_text(), re.MULTILINE | re.DOTALL)
+    shape = "--radius: 12px;"
+    style = (
+        f":root {{ color-scheme: light dark; {shape} {declarations('light')} }}\n"
+        f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {declarations('dark')} }} }}\n"
+        f"{STYLE.read_text()}"
     )
-    style = f":root {{ color-scheme: light dark; {_plain(dark)} {_plain(light)} }}"  # light lacks what both themes share
-    style += f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {_plain(dark)} }} }}\n{STYLE.read_text()}"
     head = (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -35,11 +35,6 @@ def page_of(title: str, body: Iterable[str]) -> bytes:
     )
     text = "\n".join((f"{head}<body><h1>{escaped(title)}</h1>", *body, "</body></html>\n"))
     return text.encode(errors="replace")
-
-
-def _plain(block: str) -> str:
-    """The colours of a theme, without its scheme and font."""
-    return " ".join(re.findall(r"--[\w-]+: [^;]+;", block))
 
 
 def escaped(value: object) -> str:

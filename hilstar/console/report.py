@@ -22,6 +22,7 @@ from hilstar.errors import InputError, MachineError, printable
 from hilstar.files import make_directory, write_whole
 from hilstar.frame.fault_kinds import Freeze
 from hilstar.notices import Notices
+from hilstar.palette import palette_css
 from hilstar.run.faults import read_recording
 from hilstar.run.pacer import Shown
 from hilstar.run.record.ledger_records import EventRecord, codes_ms_of, config_of, wrong_in_frame
@@ -71,7 +72,8 @@ def _hash(text: str) -> str:
 def report_page(data: dict[str, Any]) -> str:
     """The page with a run's data (see `run_data`), as HTML that needs no other file and no network."""
     html = (PAGE_DIR / "index.html").read_text(encoding="utf-8")
-    style, script = (PAGE_DIR / "page.css").read_text(encoding="utf-8"), one_script("report")
+    style = palette_css() + (PAGE_DIR / "page.css").read_text(encoding="utf-8")
+    script = one_script("report")
     policy = (
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; img-src data:; base-uri 'none'; "
         "form-action 'none'"

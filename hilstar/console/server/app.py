@@ -28,6 +28,7 @@ from hilstar.console.messages import Order, OrderAnswer, RunState, Setup
 from hilstar.console.protocol import CONTROLS, SUBPROTOCOL, TOKEN_PROTOCOL, OrderBody, PageText, SkyMap
 from hilstar.console.server.connections import OpenPage, OpenPages
 from hilstar.console.server.reader import RunReader
+from hilstar.palette import palette_css
 from hilstar.wrong_sky import ENDS
 
 LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}  # no name server says where they are
@@ -240,6 +241,7 @@ class Page:
         self.guard, self.metrics = Guard(setup), RunCollector(reader)
         self._sky = b"{}" if sky is None else msgspec.json.encode(sky)
         self._files = {path.name: path.read_bytes() for path in PAGE_FOLDER.iterdir() if path.suffix in TYPES}
+        self._files["palette.css"] = palette_css().encode()
 
     def app(self) -> ASGIApp:
         """The application, with its guard before it."""

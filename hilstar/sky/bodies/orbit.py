@@ -167,7 +167,13 @@ def _at(times_ns: npt.NDArray[np.int64], states: FloatArray, t_ns: int) -> tuple
     """Place and velocity at a time by the NODES states (n, 6) about it."""
     first = int(np.clip(np.searchsorted(times_ns, t_ns) - NODES // 2, 0, max(0, len(times_ns) - NODES)))
     near = slice(first, first + NODES)
-    return hermite((times_ns[near] - t_ns) / NS_PER_S, states[near, :3], states[near, 3:])
+    from scipy.interpolate import KroghInterpolator
+
+    # An epoch that stands twice gives its place first and then its velocity.
+    twice_s = np.repeat((times_ns[near] - t_ns) / NS_PER_S, 2)
+    place_and_velocity = states[near].reshape(-1, 3)
+    place, velocity = KroghInterpolator(twice_s, place_and_velocity).derivatives(0.0, der=2)
+    return place, velocity
 
 
 def _off_km(segment: Segment) -> float:
@@ -179,26 +185,6 @@ def _off_km(segment: Segment) -> float:
         place, _ = _at(segment.t_ns[near], segment.states[near], int(segment.t_ns[k]))
         worst_km = max(worst_km, float(np.linalg.norm(place - segment.states[k, :3])))
     return worst_km / float(2**order)
-
-
-def hermite(times_s: FloatArray, values: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Value (k,) and slope (k,) at time 0 of the polynomial with these values (n, k) and slopes (n, k) at times (n,).
-
-    By Newton's divided differences, each time twice.
-    """
-    twice = np.repeat(times_s, 2)
-    table = np.repeat(values, 2, axis=0)
-    value, slope = table[0].copy(), np.zeros(values.shape[1])
-    product, product_slope = 1.0, 0.0
-    for order in range(1, len(twice)):
-        gaps = twice[order:] - twice[:-order]
-        differences = table[1:] - table[:-1]
-        if order == 1:
-            differences[::2], gaps[::2] = slopes, 1.0
-        table = differences / gaps[:, None]
-        product, product_slope = -product * twice[order - 1], product - product_slope * twice[order - 1]
-        value, slope = value + product * table[0], slope + product_slope * table[0]
-    return value, slope
 
 
 def _segments(text: str, name: str) -> Iterator[Segment]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from itertools import combinations
 
 import numpy as np
 import pytest
 
-from hilstar.console.report import PAGE_DIR
+from hilstar.palette import THEMES, colours_of
 
 TEXT, GRAPHIC = 4.5, 3.0  # WCAG 2.2, 1.4.3 (AA) and 1.4.11
 MIN_CURVES_APART = 12.0  # CIE 1976 dE of two curves in a chart; 2.3 is just seen, side by side
@@ -34,14 +33,14 @@ TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 
 
 
 def themes() -> dict[str, dict[str, np.ndarray]]:
-    """Linear sRGB of each plain colour of the style sheet, by theme."""
-    css = (PAGE_DIR / "page.css").read_text()
-    found = {}
-    for theme, block in (("dark", r":root \{(.*?)\}"), ("light", r':root\[data-theme="light"\] \{(.*?)\}')):
-        body = re.search(block, css, re.DOTALL)
-        assert body is not None
-        found[theme] = {name: linear(value) for name, value in re.findall(r"--([\w-]+): #([0-9a-f]{6})", body[1])}
-    return found
+    """Linear sRGB of each plain colour of the palette, by theme."""
+    plain = {}
+    for theme in THEMES:
+        colours = colours_of(theme).items()
+        plain[theme] = {name: linear(colour[1:]) for name, colour in colours if colour.startswith("#")}
+    # The light theme has every colour of the dark one: what it lacked would stay dark.
+    assert plain["dark"].keys() == plain["light"].keys()
+    return plain
 
 
 def linear(value: str) -> np.ndarray:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from hilstar.tracker.centroids import (
     CentroidSettings,
     LocalBackground,
-    _components,
     estimate_background,
     find_stars,
     noisiest_background,
@@ -59,17 +57,3 @@ def test_the_background_of_whole_numbers_is_that_of_their_pixels(shape):
     counted, by_pixel = estimate_background(image), estimate_background(image.astype(np.float64), step=1.0)
     assert counted.level == pytest.approx(by_pixel.level, rel=1e-12)
     assert counted.noise == pytest.approx(by_pixel.noise, rel=1e-12)
-
-
-def test_blobs_are_those_of_scipys_labels_whatever_their_shape():
-    """By rectangular images of every density, with a spiral arm of one pixel's width that meets itself late."""
-    rng = np.random.default_rng(9)
-    images = [rng.random(shape) < lit for shape in ((1, 50), (50, 1), (40, 61)) for lit in (0.02, 0.2, 0.5, 1.0)]
-    spiral = np.zeros((64, 64), dtype=np.bool_)
-    for k in range(0, 30, 2):
-        spiral[k, k : 64 - k] = spiral[k : 64 - k, 63 - k] = True
-        spiral[63 - k, k + 2 : 64 - k] = spiral[k + 2 : 64 - k, k + 2] = True
-    for above in (*images, spiral):
-        lit = np.flatnonzero(above)
-        labels, _ = ndimage.label(above, structure=np.ones((3, 3)))
-        np.testing.assert_array_equal(_components(lit, lit % above.shape[1], above.shape), labels.ravel()[lit] - 1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.errors import InputError
-from hilstar.sky.bodies.orbit import OemOrbit, hermite
+from hilstar.sky.bodies.orbit import OemOrbit
 from tests.support.sources.oem_messages import START_NS, STATION, oem, segment
 
 MINUTES = range(0, 1260, 60)
@@ -31,13 +31,6 @@ def test_between_epochs_the_orbit_is_that_of_the_program_that_wrote_it(rng):
         (place, velocity), (true_place, true_velocity) = orbit.state(t_ns), STATION.state(t_ns)
         assert place == pytest.approx(true_place, abs=PLACE_KM)
         assert velocity == pytest.approx(true_velocity, abs=VELOCITY_KM_S)
-
-
-def test_the_polynomial_is_exact_to_its_degree(rng):
-    whole = np.polynomial.Polynomial(rng.normal(size=8))
-    times = np.array([-2.0, -0.5, 0.7, 3.0])
-    value, slope = hermite(times, whole(times)[:, None], whole.deriv()(times)[:, None])
-    assert (value[0], slope[0]) == pytest.approx((whole(0.0), whole.deriv()(0.0)), abs=1e-9)
 
 
 @pytest.mark.parametrize(("scale", "ahead_s"), [("UTC", 0.0), ("TAI", 33.0), ("TT", 65.184), ("TDB", 65.184), ("GPS", 14.0)])

@@ -127,17 +127,25 @@ def light_deviation(file: BenchFile, read: LightReadings) -> LightDeviation:
     # Light and dark share no readings, so that their scatters are two estimates, and weights take nothing from their freedom.
     lit = np.maximum(mean[place] - mean[0], 0.0)
     bright, dark = lit > BRIGHT * lit.max(), place == 0
+    shape = np.ones(len(read.code))
+    if read.noise_shape is not None:
+        shape = read.noise_shape / float(np.median(read.noise_shape[bright]))
+        # What a black image adds to a reading's noise is in its shape.
+        bright = ~dark
+    by_shape = lit * shape
     noise, floor = 1.0, 0.0
     for _ in range(3):
-        sigma = np.hypot(noise * lit, max(floor, 1e-9 * mean[-1] * noise))
+        sigma = np.hypot(noise * by_shape, max(floor, 1e-9 * mean[-1] * noise))
         inverse = np.linalg.pinv(design / sigma[:, None])
         left = read.light - design @ (found := inverse @ (read.light / sigma))
         own = 1 - np.einsum("ij,ji->i", design / sigma[:, None], inverse)
-        noise = math.sqrt(float(((left / np.maximum(lit, 1e-300))[bright] ** 2).sum()) / max(float(own[bright].sum()), 1e-9))
+        noise = math.sqrt(
+            float(((left / np.maximum(by_shape, 1e-300))[bright] ** 2).sum()) / max(float(own[bright].sum()), 1e-9)
+        )
         floor = math.sqrt(float((left[dark] ** 2).sum()) / max(float(own[dark].sum()), 1e-9))
     if own[bright].sum() < MIN_DOF / 2 or own[dark].sum() < MIN_DOF / 2:
         raise InputError("white and black are read too seldom to know their scatter; read both three times or more")
-    by_light, by_dark = (inverse * part / sigma for part in (noise * lit, np.full(len(lit), floor)))
+    by_light, by_dark = (inverse * part / sigma for part in (noise * by_shape, np.full(len(lit), floor)))
     when = np.asarray(hours if timed else np.arange(len(read.code)), dtype=np.float64)
     lasting = in_time(when, left / sigma, design / sigma[:, None])
     # What is correlated is no noise of a reading by itself.

@@ -250,12 +250,13 @@ class Photometer:
     def _links(self, channel: str, chosen: dict[Patch, int]) -> Iterator[LatticeRatio]:
         """Compare each two successive lattices of a channel by one code shown on both."""
         periods = {patch: period for patch, period in chosen.items() if patch.channel == channel}
-        dark = self._look(f"black_link_{channel}", 1, BLACK)[0]
         for dense, sparse in itertools.pairwise(sorted({*periods.values(), self.periods[-1]})):
             patch = max(patch for patch, period in periods.items() if period == dense)
             ratios = []
             for pair in range(self.pairs):
                 name = f"link_{channel}_{sparse}" + (f"_{pair}" if pair else "")
+                # Each pair has a black image of its own: the noise of one for all would be in no scatter of the pairs.
+                dark = self._look(f"{name}_black", 1, BLACK)[0]
                 dots = [
                     (self._look(f"{name}_{period}", period, patch)[0] - dark) / self.field.lit(period)
                     for period in (dense, sparse)

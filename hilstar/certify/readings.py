@@ -18,7 +18,7 @@ from hilstar.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.calibrate.first_light import image_sources
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.focus import seen_sharpness
-from hilstar.calibrate.first_light.photometry import Assumed, Photometer, Readings
+from hilstar.calibrate.first_light.photometer import Assumed, Photometer, Readings
 from hilstar.calibrate.geometric.calibration import dot_sigma_px
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen
 from hilstar.calibrate.latency import pair, swap_to_square_ms

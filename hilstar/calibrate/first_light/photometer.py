@@ -27,6 +27,7 @@ from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, blac
 from hilstar.calibrate.plan import Patch, in_channel
 from hilstar.errors import InputError
 from hilstar.files import write_whole
+from hilstar.tracker.rounding import STEP_PHASES, before_adc_dn, rounded_light, rounding_rms
 from hilstar.twin.optics import BenchGeometry
 
 SHARE = 0.5  # relative to the smaller side of what both screen and tracker have
@@ -42,9 +43,6 @@ LONGEST_S = 10.0
 FAINT_DN = 32.0  # a peak below this is exposed longer: half a step of the ADC is over 1 % of it
 MAX_PROBES = 10
 BLACK = Patch(0, "w")
-ROUNDING_VARIANCE = 1 / 12  # of a reading that noise spreads over the ADC's steps, DN^2
-STEP_PHASES = 16  # places of a dark pixel's level between two of the ADC's steps
-HARMONICS = np.arange(1, 9)  # of the sawtooth that rounding is: eight hold 93 % of its variance
 SMALL_MODE = 0.01  # of each reading's own error: modes of the rounding below it are not written
 
 
@@ -159,24 +157,6 @@ def lattice_profile(period: int, ratio: float, sigma_px: float) -> FloatArray:
 def peak_shares(periods: tuple[int, ...], ratio: float, sigma_px: float) -> FloatArray:
     """The share of a lit pixel's light in the brightest tracker pixel, per lattice; `ratio` is tracker px per monitor px."""
     return np.array([float(lattice_profile(period, ratio, sigma_px).max()) ** 2 for period in periods])
-
-
-def rounding_error(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
-    """The mean error of a level rounded to whole DN, with normal noise before the ADC; all of one shape.
-
-    The sawtooth of rounding by its harmonics, each of which noise damps (Widrow and Kollar, Quantization Noise, 2008).
-    """
-    total = np.zeros(np.broadcast_shapes(level_dn.shape, noise_dn.shape))
-    for order in HARMONICS:
-        damped = np.exp(-2 * (math.pi * order * noise_dn) ** 2)
-        total += (-1) ** order / (math.pi * order) * np.sin(2 * math.pi * order * level_dn) * damped
-    return total
-
-
-def rounding_rms(noise_dn: float) -> float:
-    """The rms of `rounding_error` over all levels, DN: 1 / sqrt 12 without noise."""
-    damped = np.exp(-2 * (math.pi * HARMONICS * noise_dn) ** 2) / (math.pi * HARMONICS)
-    return math.sqrt(float((damped**2).sum()) / 2)
 
 
 class Range(NamedTuple):
@@ -564,15 +544,12 @@ class Photometer:
 
     def _rounded(self, at: Range, light_dn: float) -> FloatArray:
         """What rounding adds to the sum of a lattice's image above black (STEP_PHASES,), DN, by the dark level's place."""
-        dark_dn = _before_adc(self.scatter.dark_dn2(at.times) / self.field.tracker_px)
+        dark_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px)
         dots = self.field.lit(at.period)
         along = self.profiles[at.period]
         level_dn = max(light_dn, 0.0) / dots * np.outer(along, along).ravel()
-        place = np.arange(STEP_PHASES)[:, None] / STEP_PHASES
-        noise_dn = np.sqrt(dark_dn**2 + self.scatter.dn_per_e * level_dn)
-        off = rounding_error(place + level_dn, noise_dn) - rounding_error(place, np.array(dark_dn))
         cell_px = (at.period * self.ratio) ** 2
-        return np.asarray(dots * cell_px * off.mean(axis=1))
+        return dots * cell_px * rounded_light(level_dn, dark_dn, self.scatter.dn_per_e)
 
     def _with_black(self, planned: list[Patch], light: FloatArray) -> tuple[FloatArray, float | None]:
         """Light (n,) with the black level, DN/s, and that level's standard error, None where it was not measured."""
@@ -592,7 +569,7 @@ class Photometer:
         dark_dn2 = max(glowing_dn2 - self.scatter.dn_per_e * max(more, 0.0), 0.0)
         variance = glowing_dn2 + dark_dn2
         for image_dn2 in (glowing_dn2, dark_dn2):
-            rounding_dn = rounding_rms(_before_adc(image_dn2 / self.field.tracker_px))
+            rounding_dn = rounding_rms(before_adc_dn(image_dn2 / self.field.tracker_px))
             variance += (self.field.tracker_px * rounding_dn) ** 2
         return light + max(more / seconds, 0.0), math.sqrt(variance) / seconds
 
@@ -614,11 +591,6 @@ class Photometer:
 
     def _part(self, path: Path) -> FloatArray:
         return self.context.pixels(path)[self.field.rows, self.field.columns]
-
-
-def _before_adc(variance_dn2: float) -> float:
-    """The noise of a pixel before the ADC, DN, by the variance of its readings."""
-    return math.sqrt(max(variance_dn2 - ROUNDING_VARIANCE, 0.0))
 
 
 def _passes(patch: Patch, at: Range, link: LatticeRatio) -> bool:

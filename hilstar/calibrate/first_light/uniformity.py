@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation
+from scipy.special import log_ndtr
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.build import bench_calibration, calibration_source
@@ -67,18 +68,21 @@ class DotLight:
 class UniformityMap:
     """Light against place: a grid (rows, columns), one field where light is even, and its value at each dot (n,), median 1.
 
-    `left_mag` is the rms error on held-out dots; `used` marks the dots that are no outliers.
+    `left_mag` is the rms error on held-out dots; `used` marks the dots that are no outliers. `fit_mag` is the standard error
+    of the fit at a dot; `missed_mag` the rms of what a finer map may show and this one does not.
     """
 
     grid: FloatArray
     at_dots: FloatArray
     left_mag: float
     used: BoolArray
+    fit_mag: float
+    missed_mag: float
 
     def error_mag(self, noise_mag: float) -> float:
-        """The map's standard error at a dot: that of its fit, and what dots differ from it by beyond their noise."""
+        """The map's standard error at a dot: that of its fit, what it misses, and how dots differ beyond their noise."""
         shape = math.sqrt(max(self.left_mag**2 - noise_mag**2, 0.0))
-        return math.hypot(self.left_mag * math.sqrt(self.grid.size / max(int(self.used.sum()), 1)), shape)
+        return math.hypot(self.fit_mag, self.missed_mag, shape)
 
     @property
     def is_even(self) -> bool:
@@ -100,6 +104,11 @@ def uniformity(context: StepContext) -> StepOutcome:
     against = map_of(dots, dots.light / as_known, size_px)
     found = map_of(dots, dots.light, size_px)
     figures = _figures(context, dots, found, against)
+    if against.is_even:
+        # The bench file keeps its map, and the error is that map's.
+        figures["map_error_mag"] = math.hypot(against.error_mag(dots.noise_mag), against.rms_mag)
+    elif found.is_even:
+        figures["map_error_mag"] = math.hypot(found.error_mag(dots.noise_mag), found.rms_mag)
     picture = context.session / "uniformity.svg"
     line = f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by {found.left_mag:.4f} mag"
     line += f" (noise {dots.noise_mag:.4f})"
@@ -327,8 +336,41 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
     worse = [(each - best)[used] for each in squares]
     place = next(k for k, each in enumerate(worse) if each.mean() <= SURE * each.std() / math.sqrt(len(each)))
     grid = _fitted(relative[used], designs[place][used], shapes[place])
-    left = MAG_PER_RELATIVE * math.sqrt(float(squares[place][used].mean()))
-    return UniformityMap(grid.reshape(shapes[place]), designs[place] @ grid, left, used)
+    square = float(squares[place][used].mean())
+    freedom = _freedom(designs[place][used], shapes[place])
+    count = int(used.sum())
+    missed = 0.0
+    finer = range(place + 1, len(shapes))
+    if finer:
+        nearest = min(finer, key=lambda k: float(squares[k][used].mean()))
+        gain = (squares[place] - squares[nearest])[used]
+        # A finer map errs more by its fields' own noise, which hides as much of what it shows.
+        noise = square * (_freedom(designs[nearest][used], shapes[nearest]) - freedom) / count
+        missed = _not_negative(float(gain.mean()) + noise, float(gain.std()) / math.sqrt(count))
+    return UniformityMap(
+        grid.reshape(shapes[place]),
+        designs[place] @ grid,
+        MAG_PER_RELATIVE * math.sqrt(square),
+        used,
+        fit_mag=MAG_PER_RELATIVE * math.sqrt(square * freedom / count),
+        missed_mag=MAG_PER_RELATIVE * math.sqrt(missed),
+    )
+
+
+def _not_negative(found: float, error: float) -> float:
+    """The mean of a square that was found as `found` with a normal `error`, and cannot be negative."""
+    if error <= 0:
+        return max(found, 0.0)
+    place = found / error
+    # Below -30 sigmas the quotient of two tiny numbers is the first term of its series.
+    ratio = math.exp(-(place**2) / 2 - float(log_ndtr(place))) / math.sqrt(2 * math.pi) if place > -30 else -place
+    return max(found + error * ratio, 0.0)
+
+
+def _freedom(design: Any, shape: tuple[int, int]) -> float:
+    """How many fields dots determine: the trace of the fit's matrix from light to map."""
+    normal = (design.T @ design).toarray()
+    return float(np.trace(np.linalg.solve(normal + _smoothness(shape), normal)))
 
 
 def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, int]) -> Any:
@@ -352,14 +394,20 @@ def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
 
 def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArray:
     """The fields (rows * columns,) by least squares; a field without dots follows its neighbours."""
-    number = np.arange(math.prod(shape)).reshape(shape)
-    joined = [(number[1:], number[:-1]), (number[:, 1:], number[:, :-1])]
-    normal = (design.T @ design).toarray()
-    for a, b in ((one.ravel(), other.ravel()) for one, other in joined):
-        np.add.at(normal, (np.concatenate([a, b]), np.concatenate([a, b])), JOINED)
-        np.add.at(normal, (np.concatenate([a, b]), np.concatenate([b, a])), -JOINED)
+    normal = (design.T @ design).toarray() + _smoothness(shape)
     found = np.linalg.solve(normal, design.T @ light)
     return np.asarray(np.maximum(found, light.min() / 2))  # a field that no dot reaches has light, too
+
+
+def _smoothness(shape: tuple[int, int]) -> FloatArray:
+    """The penalty (fields, fields) on differences between neighbouring fields."""
+    number = np.arange(math.prod(shape)).reshape(shape)
+    penalty = np.zeros((number.size, number.size))
+    for one, other in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1])):
+        a, b = one.ravel(), other.ravel()
+        np.add.at(penalty, (np.concatenate([a, b]), np.concatenate([a, b])), JOINED)
+        np.add.at(penalty, (np.concatenate([a, b]), np.concatenate([b, a])), -JOINED)
+    return penalty
 
 
 def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> BoolArray:

@@ -12,6 +12,7 @@ from hilstar.calibrate.first_light.photometry import photometry
 from hilstar.calibrate.first_light.stars import scale, verify
 from hilstar.calibrate.first_light.uniformity import DotLight, map_of, uniformity
 from hilstar.monitor.calibration import load_calibration, with_uniformity
+from hilstar.units import magnitude
 from tests.support.benches import TWIN, bench_text
 
 SIZE_PX = (640, 480)
@@ -146,3 +147,22 @@ def test_dots_that_differ_from_one_to_the_next_are_a_finding(tmp_path):
     found = did(folder, uniformity)
     assert found.verdict == "failed"
     assert "far above" in found.line
+
+
+@pytest.mark.parametrize("fall", [0.0, 0.004, 0.012, 0.05])
+def test_unevenness_that_no_map_shows_for_sure_is_in_the_error(fall):
+    """Dots over a small part of a screen whose light falls towards its sides, down to less than their noise shows."""
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(200, 440, 8), np.arange(150, 330, 8)))
+    true = 1 - fall * ((x / 320 - 1) ** 2 + (y / 240 - 1) ** 2) - fall * (x / 320 - 1)
+    sigmas = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        light = true * rng.normal(1, 0.005, x.shape)
+        found = map_of(DotLight(x, y, light, 0.0054), light, SIZE_PX)
+        off_mag = np.std(magnitude(found.at_dots / true))
+        error_mag = found.error_mag(0.0054)
+        assert error_mag > 0
+        sigmas.append(off_mag / error_mag)
+    assert max(sigmas) < 3
+    # No error is worth anything that is many times the difference.
+    assert np.median(sigmas) > (0.2 if fall else -1)

@@ -133,7 +133,18 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     time = np.array(given if given else np.arange(len(rows)), dtype=np.float64)
     clipped = {name: _clipped(codes[channel == name], reading[channel == name]) for name in set(channel.tolist())}
     digest = hashlib.sha256(raw).hexdigest()
-    return Measurements(str(path), bits, codes, channel, reading / exposure_s, time, clipped, digest, sigma, common)
+    return Measurements(
+        source=str(path),
+        bits=bits,
+        code=codes,
+        channel=channel,
+        value=reading / exposure_s,
+        time=time,
+        clipped=clipped,
+        sha256=digest,
+        sigma=sigma,
+        common=common,
+    )
 
 
 def _rows(path: Path, text: str) -> Iterator[_Row]:
@@ -186,11 +197,13 @@ def _row(place: str, cells: dict[str, str]) -> _Row:
         raise InputError(f"{place}: exposure_s = {exposure_s:g}; write more than 0")
     time = cells.get("t_s")
     if cells.get("sigma") == "":
-        raise InputError(f"{place}: sigma is empty; write the value's standard error, or leave the column out")
+        advice = "write the value's standard error, or leave the column out"
+        raise InputError(f"{place}: sigma is empty; {advice}")
     sigma = _number(place, "sigma", cells.get("sigma", "0"))
     if sigma < 0:
         raise InputError(f"{place}: sigma = {sigma:g}; write a standard error, 0 or more")
-    common = tuple(_number(place, name, cells[name] or "0") for name in cells if name.startswith(COMMON))
+    causes = [name for name in cells if name.startswith(COMMON)]
+    common = tuple(_number(place, name, cells[name] or "0") for name in causes)
     t_s = _number(place, "t_s", time) if time else None
     return _Row(code, cells["channel"], value, exposure_s, t_s, sigma, common)
 

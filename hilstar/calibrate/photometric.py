@@ -162,7 +162,7 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
     left = np.maximum(1 - _variances(best.design, best.covariance), 1e-6)
     lack = best.lack_of_fit
     light = strictly_rising(np.append(0.0, above / above[-1]))
-    off, level_error = _levels_about(best, levels, float(above[-1]) * light[levels.code[1:]])
+    off, level_error = _levels_about(best, float(above[-1]) * light[levels.code[1:]])
     black_own = scale * problem.black_sigma * math.sqrt(float(best.covariance[-1, -1]))
     black_common = float(np.linalg.norm(levels.common[0]))
     # The black level is stated relative to white, which has an error of its own.
@@ -198,10 +198,11 @@ def _variances(rows: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ij,jk,ik->i", rows, covariance, rows))
 
 
-def _levels_about(best: "_Solution", levels: measurements.MeasuredLevels, fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far levels (n,) are from the fit, their common causes taken off, and how well each is known; both relative.
+def _levels_about(best: "_Solution", fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far levels (n,) are from the fit, and how well each is known; both relative.
 
-    `fitted` (n,) is their light above black by the fit, in units of white.
+    Their common causes are taken off. `fitted` (n,) is their light above black by the fit, in units
+    of white.
     """
     problem = best.problem
     above = problem.light - problem.black - problem.common @ best.causes
@@ -379,10 +380,10 @@ def calibrate_photometric(
         crosstalk = {decade: float(more[place]) for decade, place in decades.items()}
         at = [*decades.values()]
         # A channel's errors are relative to its white, which is as well known as its readings are many.
-        off = {
-            name: np.hypot(one.error[at], one.levels.standard_error(one.noise_relative)[-1] / one.levels.mean[-1])
-            for name, one in fits.items()
-        }
+        off: dict[str, FloatArray] = {}
+        for name, one in fits.items():
+            white_error = one.levels.standard_error(one.noise_relative)[-1] / one.levels.mean[-1]
+            off[name] = np.hypot(one.error[at], white_error)
         errors = [fits[name].white * fits[name].light[at] / together[at] * off[name] for name in measurements.PRIMARIES]
         error = np.sqrt(np.square([*errors, off["w"]]).sum(axis=0))
         unsure = dict(zip(decades, (100 * error).tolist(), strict=True))
@@ -463,7 +464,8 @@ def held_out(fit: ChannelFit) -> dict[str, float]:
     sigmas = float(np.percentile(residual / fit.residual_error[shown], 95))
     found = {"rms": np.sqrt((residual**2).mean()), "p95": np.percentile(residual, 95), "max": residual.max()}
     percent = {f"{name}_percent": 100 * float(value) for name, value in found.items()}
-    return percent | {f"{name}_mag": MAG_PER_RELATIVE * float(found[name]) for name in ("rms", "max")} | {"p95_sigmas": sigmas}
+    mag = {f"{name}_mag": MAG_PER_RELATIVE * float(found[name]) for name in ("rms", "max")}
+    return percent | mag | {"p95_sigmas": sigmas}
 
 
 MIN_DRAWN_LIGHT = 1e-5  # relative to white, as drawn

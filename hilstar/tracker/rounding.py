@@ -1,8 +1,9 @@
 """What an ADC's rounding does to light where too little noise spreads a level over its steps.
 
-A level that noise of 0.6 DN or more spreads is read right in the mean. With less noise, all pixels of one light are rounded
-alike: their errors add up, and no number of images takes them away. They follow from where the dark level is between two
-steps, which is not known. So they are taken at STEP_PHASES places of it, and their spread over these is the error.
+A level that noise of 0.6 DN or more spreads is read right in the mean. With less noise, all pixels
+of one light are rounded alike: their errors add up, and no number of images takes them away. They
+follow from where the dark level is between two steps, which is not known. So they are taken at
+STEP_PHASES places of it, and their spread over these is the error.
 """
 
 import math
@@ -24,9 +25,11 @@ def before_adc_dn(variance_dn2: float) -> float:
 
 
 def rounding_error(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
-    """The mean error of a level that is rounded to whole DN, with normal noise before the ADC, DN; all of one shape.
+    """The mean error of a level that is rounded to whole DN, with normal noise before the ADC, DN;
+    all of one shape.
 
-    The sawtooth of rounding by its harmonics, each of which noise damps (Widrow and Kollar, Quantization Noise, 2008).
+    The sawtooth of rounding by its harmonics, each of which noise damps (Widrow and Kollar,
+    Quantization Noise, 2008).
     """
     total = np.zeros(np.broadcast_shapes(level_dn.shape, noise_dn.shape))
     for order in HARMONICS:
@@ -42,9 +45,11 @@ def rounding_rms(noise_dn: float) -> float:
 
 
 def rounded_light(light_dn: FloatArray, dark_noise_dn: float, dn_per_e: float) -> FloatArray:
-    """What rounding adds on average to pixels of `light_dn` (n,) above a dark frame, (STEP_PHASES,), DN.
+    """What rounding adds on average to pixels of `light_dn` (n,) above a dark frame,
+    (STEP_PHASES,), DN.
 
-    `dark_noise_dn` is the noise of a dark pixel before the ADC; light adds its shot noise, of variance `dn_per_e` a DN.
+    `dark_noise_dn` is the noise of a dark pixel before the ADC; light adds its shot noise, of
+    variance `dn_per_e` a DN.
     """
     if dark_noise_dn > DITHERED_DN:
         return np.zeros(STEP_PHASES)

@@ -1,18 +1,20 @@
-"""The tracker as a photometer: dots on lattices that do not saturate it, each reading with its standard error.
+"""The tracker as a photometer: dots on lattices that do not saturate it, each reading with its
+standard error.
 
-A reading is the sum of an image over a field of dots, less that of a black screen, over the number of dots and the exposure.
-Codes differ by three decades and more, an image holds two. Bright codes are read on sparse lattices and faint ones on dense
-lattices; those that are still faint there are exposed longer. A lattice and an exposure are a `Range`. Neighbouring ranges
-are compared by one code that both of them hold, in pairs of images.
+A reading is the sum of an image over a field of dots, less that of a black screen, over the number
+of dots and the exposure. Codes differ by three decades and more, an image holds two. Bright codes
+are read on sparse lattices and faint ones on dense lattices; those that are still faint there are
+exposed longer. A lattice and an exposure are a `Range`. Neighbouring ranges are compared by one
+code that both of them hold, in pairs of images.
 
-The standard errors come from the images themselves. Repeats of one image tell the noise of its sum, pixel by pixel. What
-several readings have in common is told apart (`Readings.common`): the ratios of ranges, and the ADC's rounding, which is
-alike in all pixels of one light where too little noise spreads it over the steps.
+The standard errors come from the images themselves. Repeats of one image tell the noise of its sum,
+pixel by pixel. What several readings have in common is told apart (`Readings.common`): the ratios
+of ranges, and the ADC's rounding, which is alike in all pixels of one light where too little noise
+spreads it over the steps.
 """
 
 import itertools
 import math
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +26,7 @@ from scipy.special import ndtr
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
 from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
+from hilstar.calibrate.measurements import COMMON
 from hilstar.calibrate.plan import Patch, in_channel
 from hilstar.errors import InputError
 from hilstar.files import write_whole
@@ -43,12 +46,14 @@ LONGEST_S = 10.0
 FAINT_DN = 32.0  # a peak below this is exposed longer: half a step of the ADC is over 1 % of it
 MAX_PROBES = 10
 BLACK = Patch(0, "w")
+HALF_STEP_DN = 0.5  # of the ADC
 SMALL_MODE = 0.01  # of each reading's own error: modes of the rounding below it are not written
 
 
 @dataclass(frozen=True, slots=True)
 class DotField:
-    """A square of the monitor (left, top, side; px) and the part of the tracker's image with its light (slices).
+    """A square of the monitor (left, top, side; px) and the part of the tracker's image with its
+    light (slices).
 
     `monitor_px` is the number of monitor pixels seen in that part.
     """
@@ -81,7 +86,8 @@ class DotField:
 
 
 def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple[int, ...]]:
-    """The square for lattices, and their periods from dense to sparse; `sigma_px` is the tracker's PSF.
+    """The square for lattices, and their periods from dense to sparse; `sigma_px` is the tracker's
+    PSF.
 
     Raises InputError where too little of the monitor is seen.
     """
@@ -123,9 +129,11 @@ def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: f
 
 
 def monitor_area(geometry: BenchGeometry, rows: slice, columns: slice) -> float:
-    """The number of monitor pixels that a part of the tracker's image sees, those beyond the screen's edge not counted.
+    """The number of monitor pixels that a part of the tracker's image sees, those beyond the
+    screen's edge not counted.
 
-    Each tracker pixel is a quadrangle on the monitor. A tilted screen and a wide field make them differ by several percent.
+    Each tracker pixel is a quadrangle on the monitor. A tilted screen and a wide field make them
+    differ by several percent.
     """
     y, x = np.mgrid[rows.start : rows.stop + 1, columns.start : columns.stop + 1] - 0.5
     corner_x, corner_y = (part.reshape(y.shape) for part in geometry.to_monitor(x.ravel(), y.ravel()))
@@ -142,7 +150,8 @@ def monitor_area(geometry: BenchGeometry, rows: slice, columns: slice) -> float:
 
 
 def lattice_profile(period: int, ratio: float, sigma_px: float) -> FloatArray:
-    """The share of a lit pixel's light along one axis, at PHASES places of a tracker pixel between two of a lattice's dots.
+    """The share of a lit pixel's light along one axis, at PHASES places of a tracker pixel between
+    two of a lattice's dots.
 
     `ratio` is tracker px per monitor px. A monitor pixel counts as a Gaussian of its own variance.
     """
@@ -155,12 +164,16 @@ def lattice_profile(period: int, ratio: float, sigma_px: float) -> FloatArray:
 
 
 def peak_shares(periods: tuple[int, ...], ratio: float, sigma_px: float) -> FloatArray:
-    """The share of a lit pixel's light in the brightest tracker pixel, per lattice; `ratio` is tracker px per monitor px."""
+    """The share of a lit pixel's light in the brightest tracker pixel, per lattice; `ratio` is
+    tracker px per monitor px.
+    """
     return np.array([float(lattice_profile(period, ratio, sigma_px).max()) ** 2 for period in periods])
 
 
 class Range(NamedTuple):
-    """A lattice, every `period`-th pixel lit, and how many times longer than the exposure for white it is exposed."""
+    """A lattice, every `period`-th pixel lit, and how many times longer than the exposure for white
+    it is exposed.
+    """
 
     period: int
     times: int = 1
@@ -168,10 +181,12 @@ class Range(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LatticeRatio:
-    """A lit pixel's light on a dense lattice relative to a sparse one, both of one code: 1 where light is additive.
+    """A lit pixel's light on a dense lattice relative to a sparse one, both of one code: 1 where
+    light is additive.
 
-    `ratio` is the mean of `pairs`, of one pair of images each, and `error` its standard error. Where `times` is not (1, 1),
-    the dense lattice was exposed so many times longer, and then the sparse one.
+    `ratio` is the mean of `pairs`, of one pair of images each, and `error` its standard error.
+    Where `times` is not (1, 1), the dense lattice was exposed so many times longer, and then the
+    sparse one.
     """
 
     patch: Patch
@@ -183,21 +198,33 @@ class LatticeRatio:
     times: tuple[int, int] = (1, 1)
 
     @property
+    def sigmas(self) -> float:
+        """How far the ratio is from 1, in its standard errors."""
+        return abs(self.ratio - 1) / self.error if self.error else 0.0
+
+    @property
     def words(self) -> str:
         """The ratio for a person."""
-        longer, shorter = (f", exposed {times} times longer" if times > 1 else "" for times in self.times)
-        more = f"a pixel of every {self.dense}{longer} is {self.ratio:.5f} +- {self.error:.5f} times one of every {self.sparse}"
-        return f"code {self.patch.code} of {self.patch.channel}: {more}{shorter}"
+        more, less = (_exposed(times) for times in self.times)
+        ratio = f"{self.ratio:.5f} +- {self.error:.5f} times"
+        code = f"code {self.patch.code} of {self.patch.channel}"
+        return f"{code}: a pixel of every {self.dense}{more} is {ratio} one of every {self.sparse}{less}"
+
+
+def _exposed(times: int) -> str:
+    return f", exposed {times} times longer" if times > 1 else ""
 
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Light (n,) of a lit pixel for each patch, black level included, DN/s; the exposure; how lattices agree.
+    """Light (n,) of a lit pixel for each patch, black level included, DN/s; the exposure; how
+    lattices agree.
 
-    `above_black` (n,) is without it, and may be negative by noise, which `light` is not. `period` (n,) is each one's lattice.
-    `black_known` says whether the black level was measured; else it is the bench file's. `sigma` (n,) is each reading's own
-    standard error, DN/s. `common` (n, causes) is what one standard error of a cause does to all of them, DN/s: of the ratios
-    of ranges, of rounding, of the black level.
+    `above_black` (n,) is without it, and may be negative by noise, which `light` is not. `period`
+    (n,) is each one's lattice. `black_known` says whether the black level was measured; else it is
+    the bench file's. `sigma` (n,) is each reading's own standard error, DN/s. `common` (n, causes)
+    is what one standard error of a cause does to all of them, DN/s: of the ratios of ranges, of
+    rounding, of the black level.
     """
 
     patches: list[Patch]
@@ -213,21 +240,25 @@ class Readings:
 
     def write(self, path: Path) -> None:
         """MEASURED.csv, as `calibrate photometric` reads it. Raises InputError."""
-        head = [f"# light of one monitor pixel in the tracker, DN/s, by dots on lattices; exposed for {self.exposure_s:.6g} s"]
+        light = "light of one monitor pixel in the tracker, DN/s, by dots on lattices"
+        head = [f"# {light}; exposed for {self.exposure_s:.6g} s"]
         head += [f"# {link.words}" for link in self.links]
-        causes = range(1, self.common.shape[1] + 1)
-        columns = ["order", "code", "channel", "value", "sigma", *(f"common_{cause}" for cause in causes)]
+        columns = ["order", "code", "channel", "value", "sigma"]
+        columns += [f"{COMMON}{cause}" for cause in range(1, self.common.shape[1] + 1)]
         rows = []
         for order, patch in enumerate(self.patches):
-            errors = [f"{error:.5g}" for error in (self.sigma[order], *self.common[order])]
-            cells = [str(order + 1), str(patch.code), patch.channel, repr(float(self.light[order])), *errors]
+            value = float(self.light[order])
+            cells = [str(order + 1), str(patch.code), patch.channel, repr(value)]
+            cells += [f"{error:.5g}" for error in (self.sigma[order], *self.common[order])]
             rows.append(",".join(cells))
         write_whole(path, "\n".join([*head, ",".join(columns), *rows]) + "\n")
 
 
 @dataclass(frozen=True, slots=True)
 class Assumed:
-    """The bench file's light above black by channel and code (2^bits,), relative to white, and its black level."""
+    """The bench file's light above black by channel and code (2^bits,), relative to white, and its
+    black level.
+    """
 
     light: dict[str, FloatArray]
     black: float
@@ -244,12 +275,13 @@ class Look(NamedTuple):
 class PixelScatter:
     """The noise of sums over the field, from images of one pattern that were taken again.
 
-    By exposure: the variance of a black image's sum, DN^2. `dn_per_e` is that of a lit one over it, for each DN of light.
+    By exposure: the variance of a black image's sum, DN^2. `dn_per_e` is that of a lit one over it,
+    for each DN of light.
     """
 
     default_dn_per_e: float
     _before: dict[tuple[Patch, Range], FloatArray] = field(default_factory=dict)
-    _squares: dict[tuple[Patch, Range], list[float]] = field(default_factory=lambda: defaultdict(list))
+    _squares: dict[tuple[Patch, Range], list[float]] = field(default_factory=dict)
     _sums: dict[tuple[Patch, Range], float] = field(default_factory=dict)
 
     def add(self, patch: Patch, at: Range, image: FloatArray) -> None:
@@ -257,8 +289,10 @@ class PixelScatter:
         place = (patch, at) if patch.code else (BLACK, Range(1, at.times))
         before = self._before.get(place)
         if before is not None:
-            # Half the square of a difference is the variance of each of the two, where pixels' noise is their own.
-            self._squares[place].append(float(((image - before) ** 2).sum()) / 2)
+            # Half the square of a difference is the variance of each of the two, where pixels'
+            # noise is their own.
+            variance = float(((image - before) ** 2).sum()) / 2
+            self._squares.setdefault(place, []).append(variance)
         self._before[place] = image
         self._sums[place] = float(image.sum())
 
@@ -266,12 +300,15 @@ class PixelScatter:
         """The variance of the sum of a black image, exposed so many times longer."""
         squares = self._squares.get((BLACK, Range(1, times)), [])
         if not squares:
-            squares = list(itertools.chain.from_iterable(more for (patch, _), more in self._squares.items() if not patch.code))
+            for (patch, _), more in self._squares.items():
+                squares = squares + more * (not patch.code)
         return float(np.mean(squares)) if squares else 0.0
 
     @property
     def dn_per_e(self) -> float:
-        """The variance of light over light, DN: by the images of lit patterns; as the detector is stated without repeats."""
+        """The variance of light over light, DN: by the images of lit patterns; as the detector is
+        stated without repeats.
+        """
         variance, light = 0.0, 0.0
         for (patch, at), squares in self._squares.items():
             dark = self._sums.get((BLACK, Range(1, at.times)))
@@ -282,12 +319,15 @@ class PixelScatter:
         return max(variance / light, 0.0) if light > 0 else self.default_dn_per_e
 
     def sum_dn2(self, light_dn: float, times: int, blacks: float = 1.0) -> float:
-        """The variance of a sum above black; `blacks` is the variance of the black sum relative to that of one image."""
+        """The variance of a sum above black; `blacks` is the variance of the black sum relative to
+        that of one image.
+        """
         return self.dn_per_e * max(light_dn, 0.0) + (1 + blacks) * self.dark_dn2(times)
 
 
 class _Reading(NamedTuple):
-    """A lit patch as it was read: its range, and its light above black, DN, summed over the field in that range's exposure.
+    """A lit patch as it was read: its range, and its light above black, DN, summed over the field
+    in that range's exposure.
 
     `blacks` is the variance of the black sum under it relative to that of one image.
     """
@@ -298,8 +338,20 @@ class _Reading(NamedTuple):
     blacks: float
 
 
+class _Own(NamedTuple):
+    """Of each patch (n,): light above black and its own standard error, DN/s; light for a DN of a
+    lit patch's sum.
+    """
+
+    light: FloatArray
+    sigma: FloatArray
+    per_dn: FloatArray
+
+
 class _Pair(NamedTuple):
-    """One code read in two neighbouring ranges, and the means of its light over the pairs of images, as in `_Reading`."""
+    """One code read in two neighbouring ranges, and the means of its light over the pairs of
+    images, as in `_Reading`.
+    """
 
     patch: Patch
     more: Range
@@ -311,17 +363,27 @@ class _Pair(NamedTuple):
 class Photometer:
     """The tracker as a photometer. Raises InputError where the lattices are not whole in its field.
 
-    Ranges are compared by `pairs` pairs of images. Faint codes are exposed for up to `longest_s`, where the source of images
-    sets exposures.
+    Ranges are compared by `pairs` pairs of images. Faint codes are exposed for up to `longest_s`,
+    where the source of images sets exposures.
     """
 
-    def __init__(self, context: StepContext, sigma_px: float, assumed: Assumed, pairs: int = 1, longest_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        context: StepContext,
+        sigma_px: float,
+        assumed: Assumed,
+        pairs: int = 1,
+        longest_s: float = 0.0,
+    ) -> None:
         geometry = context.real_geometry()
-        self.context, self.assumed, self.pairs, self.longest_s = context, assumed, pairs, longest_s
+        self.context, self.assumed = context, assumed
+        self.pairs, self.longest_s = pairs, longest_s
         self.field, self.periods = field_for(geometry, sigma_px)
         self.ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
         self.shares = peak_shares(self.periods, self.ratio, sigma_px)
-        self.profiles = {period: lattice_profile(period, self.ratio, sigma_px) for period in self.periods}
+        self.profiles: dict[int, FloatArray] = {}
+        for period in self.periods:
+            self.profiles[period] = lattice_profile(period, self.ratio, sigma_px)
         self.exposure_s = context.exposure_s
         self.scatter = PixelScatter(1 / context.file.config.tracker.detector.gain_e_per_dn)
         self._dark_screen = context.take(Pattern("black_screen", black(context.resolution_px)))
@@ -333,32 +395,22 @@ class Photometer:
         peaks = self._peaks(planned, self._expose())
         chosen = {patch: self._range(peaks[patch]) for patch in planned if patch.code}
         blacks, sums = self._sums(planned, chosen)
-        pairs = [pair for channel in self.assumed.light for pair in self._pairs(channel, chosen, peaks)]
+        pairs: list[_Pair] = []
+        for channel in self.assumed.light:
+            pairs += self._pairs(channel, chosen, peaks)
         links = [self._link(pair) for pair in pairs]
-        factors = self._factors(links)
-        orders = np.flatnonzero([patch.code == 0 for patch in planned])
-        light = np.zeros(len(planned))
-        black_dn2 = self.scatter.dark_dn2(1)
-        to_black = 1 / (self.field.monitor_px * self.exposure_s)
-        sigma = np.full(len(planned), math.sqrt(black_dn2) * to_black)
-        # On a black screen every pixel glows alike; the repeats tell how well that is known.
-        light[orders] = (blacks[1] - blacks[1].mean()) * to_black
-        lit: dict[int, _Reading] = {}
-        per_dn = np.zeros(len(planned))  # light of a reading for each DN of its sum
-        for order, total in sums.items():
-            patch = planned[order]
-            at = chosen[patch]
-            under, variance = _between(order, orders, blacks[at.times])
-            lit[order] = _Reading(patch, at, total - under, variance)
-            dots = self.field.lit(at.period) * at.times * factors[patch.channel, at]
-            per_dn[order] = 1 / (dots * self.exposure_s)
-            light[order] = (total - under) * per_dn[order]
-            sigma[order] = math.sqrt(self.scatter.sum_dn2(total - under, at.times, variance)) * per_dn[order]
-        causes = [self._of_ratios(light, lit, links), self._of_rounding(light, sigma, lit, per_dn, pairs, links)]
-        with_black, black_error = self._with_black(planned, light)
+        lit = _lit(planned, chosen, blacks, sums)
+        own = self._own(planned, lit, blacks[1], self._factors(links))
+        causes = [
+            self._of_ratios(own.light, lit, links),
+            self._of_rounding(own, lit, pairs, links),
+        ]
+        with_black, black_error = self._with_black(planned, own.light)
         if black_error is not None:
             causes.append(np.full((len(planned), 1), black_error))
-        periods = [chosen[patch].period if patch.code else self.periods[-1] for patch in planned]
+        period = np.full(len(planned), self.periods[-1], dtype=np.intp)
+        for order, reading in lit.items():
+            period[order] = reading.at.period
         return Readings(
             planned,
             np.maximum(with_black, 0.0),
@@ -366,14 +418,16 @@ class Photometer:
             links,
             black_error is not None,
             tuple(self.images),
-            light,
-            np.array(periods, dtype=np.intp),
-            sigma,
+            own.light,
+            period,
+            own.sigma,
             np.hstack(causes),
         )
 
     def _expose(self) -> float:
-        """Choose an exposure in which white does not saturate, first the bench file's; returns a white dot's peak, DN."""
+        """Choose an exposure in which white does not saturate, first the bench file's; returns a
+        white dot's peak, DN.
+        """
         brightest = max(self.assumed.light, key=lambda name: float(self.assumed.light[name][-1]))
         white = Patch(self.context.white, brightest)
         sparsest = Range(self.periods[-1])
@@ -398,7 +452,9 @@ class Photometer:
         return float((bright - dark)[self._cold].max(initial=1.0)) / share
 
     def _peaks(self, planned: list[Patch], white_dn: float) -> dict[Patch, FloatArray]:
-        """The brightest pixel (periods,), DN, of each lit patch on each lattice, by the bench file's response."""
+        """The brightest pixel (periods,), DN, of each lit patch on each lattice, by the bench
+        file's response.
+        """
         peaks: dict[Patch, FloatArray] = {}
         for patch in planned:
             if patch.code:
@@ -407,7 +463,9 @@ class Photometer:
         return peaks
 
     def _range(self, peaks: FloatArray) -> Range:
-        """The densest lattice that does not saturate by `peaks` (periods,), DN; a longer exposure where it is faint there."""
+        """The densest lattice that does not saturate by `peaks` (periods,), DN; a longer exposure
+        where it is faint there.
+        """
         highest_dn = FILL * self.context.full_dn
         fits = np.flatnonzero(peaks <= highest_dn)
         place = int(fits[0]) if len(fits) else len(peaks) - 1
@@ -417,8 +475,14 @@ class Photometer:
             times *= LONGER
         return Range(self.periods[place], times)
 
-    def _sums(self, planned: list[Patch], chosen: dict[Patch, Range]) -> tuple[dict[int, FloatArray], dict[int, float]]:
-        """The sums of black images, in turn, by how many times longer they are exposed; those of lit ones by their order."""
+    def _sums(
+        self,
+        planned: list[Patch],
+        chosen: dict[Patch, Range],
+    ) -> tuple[dict[int, FloatArray], dict[int, float]]:
+        """The sums of black images, in turn, by how many times longer they are exposed; those of
+        lit ones by their order.
+        """
         longer = sorted({at.times for at in chosen.values()} | {1})
         blacks: dict[int, list[float]] = {times: [] for times in longer}
         sums: dict[int, float] = {}
@@ -426,7 +490,8 @@ class Photometer:
         for order, patch in enumerate(planned):
             if not patch.code:
                 for times in longer:
-                    blacks[times].append(self._look(f"patch_{order:03}_1", Range(1, times), patch).sum_dn)
+                    seen = self._look(f"patch_{order:03}_1", Range(1, times), patch)
+                    blacks[times].append(seen.sum_dn)
                 continue
             while True:
                 at = chosen[patch]
@@ -439,7 +504,12 @@ class Photometer:
             sums[order] = total
         return {times: np.array(each) for times, each in blacks.items()}, sums
 
-    def _pairs(self, channel: str, chosen: dict[Patch, Range], peaks: dict[Patch, FloatArray]) -> Iterator[_Pair]:
+    def _pairs(
+        self,
+        channel: str,
+        chosen: dict[Patch, Range],
+        peaks: dict[Patch, FloatArray],
+    ) -> Iterator[_Pair]:
         """Compare each two neighbouring ranges of a channel by one code shown in both."""
         ranges = {patch: at for patch, at in chosen.items() if patch.channel == channel}
         used = {*ranges.values(), Range(self.periods[-1])}
@@ -449,29 +519,72 @@ class Photometer:
             lights: list[tuple[float, float]] = []
             for pair in range(self.pairs):
                 name = f"link_{channel}_{step}_{pair}"
-                # Each pair has black images of its own: the noise of one for all would be in no scatter of the pairs.
-                dark: dict[int, float] = {}
-                for times in sorted({more.times, less.times}):
-                    dark[times] = self._look(f"{name}_black", Range(1, times), BLACK).sum_dn
-                seen = [self._look(f"{name}_{at.period}", at, patch).sum_dn - dark[at.times] for at in (more, less)]
-                if seen[1] <= 0:
-                    raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
-                lights.append((seen[0], seen[1]))
+                lights.append(self._both(name, patch, more, less))
             scale = self._dots(less) / self._dots(more)
-            mean = np.mean(lights, axis=0)
-            yield _Pair(patch, more, less, (float(mean[0]), float(mean[1])), tuple(a / b * scale for a, b in lights))
+            means = [float(mean) for mean in np.mean(lights, axis=0)]
+            ratios = tuple(one / other * scale for one, other in lights)
+            yield _Pair(patch, more, less, (means[0], means[1]), ratios)
 
-    def _brightest(self, name: str, ranges: dict[Patch, Range], peaks: dict[Patch, FloatArray], at: Range) -> Patch:
-        """The patch with the most light that a range holds: by the bench file's response, then by an image."""
+    def _both(self, name: str, patch: Patch, more: Range, less: Range) -> tuple[float, float]:
+        """A patch's light in two ranges, DN, as in `_Reading`."""
+        # Each pair has black images of its own: the noise of one for all would be in no scatter of
+        # the pairs.
+        dark: dict[int, float] = {}
+        for times in sorted({more.times, less.times}):
+            dark[times] = self._look(f"{name}_black", Range(1, times), BLACK).sum_dn
+        seen: list[float] = []
+        for at in (more, less):
+            look = self._look(f"{name}_{at.period}", at, patch)
+            seen.append(look.sum_dn - dark[at.times])
+        if seen[1] <= 0:
+            raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
+        return seen[0], seen[1]
+
+    def _brightest(
+        self,
+        name: str,
+        ranges: dict[Patch, Range],
+        peaks: dict[Patch, FloatArray],
+        at: Range,
+    ) -> Patch:
+        """The patch with the most light that a range holds: by the bench file's response, then by
+        an image.
+        """
         place = self.periods.index(at.period)
         highest_dn = FILL * self.context.full_dn
-        by_light = sorted(ranges)
         own = max(patch for patch, its in ranges.items() if its == at)
-        brighter = [patch for patch in by_light if patch > own and peaks[patch][place] * at.times <= highest_dn]
-        for patch in reversed(brighter):
+        for patch in sorted(ranges, reverse=True):
+            if patch <= own or peaks[patch][place] * at.times > highest_dn:
+                continue
             if self._look(f"{name}_{patch.code}", at, patch).fill <= MAX_FILL:
                 return patch
         return own
+
+    def _own(
+        self,
+        planned: list[Patch],
+        lit: dict[int, _Reading],
+        blacks: FloatArray,
+        factors: dict[tuple[str, Range], float],
+    ) -> _Own:
+        """Light above black of each patch, and the standard error of its own images."""
+        count = len(planned)
+        light, per_dn = np.zeros(count), np.zeros(count)
+        # On a black screen every pixel glows alike; the repeats tell how well that is known.
+        to_black = 1 / (self.field.monitor_px * self.exposure_s)
+        sigma = np.full(count, math.sqrt(self.scatter.dark_dn2(1)) * to_black)
+        dark = [order for order in range(count) if order not in lit]
+        light[dark] = (blacks - blacks.mean()) * to_black
+        for order, reading in lit.items():
+            dots = self._dots(reading.at) * factors[reading.patch.channel, reading.at]
+            per_dn[order] = 1 / (dots * self.exposure_s)
+            light[order] = reading.light_dn * per_dn[order]
+            # Light that rounding hides has shot noise, too.
+            hidden_dn = float(np.sqrt((self._rounded(reading.at, reading.light_dn) ** 2).mean()))
+            known_dn = max(reading.light_dn, 0.0) + hidden_dn
+            variance = self.scatter.sum_dn2(known_dn, reading.at.times, reading.blacks)
+            sigma[order] = math.sqrt(variance) * per_dn[order]
+        return _Own(light, sigma, per_dn)
 
     def _dots(self, at: Range) -> int:
         """By how many lit pixels and exposures a sum in a range has to be divided."""
@@ -490,10 +603,20 @@ class Photometer:
         ratio = float(np.mean(pair.ratios))
         error = ratio * math.sqrt(variance / len(pair.ratios))
         times = (pair.more.times, pair.less.times)
-        return LatticeRatio(pair.patch, pair.more.period, pair.less.period, ratio, pair.ratios, error, times)
+        return LatticeRatio(
+            pair.patch,
+            pair.more.period,
+            pair.less.period,
+            ratio,
+            pair.ratios,
+            error,
+            times,
+        )
 
     def _factors(self, links: list[LatticeRatio]) -> dict[tuple[str, Range], float]:
-        """A lit pixel's light in each channel and range, relative to that in the range of the sparsest lattice."""
+        """A lit pixel's light in each channel and range, relative to that in the range of the
+        sparsest lattice.
+        """
         factors = {(channel, Range(self.periods[-1])): 1.0 for channel in self.assumed.light}
         for link in reversed(links):
             more, less = Range(link.dense, link.times[0]), Range(link.sparse, link.times[1])
@@ -501,8 +624,15 @@ class Photometer:
             factors[channel, more] = factors[channel, less] * link.ratio
         return factors
 
-    def _of_ratios(self, light: FloatArray, lit: dict[int, _Reading], links: list[LatticeRatio]) -> FloatArray:
-        """What the error of each ratio does to light (n,): (n, ratios). Light of a range is divided by all ratios below it."""
+    def _of_ratios(
+        self,
+        light: FloatArray,
+        lit: dict[int, _Reading],
+        links: list[LatticeRatio],
+    ) -> FloatArray:
+        """What the error of each ratio does to light (n,): (n, ratios). Light of a range is divided
+        by all ratios below it.
+        """
         effects = np.zeros((len(light), len(links)))
         for place, link in enumerate(links):
             for order, reading in lit.items():
@@ -512,47 +642,56 @@ class Photometer:
 
     def _of_rounding(
         self,
-        light: FloatArray,
-        sigma: FloatArray,
+        own: _Own,
         lit: dict[int, _Reading],
-        per_dn: FloatArray,
         pairs: list[_Pair],
         links: list[LatticeRatio],
     ) -> FloatArray:
-        """What the ADC's rounding does to light (n,) where too little noise spreads it over the steps: (n, modes).
+        """What the ADC's rounding does to light where too little noise spreads it: (n, modes).
 
-        Pixels of one light are rounded alike, by where their dark level is between two steps. That is not known. It is taken
-        at STEP_PHASES places, on its own for each exposure, and the covariance of readings over them is split into modes.
+        Pixels of one light are rounded alike, by where their dark level is between two steps. That
+        is not known. It is taken at STEP_PHASES places, on its own for each exposure, and the
+        covariance of readings over them is split into modes.
         """
         longer = sorted({reading.at.times for reading in lit.values()})
-        effects = np.zeros((len(light), len(longer), STEP_PHASES))
+        effects = np.zeros((len(own.light), len(longer), STEP_PHASES))
         for order, reading in lit.items():
-            effects[order, longer.index(reading.at.times)] = self._rounded(reading.at, reading.light_dn) * per_dn[order]
+            place = longer.index(reading.at.times)
+            effects[order, place] = self._rounded(reading.at, reading.light_dn) * own.per_dn[order]
         for pair, link in zip(pairs, links, strict=True):
             off = np.zeros((len(longer), STEP_PHASES))
-            for at, light_dn, sign in zip((pair.more, pair.less), pair.light_dn, (1, -1), strict=True):
+            ranges = zip((pair.more, pair.less), pair.light_dn, (1, -1), strict=True)
+            for at, light_dn, sign in ranges:
                 if at.times in longer:
-                    off[longer.index(at.times)] += sign * self._rounded(at, light_dn) / light_dn
+                    rounded = self._rounded(at, light_dn) / light_dn
+                    off[longer.index(at.times)] += sign * rounded
             for order, reading in lit.items():
                 if _passes(reading.patch, reading.at, link):
-                    effects[order] -= light[order] * off
-        flat = effects.reshape(len(light), -1) / math.sqrt(STEP_PHASES)
+                    effects[order] -= own.light[order] * off
+        flat = effects.reshape(len(own.light), -1) / math.sqrt(STEP_PHASES)
         modes, sizes, _ = np.linalg.svd(flat, full_matrices=False)
         modes = modes * sizes
-        used = (np.abs(modes) > SMALL_MODE * sigma[:, None]).any(axis=0)
+        used = (np.abs(modes) > SMALL_MODE * own.sigma[:, None]).any(axis=0)
         return np.asarray(modes[:, used])
 
     def _rounded(self, at: Range, light_dn: float) -> FloatArray:
-        """What rounding adds to the sum of a lattice's image above black (STEP_PHASES,), DN, by the dark level's place."""
+        """What rounding adds to the sum of a lattice's image above black (STEP_PHASES,), DN, by the
+        dark level's place.
+        """
         dark_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px)
         dots = self.field.lit(at.period)
         along = self.profiles[at.period]
-        level_dn = max(light_dn, 0.0) / dots * np.outer(along, along).ravel()
+        shares = np.outer(along, along).ravel()
+        # Dots that are rounded away may have a peak of half a step.
+        dot_dn = max(light_dn / dots, HALF_STEP_DN / float(shares.max()))
+        level_dn = dot_dn * shares
         cell_px = (at.period * self.ratio) ** 2
         return dots * cell_px * rounded_light(level_dn, dark_dn, self.scatter.dn_per_e)
 
     def _with_black(self, planned: list[Patch], light: FloatArray) -> tuple[FloatArray, float | None]:
-        """Light (n,) with the black level, DN/s, and that level's standard error, None where it was not measured."""
+        """Light (n,) with the black level, DN/s, and that level's standard error, None where it was
+        not measured.
+        """
         unlit = self.context.unlit()
         if unlit is None:
             whites = []
@@ -564,7 +703,8 @@ class Photometer:
         self.images.append(unlit)
         more = float((self._part(self._dark_screen) - self._part(unlit)).sum())
         seconds = self.field.monitor_px * self.context.exposure_s
-        # Each of the two images has its noise, and is rounded; the one without glow has less noise to spread it.
+        # Each of the two images has its noise, and is rounded; the one without glow has less noise
+        # to spread it.
         glowing_dn2 = self.scatter.dark_dn2(1)
         dark_dn2 = max(glowing_dn2 - self.scatter.dn_per_e * max(more, 0.0), 0.0)
         variance = glowing_dn2 + dark_dn2
@@ -585,7 +725,8 @@ class Photometer:
 
     def _take(self, name: str, at: Range, patch: Patch) -> Path:
         longer = f"_{at.times}" if at.times > 1 else ""
-        pattern = Pattern(name + longer, self.field.lattice(self.context.resolution_px, at.period, patch))
+        codes = self.field.lattice(self.context.resolution_px, at.period, patch)
+        pattern = Pattern(name + longer, codes)
         self.images.append(self.context.take(pattern, self.exposure_s * at.times))
         return self.images[-1]
 
@@ -594,10 +735,29 @@ class Photometer:
 
 
 def _passes(patch: Patch, at: Range, link: LatticeRatio) -> bool:
-    """Whether the light of a patch is divided by a ratio: that of its own range, or of one with less light."""
+    """Whether the light of a patch is divided by a ratio: that of its own range, or of one with
+    less light.
+    """
     if patch.channel != link.patch.channel:
         return False
     return (-at.times, at.period) <= (-link.times[0], link.dense)
+
+
+def _lit(
+    planned: list[Patch],
+    chosen: dict[Patch, Range],
+    blacks: dict[int, FloatArray],
+    sums: dict[int, float],
+) -> dict[int, _Reading]:
+    """The lit patches by their order, above the black images before and after them."""
+    orders = np.flatnonzero([patch.code == 0 for patch in planned])
+    lit: dict[int, _Reading] = {}
+    for order, total in sums.items():
+        patch = planned[order]
+        at = chosen[patch]
+        under, variance = _between(order, orders, blacks[at.times])
+        lit[order] = _Reading(patch, at, total - under, variance)
+    return lit
 
 
 def _between(order: int, orders: IntArray, values: FloatArray) -> tuple[float, float]:
@@ -606,4 +766,5 @@ def _between(order: int, orders: IntArray, values: FloatArray) -> tuple[float, f
         return float(values[0]), 1.0
     after = int(np.clip(np.searchsorted(orders, order), 1, len(orders) - 1))
     share = float(np.clip((order - orders[after - 1]) / (orders[after] - orders[after - 1]), 0, 1))
-    return float((1 - share) * values[after - 1] + share * values[after]), (1 - share) ** 2 + share**2
+    value = (1 - share) * values[after - 1] + share * values[after]
+    return float(value), (1 - share) ** 2 + share**2

@@ -135,7 +135,7 @@ def _response_figures(
         "exposure_s": readings.exposure_s,
         "links": ", ".join(f"{link.ratio:.4f}" for link in readings.links) or "none",
         "links_max_mag": max((abs(float(magnitude(link.ratio))) for link in readings.links), default=0.0),
-        "links_max_sigmas": max((abs(link.ratio - 1) / link.error for link in readings.links if link.error), default=0.0),
+        "links_max_sigmas": max((link.sigmas for link in readings.links), default=0.0),
         **{f"error_at_{decade}_percent": value for decade, value in found["error_percent"].items()},
     }
     if context.truth is not None:
@@ -167,7 +167,8 @@ def _judged(
     rms_mag = float(figures["held_out_rms_mag"])
     error = rms_mag / math.sqrt(2 * float(figures["codes"]))
     number = StepNumber(rms_mag, error, "mag", "rms distance of held-out levels from the response")
-    if float(figures["links_max_mag"]) > limit_mag and float(figures["links_max_sigmas"]) > SURE_SIGMAS:
+    differs = float(figures["links_max_mag"]) > limit_mag
+    if differs and float(figures["links_max_sigmas"]) > SURE_SIGMAS:
         why = "switch off dynamic contrast and local dimming, or is the tracker not linear?"
         line = f"dense and sparse dots of one code differ by {figures['links_max_mag']:.3f} mag: {why}"
         return StepOutcome("failed", line, figures, files, pictures, number=number)

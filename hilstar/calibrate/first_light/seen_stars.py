@@ -114,20 +114,24 @@ class StarSpot:
         """The noise (n,) of stars of `dn` (n,) in all, magnitudes, over a background of `noise_dn` in a pixel."""
         shares, _ = self._shares
         light = np.maximum(dn, 1e-9)
-        variance = light * self.window_share / (self.gain_e_per_dn * self.frames) + shares.size * noise_dn**2
+        photons = light * self.window_share / (self.gain_e_per_dn * self.frames)
+        variance = photons + shares.size * noise_dn**2
         variance += (self.prnu * light) ** 2 * float((shares**2).sum())
         variance += (self.rounded_dn(light, noise_dn) ** 2).mean(axis=1)
         return np.asarray(MAG_PER_RELATIVE * np.sqrt(variance) / (light * self.window_share))
 
     def rounded_dn(self, dn: FloatArray, noise_dn: float) -> FloatArray:
-        """What the ADC's rounding adds to the windows of stars of `dn` (n,) in all, DN (n, STEP_PHASES): see `rounded_light`.
+        """What the ADC's rounding adds to windows of stars of `dn` (n,) in all, DN.
 
-        `noise_dn` is that of a pixel less its dark frame's, in the mean of the frames.
+        (n, STEP_PHASES), see `rounded_light`. `noise_dn` is that of a pixel less its dark frame's, in the mean of the
+        frames.
         """
         shares, _ = self._shares
         dark_dn = before_adc_dn(noise_dn**2 * self.frames / 2)
-        rows = [rounded_light(one * shares.ravel(), dark_dn, 1 / self.gain_e_per_dn) for one in dn.tolist()]
-        return shares.size * np.array(rows).reshape(len(dn), STEP_PHASES)
+        rounded = np.zeros((len(dn), STEP_PHASES))
+        for star, light_dn in enumerate(dn.tolist()):
+            rounded[star] = rounded_light(light_dn * shares.ravel(), dark_dn, 1 / self.gain_e_per_dn)
+        return shares.size * rounded
 
     def place_noise_px(self, dn: FloatArray, noise_dn: float) -> FloatArray:
         """The noise (n,) of the places of such stars along one axis, px: that of the window's first moment."""

@@ -362,9 +362,8 @@ def _not_negative(found: float, error: float) -> float:
     if error <= 0:
         return max(found, 0.0)
     place = found / error
-    # Below -30 sigmas the quotient of two tiny numbers is the first term of its series.
-    ratio = math.exp(-(place**2) / 2 - float(log_ndtr(place))) / math.sqrt(2 * math.pi) if place > -30 else -place
-    return max(found + error * ratio, 0.0)
+    log_ratio = -(place**2) / 2 - float(log_ndtr(place)) - math.log(2 * math.pi) / 2
+    return max(found + error * math.exp(log_ratio), 0.0)
 
 
 def _freedom(design: Any, shape: tuple[int, int]) -> float:

@@ -1,4 +1,6 @@
-"""What the tracker reads of a response is as far off as its errors say: noise, ratios of ranges, rounding and black."""
+"""What the tracker reads of a response is as far off as its errors say: noise, ratios of ranges,
+rounding and black.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ pytestmark = pytest.mark.usefixtures("without_charts")
 BITS, BLACK, POWER = 8, 1e-3, 2.35
 DECADES = (1e-1, 1e-2, 1e-3)
 SURE = 4.0  # sigmas: one figure in 16 000 is further off
-# Root mean square of figures in their sigmas: 1 for honest errors. 12 figures give it to a fifth, three times.
+# Root mean square of figures in their sigmas: 1 for honest errors. 12 figures give it to a fifth,
+# three times.
 MAX_RMS = 1.6
 NOISY = {"gain_e_per_dn": 8.0, "read_noise_e": 12.0, "full_well_e": 30_000.0, "offset_dn": 40.0, "prnu": 0.005}
 # Nothing spreads a level over the ADC's steps: the defaults of a bench file.
@@ -44,10 +47,13 @@ def planted(folder, detector, collimator_mm=120):
     (folder / "truth.toml").write_text(bench_text(TWIN, true))
 
 
-def measured(folder, seed):
-    """What the step comes to on the planted bench, and its figures in sigmas: the response by decades, and black."""
+def measured(folder, seed, sets_exposure=True):
+    """What the step comes to on the planted bench, and its figures in sigmas: the response by
+    decades, and black.
+    """
     file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
     source = VirtualBench(file, true, seed)
+    source.sets_exposure = sets_exposure
     try:
         outcome = photometry(StepContext(file, folder, folder / f"images-{seed}", source, {}, {}, 96))
     finally:
@@ -66,7 +72,9 @@ def measured(folder, seed):
 
 @pytest.mark.parametrize("detector", [NOISY, SILENT], ids=["noisy", "silent"])
 def test_a_response_and_its_black_level_are_as_far_off_as_their_errors_say(detector, tmp_path):
-    """The ratios of lattices, read once each, put all codes beside white up to 8 sigmas off, and black was 20 off."""
+    """The ratios of lattices, read once each, put all codes beside white up to 8 sigmas off, and
+    black was 20 off.
+    """
     planted(tmp_path, detector)
     off, black = [], []
     for seed in range(4):
@@ -79,13 +87,24 @@ def test_a_response_and_its_black_level_are_as_far_off_as_their_errors_say(detec
 
 
 def test_a_tracker_without_noise_before_wide_pixels_gives_one_smooth_response(tmp_path):
-    """A monitor pixel is 3.7 tracker pixels: no lattice is brighter than a lone pixel, and codes were read as 0 or 1 DN."""
+    """A monitor pixel is 3.7 tracker pixels: no lattice is brighter than a lone pixel, and codes
+    were read as 0 or 1 DN.
+    """
     planted(tmp_path, SILENT, collimator_mm=30)
     outcome, off, black = measured(tmp_path, 0)
     assert np.abs(off).max() < SURE
     assert abs(black) < SURE
     assert float(outcome.figures["error_at_1e-3_percent"]) < 1.0
     assert "exposed 16 times longer" in (tmp_path / "measured.csv").read_text()
+
+
+def test_what_rounding_takes_of_codes_that_cannot_be_exposed_longer_is_in_their_errors(tmp_path):
+    planted(tmp_path, SILENT, collimator_mm=30)
+    outcome, off, black = measured(tmp_path, 0, sets_exposure=False)
+    assert np.abs(off).max() < SURE
+    assert abs(black) < SURE
+    # Half a step of the ADC, of codes whose peak is a few steps.
+    assert float(outcome.figures["error_at_1e-3_percent"]) > 1.0
 
 
 def test_the_command_and_the_step_give_the_same_figures(tmp_path):
@@ -106,7 +125,9 @@ def written(path, rows, header):
 
 
 def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
-    """Codes below half were read in a range whose ratio is known to 1 %; each reading repeats to 0.1 %."""
+    """Codes below half were read in a range whose ratio is known to 1 %; each reading repeats to
+    0.1 %.
+    """
     ratios = []
     for seed in range(40):
         rng = np.random.default_rng(seed)

@@ -143,9 +143,11 @@ def warm_up(context: StepContext) -> StepOutcome:
     if not context.watched_s:
         how = "give --warm-up MINUTES, 30 for most monitors, right after the monitor was switched on"
         return StepOutcome("skipped", f"not measured, the monitor is taken to be warm: {how}")
-    code, (_, period, _) = dot_code(context), _spacing(context)
-    codes = _shown([period // 2, period // 2], period, code, context.resolution_px)
+    period = _spacing(context).period
+    firsts = [period // 2, period // 2]
     dark, file, lit, number = context.read(context.dark()), context.file, np.zeros(0, dtype=np.bool_), 0
+    code, _ = _unsaturated(context, dark, "white", [firsts], period)
+    codes = _shown(firsts, period, code, context.resolution_px)
     cold, beside = dark < HOT_FILL * context.full_dn, lit
 
     def read() -> float:
@@ -250,9 +252,37 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
     return figures
 
 
+def _unsaturated(
+    context: StepContext,
+    dark: FloatArray,
+    name: str,
+    lattices: list[list[int]],
+    period: int,
+) -> tuple[int, list[DarkSubtracted]]:
+    """The images of lattices, each from its first dot (x, y) on, and their code.
+
+    It is the brightest of the codes from the focus's down at which no dot saturates the tracker: the
+    focus saw other dots, and light differs from place to place. Raises InputError where none is left.
+    """
+    code = dot_code(context)
+    while True:
+        looks: list[DarkSubtracted] = []
+        for number, firsts in enumerate(lattices):
+            codes = _shown(firsts, period, code, context.resolution_px)
+            looks.append(context.look(Pattern(f"{name}_{code:05}_{number:03}", codes), dark))
+            if context.is_too_bright(looks[-1]):
+                break
+        else:
+            return code, looks
+        code = context.darker(code)
+
+
 def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
-    """Measure dots on lattices over the whole screen; their light, and the images. Raises InputError for too few whole dots."""
-    geometry, code = context.real_geometry(), dot_code(context)
+    """Measure dots on lattices over the whole screen; their light, and the images.
+
+    Raises InputError for too few whole dots.
+    """
+    geometry = context.real_geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     sigma_px, period, reach = _spacing(context)
     width, height = geometry.tracker.resolution_px
@@ -262,19 +292,20 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     dark = context.read(dark_path)
     bad = dark > HOT_FILL * context.full_dn
     bad[[0, -1]], bad[:, [0, -1]] = True, True  # a dot that reaches the detector's edge has lost light
-    parts, paths, noise_dn = [], [dark_path], 0.0
-    for number, shift in enumerate(SHIFTS):
-        firsts = [period // 2 + period // 2 * half for half in shift]
-        looked = context.look(Pattern(f"lattice_{number:03}", _shown(firsts, period, code, context.resolution_px)), dark)
-        paths.append(looked.path)
-        _check_brightness(context, looked, code)
+    lattices = [[period // 2 + period // 2 * half for half in shift] for shift in SHIFTS]
+    _, looks = _unsaturated(context, dark, "lattice", lattices, period)
+    parts, noise_dn = [], 0.0
+    size = np.array(context.resolution_px)
+    for firsts, looked in zip(lattices, looks, strict=True):
         noise_dn = noisiest_background(looked.image).noise
-        size, first = np.array(context.resolution_px), np.array(firsts)
+        first = np.array(firsts)
         parts.append(_sums(seen, looked.image, bad, firsts=first, period=period, reach=reach, size=size))
+    paths = [dark_path, *(looked.path for looked in looks)]
     columns, rows, light = (np.concatenate(part) for part in zip(*parts, strict=True))
     lit = light > 0
     if lit.sum() < MIN_DOTS:
-        raise InputError(f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed; look at the geometry and the focus")
+        few = f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed"
+        raise InputError(f"{few}; look at the geometry and the focus")
     detector = context.file.config.tracker.detector
     dn = float(np.median(light[lit]))
     pixels = math.pi * (reach * ratio) ** 2

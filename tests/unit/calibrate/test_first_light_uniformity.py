@@ -10,7 +10,7 @@ from hilstar.calibrate.first_light.context import StepContext, rewrite
 from hilstar.calibrate.first_light.image_sources import VirtualBench
 from hilstar.calibrate.first_light.photometry import photometry
 from hilstar.calibrate.first_light.stars import scale, verify
-from hilstar.calibrate.first_light.uniformity import DotLight, map_of, uniformity
+from hilstar.calibrate.first_light.uniformity import DotLight, map_of, uniformity, warm_up
 from hilstar.monitor.calibration import load_calibration, with_uniformity
 from hilstar.units import magnitude
 from tests.support.benches import TWIN, bench_text
@@ -42,12 +42,23 @@ def charts_of_one(request, grid):
         request.getfixturevalue("without_charts")
 
 
-def did(folder, step, patches=0):
+def did(folder, step, patches=0, known=None, watched_s=0.0):
     """What a step comes to, with the bench file rewritten as a session does it."""
     file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
     source = VirtualBench(file, true, 0)
     try:
-        outcome = step(StepContext(file, folder, folder / step.__name__, source, {}, {}, patches))
+        outcome = step(
+            StepContext(
+                file,
+                folder,
+                folder / step.__name__,
+                source,
+                known or {},
+                {},
+                patches,
+                watched_s=watched_s,
+            )
+        )
     finally:
         source.close()
     rewrite(file, outcome.changes)
@@ -166,3 +177,22 @@ def test_unevenness_that_no_map_shows_for_sure_is_in_the_error(fall):
     assert max(sigmas) < 3
     # No error is worth anything that is many times the difference.
     assert np.median(sigmas) > (0.2 if fall else -1)
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_dots_brighter_than_those_of_the_focus_are_shown_in_a_darker_code(tmp_path):
+    """The step ended there, and sent its user back to a focus that was right."""
+    folder = planted(tmp_path, VIGNETTING)
+    found = did(folder, uniformity, known={"focus.dot_code": 1023})
+    assert found.verdict == "done", found.line
+    names = {path.stem.rpartition("_")[0] for path in found.files if path.stem.startswith("lattice")}
+    assert len(names) == 1
+    assert names != {"lattice_01023"}
+    assert found.figures["truth_rms_mag"] < MAP_MAG
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_white_is_watched_in_a_code_that_does_not_saturate(tmp_path):
+    folder = planted(tmp_path, None)
+    found = did(folder, warm_up, known={"focus.dot_code": 1023}, watched_s=600.0)
+    assert found.verdict == "done", found.line

@@ -134,8 +134,13 @@ class _Solution:
     @property
     def lack_of_fit(self) -> float:
         """The misfit relative to what the noise explains, where that is less."""
-        left = max(len(self.misfit) - self.parameters, 1.0)
-        return math.sqrt(max(float(self.misfit @ self.misfit) / left, 1.0))
+        return math.sqrt(max(self.square_per_freedom, 1.0))
+
+    @property
+    def square_per_freedom(self) -> float:
+        """Chi-square over its freedom."""
+        freedom = max(len(self.misfit) - self.parameters, 1.0)
+        return float(self.misfit @ self.misfit) / freedom
 
 
 def fit_channel(measured: measurements.Measurements, channel: str) -> ChannelFit:
@@ -159,7 +164,7 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
     from_white = problem.at_codes - problem.at_codes[-1]
     shape_covariance = best.covariance[: len(best.theta), : len(best.theta)]
     error = np.sqrt(np.maximum(_variances(from_white, shape_covariance), 0.0))
-    left = np.maximum(1 - _variances(best.design, best.covariance), 1e-6)
+    held_out_share = np.maximum(1 - _variances(best.design, best.covariance), 1e-6)
     lack = best.lack_of_fit
     light = strictly_rising(np.append(0.0, above / above[-1]))
     off, level_error = _levels_about(best, float(above[-1]) * light[levels.code[1:]])
@@ -173,12 +178,12 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
         black=best.black * scale,
         error=np.append(0.0, lack * error),
         levels=levels,
-        residual=best.misfit / left * problem.sigma / best.above,
+        residual=best.misfit / held_out_share * problem.sigma / best.above,
         noise_relative=noise,
         shape=best.shape.name,
         parameters=best.parameters,
         black_error=math.hypot(black_own, black_common, best.black * scale * white_error),
-        residual_error=problem.sigma / best.above / np.sqrt(left),
+        residual_error=problem.sigma / best.above / np.sqrt(held_out_share),
         level_off=off,
         level_error=lack * level_error,
         lack_of_fit=lack,
@@ -188,8 +193,7 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
 def _residual_noise(levels: measurements.MeasuredLevels, white: int) -> float:
     """The relative noise of a reading where nothing was repeated: by the residuals of a first fit."""
     first = _best_solution(levels, white, measurements.ASSUMED_NOISE)
-    left = max(len(first.misfit) - first.parameters, 1.0)
-    noise = measurements.ASSUMED_NOISE * math.sqrt(float(first.misfit @ first.misfit) / left)
+    noise = measurements.ASSUMED_NOISE * math.sqrt(first.square_per_freedom)
     return max(noise, measurements.NOISE_FLOOR)
 
 
@@ -207,13 +211,13 @@ def _levels_about(best: "_Solution", fitted: FloatArray) -> tuple[FloatArray, Fl
     problem = best.problem
     above = problem.light - problem.black - problem.common @ best.causes
     off = above / fitted - 1
-    own = np.hypot(problem.sigma, problem.black_sigma) / fitted
+    noise = np.hypot(problem.sigma, problem.black_sigma) / fitted
     # White's own share of a cause is full scale's.
     common = problem.common / fitted[:, None]
     common = common - common[-1]
     first = len(best.theta)
     shared = _variances(common, best.covariance[first:-1, first:-1])
-    return off, np.sqrt(own**2 + np.maximum(shared, 0.0))
+    return off, np.sqrt(noise**2 + np.maximum(shared, 0.0))
 
 
 def strictly_rising(light: FloatArray) -> FloatArray:

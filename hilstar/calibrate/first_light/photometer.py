@@ -116,11 +116,11 @@ def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: f
     low, high = np.zeros_like(along), np.full_like(along, side - 1)
     x = corner[0] + np.concatenate([along, along, low, high])
     y = corner[1] + np.concatenate([low, high, along, along])
-    seen = geometry.to_tracker(x, y)
-    if not all(np.isfinite(part).all() for part in seen):
+    place = geometry.to_tracker(x, y)
+    if not all(np.isfinite(part).all() for part in place):
         raise InputError("the middle of the tracker's field sees no screen; run the geometry again")
     ends = []
-    for part, size in zip(seen, geometry.tracker.resolution_px, strict=True):
+    for part, size in zip(place, geometry.tracker.resolution_px, strict=True):
         first, last = math.floor(part.min() - margin), math.ceil(part.max() + margin) + 1
         if first < 0 or last > size:
             raise InputError("the dots are not whole in the tracker's field; look at [collimator] and run the geometry again")
@@ -338,7 +338,7 @@ class _Reading(NamedTuple):
     blacks: float
 
 
-class _Own(NamedTuple):
+class _Values(NamedTuple):
     """Of each patch (n,): light above black and its own standard error, DN/s; light for a DN of a
     lit patch's sum.
     """
@@ -400,12 +400,12 @@ class Photometer:
             pairs += self._pairs(channel, chosen, peaks)
         links = [self._link(pair) for pair in pairs]
         lit = _lit(planned, chosen, blacks, sums)
-        own = self._own(planned, lit, blacks[1], self._factors(links))
+        values = self._values(planned, lit, blacks[1], self._factors(links))
         causes = [
-            self._of_ratios(own.light, lit, links),
-            self._of_rounding(own, lit, pairs, links),
+            self._of_ratios(values.light, lit, links),
+            self._of_rounding(values, lit, pairs, links),
         ]
-        with_black, black_error = self._with_black(planned, own.light)
+        with_black, black_error = self._with_black(planned, values.light)
         if black_error is not None:
             causes.append(np.full((len(planned), 1), black_error))
         period = np.full(len(planned), self.periods[-1], dtype=np.intp)
@@ -418,9 +418,9 @@ class Photometer:
             links,
             black_error is not None,
             tuple(self.images),
-            own.light,
+            values.light,
             period,
-            own.sigma,
+            values.sigma,
             np.hstack(causes),
         )
 
@@ -490,8 +490,8 @@ class Photometer:
         for order, patch in enumerate(planned):
             if not patch.code:
                 for times in longer:
-                    seen = self._look(f"patch_{order:03}_1", Range(1, times), patch)
-                    blacks[times].append(seen.sum_dn)
+                    look = self._look(f"patch_{order:03}_1", Range(1, times), patch)
+                    blacks[times].append(look.sum_dn)
                 continue
             while True:
                 at = chosen[patch]
@@ -532,13 +532,13 @@ class Photometer:
         dark: dict[int, float] = {}
         for times in sorted({more.times, less.times}):
             dark[times] = self._look(f"{name}_black", Range(1, times), BLACK).sum_dn
-        seen: list[float] = []
+        lights: list[float] = []
         for at in (more, less):
             look = self._look(f"{name}_{at.period}", at, patch)
-            seen.append(look.sum_dn - dark[at.times])
-        if seen[1] <= 0:
+            lights.append(look.sum_dn - dark[at.times])
+        if lights[1] <= 0:
             raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
-        return seen[0], seen[1]
+        return lights[0], lights[1]
 
     def _brightest(
         self,
@@ -552,21 +552,21 @@ class Photometer:
         """
         place = self.periods.index(at.period)
         highest_dn = FILL * self.context.full_dn
-        own = max(patch for patch, its in ranges.items() if its == at)
+        highest = max(patch for patch, its in ranges.items() if its == at)
         for patch in sorted(ranges, reverse=True):
-            if patch <= own or peaks[patch][place] * at.times > highest_dn:
+            if patch <= highest or peaks[patch][place] * at.times > highest_dn:
                 continue
             if self._look(f"{name}_{patch.code}", at, patch).fill <= MAX_FILL:
                 return patch
-        return own
+        return highest
 
-    def _own(
+    def _values(
         self,
         planned: list[Patch],
         lit: dict[int, _Reading],
         blacks: FloatArray,
         factors: dict[tuple[str, Range], float],
-    ) -> _Own:
+    ) -> _Values:
         """Light above black of each patch, and the standard error of its own images."""
         count = len(planned)
         light, per_dn = np.zeros(count), np.zeros(count)
@@ -584,7 +584,7 @@ class Photometer:
             known_dn = max(reading.light_dn, 0.0) + hidden_dn
             variance = self.scatter.sum_dn2(known_dn, reading.at.times, reading.blacks)
             sigma[order] = math.sqrt(variance) * per_dn[order]
-        return _Own(light, sigma, per_dn)
+        return _Values(light, sigma, per_dn)
 
     def _dots(self, at: Range) -> int:
         """By how many lit pixels and exposures a sum in a range has to be divided."""
@@ -642,7 +642,7 @@ class Photometer:
 
     def _of_rounding(
         self,
-        own: _Own,
+        values: _Values,
         lit: dict[int, _Reading],
         pairs: list[_Pair],
         links: list[LatticeRatio],
@@ -654,10 +654,10 @@ class Photometer:
         covariance of readings over them is split into modes.
         """
         longer = sorted({reading.at.times for reading in lit.values()})
-        effects = np.zeros((len(own.light), len(longer), STEP_PHASES))
+        effects = np.zeros((len(values.light), len(longer), STEP_PHASES))
         for order, reading in lit.items():
             place = longer.index(reading.at.times)
-            effects[order, place] = self._rounded(reading.at, reading.light_dn) * own.per_dn[order]
+            effects[order, place] = self._rounded(reading.at, reading.light_dn) * values.per_dn[order]
         for pair, link in zip(pairs, links, strict=True):
             off = np.zeros((len(longer), STEP_PHASES))
             ranges = zip((pair.more, pair.less), pair.light_dn, (1, -1), strict=True)
@@ -667,11 +667,11 @@ class Photometer:
                     off[longer.index(at.times)] += sign * rounded
             for order, reading in lit.items():
                 if _passes(reading.patch, reading.at, link):
-                    effects[order] -= own.light[order] * off
-        flat = effects.reshape(len(own.light), -1) / math.sqrt(STEP_PHASES)
+                    effects[order] -= values.light[order] * off
+        flat = effects.reshape(len(values.light), -1) / math.sqrt(STEP_PHASES)
         modes, sizes, _ = np.linalg.svd(flat, full_matrices=False)
         modes = modes * sizes
-        used = (np.abs(modes) > SMALL_MODE * own.sigma[:, None]).any(axis=0)
+        used = (np.abs(modes) > SMALL_MODE * values.sigma[:, None]).any(axis=0)
         return np.asarray(modes[:, used])
 
     def _rounded(self, at: Range, light_dn: float) -> FloatArray:

@@ -68,21 +68,28 @@ class DotLight:
 class UniformityMap:
     """Light against place: a grid (rows, columns), one field where light is even, and its value at each dot (n,), median 1.
 
-    `left_mag` is the rms error on held-out dots; `used` marks the dots that are no outliers. `fit_mag` is the standard error
-    of the fit at a dot; `missed_mag` the rms of what a finer map may show and this one does not.
+    `left_mag` is the rms error on held-out dots, and `left_error_mag2` the standard error of its
+    square; `used` marks the dots that are no outliers. `fit_mag` is the standard error of the fit at a
+    dot; `missed_mag` the rms of what a finer map may show and this one does not.
     """
 
     grid: FloatArray
     at_dots: FloatArray
     left_mag: float
+    left_error_mag2: float
     used: BoolArray
     fit_mag: float
     missed_mag: float
 
     def error_mag(self, noise_mag: float) -> float:
-        """The map's standard error at a dot: that of its fit, what it misses, and how dots differ beyond their noise."""
-        shape = math.sqrt(max(self.left_mag**2 - noise_mag**2, 0.0))
-        return math.hypot(self.fit_mag, self.missed_mag, shape)
+        """The map's standard error at a dot: that of its fit, and of what its form lacks.
+
+        That is seen twice: by a finer map, and by held-out dots, which differ from this one by more
+        than their noise. The larger counts.
+        """
+        beyond_mag2 = self.left_mag**2 - noise_mag**2 - self.fit_mag**2
+        form_mag = math.sqrt(_not_negative(beyond_mag2, self.left_error_mag2))
+        return math.hypot(self.fit_mag, max(form_mag, self.missed_mag))
 
     @property
     def is_even(self) -> bool:
@@ -309,9 +316,9 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     detector = context.file.config.tracker.detector
     dn = float(np.median(light[lit]))
     pixels = math.pi * (reach * ratio) ** 2
-    # The dark frame adds an image's noise; PRNU averages over the pixels of a dot.
+    # The noise of the dark frame is in that of the image above it; PRNU averages over a dot's pixels.
     shared = detector.prnu**2 / (4 * math.pi * sigma_px**2)
-    noise = math.sqrt((dn / detector.gain_e_per_dn + 2 * pixels * noise_dn**2) / dn**2 + shared)
+    noise = math.sqrt((dn / detector.gain_e_per_dn + pixels * noise_dn**2) / dn**2 + shared)
     return DotLight(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
 
 
@@ -368,22 +375,23 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
     place = next(k for k, each in enumerate(worse) if each.mean() <= SURE * each.std() / math.sqrt(len(each)))
     grid = _fitted(relative[used], designs[place][used], shapes[place])
     square = float(squares[place][used].mean())
-    freedom = _freedom(designs[place][used], shapes[place])
     count = int(used.sum())
+    error = float(squares[place][used].std()) / math.sqrt(count)
+    freedoms = _Freedoms(designs, shapes, used)
     missed = 0.0
-    finer = range(place + 1, len(shapes))
-    if finer:
+    if finer := range(place + 1, len(shapes)):
         nearest = min(finer, key=lambda k: float(squares[k][used].mean()))
         gain = (squares[place] - squares[nearest])[used]
         # A finer map errs more by its fields' own noise, which hides as much of what it shows.
-        noise = square * (_freedom(designs[nearest][used], shapes[nearest]) - freedom) / count
+        noise = square * (freedoms.of(nearest) - freedoms.of(place)) / count
         missed = _not_negative(float(gain.mean()) + noise, float(gain.std()) / math.sqrt(count))
     return UniformityMap(
         grid.reshape(shapes[place]),
         designs[place] @ grid,
-        MAG_PER_RELATIVE * math.sqrt(square),
-        used,
-        fit_mag=MAG_PER_RELATIVE * math.sqrt(square * freedom / count),
+        left_mag=MAG_PER_RELATIVE * math.sqrt(square),
+        left_error_mag2=MAG_PER_RELATIVE**2 * error,
+        used=used,
+        fit_mag=MAG_PER_RELATIVE * math.sqrt(square * freedoms.of(place) / count),
         missed_mag=MAG_PER_RELATIVE * math.sqrt(missed),
     )
 
@@ -397,10 +405,19 @@ def _not_negative(found: float, error: float) -> float:
     return max(found + error * math.exp(log_ratio), 0.0)
 
 
-def _freedom(design: Any, shape: tuple[int, int]) -> float:
-    """How many fields dots determine: the trace of the fit's matrix from light to map."""
-    normal = (design.T @ design).toarray()
-    return float(np.trace(np.linalg.solve(normal + _smoothness(shape), normal)))
+class _Freedoms(NamedTuple):
+    """The designs of maps (dots, fields) with their shapes, and the dots that are used."""
+
+    designs: list[Any]
+    shapes: list[tuple[int, int]]
+    used: BoolArray
+
+    def of(self, place: int) -> float:
+        """How many fields the dots determine: the trace of the fit's matrix from light to map."""
+        design = self.designs[place][self.used]
+        normal = (design.T @ design).toarray()
+        fit = np.linalg.solve(normal + _smoothness(self.shapes[place]), normal)
+        return float(np.trace(fit))
 
 
 def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, int]) -> Any:

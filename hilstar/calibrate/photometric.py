@@ -126,6 +126,7 @@ class _Solution:
     design: FloatArray  # (levels - 1, parameters), rows in units of sigma
     misfit: FloatArray  # (levels - 1,), in units of sigma
     above: FloatArray  # (levels - 1,) light above black
+    has_settled: bool
 
     @property
     def parameters(self) -> float:
@@ -232,7 +233,15 @@ def strictly_rising(light: FloatArray) -> FloatArray:
 
 
 def _best_solution(levels: measurements.MeasuredLevels, white: int, noise: float) -> _Solution:
-    return min((_solve(shape, _problem(shape, levels, white, noise)) for shape in SHAPES), key=lambda s: s.minus_log_evidence)
+    solutions: list[_Solution] = []
+    for shape in SHAPES:
+        problem = _problem(shape, levels, white, noise)
+        solutions.append(_solve(shape, problem, is_whole=False))
+        # Far from its place a stiff curve misfits and a soft one leads: from there on the whole range
+        # of stiffness is looked at again. Where that has not settled it is no solution.
+        again = _solve(shape, problem, is_whole=True)
+        solutions += [again] * again.has_settled
+    return min(solutions, key=lambda solution: solution.minus_log_evidence)
 
 
 def _problem(shape: Shape, levels: measurements.MeasuredLevels, white: int, noise: float) -> _Problem:
@@ -276,9 +285,13 @@ def _spline(place: FloatArray, knots: FloatArray, derivative: int = 0) -> FloatA
     return np.asarray(BSpline(padded, np.eye(len(knots) + 2), 3)(np.clip(place, 0, 1), nu=derivative))
 
 
-def _solve(shape: Shape, problem: _Problem) -> _Solution:
-    """Gauss-Newton steps; each of the first ones takes the stiffness with the largest evidence."""
+def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
+    """Gauss-Newton steps; each of the first ones takes the stiffness with the largest evidence.
+
+    It is looked for over its whole range, or beside that of the step before.
+    """
     black, stiffness = problem.black, math.nan
+    moved = math.inf
     start = np.maximum(problem.light - problem.black, 0.05 * np.maximum(problem.light, BLACK_FLOOR))
     normal = problem.at_levels.T @ problem.at_levels + 1e-6 * (problem.prior + problem.penalty)
     theta = np.asarray(np.linalg.solve(normal, problem.at_levels.T @ (np.log(start) - problem.log_base_levels)))
@@ -293,7 +306,7 @@ def _solve(shape: Shape, problem: _Problem) -> _Solution:
         shift = (black - problem.black) / problem.black_sigma
         target = misfit + design @ np.concatenate([theta, causes, [shift]])
         if step < STIFFNESS_STEPS:
-            stiffness = _stiffest(problem, design, target, stiffness)
+            stiffness = _stiffest(problem, design, target, math.nan if is_whole else stiffness)
         evidence, precision = _evidence(problem, design, target, stiffness)
         covariance = np.linalg.inv(precision)
         new = covariance @ (design.T @ target)
@@ -302,7 +315,9 @@ def _solve(shape: Shape, problem: _Problem) -> _Solution:
         black = max(problem.black + new[-1] * problem.black_sigma, 0.0)
         if moved < SETTLED and step >= 2:
             break
-    return _Solution(problem, shape, theta, causes, black, evidence, np.asarray(covariance), design, misfit, above)
+    return _Solution(
+        problem, shape, theta, causes, black, evidence, np.asarray(covariance), design, misfit, above, moved < SETTLED
+    )
 
 
 def _evidence(problem: _Problem, design: FloatArray, target: FloatArray, stiffness: float) -> tuple[float, FloatArray]:

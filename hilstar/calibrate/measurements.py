@@ -17,7 +17,8 @@ from hilstar.reading import as_text, read_bytes
 
 PRIMARIES = ("r", "g", "b")
 CHANNELS = ("w", *PRIMARIES)
-COLUMNS = ("order", "code", "channel", "value", "exposure_s", "t_s")
+COLUMNS = ("order", "code", "channel", "value", "exposure_s", "t_s", "sigma")
+COMMON = "common_"  # before the name of a cause of errors that readings have in common
 NEEDED = ("code", "channel", "value")
 USUAL_BITS = (8, 10, 12, 14, 16)
 MAX_BYTES = 10_000_000
@@ -27,6 +28,7 @@ FALSE_ALARM_SIGMA = 4.0  # one run in a few hundred is refused because of noise 
 MIN_DRIFT = 0.005  # over the run; less does not matter beside 1 % of noise
 BRIGHT_DOF = 8
 FAINT_ALARM = 0.999  # quantile of the F distribution beyond which additive noise is believed
+ASSUMED_NOISE = 0.01  # where nothing was repeated and no error stated, until the residuals tell
 NOISE_FLOOR = 1e-4  # relative; no photometer repeats better
 CLIPPED_VALUES = 3  # equal largest readings, over two codes or more
 
@@ -35,7 +37,9 @@ CLIPPED_VALUES = 3  # equal largest readings, over two codes or more
 class Measurements:
     """Light (n,) of patches in one linear unit, their codes and channels, and the time of each (s, or the row's number).
 
-    `clipped` has by channel the codes that share the largest reading, where that looks like the instrument's limit.
+    `clipped` has by channel the codes that share the largest reading, where that looks like the instrument's limit. `sigma`
+    (n,) is the standard error of each value, 0 where none is stated; `common` (n, causes) is what one standard error of a
+    cause does to all of them.
     """
 
     source: str
@@ -46,6 +50,8 @@ class Measurements:
     time: FloatArray
     clipped: dict[str, list[int]]
     sha256: str
+    sigma: FloatArray
+    common: FloatArray
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -63,6 +69,8 @@ class MeasuredLevels:
     """Repeats combined: for each distinct code (n,), rising, the mean light and the number of readings.
 
     `relative_noise` is that of one reading, nan where nothing was repeated; `additive_noise` is in the unit of measurement.
+    Both are what repeats scatter beyond the readings' own errors, where these are stated: `stated` (n,) is that of the mean.
+    `common` (n, causes) is what one standard error of a cause does to the means.
     """
 
     code: IntArray
@@ -70,11 +78,23 @@ class MeasuredLevels:
     count: IntArray
     relative_noise: float
     additive_noise: float
+    stated: FloatArray
+    common: FloatArray
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether the readings came with standard errors."""
+        return bool(self.stated.any())
+
+    def reading_noise(self, relative_noise: float) -> float:
+        """The noise of one reading of white, relative to it, for a given relative noise beyond stated errors."""
+        stated = float(self.stated[-1] * math.sqrt(self.count[-1]) / self.mean[-1])
+        return math.hypot(relative_noise, stated)
 
     def standard_error(self, relative_noise: float) -> FloatArray:
         """Standard error of the mean (n,), in its unit, for a given relative noise of one reading."""
         variance = (relative_noise * self.mean) ** 2 + self.additive_noise**2
-        return np.asarray(np.sqrt(variance / self.count), dtype=np.float64)
+        return np.asarray(np.sqrt(variance / self.count + self.stated**2), dtype=np.float64)
 
 
 class _Row(NamedTuple):
@@ -83,12 +103,15 @@ class _Row(NamedTuple):
     value: float
     exposure_s: float
     t_s: float | None
+    sigma: float
+    common: tuple[float, ...]
 
 
 def read_measurements(path: Path, bits: int | None = None) -> Measurements:
-    """Read `code,channel,value` rows, with `exposure_s`, `t_s` and `order` where they are given; '#' starts a comment line.
+    """Read `code,channel,value` rows; '#' starts a comment line.
 
-    Values are divided by exposure_s. `bits` is by default the smallest of 8, 10, 12, 14, 16 that holds every code.
+    `exposure_s`, `t_s`, `order`, `sigma` and any `common_NAME` are read where they are given. Values and their errors are
+    divided by exposure_s. `bits` is by default the smallest of 8, 10, 12, 14, 16 that holds every code.
     Raises InputError: file, line, what is wrong.
     """
     raw = read_bytes(path, ADVICE, MAX_BYTES)
@@ -99,14 +122,29 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     bits = bits or next(usual for usual in USUAL_BITS if codes.max() < 2**usual)
     if codes.max() >= 2**bits:
         raise InputError(f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say --bits")
-    _, channel, reading, exposure_s, _ = (np.array(column) for column in zip(*rows, strict=True))
+    channel = np.array([row.channel for row in rows])
+    reading = np.array([row.value for row in rows])
+    exposure_s = np.array([row.exposure_s for row in rows])
+    sigma = np.array([row.sigma for row in rows]) / exposure_s
+    common = np.array([row.common for row in rows]).reshape(len(rows), -1) / exposure_s[:, None]
     given = [row.t_s for row in rows if row.t_s is not None]
     if given and len(given) < len(rows):
         raise InputError(f"{path}: t_s is empty in some rows; give it in every row or leave the column out")
     time = np.array(given if given else np.arange(len(rows)), dtype=np.float64)
     clipped = {name: _clipped(codes[channel == name], reading[channel == name]) for name in set(channel.tolist())}
     digest = hashlib.sha256(raw).hexdigest()
-    return Measurements(str(path), bits, codes, channel, reading / exposure_s, time, clipped, digest)
+    return Measurements(
+        source=str(path),
+        bits=bits,
+        code=codes,
+        channel=channel,
+        value=reading / exposure_s,
+        time=time,
+        clipped=clipped,
+        sha256=digest,
+        sigma=sigma,
+        common=common,
+    )
 
 
 def _rows(path: Path, text: str) -> Iterator[_Row]:
@@ -128,7 +166,7 @@ def _rows(path: Path, text: str) -> Iterator[_Row]:
 
 def _header(path: Path, number: int, cells: list[str]) -> list[str]:
     missing = [name for name in NEEDED if name not in cells]
-    unknown = [name for name in cells if name not in COLUMNS]
+    unknown = [name for name in cells if name not in COLUMNS and not name.startswith(COMMON)]
     if missing:
         raise InputError(f"{path}: line {number}: the column {missing[0]} is missing; the header is code,channel,value")
     if unknown or len(set(cells)) < len(cells):
@@ -158,7 +196,16 @@ def _row(place: str, cells: dict[str, str]) -> _Row:
     if exposure_s <= 0:
         raise InputError(f"{place}: exposure_s = {exposure_s:g}; write more than 0")
     time = cells.get("t_s")
-    return _Row(code, cells["channel"], value, exposure_s, _number(place, "t_s", time) if time else None)
+    if cells.get("sigma") == "":
+        advice = "write the value's standard error, or leave the column out"
+        raise InputError(f"{place}: sigma is empty; {advice}")
+    sigma = _number(place, "sigma", cells.get("sigma", "0"))
+    if sigma < 0:
+        raise InputError(f"{place}: sigma = {sigma:g}; write a standard error, 0 or more")
+    causes = [name for name in cells if name.startswith(COMMON)]
+    common = tuple(_number(place, name, cells[name] or "0") for name in causes)
+    t_s = _number(place, "t_s", time) if time else None
+    return _Row(code, cells["channel"], value, exposure_s, t_s, sigma, common)
 
 
 def _number(place: str, name: str, text: str) -> float:
@@ -185,14 +232,29 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
     code, place, count = np.unique(measured.code[chosen], return_inverse=True, return_counts=True)
     mean = np.asarray(np.bincount(place, value) / count, dtype=np.float64)
     squares = np.asarray(np.bincount(place, (value - mean[place]) ** 2), dtype=np.float64)
+    variance = np.bincount(place, measured.sigma[chosen] ** 2) / count
+    # What repeats scatter beyond the readings' own errors.
+    squares -= (count - 1) * variance
+    floor = 0.0 if variance.any() else NOISE_FLOOR
     # The relative noise of the bright half, where the instrument's floor is negligible; of all but black if too few repeat.
     relative = math.nan
     for part in ((mean > 0) & (code > 0), mean > np.median(mean)):
         dof = int((count[part] - 1).sum())
         if dof >= BRIGHT_DOF:
-            relative = max(math.sqrt(float((squares[part] / mean[part] ** 2).sum()) / dof), NOISE_FLOOR)
-    additive = _additive(squares, mean, count, relative)
-    return MeasuredLevels(code.astype(np.intp), mean, count.astype(np.intp), relative, additive)
+            square = max(float((squares[part] / mean[part] ** 2).sum()), 0.0)
+            relative = max(math.sqrt(square / dof), floor)
+    additive = 0.0 if variance.any() else _additive(squares, mean, count, relative)
+    common = np.zeros((len(code), measured.common.shape[1]))
+    np.add.at(common, place, measured.common[chosen])
+    return MeasuredLevels(
+        code.astype(np.intp),
+        mean,
+        count.astype(np.intp),
+        relative,
+        additive,
+        stated=np.sqrt(variance / count),
+        common=common / count[:, None],
+    )
 
 
 def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: float) -> float:
@@ -224,7 +286,9 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
         )
     if not levels.mean[-1] > levels.mean[0]:
         raise InputError(f"{place}: white is not brighter than code 0; check that the instrument looks at the patch")
-    relative = 0.01 if math.isnan(levels.relative_noise) else levels.relative_noise
+    relative = levels.relative_noise
+    if math.isnan(relative):
+        relative = 0.0 if levels.has_errors else ASSUMED_NOISE
     error = levels.standard_error(relative)
     _check_saturation(measured, channel, levels, error)
     highest = np.maximum.accumulate(levels.mean)

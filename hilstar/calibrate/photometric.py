@@ -8,7 +8,11 @@ level's mean, so a faint level counts as much as a bright one. `g` is a cubic sp
     smooth  base s^2.2    g over s plus a log s, penalty on g'''  S-curves of liquid crystals: analytic in s
 
 The stiffness of the penalty and the shape are those of the maximum marginal likelihood (with weak normal priors on the
-coefficients); the noise comes from the repeats. Black is a parameter with the repeats of code 0 as its prior.
+coefficients). The noise is that stated with the readings, and what the repeats scatter beyond it. Black is a parameter with
+the repeats of code 0 as its prior. So is each cause of errors that readings have in common, in units of its standard error.
+
+Where the levels are further from the fit than their noise explains, the errors grow by the root of chi-square over its
+freedom (Birge, Phys. Rev. 40 (1932) 207).
 """
 
 import datetime
@@ -40,8 +44,8 @@ LOG_STIFFNESS = np.arange(-26.0, 15.0, 2.0)
 MAX_STEPS = 20
 SETTLED = 1e-6  # change of log light
 STIFFNESS_STEPS = 8  # the stiffness is chosen anew in each of the first steps
-ASSUMED_NOISE = 0.01  # where nothing was repeated, until the residuals tell
-BLACK_FLOOR = 1e-6  # relative to white: how well a black level of zero is known
+BLACK_FLOOR = 1e-6  # relative to white: how well a black level of zero is known, where its readings state no error
+STATED_FLOOR = 1e-9  # where they do, which may be none
 MIN_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
 MIN_LIGHT = 1e-9  # relative to white, at code 1
 MIN_STEP = 1e-12  # relative to white: in float64 it survives a black level a thousand times as bright
@@ -70,8 +74,11 @@ class ChannelFit:
     """The response of one channel and its errors.
 
     `light` (2^bits,) is above black, 0 to 1 at white, strictly rising; `white` (above black) and `black` are in the unit of
-    measurement. `error` (2^bits,) is the relative standard error of `light`. `residual` (levels - 1,) is the relative error
-    of each level except code 0 in a fit without it.
+    measurement, `black_error` the standard error of `black` beside white. `error` (2^bits,) is the relative standard error of
+    `light`.
+    Of each level but code 0 (levels - 1,): `residual` is its relative error in a fit without it, `residual_error` that
+    residual's standard error; `level_off` is its light, corrected for common causes, over the fit's, less 1, and
+    `level_error` its relative standard error. `lack_of_fit` is the factor by which the errors were raised, 1 for none.
     """
 
     light: FloatArray
@@ -83,6 +90,11 @@ class ChannelFit:
     noise_relative: float
     shape: str
     parameters: float
+    black_error: float
+    residual_error: FloatArray
+    level_off: FloatArray
+    level_error: FloatArray
+    lack_of_fit: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +111,7 @@ class _Problem:
     sigma: FloatArray
     black: float
     black_sigma: float
+    common: FloatArray  # (levels - 1, causes), beside what each does to code 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,16 +119,29 @@ class _Solution:
     problem: _Problem
     shape: Shape
     theta: FloatArray
+    causes: FloatArray
     black: float
     minus_log_evidence: float  # twice
-    covariance: FloatArray  # for theta, and for black in units of its sigma
+    covariance: FloatArray  # for theta, for the common causes, and for black in units of its sigma
     design: FloatArray  # (levels - 1, parameters), rows in units of sigma
     misfit: FloatArray  # (levels - 1,), in units of sigma
     above: FloatArray  # (levels - 1,) light above black
+    has_settled: bool
 
     @property
     def parameters(self) -> float:
-        return float(np.einsum("ij,jk,ik->", self.design, self.covariance, self.design))
+        return float(_variances(self.design, self.covariance).sum())
+
+    @property
+    def lack_of_fit(self) -> float:
+        """The misfit relative to what the noise explains, where that is less."""
+        return math.sqrt(max(self.square_per_freedom, 1.0))
+
+    @property
+    def square_per_freedom(self) -> float:
+        """Chi-square over its freedom."""
+        freedom = max(len(self.misfit) - self.parameters, 1.0)
+        return float(self.misfit @ self.misfit) / freedom
 
 
 def fit_channel(measured: measurements.Measurements, channel: str) -> ChannelFit:
@@ -132,27 +158,67 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
     """The response to levels that have passed `check_levels`, for codes 0 to `white`."""
     noise = levels.relative_noise
     if math.isnan(noise):
-        first = _best_solution(levels, white, ASSUMED_NOISE)
-        left = max(len(first.misfit) - first.parameters, 1.0)
-        noise = max(ASSUMED_NOISE * math.sqrt(float(first.misfit @ first.misfit) / left), measurements.NOISE_FLOOR)
+        noise = 0.0 if levels.has_errors else _residual_noise(levels, white)
     best = _best_solution(levels, white, noise)
     problem, scale = best.problem, float(levels.mean[-1] - levels.mean[0])
     above = np.exp(problem.log_base_codes + problem.at_codes @ best.theta)
     from_white = problem.at_codes - problem.at_codes[-1]
-    covariance = best.covariance[:-1, :-1]
-    error = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", from_white, covariance, from_white), 0.0))
-    leverage = np.einsum("ij,jk,ik->i", best.design, best.covariance, best.design)
+    shape_covariance = best.covariance[: len(best.theta), : len(best.theta)]
+    error = np.sqrt(np.maximum(_variances(from_white, shape_covariance), 0.0))
+    held_out_share = np.maximum(1 - _variances(best.design, best.covariance), 1e-6)
+    lack = best.lack_of_fit
+    light = strictly_rising(np.append(0.0, above / above[-1]))
+    off, level_error = _levels_about(best, float(above[-1]) * light[levels.code[1:]])
+    black_own = scale * problem.black_sigma * math.sqrt(float(best.covariance[-1, -1]))
+    black_common = float(np.linalg.norm(levels.common[0]))
+    # The black level is stated relative to white, which has an error of its own.
+    white_error = math.sqrt(max(_variances(problem.at_codes[-1:], shape_covariance)[0], 0.0))
     return ChannelFit(
-        light=strictly_rising(np.append(0.0, above / above[-1])),
+        light=light,
         white=float(above[-1]) * scale,
         black=best.black * scale,
-        error=np.append(0.0, error),
+        error=np.append(0.0, lack * error),
         levels=levels,
-        residual=best.misfit / np.maximum(1 - leverage, 1e-6) * problem.sigma / best.above,
+        residual=best.misfit / held_out_share * problem.sigma / best.above,
         noise_relative=noise,
         shape=best.shape.name,
         parameters=best.parameters,
+        black_error=math.hypot(black_own, black_common, best.black * scale * white_error),
+        residual_error=problem.sigma / best.above / np.sqrt(held_out_share),
+        level_off=off,
+        level_error=lack * level_error,
+        lack_of_fit=lack,
     )
+
+
+def _residual_noise(levels: measurements.MeasuredLevels, white: int) -> float:
+    """The relative noise of a reading where nothing was repeated: by the residuals of a first fit."""
+    first = _best_solution(levels, white, measurements.ASSUMED_NOISE)
+    noise = measurements.ASSUMED_NOISE * math.sqrt(first.square_per_freedom)
+    return max(noise, measurements.NOISE_FLOOR)
+
+
+def _variances(rows: FloatArray, covariance: FloatArray) -> FloatArray:
+    """The variance (n,) of each of the sums `rows` (n, parameters)."""
+    return np.asarray(np.einsum("ij,jk,ik->i", rows, covariance, rows))
+
+
+def _levels_about(best: "_Solution", fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far levels (n,) are from the fit, and how well each is known; both relative.
+
+    Their common causes are taken off. `fitted` (n,) is their light above black by the fit, in units
+    of white.
+    """
+    problem = best.problem
+    above = problem.light - problem.black - problem.common @ best.causes
+    off = above / fitted - 1
+    noise = np.hypot(problem.sigma, problem.black_sigma) / fitted
+    # White's own share of a cause is full scale's.
+    common = problem.common / fitted[:, None]
+    common = common - common[-1]
+    first = len(best.theta)
+    shared = _variances(common, best.covariance[first:-1, first:-1])
+    return off, np.sqrt(noise**2 + np.maximum(shared, 0.0))
 
 
 def strictly_rising(light: FloatArray) -> FloatArray:
@@ -167,7 +233,15 @@ def strictly_rising(light: FloatArray) -> FloatArray:
 
 
 def _best_solution(levels: measurements.MeasuredLevels, white: int, noise: float) -> _Solution:
-    return min((_solve(shape, _problem(shape, levels, white, noise)) for shape in SHAPES), key=lambda s: s.minus_log_evidence)
+    solutions: list[_Solution] = []
+    for shape in SHAPES:
+        problem = _problem(shape, levels, white, noise)
+        solutions.append(_solve(shape, problem, is_whole=False))
+        # Far from its place a stiff curve misfits and a soft one leads: from there on the whole range
+        # of stiffness is looked at again. Where that has not settled it is no solution.
+        again = _solve(shape, problem, is_whole=True)
+        solutions += [again] * again.has_settled
+    return min(solutions, key=lambda solution: solution.minus_log_evidence)
 
 
 def _problem(shape: Shape, levels: measurements.MeasuredLevels, white: int, noise: float) -> _Problem:
@@ -188,7 +262,8 @@ def _problem(shape: Shape, levels: measurements.MeasuredLevels, white: int, nois
         penalty, prior = np.pad(penalty, (0, 1)), np.pad(prior, (0, 1))
         prior[-1, -1] = 1 / PRIOR_SLOPE_SIGMA**2
     scale = levels.mean[-1] - levels.mean[0]
-    sigma = np.hypot(levels.standard_error(noise) / scale, BLACK_FLOOR)
+    floor = STATED_FLOOR if levels.has_errors else BLACK_FLOOR
+    sigma = np.hypot(levels.standard_error(noise) / scale, floor)
     return _Problem(
         at_levels=columns(at),
         at_codes=columns(codes),
@@ -200,6 +275,7 @@ def _problem(shape: Shape, levels: measurements.MeasuredLevels, white: int, nois
         sigma=sigma[1:],
         black=float(levels.mean[0] / scale),
         black_sigma=float(sigma[0]),
+        common=(levels.common[1:] - levels.common[0]) / scale,
     )
 
 
@@ -209,37 +285,48 @@ def _spline(place: FloatArray, knots: FloatArray, derivative: int = 0) -> FloatA
     return np.asarray(BSpline(padded, np.eye(len(knots) + 2), 3)(np.clip(place, 0, 1), nu=derivative))
 
 
-def _solve(shape: Shape, problem: _Problem) -> _Solution:
-    """Gauss-Newton steps; each of the first ones takes the stiffness with the largest evidence."""
+def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
+    """Gauss-Newton steps; each of the first ones takes the stiffness with the largest evidence.
+
+    It is looked for over its whole range, or beside that of the step before.
+    """
     black, stiffness = problem.black, math.nan
+    moved = math.inf
     start = np.maximum(problem.light - problem.black, 0.05 * np.maximum(problem.light, BLACK_FLOOR))
     normal = problem.at_levels.T @ problem.at_levels + 1e-6 * (problem.prior + problem.penalty)
     theta = np.asarray(np.linalg.solve(normal, problem.at_levels.T @ (np.log(start) - problem.log_base_levels)))
+    causes = np.zeros(problem.common.shape[1])
+    first = len(theta)
     for step in range(MAX_STEPS):
         above = np.exp(np.clip(problem.log_base_levels + problem.at_levels @ theta, -60, 10))
-        misfit = (problem.light - black - above) / problem.sigma
-        slope = problem.at_levels * (above / problem.sigma)[:, None]
-        design = np.hstack([slope, (problem.black_sigma / problem.sigma)[:, None]])
+        misfit = (problem.light - black - above - problem.common @ causes) / problem.sigma
+        slope = problem.at_levels * above[:, None]
+        dark = np.full((len(above), 1), problem.black_sigma)
+        design = np.hstack([slope, problem.common, dark]) / problem.sigma[:, None]
         shift = (black - problem.black) / problem.black_sigma
-        target = misfit + design @ np.append(theta, shift)
+        target = misfit + design @ np.concatenate([theta, causes, [shift]])
         if step < STIFFNESS_STEPS:
-            stiffness = _stiffest(problem, design, target, stiffness)
+            stiffness = _stiffest(problem, design, target, math.nan if is_whole else stiffness)
         evidence, precision = _evidence(problem, design, target, stiffness)
         covariance = np.linalg.inv(precision)
         new = covariance @ (design.T @ target)
-        moved = float(np.abs(problem.at_levels @ (new[:-1] - theta)).max())
-        theta, black = new[:-1], max(problem.black + new[-1] * problem.black_sigma, 0.0)
+        moved = float(np.abs(problem.at_levels @ (new[:first] - theta)).max())
+        theta, causes = new[:first], new[first:-1]
+        black = max(problem.black + new[-1] * problem.black_sigma, 0.0)
         if moved < SETTLED and step >= 2:
             break
-    return _Solution(problem, shape, theta, black, evidence, np.asarray(covariance), design, misfit, above)
+    return _Solution(
+        problem, shape, theta, causes, black, evidence, np.asarray(covariance), design, misfit, above, moved < SETTLED
+    )
 
 
 def _evidence(problem: _Problem, design: FloatArray, target: FloatArray, stiffness: float) -> tuple[float, FloatArray]:
     """Minus twice the log marginal likelihood of the linearised problem, up to a constant, and the posterior precision."""
     prior = math.exp(stiffness) * problem.penalty + problem.prior
     precision = design.T @ design
-    precision[:-1, :-1] += prior
-    precision[-1, -1] += 1.0
+    count = len(prior)
+    precision[:count, :count] += prior
+    precision[count:, count:] += np.eye(len(precision) - count)
     root = np.linalg.cholesky(precision)
     explained = np.linalg.solve(root, design.T @ target)
     determinants = 2 * np.log(np.diag(root)).sum() - np.linalg.slogdet(prior)[1]
@@ -290,7 +377,7 @@ def calibrate_photometric(
     names = measurements.PRIMARIES if "r" in fits else ("w",)
     black = float(np.mean([fits[name].black for name in names]))
     columns = {name: black + fits[name].white * fits[name].light for name in names}
-    noise = max(fits[name].noise_relative for name in columns)
+    noise = max(fits[name].levels.reading_noise(fits[name].noise_relative) for name in columns)
     drift_note = "not known: nothing was repeated" if math.isnan(drift) else f"{100 * drift:+.2f} % over the run"
     text = f"fitted to {measured.name}, sha256 {data.sha256}"
     if output.with_suffix(".csv").resolve() == measured.resolve():
@@ -312,9 +399,10 @@ def calibrate_photometric(
         crosstalk = {decade: float(more[place]) for decade, place in decades.items()}
         at = [*decades.values()]
         # A channel's errors are relative to its white, which is as well known as its readings are many.
-        off = {
-            name: np.hypot(one.error[at], one.noise_relative / math.sqrt(one.levels.count[-1])) for name, one in fits.items()
-        }
+        off: dict[str, FloatArray] = {}
+        for name, one in fits.items():
+            white_error = one.levels.standard_error(one.noise_relative)[-1] / one.levels.mean[-1]
+            off[name] = np.hypot(one.error[at], white_error)
         errors = [fits[name].white * fits[name].light[at] / together[at] * off[name] for name in measurements.PRIMARIES]
         error = np.sqrt(np.square([*errors, off["w"]]).sum(axis=0))
         unsure = dict(zip(decades, (100 * error).tolist(), strict=True))
@@ -334,14 +422,23 @@ def calibrate_photometric(
 def errors_of(fits: dict[str, ChannelFit]) -> ErrorsTable | None:
     """How far white's levels are from the fit, and how well each is known; None where white or its repeats are missing."""
     fit = fits.get("w")
-    if fit is None or "r" in fits or math.isnan(fit.levels.relative_noise):
+    if fit is None or "r" in fits:
         return None
-    levels, fitted = fit.levels, fit.white * fit.light[fit.levels.code[1:]]
-    error = np.hypot(levels.standard_error(fit.noise_relative), levels.standard_error(fit.noise_relative)[0])[1:]
-    off = (levels.mean[1:] - levels.mean[0]) / fitted - 1
-    rounded = [[float(f"{x:.6g}") for x in part] for part in (fit.light[levels.code[1:]], off, error / fitted)]
-    black = float(f"{levels.standard_error(fit.noise_relative)[0] / fit.white:.6g}")
-    return ErrorsTable(light=rounded[0], off=rounded[1], relative=rounded[2], black=black, dof=float((levels.count - 1).sum()))
+    levels = fit.levels
+    if math.isnan(levels.relative_noise) and not levels.has_errors:
+        return None
+    return ErrorsTable(
+        light=_rounded(fit.light[levels.code[1:]]),
+        off=_rounded(fit.level_off),
+        relative=_rounded(fit.level_error),
+        dof=float((levels.count - 1).sum()),
+        black=_rounded(fit.black_error / fit.white)[0],
+        common=_rounded(levels.standard_error(fit.noise_relative)[0] / fit.white)[0],
+    )
+
+
+def _rounded(values: FloatArray | float) -> list[float]:
+    return [float(f"{value:.6g}") for value in np.atleast_1d(values).tolist()]
 
 
 def fit_all(data: measurements.Measurements) -> dict[str, ChannelFit]:
@@ -365,8 +462,13 @@ def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
     return {
         "codes": len(count),
         "repeats": {"min": int(count.min()), "max": int(count.max())},
-        "black_level": {"relative": fit.black / fit.white, "unit": fit.black},
-        "noise_relative": fit.noise_relative,
+        "black_level": {
+            "relative": fit.black / fit.white,
+            "unit": fit.black,
+            "error": fit.black_error / fit.white,
+        },
+        "noise_relative": fit.levels.reading_noise(fit.noise_relative),
+        "lack_of_fit": fit.lack_of_fit,
         "shape": fit.shape,
         "parameters": fit.parameters,
         "error_percent": {f"1e-{decade}": 100 * float(fit.error[place]) for decade, place in _decades(fit).items()},
@@ -378,9 +480,11 @@ def held_out(fit: ChannelFit) -> dict[str, float]:
     """The errors of a fit's levels, each held out of the fit, from white to three decades below; light is above black."""
     shown = fit.light[fit.levels.code[1:]] >= 10.0 ** -DECADES[-1]
     residual = np.abs(fit.residual[shown])
+    sigmas = float(np.percentile(residual / fit.residual_error[shown], 95))
     found = {"rms": np.sqrt((residual**2).mean()), "p95": np.percentile(residual, 95), "max": residual.max()}
     percent = {f"{name}_percent": 100 * float(value) for name, value in found.items()}
-    return percent | {f"{name}_mag": MAG_PER_RELATIVE * float(found[name]) for name in ("rms", "max")}
+    mag = {f"{name}_mag": MAG_PER_RELATIVE * float(found[name]) for name in ("rms", "max")}
+    return percent | mag | {"p95_sigmas": sigmas}
 
 
 MIN_DRAWN_LIGHT = 1e-5  # relative to white, as drawn
@@ -396,9 +500,10 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
     fits = fit_all(measurements.read_measurements(measured, bits))
     worst = max(fits.values(), key=lambda fit: held_out(fit)["rms_percent"])
     left = held_out(worst)
+    repeats = worst.levels.reading_noise(worst.noise_relative)
     finding = (
         f"Levels held out of the fit are {left['rms_percent']:.2g} % ({left['rms_mag']:.2g} mag) rms off,"
-        f" {left['max_percent']:.2g} % at the maximum; a patch repeats to {100 * worst.noise_relative:.2g} %"
+        f" {left['max_percent']:.2g} % at the maximum; a patch repeats to {100 * repeats:.2g} %"
     )
     note = "Lines: the fit. Dots: measured above, held out of the fit below. Dotted: black. Bands: the fit's error."
     with chart(path, finding, panels=2, note=note) as (response, residual):

@@ -261,7 +261,8 @@ def _of_files(file: BenchFile, figures: Figures, value: Deviations, missing: lis
         join = CubicSpline(light, np.eye(len(light)), bc_type="natural")(np.clip(figures.log_light, light[0], light[-1]))
         join = join - np.eye(len(light))[-1]  # relative to white, whose light is full scale
         value.levels[0] += join @ np.array(errors.off)
-        black = errors.black / np.array(errors.light)  # common to all levels
+        common = errors.black if errors.common is None else errors.common
+        black = common / np.array(errors.light)  # common to all levels
         own, source = np.sqrt(np.maximum(relative**2 - black**2, 0.0)), f"levels of {name}"
         yield Effect(
             Input("response", "Student t", source, len(light) + 1, float(np.median(relative)), "relative", errors.dof),

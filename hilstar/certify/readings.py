@@ -18,7 +18,7 @@ from hilstar.bench.cameras import bench_camera, tracker_camera, tracker_psf
 from hilstar.calibrate.first_light import image_sources
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.focus import seen_sharpness
-from hilstar.calibrate.first_light.photometry import Assumed, LatticeRatio, Photometer, Readings
+from hilstar.calibrate.first_light.photometer import Assumed, Photometer, Readings
 from hilstar.calibrate.geometric.calibration import dot_sigma_px
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen
 from hilstar.calibrate.latency import pair, swap_to_square_ms
@@ -39,6 +39,7 @@ PAIRS = 4  # of images, for each ratio of two lattices
 DOT_LIGHT = 0.25  # relative to white: a dot of nine pixels at white could saturate the tracker
 WATCHED_S = 5.0
 THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
+NO_LIGHT_DN_PER_S = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,15 +220,13 @@ class ImageReader:
         # Patches take the same time each.
         t_s = np.linspace(0.0, (self.now_ns() - start_ns) / NS_PER_S, len(codes))
         level = readings.light[codes == 0].mean()
-        common, dof = _of_ratios(readings, meter, gain)
         return LightReadings(
             codes,
             (readings.above_black + level) * gain,
             t_s,
             square_px=(meter.field.left, meter.field.top, meter.field.side),
-            common=common,
-            common_dof=dof,
-            noise_shape=_noise_shape(readings, meter, gain),
+            common=_common(readings),
+            noise_shape=_noise_shape(readings),
         )
 
     def dots(self, x_px: IntArray, y_px: IntArray, images: int) -> DotReadings:
@@ -271,55 +270,26 @@ class ImageReader:
         return delays_of(self.source.diode(self.file, WATCHED_S), self.file)
 
 
-def _noise_relative(light_e: FloatArray, meter: Photometer) -> FloatArray:
-    """The noise (n,) of light summed over a lattice's field, relative to it, by the detector as stated.
-
-    `light_e` (n,) is that sum above black, e-. Its own shot noise counts, and each pixel's noise in it and in its black image.
-    """
-    detector = meter.context.file.config.tracker.detector
-    pixels = (meter.field.rows.stop - meter.field.rows.start) * (meter.field.columns.stop - meter.field.columns.start)
-    pixel_e2 = float(detector.noise(0.0, meter.exposure_s).total_e2)
-    known_e = np.maximum(light_e, 1.0)
-    return np.asarray(np.sqrt(known_e + 2 * pixels * pixel_e2) / known_e)
-
-
-def _noise_shape(readings: Readings, meter: Photometer, gain_e_per_dn: float) -> FloatArray:
+def _noise_shape(readings: Readings) -> FloatArray:
     """The noise (n,) of readings relative to their light, 1 where they are black.
 
     A lattice of few dots collects less light in the same pixels than a dense one, and knows its light less well.
     """
     lit = np.flatnonzero([patch.code for patch in readings.patches])
-    dots = np.array([meter.field.lit(int(period)) for period in readings.period[lit]])
-    a_dot_e = readings.above_black[lit] * readings.exposure_s * gain_e_per_dn
     shape = np.ones(len(readings.patches))
-    shape[lit] = _noise_relative(a_dot_e * dots, meter)
+    shape[lit] = readings.sigma[lit] / np.maximum(readings.above_black[lit], NO_LIGHT_DN_PER_S)
     return shape
 
 
-def _of_ratios(readings: Readings, meter: Photometer, gain_e_per_dn: float) -> tuple[FloatArray | None, float]:
-    """What the errors of the lattices' ratios do to readings, and its freedom.
-
-    (n, ratios), relative to light: each ratio's noise by its lattices' light, times what the scatter of all ratios' pairs is
-    relative to that.
-    """
-    if not readings.links:
-        return None, math.inf
-    ratios = np.log([link.pairs for link in readings.links])
-    pairs = ratios.shape[1]
-    by_light = np.array([_ratio_noise(link, readings, meter, gain_e_per_dn) for link in readings.links])
-    factor = math.sqrt(float((ratios.var(axis=1, ddof=1) / by_light**2).mean()))
-    error = factor * by_light / math.sqrt(pairs)
-    # Light of a lattice is divided by the ratios of all that are sparser.
-    divided = readings.period[:, None] <= np.array([link.dense for link in readings.links])
-    return np.asarray(-error * divided), float(len(ratios) * (pairs - 1))
-
-
-def _ratio_noise(link: LatticeRatio, readings: Readings, meter: Photometer, gain_e_per_dn: float) -> float:
-    """The noise of one pair of images' ratio of two lattices, relative to it."""
-    of_patch = np.array([patch == link.patch for patch in readings.patches])
-    a_dot_e = float(readings.above_black[of_patch].mean()) * readings.exposure_s * gain_e_per_dn
-    dots = np.array([meter.field.lit(period) for period in (link.dense, link.sparse)])
-    return float(np.linalg.norm(_noise_relative(a_dot_e * dots, meter)))
+def _common(readings: Readings) -> FloatArray:
+    """What readings share, relative to their light above black: (n, causes), one standard error of each."""
+    codes = np.array([patch.code for patch in readings.patches])
+    # What shifts black as well shifts no light above it.
+    black = readings.common[codes == 0].mean(axis=0)
+    above = np.maximum(readings.above_black, NO_LIGHT_DN_PER_S)
+    relative = (readings.common - black) / above[:, None]
+    relative[codes == 0] = 0.0
+    return np.asarray(relative)
 
 
 Reader = VirtualReader | ImageReader

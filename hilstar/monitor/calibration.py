@@ -275,7 +275,8 @@ class NoiseTable(Table, frozen=True):
 class ErrorsTable(Table, frozen=True):
     """[errors]: at the levels measured, by their light relative to white: measured over fitted light less 1, and its error.
 
-    `black` is the error of code 0 over white: it is part of every level's, and all that is common to them.
+    `black` is the error of the black level over white. `common` is that of the readings of code 0 among the others: it is part
+    of every level's light above black, and all that is common to them. Without it, it is `black`.
     """
 
     light: list[Annotated[float, Meta(gt=0, le=1)]]
@@ -283,6 +284,7 @@ class ErrorsTable(Table, frozen=True):
     relative: list[Share]
     dof: Annotated[float, Meta(gt=0, le=1e9)]
     black: Share = 0.0
+    common: Share | None = None
 
 
 class NotesTable(Table, frozen=True):

@@ -28,6 +28,7 @@ from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import Levels
 from hilstar.rotation import from_matrix, to_matrix
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
+from hilstar.tracker.rounding import STEP_PHASES, before_adc_dn, rounded_light
 from hilstar.units import MAG_PER_RELATIVE, magnitude
 
 RANDOM_ATTITUDES, POINTED_ATTITUDES, SEED = 40, 60, 3  # at random, and at bright stars: a narrow field has few others
@@ -47,11 +48,15 @@ ONE_SIDED = 1.645  # sigmas of 95 %
 
 @dataclass(frozen=True)
 class StarSpot:
-    """A star in the tracker's image: its sigma along x and y, tracker px, and what the detector adds."""
+    """A star in the tracker's image: its sigma along x and y, tracker px, and what the detector adds.
+
+    The image is the mean of `frames`.
+    """
 
     sigma_px: tuple[float, float]
     gain_e_per_dn: float
     prnu: float
+    frames: int = 1
 
     @classmethod
     def of(cls, context: StepContext) -> "StarSpot":
@@ -109,9 +114,24 @@ class StarSpot:
         """The noise (n,) of stars of `dn` (n,) in all, magnitudes, over a background of `noise_dn` in a pixel."""
         shares, _ = self._shares
         light = np.maximum(dn, 1e-9)
-        variance = light * self.window_share / self.gain_e_per_dn + shares.size * noise_dn**2
+        photons = light * self.window_share / (self.gain_e_per_dn * self.frames)
+        variance = photons + shares.size * noise_dn**2
         variance += (self.prnu * light) ** 2 * float((shares**2).sum())
+        variance += (self.rounded_dn(light, noise_dn) ** 2).mean(axis=1)
         return np.asarray(MAG_PER_RELATIVE * np.sqrt(variance) / (light * self.window_share))
+
+    def rounded_dn(self, dn: FloatArray, noise_dn: float) -> FloatArray:
+        """What the ADC's rounding adds to windows of stars of `dn` (n,) in all, DN.
+
+        (n, STEP_PHASES), see `rounded_light`. `noise_dn` is that of a pixel less its dark frame's, in the mean of the
+        frames.
+        """
+        shares, _ = self._shares
+        dark_dn = before_adc_dn(noise_dn**2 * self.frames / 2)
+        rounded = np.zeros((len(dn), STEP_PHASES))
+        for star, light_dn in enumerate(dn.tolist()):
+            rounded[star] = rounded_light(light_dn * shares.ravel(), dark_dn, 1 / self.gain_e_per_dn)
+        return shares.size * rounded
 
     def place_noise_px(self, dn: FloatArray, noise_dn: float) -> FloatArray:
         """The noise (n,) of the places of such stars along one axis, px: that of the window's first moment."""
@@ -121,7 +141,8 @@ class StarSpot:
         pull2 = (window * offset) ** 2
         slope = float((shares * window * (1 - offset**2 / sigma2)).sum())
         light = np.maximum(dn, 1e-9)
-        variance = noise_dn**2 * float(pull2.sum()) + light / self.gain_e_per_dn * float((pull2 * shares).sum())
+        photons = light / (self.gain_e_per_dn * self.frames)
+        variance = noise_dn**2 * float(pull2.sum()) + photons * float((pull2 * shares).sum())
         variance += (self.prnu * light) ** 2 * float((pull2 * shares**2).sum())
         return np.asarray(np.sqrt(variance) / (light * slope))
 
@@ -164,7 +185,8 @@ class StarsSeen:
     """Isolated stars that the tracker sees: places by the sky (n, 2), tracker px, and the residuals of their images (n, 2).
 
     `place_noise_px` (n,) is the noise of a residual along one axis. `dn` is the whole light of each (n,), `e_per_s` the light
-    asked for, `noise_mag` its error, infinite where the tracker saturated. `screen` (n, 2) is the place on the screen, -1 to 1;
+    asked for, `noise_mag` its error, infinite where the tracker saturated. `rounding_mag` (n, STEP_PHASES) is the part of it
+    that the ADC's rounding does to all stars together. `screen` (n, 2) is the place on the screen, -1 to 1;
     `codes_mag` (n,) how much too faint the codes are. `frames` images of each field were averaged.
     """
 
@@ -175,6 +197,7 @@ class StarsSeen:
     dn: FloatArray
     e_per_s: FloatArray
     noise_mag: FloatArray
+    rounding_mag: FloatArray
     screen: FloatArray
     codes_mag: FloatArray
     lost: int
@@ -403,8 +426,10 @@ def _compared(context: StepContext, looked: list[DarkSubtracted], wanted: Expect
     peak_sigmas = brighter * expected_dn * spot.peak_share / noise_dn
     chosen = nearest[matched]
     dn = found.flux[chosen] / spot.window_share
-    shared = dataclasses.replace(spot, gain_e_per_dn=spot.gain_e_per_dn * len(looked))
+    shared = dataclasses.replace(spot, frames=len(looked))
     noise_mag = shared.light_noise_mag(dn, noise_dn)
+    whole_dn = np.maximum(dn * spot.window_share, 1e-9)
+    rounded = shared.rounded_dn(dn, noise_dn) / whole_dn[:, None]
     saturated = found.peak[chosen] > MAX_FILL * context.full_dn - looked[0].floor_dn
     return StarsSeen(
         hip=wanted.hip[matched],
@@ -414,6 +439,7 @@ def _compared(context: StepContext, looked: list[DarkSubtracted], wanted: Expect
         dn=dn,
         e_per_s=wanted.e_per_s[matched],
         noise_mag=np.where(saturated, np.inf, noise_mag),
+        rounding_mag=MAG_PER_RELATIVE * rounded,
         screen=wanted.screen[matched],
         codes_mag=wanted.codes_mag[matched],
         lost=int((~near & (peak_sigmas > LOST_MARGIN * THRESHOLD_SIGMA)).sum()),

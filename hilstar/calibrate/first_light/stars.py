@@ -240,8 +240,16 @@ def scale(context: StepContext) -> StepOutcome:
     found = scale_of(white, ratios, noise_mag)
     scatter = seen.scatter(np.asarray(magnitude(ratios)), used)
     by_mag = float(magnitude(found.flux_at_white_e_per_s / white))
-    error_mag = math.hypot(MAG_PER_RELATIVE * (found.relative_error or 0.0), SYSTEMATIC_MAG)
-    trend_mag, trend_error_mag = trend(wanted, np.asarray(magnitude(ratios)), np.sqrt(found.weights))
+    # The ADC rounds all stars by where its one dark level is.
+    rounding_mag = found.weights @ seen.rounding_mag[used] / found.weights.sum()
+    rounding_rms_mag = float(np.sqrt((rounding_mag**2).mean()))
+    by_readings_mag = MAG_PER_RELATIVE * (found.relative_error or 0.0)
+    error_mag = math.hypot(by_readings_mag, SYSTEMATIC_MAG, rounding_rms_mag)
+    weight = np.sqrt(found.weights)
+    trend_mag, trend_error_mag = trend(wanted, np.asarray(magnitude(ratios)), weight)
+    rounding_trends_mag = [trend(wanted, one, weight)[0] for one in seen.rounding_mag[used].T]
+    rounding_trend_mag = float(np.sqrt(np.mean(np.square(rounding_trends_mag))))
+    trend_error_mag = math.hypot(trend_error_mag, rounding_trend_mag)
     figures: dict[str, Figure] = {
         "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
         "in_bench_file_e_per_s": white,

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation
+from scipy.special import log_ndtr
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.build import bench_calibration, calibration_source
@@ -67,18 +68,28 @@ class DotLight:
 class UniformityMap:
     """Light against place: a grid (rows, columns), one field where light is even, and its value at each dot (n,), median 1.
 
-    `left_mag` is the rms error on held-out dots; `used` marks the dots that are no outliers.
+    `left_mag` is the rms error on held-out dots, and `left_error_mag2` the standard error of its
+    square; `used` marks the dots that are no outliers. `fit_mag` is the standard error of the fit at a
+    dot; `missed_mag` the rms of what a finer map may show and this one does not.
     """
 
     grid: FloatArray
     at_dots: FloatArray
     left_mag: float
+    left_error_mag2: float
     used: BoolArray
+    fit_mag: float
+    missed_mag: float
 
     def error_mag(self, noise_mag: float) -> float:
-        """The map's standard error at a dot: that of its fit, and what dots differ from it by beyond their noise."""
-        shape = math.sqrt(max(self.left_mag**2 - noise_mag**2, 0.0))
-        return math.hypot(self.left_mag * math.sqrt(self.grid.size / max(int(self.used.sum()), 1)), shape)
+        """The map's standard error at a dot: that of its fit, and of what its form lacks.
+
+        That is seen twice: by a finer map, and by held-out dots, which differ from this one by more
+        than their noise. The larger counts.
+        """
+        beyond_mag2 = self.left_mag**2 - noise_mag**2 - self.fit_mag**2
+        form_mag = math.sqrt(_not_negative(beyond_mag2, self.left_error_mag2))
+        return math.hypot(self.fit_mag, max(form_mag, self.missed_mag))
 
     @property
     def is_even(self) -> bool:
@@ -100,6 +111,11 @@ def uniformity(context: StepContext) -> StepOutcome:
     against = map_of(dots, dots.light / as_known, size_px)
     found = map_of(dots, dots.light, size_px)
     figures = _figures(context, dots, found, against)
+    if against.is_even:
+        # The bench file keeps its map, and the error is that map's.
+        figures["map_error_mag"] = math.hypot(against.error_mag(dots.noise_mag), against.rms_mag)
+    elif found.is_even:
+        figures["map_error_mag"] = math.hypot(found.error_mag(dots.noise_mag), found.rms_mag)
     picture = context.session / "uniformity.svg"
     line = f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by {found.left_mag:.4f} mag"
     line += f" (noise {dots.noise_mag:.4f})"
@@ -134,9 +150,11 @@ def warm_up(context: StepContext) -> StepOutcome:
     if not context.watched_s:
         how = "give --warm-up MINUTES, 30 for most monitors, right after the monitor was switched on"
         return StepOutcome("skipped", f"not measured, the monitor is taken to be warm: {how}")
-    code, (_, period, _) = dot_code(context), _spacing(context)
-    codes = _shown([period // 2, period // 2], period, code, context.resolution_px)
+    period = _spacing(context).period
+    firsts = [period // 2, period // 2]
     dark, file, lit, number = context.read(context.dark()), context.file, np.zeros(0, dtype=np.bool_), 0
+    code, _ = _unsaturated(context, dark, "white", [firsts], period)
+    codes = _shown(firsts, period, code, context.resolution_px)
     cold, beside = dark < HOT_FILL * context.full_dn, lit
 
     def read() -> float:
@@ -241,9 +259,37 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
     return figures
 
 
+def _unsaturated(
+    context: StepContext,
+    dark: FloatArray,
+    name: str,
+    lattices: list[list[int]],
+    period: int,
+) -> tuple[int, list[DarkSubtracted]]:
+    """The images of lattices, each from its first dot (x, y) on, and their code.
+
+    It is the brightest of the codes from the focus's down at which no dot saturates the tracker: the
+    focus saw other dots, and light differs from place to place. Raises InputError where none is left.
+    """
+    code = dot_code(context)
+    while True:
+        looks: list[DarkSubtracted] = []
+        for number, firsts in enumerate(lattices):
+            codes = _shown(firsts, period, code, context.resolution_px)
+            looks.append(context.look(Pattern(f"{name}_{code:05}_{number:03}", codes), dark))
+            if context.is_too_bright(looks[-1]):
+                break
+        else:
+            return code, looks
+        code = context.darker(code)
+
+
 def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
-    """Measure dots on lattices over the whole screen; their light, and the images. Raises InputError for too few whole dots."""
-    geometry, code = context.real_geometry(), dot_code(context)
+    """Measure dots on lattices over the whole screen; their light, and the images.
+
+    Raises InputError for too few whole dots.
+    """
+    geometry = context.real_geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     sigma_px, period, reach = _spacing(context)
     width, height = geometry.tracker.resolution_px
@@ -253,25 +299,26 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     dark = context.read(dark_path)
     bad = dark > HOT_FILL * context.full_dn
     bad[[0, -1]], bad[:, [0, -1]] = True, True  # a dot that reaches the detector's edge has lost light
-    parts, paths, noise_dn = [], [dark_path], 0.0
-    for number, shift in enumerate(SHIFTS):
-        firsts = [period // 2 + period // 2 * half for half in shift]
-        looked = context.look(Pattern(f"lattice_{number:03}", _shown(firsts, period, code, context.resolution_px)), dark)
-        paths.append(looked.path)
-        _check_brightness(context, looked, code)
+    lattices = [[period // 2 + period // 2 * half for half in shift] for shift in SHIFTS]
+    _, looks = _unsaturated(context, dark, "lattice", lattices, period)
+    parts, noise_dn = [], 0.0
+    size = np.array(context.resolution_px)
+    for firsts, looked in zip(lattices, looks, strict=True):
         noise_dn = noisiest_background(looked.image).noise
-        size, first = np.array(context.resolution_px), np.array(firsts)
+        first = np.array(firsts)
         parts.append(_sums(seen, looked.image, bad, firsts=first, period=period, reach=reach, size=size))
+    paths = [dark_path, *(looked.path for looked in looks)]
     columns, rows, light = (np.concatenate(part) for part in zip(*parts, strict=True))
     lit = light > 0
     if lit.sum() < MIN_DOTS:
-        raise InputError(f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed; look at the geometry and the focus")
+        few = f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed"
+        raise InputError(f"{few}; look at the geometry and the focus")
     detector = context.file.config.tracker.detector
     dn = float(np.median(light[lit]))
     pixels = math.pi * (reach * ratio) ** 2
-    # The dark frame adds an image's noise; PRNU averages over the pixels of a dot.
+    # The noise of the dark frame is in that of the image above it; PRNU averages over a dot's pixels.
     shared = detector.prnu**2 / (4 * math.pi * sigma_px**2)
-    noise = math.sqrt((dn / detector.gain_e_per_dn + 2 * pixels * noise_dn**2) / dn**2 + shared)
+    noise = math.sqrt((dn / detector.gain_e_per_dn + pixels * noise_dn**2) / dn**2 + shared)
     return DotLight(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
 
 
@@ -327,8 +374,50 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
     worse = [(each - best)[used] for each in squares]
     place = next(k for k, each in enumerate(worse) if each.mean() <= SURE * each.std() / math.sqrt(len(each)))
     grid = _fitted(relative[used], designs[place][used], shapes[place])
-    left = MAG_PER_RELATIVE * math.sqrt(float(squares[place][used].mean()))
-    return UniformityMap(grid.reshape(shapes[place]), designs[place] @ grid, left, used)
+    square = float(squares[place][used].mean())
+    count = int(used.sum())
+    error = float(squares[place][used].std()) / math.sqrt(count)
+    freedoms = _Freedoms(designs, shapes, used)
+    missed = 0.0
+    if finer := range(place + 1, len(shapes)):
+        nearest = min(finer, key=lambda k: float(squares[k][used].mean()))
+        gain = (squares[place] - squares[nearest])[used]
+        # A finer map errs more by its fields' own noise, which hides as much of what it shows.
+        noise = square * (freedoms.of(nearest) - freedoms.of(place)) / count
+        missed = _not_negative(float(gain.mean()) + noise, float(gain.std()) / math.sqrt(count))
+    return UniformityMap(
+        grid.reshape(shapes[place]),
+        designs[place] @ grid,
+        left_mag=MAG_PER_RELATIVE * math.sqrt(square),
+        left_error_mag2=MAG_PER_RELATIVE**2 * error,
+        used=used,
+        fit_mag=MAG_PER_RELATIVE * math.sqrt(square * freedoms.of(place) / count),
+        missed_mag=MAG_PER_RELATIVE * math.sqrt(missed),
+    )
+
+
+def _not_negative(found: float, error: float) -> float:
+    """The mean of a square that was found as `found` with a normal `error`, and cannot be negative."""
+    if error <= 0:
+        return max(found, 0.0)
+    place = found / error
+    log_ratio = -(place**2) / 2 - float(log_ndtr(place)) - math.log(2 * math.pi) / 2
+    return max(found + error * math.exp(log_ratio), 0.0)
+
+
+class _Freedoms(NamedTuple):
+    """The designs of maps (dots, fields) with their shapes, and the dots that are used."""
+
+    designs: list[Any]
+    shapes: list[tuple[int, int]]
+    used: BoolArray
+
+    def of(self, place: int) -> float:
+        """How many fields the dots determine: the trace of the fit's matrix from light to map."""
+        design = self.designs[place][self.used]
+        normal = (design.T @ design).toarray()
+        fit = np.linalg.solve(normal + _smoothness(self.shapes[place]), normal)
+        return float(np.trace(fit))
 
 
 def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, int]) -> Any:
@@ -352,14 +441,20 @@ def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
 
 def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArray:
     """The fields (rows * columns,) by least squares; a field without dots follows its neighbours."""
-    number = np.arange(math.prod(shape)).reshape(shape)
-    joined = [(number[1:], number[:-1]), (number[:, 1:], number[:, :-1])]
-    normal = (design.T @ design).toarray()
-    for a, b in ((one.ravel(), other.ravel()) for one, other in joined):
-        np.add.at(normal, (np.concatenate([a, b]), np.concatenate([a, b])), JOINED)
-        np.add.at(normal, (np.concatenate([a, b]), np.concatenate([b, a])), -JOINED)
+    normal = (design.T @ design).toarray() + _smoothness(shape)
     found = np.linalg.solve(normal, design.T @ light)
     return np.asarray(np.maximum(found, light.min() / 2))  # a field that no dot reaches has light, too
+
+
+def _smoothness(shape: tuple[int, int]) -> FloatArray:
+    """The penalty (fields, fields) on differences between neighbouring fields."""
+    number = np.arange(math.prod(shape)).reshape(shape)
+    penalty = np.zeros((number.size, number.size))
+    for one, other in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1])):
+        a, b = one.ravel(), other.ravel()
+        np.add.at(penalty, (np.concatenate([a, b]), np.concatenate([a, b])), JOINED)
+        np.add.at(penalty, (np.concatenate([a, b]), np.concatenate([b, a])), -JOINED)
+    return penalty
 
 
 def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> BoolArray:

@@ -19,6 +19,7 @@ from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.build import bench_calibration
 from hilstar.bench.cameras import bench_camera, tracker_camera
 from hilstar.bench.config.hardware import Monitor
+from hilstar.certify.readings import white_of
 from hilstar.monitor.calibration import read_toml
 from hilstar.units import ARCSEC_PER_RAD, magnitude
 from tests.support.any_bench.draw import DrawnBench, true_light
@@ -154,7 +155,8 @@ def _light(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     """Light of white, electrons per second, at pixels (n,) of the image."""
     monitor = file.config.monitor
     grid = bench_calibration(file.config, file.folder).uniformity_map(monitor.resolution_px)
-    white = file.config.render.flux_at_white_e_per_s or 1.0
+    # A scale that agrees with the bench file's writes no key.
+    white = white_of(file)
     if grid is None:
         return np.full(len(x_px), white)
     columns, rows = np.rint(x_px).astype(np.intp), np.rint(y_px).astype(np.intp)

@@ -10,12 +10,14 @@ from scipy.special import ndtr
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.image_sources import ImageSource, VirtualBench
-from hilstar.calibrate.first_light.photometry import (
+from hilstar.calibrate.first_light.photometer import (
     Assumed,
     Photometer,
-    exponent,
     field_for,
     peak_shares,
+)
+from hilstar.calibrate.first_light.photometry import (
+    exponent,
     photometry,
     plan_for,
     response_error_mag,

@@ -10,8 +10,9 @@ from hilstar.calibrate.first_light.context import StepContext, rewrite
 from hilstar.calibrate.first_light.image_sources import VirtualBench
 from hilstar.calibrate.first_light.photometry import photometry
 from hilstar.calibrate.first_light.stars import scale, verify
-from hilstar.calibrate.first_light.uniformity import DotLight, map_of, uniformity
+from hilstar.calibrate.first_light.uniformity import DotLight, map_of, uniformity, warm_up
 from hilstar.monitor.calibration import load_calibration, with_uniformity
+from hilstar.units import magnitude
 from tests.support.benches import TWIN, bench_text
 
 SIZE_PX = (640, 480)
@@ -41,12 +42,23 @@ def charts_of_one(request, grid):
         request.getfixturevalue("without_charts")
 
 
-def did(folder, step, patches=0):
+def did(folder, step, patches=0, known=None, watched_s=0.0):
     """What a step comes to, with the bench file rewritten as a session does it."""
     file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
     source = VirtualBench(file, true, 0)
     try:
-        outcome = step(StepContext(file, folder, folder / step.__name__, source, {}, {}, patches))
+        outcome = step(
+            StepContext(
+                file,
+                folder,
+                folder / step.__name__,
+                source,
+                known or {},
+                {},
+                patches,
+                watched_s=watched_s,
+            )
+        )
     finally:
         source.close()
     rewrite(file, outcome.changes)
@@ -146,3 +158,41 @@ def test_dots_that_differ_from_one_to_the_next_are_a_finding(tmp_path):
     found = did(folder, uniformity)
     assert found.verdict == "failed"
     assert "far above" in found.line
+
+
+@pytest.mark.parametrize("fall", [0.0, 0.004, 0.012, 0.05])
+def test_unevenness_that_no_map_shows_for_sure_is_in_the_error(fall):
+    """Dots over a small part of a screen whose light falls towards its sides, down to less than their noise shows."""
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(200, 440, 8), np.arange(150, 330, 8)))
+    true = 1 - fall * ((x / 320 - 1) ** 2 + (y / 240 - 1) ** 2) - fall * (x / 320 - 1)
+    sigmas = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        light = true * rng.normal(1, 0.005, x.shape)
+        found = map_of(DotLight(x, y, light, 0.0054), light, SIZE_PX)
+        off_mag = np.std(magnitude(found.at_dots / true))
+        error_mag = found.error_mag(0.0054)
+        assert error_mag > 0
+        sigmas.append(off_mag / error_mag)
+    assert max(sigmas) < 3
+    # No error is worth anything that is many times the difference.
+    assert np.median(sigmas) > (0.2 if fall else -1)
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_dots_brighter_than_those_of_the_focus_are_shown_in_a_darker_code(tmp_path):
+    """The step ended there, and sent its user back to a focus that was right."""
+    folder = planted(tmp_path, VIGNETTING)
+    found = did(folder, uniformity, known={"focus.dot_code": 1023})
+    assert found.verdict == "done", found.line
+    names = {path.stem.rpartition("_")[0] for path in found.files if path.stem.startswith("lattice")}
+    assert len(names) == 1
+    assert names != {"lattice_01023"}
+    assert found.figures["truth_rms_mag"] < MAP_MAG
+
+
+@pytest.mark.usefixtures("without_charts")
+def test_white_is_watched_in_a_code_that_does_not_saturate(tmp_path):
+    folder = planted(tmp_path, None)
+    found = did(folder, warm_up, known={"focus.dot_code": 1023}, watched_s=600.0)
+    assert found.verdict == "done", found.line

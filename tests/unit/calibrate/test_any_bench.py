@@ -68,7 +68,7 @@ def true_geometry(file, turn_deg):
     monitor = replace(
         nominal.monitor, focal_length_px=1.015 * nominal.monitor.focal_length_px, cam_to_image=to_matrix(q), lens=lens
     )
-    return SeenScreen(monitor, nominal.tracker, is_sure=True)
+    return SeenScreen(monitor, nominal.tracker, is_sure=True, psf_sigma_px=0.5)
 
 
 def observed(plan, real, rng, first=0):
@@ -108,7 +108,7 @@ def test_dots_are_within_the_field_of_a_tracker_that_sees_any_share_of_the_scree
     side_px = 1024
     focal_px = screen.focal_length_px * side_px / math.sqrt(share * 1920 * 1080)
     tracker = replace(screen, resolution_px=(side_px, side_px), focal_length_px=focal_px, principal_point_px=(511.5, 511.5))
-    seen = SeenScreen(screen, tracker, is_sure=True)
+    seen = SeenScreen(screen, tracker, is_sure=True, psf_sigma_px=0.5)
     plan = plan_seen_dots(seen, 16, lit_for(seen), np.random.default_rng(0))
     assert len(plan) >= 21
     assert seen.shows(plan.x_px, plan.y_px).all()
@@ -163,7 +163,9 @@ def test_dots_of_a_turned_screen_are_as_sharp_whoever_says_the_turn(turn_deg):
     """A bench file that states the turn leaves orientation none to find, and a certificate has it from the geometry file."""
     turned = from_rotation_vector(np.radians([0.0, 0.0, turn_deg]))
     monitor = monitor_camera((640, 480), 57.65, 30, turned)
-    seen = SeenScreen(monitor, monitor_camera((500, 500), 13, 25, np.array([1.0, 0.0, 0.0, 0.0])), is_sure=True)
+    seen = SeenScreen(
+        monitor, monitor_camera((500, 500), 13, 25, np.array([1.0, 0.0, 0.0, 0.0])), is_sure=True, psf_sigma_px=0.6
+    )
     assert seen.turn_deg == pytest.approx(-turn_deg, abs=0.01)
     side_px = DOT_PX * seen.tracker_px_a_monitor_px
     image = dots_image(0.6, side_px, seen.turn_deg, np.random.default_rng(4))

@@ -21,7 +21,6 @@ from hilstar.bench.config import parse_config
 from hilstar.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, VirtualBench, black
 from hilstar.calibrate.geometric.calibration import psf_sigma_of
 from hilstar.calibrate.geometric.dots import SeenScreen
-from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError, shortened
 from hilstar.files import make_directory, write_whole
 from hilstar.reading import NOT_JSON, exists, read_bytes
@@ -336,7 +335,7 @@ class StepContext:
 
     def pixels(self, path: Path) -> FloatArray:
         """The pixels (h, w) of an image of the tracker, DN."""
-        return read_image(path, self.file.config.tracker.resolution_px)
+        return self.source.pixels(path, self.file.config.tracker.resolution_px)
 
     @property
     def full_dn(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from dataclasses import replace
@@ -11,15 +12,16 @@ import pytest
 from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.calibrate.first_light import focus as focuses
 from hilstar.calibrate.first_light import session as sessions
-from hilstar.calibrate.first_light.context import FittedFigure, StepContext, StepOutcome
+from hilstar.calibrate.first_light.context import DarkSubtracted, FittedFigure, StepContext, StepOutcome
 from hilstar.calibrate.first_light.focus import seen_sharpness, sharpness
 from hilstar.calibrate.first_light.geometry import UPRIGHT, figure_for, see_figure
 from hilstar.calibrate.first_light.image_sources import ImageSource
 from hilstar.calibrate.first_light.photometry import rounds_alike
 from hilstar.calibrate.first_light.seen_stars import Beyond, StarSpot
 from hilstar.calibrate.first_light.session import FirstLightSession, Progress
-from hilstar.calibrate.first_light.stars import P95_OF_TWO, frames_for, place_reasons
+from hilstar.calibrate.first_light.stars import P95_OF_TWO, frames_for, noise_words, place_reasons
 from hilstar.calibrate.geometric.calibration import calibrate_seen, nominal_of, rough_geometry, seen_screen_of
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen, joined, lit_for, plan_seen_dots
 from hilstar.calibrate.geometric.observed import Observed
@@ -232,6 +234,23 @@ def test_a_step_tells_of_itself_while_it_runs(monkeypatch):
     assert lines[-1].startswith("geometry")
 
 
+def test_a_focus_that_has_not_settled_is_not_done(tmp_path, monkeypatch):
+    """The fit ended after its rounds without a word."""
+    monkeypatch.setattr(focuses, "ROUNDS", 1)
+    file = large_screen(tmp_path)
+    image = np.random.default_rng(4).normal(0, 1.0, (400, 400))
+    for x, y in itertools.product(range(50, 400, 75), repeat=2):
+        image[y : y + 3, x : x + 3] += 300
+    found = sharpness(image, 3.0)
+    assert not found.has_settled
+    dots = focuses.SharpDots(255, found, DarkSubtracted(tmp_path / "dots.png", image, 300.0, 0.0))
+    monkeypatch.setattr(focuses, "sharp_dots", lambda context: dots)
+    context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 1)
+    outcome = focuses.focus(context)
+    assert outcome.verdict == "failed"
+    assert "has not settled in 1 rounds" in outcome.line
+
+
 @pytest.mark.parametrize("turn_deg", [0.0, 25.0, 44.0, -40.0, 47.0, -48.0])
 def test_a_figure_that_is_turned_by_any_angle_is_seen_with_its_turn(turn_deg):
     turn = np.array([1.0, 0.0, 0.0, 0.0])
@@ -283,6 +302,19 @@ def test_what_is_beyond_noise_is_told_from_noise():
     assert alone.high < 0.1
     assert more.low < 0.3 < more.high
     assert more.low > 0.2
+
+
+class Distances:
+    """Stars `off_px` from the sky along x and y, with noise along each axis, for `noise_words`."""
+
+    def __init__(self, off_px, noise_px):
+        self.residual_px, self.place_noise_px = np.full((4, 2), off_px), np.full(4, noise_px)
+
+
+def test_noise_is_never_said_to_be_more_than_the_whole():
+    """A line said that stars were 0.081 px off, of which noise was 0.086."""
+    assert noise_words(Distances(0.1, 0.05)) == "of which noise is 0.071 px"
+    assert noise_words(Distances(0.05, 0.06)) == "no more than their noise makes (0.085 px)"
 
 
 class Places:

@@ -216,6 +216,19 @@ def test_a_session_holds_every_step_to_the_ends_of_its_model(tmp_path, monkeypat
     assert {record.verdict for record in session.records.values()} <= {"failed", "skipped"}
 
 
+@pytest.mark.parametrize(("photometry", "scale"), [("done", "done"), ("skipped", "done"), ("failed", "skipped")])
+def test_no_scale_is_done_by_a_response_that_failed(tmp_path, monkeypatch, photometry, scale):
+    """White was 0.167 mag off with 0.016 stated, by stars in a response that was not measured."""
+    runs = {name: lambda context: StepOutcome("done", "found") for name in sessions.NAMES}
+    runs["photometry"] = lambda context: StepOutcome(photometry, "so it ended")
+    monkeypatch.setattr(sessions, "RUNS", runs)
+    (tmp_path / "bench.toml").write_text(bench_text())
+    (tmp_path / "s").mkdir()
+    session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Dark(), 0)
+    session.run(frozenset(), lambda line: None)
+    assert session.records["scale"].verdict == scale
+
+
 def test_a_step_tells_of_itself_while_it_runs(monkeypatch):
     monkeypatch.setattr(sessions, "PROGRESS_S", 0.01)
     lines: list[str] = []

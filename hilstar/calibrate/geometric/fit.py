@@ -352,7 +352,8 @@ def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ..
     for name, names, degree in wanted:
         model = Model(names, tracker_names if names is BROWN_CONRADY else (), poses)
         numbers = model.size + (degree + 1) * (degree + 2)
-        if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers / 2:
+        # A dot has two numbers of its own. Half as many are left over: a field of 55 numbers followed 42 dots' own errors.
+        if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers:
             found.append(held_out(problem, name, model, degree, data))
         if len(found) > 4 and found[-1].rms_arcsec > found[-2].rms_arcsec > found[-3].rms_arcsec:
             break  # larger fields only follow the noise

@@ -19,7 +19,7 @@ from hilstar.calibrate.first_light import image_sources
 from hilstar.calibrate.first_light.context import StepContext
 from hilstar.calibrate.first_light.focus import seen_sharpness
 from hilstar.calibrate.first_light.photometer import Assumed, Photometer, Readings
-from hilstar.calibrate.geometric.calibration import dot_sigma_px
+from hilstar.calibrate.geometric.calibration import dot_sigma_px, psf_sigma_of
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen
 from hilstar.calibrate.latency import pair, swap_to_square_ms
 from hilstar.calibrate.plan import Patch
@@ -257,7 +257,7 @@ class ImageReader:
         kept = (far < APART_TRACKER_PX / 2) & ~found.at_edge[near]
         if kept.sum() < MIN_DOTS:
             raise InputError(f"{int(kept.sum())} dots are where the bench file has them; run the geometry again (first-light)")
-        seen = SeenScreen(geometry.monitor, geometry.tracker, is_sure=True)
+        seen = SeenScreen(geometry.monitor, geometry.tracker, is_sure=True, psf_sigma_px=psf_sigma_of(self._context.file))
         sharp = seen_sharpness(image, seen, self.file.config.tracker.detector, len(looked))
         at = near[kept]
         places = x[kept], y[kept], found.x_px[at], found.y_px[at]

@@ -19,8 +19,8 @@ from hilstar.bench.bench_file import BenchFile, read_bench_file, with_key
 from hilstar.bench.cameras import before_detector, bench_camera, ideal_monitor, tracker_camera
 from hilstar.bench.config import parse_config
 from hilstar.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, VirtualBench, black
+from hilstar.calibrate.geometric.calibration import psf_sigma_of
 from hilstar.calibrate.geometric.dots import SeenScreen
-from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError, shortened
 from hilstar.files import make_directory, write_whole
 from hilstar.reading import NOT_JSON, exists, read_bytes
@@ -266,13 +266,13 @@ class StepContext:
     @property
     def seen_screen(self) -> SeenScreen:
         """The part of the screen that the tracker sees, by the figure of the step `orientation` where it was measured."""
-        geometry = self.geometry()
+        geometry, psf_px = self.geometry(), psf_sigma_of(self.file)
         focal_px = self.known.get(f"orientation.{SEEN_FOCAL}")
         if focal_px is None:
-            return SeenScreen(geometry.monitor, geometry.tracker, is_sure=False)
+            return SeenScreen(geometry.monitor, geometry.tracker, is_sure=False, psf_sigma_px=psf_px)
         turn = np.array([float(self.known[f"orientation.{name}"]) for name in SEEN_Q])
         monitor = dataclasses.replace(geometry.monitor, focal_length_px=float(focal_px), cam_to_image=to_matrix(turn))
-        return SeenScreen(monitor, geometry.tracker, is_sure=True)
+        return SeenScreen(monitor, geometry.tracker, is_sure=True, psf_sigma_px=psf_px)
 
     @property
     def psf_sigma_px(self) -> float:
@@ -335,7 +335,7 @@ class StepContext:
 
     def pixels(self, path: Path) -> FloatArray:
         """The pixels (h, w) of an image of the tracker, DN."""
-        return read_image(path, self.file.config.tracker.resolution_px)
+        return self.source.pixels(path, self.file.config.tracker.resolution_px)
 
     @property
     def full_dn(self) -> float:

@@ -44,6 +44,8 @@ ROUNDS, FIRST_DAMPING, SETTLED = 40, 1e-3, 1e-4
 SIDE_SHARE = 0.01  # sigma of a dot's side: lens and tilt change it so much over the field
 # What the model leaves, relative to the PSF's sigma: a pixel is no even square, and the points are not infinitely many.
 MODEL_SHARE = 0.01
+# Sigma of the PSF by an edge that is softer than a square's, relative to a dot's side: of 19.5 px it was 0.019 px off.
+EDGE_SHARE = 3.5e-4
 FLUX_FLOOR = 1e-9
 WILD_SIGMAS = 5.0  # a dot whose own sigma is so far from the others' has a neighbour, dust or a dead pixel
 
@@ -60,7 +62,7 @@ class DotNoise:
 class Sharpness:
     """Dots in the tracker's image: places (n,), the PSF's sigma by each (n,), and by all together with its error, tracker px.
 
-    `dot_side_px` is the side that was fitted with it, with its error.
+    `dot_side_px` is the side that was fitted with it, with its error. Where the fit did not settle `has_settled` is False.
     """
 
     x_px: FloatArray
@@ -70,6 +72,7 @@ class Sharpness:
     psf_sigma_error_px: float
     dot_side_px: float
     dot_side_error_px: float
+    has_settled: bool = True
 
 
 class _Dots(NamedTuple):
@@ -87,6 +90,16 @@ class _Shape(NamedTuple):
     points: FloatArray
     sigma_px: float
     side_px: float
+
+
+class _Fitted(NamedTuple):
+    """The shape common to all dots, their places (n, 2), and the standard errors of the PSF's sigma and of the side."""
+
+    shape: _Shape
+    places: FloatArray
+    sigma_error_px: float
+    side_error_px: float
+    has_settled: bool
 
 
 def sharpness(image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, noise: DotNoise | None = None) -> Sharpness:
@@ -119,16 +132,26 @@ def sharpness(image: FloatArray, dot_side_px: float, turn_deg: float = 0.0, nois
     noise = noise or DotNoise()
     shape = _started(dots, dot_side_px, turn)
     dots = _first(dots, max(MAX_ALL_POINTS // len(shape.points), MIN_DOTS + 3))
-    shape, places, error = _fitted(dots, shape, dot_side_px, background.noise, noise)
-    each, usable = _each_sigma(dots, shape, places, background.noise, noise)
+    fit = _fitted(dots, shape, dot_side_px, background.noise, noise)
+    each, usable = _each_sigma(dots, fit.shape, fit.places, background.noise, noise)
     if usable.sum() >= MIN_DOTS and not usable.all():
         dots = _Dots(dots.values[usable], dots.x_px[usable], dots.y_px[usable], half)
-        shape, places, error = _fitted(dots, shape, dot_side_px, background.noise, noise)
-        each, _ = _each_sigma(dots, shape, places, background.noise, noise)
+        fit = _fitted(dots, fit.shape, dot_side_px, background.noise, noise)
+        each, _ = _each_sigma(dots, fit.shape, fit.places, background.noise, noise)
+    sigma_px = fit.shape.sigma_px
     by_scatter = float(np.std(each)) / math.sqrt(len(each))
-    error_px = math.hypot(max(error[0], by_scatter), MODEL_SHARE * shape.sigma_px)
-    x_px, y_px = np.rint(dots.x_px) + places[:, 0], np.rint(dots.y_px) + places[:, 1]
-    return Sharpness(x_px, y_px, each, shape.sigma_px, error_px, shape.side_px, error[1])
+    by_model = math.hypot(MODEL_SHARE * sigma_px, EDGE_SHARE * fit.shape.side_px)
+    error_px = math.hypot(max(fit.sigma_error_px, by_scatter), by_model)
+    return Sharpness(
+        x_px=np.rint(dots.x_px) + fit.places[:, 0],
+        y_px=np.rint(dots.y_px) + fit.places[:, 1],
+        each_psf_sigma_px=each,
+        psf_sigma_px=sigma_px,
+        psf_sigma_error_px=error_px,
+        dot_side_px=fit.shape.side_px,
+        dot_side_error_px=fit.side_error_px,
+        has_settled=fit.has_settled,
+    )
 
 
 def _alone(image: FloatArray, level: float, x_px: FloatArray, y_px: FloatArray, half: int) -> _Dots:
@@ -218,15 +241,13 @@ def _weights(own: FloatArray, flux: FloatArray, noise_dn: float, noise: DotNoise
     return np.asarray(1 / np.sqrt(noise_dn**2 + light / noise.gain_e_per_dn + (noise.prnu * light) ** 2))
 
 
-def _fitted(
-    dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: DotNoise
-) -> tuple[_Shape, FloatArray, tuple[float, float]]:
-    """The shape common to all dots, their places (n, 2), and the standard errors of the PSF's sigma and of the side.
+def _fitted(dots: _Dots, start: _Shape, side_px: float, noise_dn: float, noise: DotNoise) -> _Fitted:
+    """The shape common to all dots and their places, fitted to their pixels.
 
     Levenberg and Marquardt's steps; each dot's own light, background and place are eliminated from the normal equations.
     """
     shape, places, damping = start, _first_places(dots), FIRST_DAMPING
-    value = math.inf
+    value, settled = math.inf, False
     for _ in range(ROUNDS):
         own, *slopes = _slopes(shape, places, dots.half_px)
         flux, level = _amplitudes(own, dots.values)
@@ -250,7 +271,7 @@ def _fitted(
         sigma_px = float(np.clip(grown, *SIGMAS_PX))
         moved = by_own[:, 2:4, 2] - by_own[:, 2:4, :2] @ step
         places = places + np.clip(moved, -0.5, 0.5)
-        settled = abs(sigma_px - shape.sigma_px) < SETTLED * sigma_px and abs(step[1]) < SETTLED
+        settled = bool(abs(sigma_px - shape.sigma_px) < SETTLED * sigma_px and abs(step[1]) < SETTLED)
         side = shape.side_px * math.exp(float(np.clip(step[1], -0.05, 0.05)))
         turn = math.atan2(*(shape.points[-1] - shape.points[0])[::-1]) - math.pi / 4
         shape = _Shape(_points(sigma_px, side, turn), sigma_px, side)
@@ -259,7 +280,8 @@ def _fitted(
         if settled:
             break
     covariance = np.linalg.inv(common) * chi2
-    return shape, places, (math.sqrt(covariance[0, 0]), shape.side_px * math.sqrt(covariance[1, 1]))
+    side_error_px = shape.side_px * math.sqrt(covariance[1, 1])
+    return _Fitted(shape, places, math.sqrt(covariance[0, 0]), side_error_px, settled)
 
 
 def _each_sigma(
@@ -284,6 +306,9 @@ FIRST_FRAMES = 8  # of dots where the figure of `orientation` says that the trac
 FIRST_LIT_DOTS = 18  # in a frame: 48 dots, of 56 codes of three frames in eight
 OVERSAMPLING = 4  # for the effective PSF
 BLURRED, BLURRED_BY_PX = 1.3, 0.1  # times the bench file's sigma, and px: less is no reason to turn the focus
+# Relative to the tracker's range: the brightest of a few dots. Of a thousand, one stands on a pixel's middle where the screen
+# is brightest, and later steps refuse what is over MAX_FILL.
+DOT_FILL = 0.6
 MAX_ERROR_SHARE = 0.2  # of the PSF's sigma: with a larger error it cannot be told from the pixel's own width
 
 
@@ -329,7 +354,10 @@ def focus(context: StepContext) -> StepOutcome:
         line += f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the field"
     number = StepNumber(sigma, error, "px", f"PSF sigma; the bench file says {wanted:.4g}")
     verdict: Verdict = "done"
-    if error > MAX_ERROR_SHARE * sigma:
+    if not found.has_settled:
+        why = f"the fit of the dots has not settled in {ROUNDS} rounds: look at the dots' image, and at the focal lengths"
+        line, verdict = f"{line}: {why}", "failed"
+    elif error > MAX_ERROR_SHARE * sigma:
         why = f"the PSF cannot be told from a monitor pixel of {pixel_px:.2f} px: take a longer [tracker] exposure_s"
         line, verdict = f"{line}: {why}", "failed"
     elif sigma > BLURRED * wanted + BLURRED_BY_PX:
@@ -355,7 +383,7 @@ def sharp_dots(context: StepContext) -> SharpDots:
     for number in range(context.file.config.monitor.bits * 2):
         codes = dot_image(plan, 0, context.resolution_px, code)
         looked = context.look(Pattern(f"dots_{number:03}", codes), dark)
-        if not context.is_too_bright(looked):
+        if looked.raw_peak < DOT_FILL * context.full_dn:
             break
         code = context.darker(code)
     return SharpDots(code, seen_sharpness(looked.image, seen, context.file.config.tracker.detector), looked)

@@ -40,7 +40,7 @@ from hilstar.charts import DARK, ORANGE, TEXT_PT, chart
 from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.rotation import from_matrix
-from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background, squares
 from hilstar.twin.optics import BenchGeometry
 
 FIGURE_REACH = 0.25  # half the figure's side, relative to the smaller side of what both screen and tracker have
@@ -87,7 +87,9 @@ MIN_PIXELS = 3
 MAX_STRETCH = 1.25  # of the figure's one side to its other: a tilt of 35 degrees
 SPOT_ERROR_PX = 0.1  # of a square's centroid in the tracker's image, by its threshold and the lens
 MAX_SCALE = 2.0
-MIN_SIZE_STEP = 1.3  # between the pixels of one square and the next
+MIN_LIGHT_STEP = 1.3  # between the light of one square and the next: 9, 4 and 1 of one code, however wide the PSF is
+WINDOW_SIDES = 0.75  # half the side of a square's window, in sides of the largest spot
+MAX_SPOTS = 12  # the largest, of which the three brightest are the squares
 UPRIGHT = (1, 0, 0, 1)
 QUARTER_TURNS_DEG = {(0, -1, 1, 0): 90.0, (0, 1, -1, 0): -90.0}
 OBLIQUE_DEG = 40.0  # from the nearest right angle
@@ -129,23 +131,41 @@ class SeenFigure:
         return self.turn_deg + QUARTER_TURNS_DEG.get(self.way, 0.0)
 
 
+class SquaresAlike(InputError):
+    """The figure's squares have about the same light: they saturate the tracker, or other light is among them."""
+
+
+def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places (3,) of the figure's squares in an image (h, w), the largest first. Raises InputError, SquaresAlike."""
+    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=MIN_PIXELS)
+    background = noisiest_background(image)
+    found = find_stars(image, settings, background)
+    if len(found) < len(SQUARES):
+        raise InputError(f"{len(found)} of the figure's three squares are in the image; {NOT_SEEN}")
+    largest = np.argsort(-found.pixels, kind="stable")[:MAX_SPOTS]
+    # By light, for a wide PSF makes spots of nearly one size of squares of three.
+    radius_px = math.ceil(WINDOW_SIDES * math.sqrt(found.pixels.max()))
+    values, dx, dy = squares(image, background.level, found.x_px[largest], found.y_px[largest], radius_px)
+    light = values.sum(axis=(1, 2))
+    brightest = np.argsort(-light, kind="stable")[: len(SQUARES)]
+    step = light[brightest[:-1]] / np.maximum(light[brightest[1:]], 1e-9)
+    if (step < MIN_LIGHT_STEP).any():
+        told = ", ".join(f"{each:.3g}" for each in light[brightest])
+        raise SquaresAlike(
+            f"the three brightest spots have {told} DN in all and cannot be told apart, where squares of three sizes have 9, 4"
+            " and 1 parts; look at stray light and reflections, or expose shorter"
+        )
+    right, down = ((values * offset).sum(axis=(1, 2)) / light for offset in (dx, dy))
+    which = largest[brightest]
+    return found.x_px[which] + right[brightest], found.y_px[which] + down[brightest]
+
+
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
     """Find the figure in a tracker's image (h, w) above its dark frame, by the bench file's lens.
 
-    Raises InputError where it is not there, or not as large as the focal lengths say.
+    Raises InputError where it is not there, or not as large as the focal lengths say, SquaresAlike where its squares are.
     """
-    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=MIN_PIXELS)
-    found = find_stars(image, settings, noisiest_background(image))
-    if len(found) < len(figure.x_px):
-        raise InputError(f"{len(found)} of the figure's three squares are in the image; {NOT_SEEN}")
-    largest = np.argsort(-found.pixels, kind="stable")[:3]
-    sizes = found.pixels[largest]
-    if (sizes[:-1] < MIN_SIZE_STEP * sizes[1:]).any():
-        counts = ", ".join(map(str, sizes))
-        raise InputError(
-            f"the three largest spots have {counts} pixels and cannot be told apart; look at focus and stray light"
-        )
-    x_px, y_px = found.x_px[largest], found.y_px[largest]
+    x_px, y_px = _squares_of(image)
     monitor_px = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
     shown_x, shown_y = geometry.to_monitor(x_px, y_px)
     corner, right, below = np.stack([shown_x, shown_y], axis=1)
@@ -259,14 +279,24 @@ def _is_oblique(measured: tuple[SeenFigure, DarkSubtracted] | None) -> bool:
 def _way(context: StepContext, name: str) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
     """The figure's orientation, and its measurement; None where a person pressed a key instead."""
     geometry = context.geometry()
-    figure = figure_for(geometry)
-    pattern, keys = figure.pattern(name, context.resolution_px, context.white), keys_of_ways()
-    told = context.take_or_key(pattern, {key: look_of(way) for key, way in keys.items()})
-    if isinstance(told, str):
-        return keys[told], None
-    looked = context.looked(told, context.read(context.dark()))
-    found = see_figure(looked.image, figure, geometry)
-    return found.way, (found, looked)
+    figure, keys = figure_for(geometry), keys_of_ways()
+    code, tries = context.white, 0
+    while True:
+        shown = name if not tries else f"{name}_dim{tries}"
+        pattern = figure.pattern(shown, context.resolution_px, code)
+        told = context.take_or_key(pattern, {key: look_of(way) for key, way in keys.items()})
+        if isinstance(told, str):
+            return keys[told], None
+        looked = context.looked(told, context.read(context.dark()))
+        try:
+            found = see_figure(looked.image, figure, geometry)
+        except SquaresAlike:
+            # Squares that saturate the tracker are alike: darker ones are not.
+            if not context.is_too_bright(looked):
+                raise
+            code, tries = context.darker(code), tries + 1
+        else:
+            return found.way, (found, looked)
 
 
 SQUARE_NAMES = ("corner", "right", "below")

@@ -26,6 +26,7 @@ from hilstar.bench.build import calibration_source, open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame_files import png_of, write_codes_png
 from hilstar.bench.measured_on import check_monitor
+from hilstar.calibrate.geometric.observed import read_image
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of, swap_to_square_ms
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.files import written
@@ -120,6 +121,10 @@ class ImageSource:
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """Show a pattern on the screen as it is mounted; the tracker's image, `stem` with an ending. Raises NoImage."""
         raise NotImplementedError
+
+    def pixels(self, path: Path, resolution_px: tuple[int, int]) -> FloatArray:
+        """The pixels (h, w) of an image that this source took, DN. Raises InputError for one that cannot be read."""
+        return read_image(path, resolution_px)
 
     def unlit(self, stem: Path) -> Path | None:
         """The tracker's image with the monitor switched off, at the bench file's exposure; None where there is none."""
@@ -503,6 +508,7 @@ class VirtualBench(ImageSource):
         self._white_e_per_s: FloatArray = np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
         self._units: dict[bytes, FloatArray] = {}
         self._last: tuple[bytes, FloatArray] | None = None
+        self._newest: tuple[Path, CodeImage] | None = None
         self._on_for_ns = 0
         if bench.config.render.bit_stealing:
             _ = self._primaries  # refused now where they are not known
@@ -543,10 +549,17 @@ class VirtualBench(ImageSource):
     def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
         mean_e = (light_e_per_s + self._sky_e_per_s) * exposure_s
         rng = np.random.default_rng((self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode())))
-        image = png_of(self._detector.expose(mean_e, exposure_s, rng))
-        path = stem.with_name(stem.name + ".png")
+        pixels = self._detector.expose(mean_e, exposure_s, rng)
+        image, path = png_of(pixels), stem.with_name(stem.name + ".png")
         written(path, lambda file: file.write(image))
+        self._newest = path, pixels
         return path
+
+    def pixels(self, path: Path, resolution_px: tuple[int, int]) -> FloatArray:
+        """As of any source; the newest image need not be read from its file, which takes longer than to write it."""
+        if self._newest is not None and self._newest[0] == path:
+            return self._newest[1].astype(np.float64)
+        return super().pixels(path, resolution_px)
 
     def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:
         """The light of frames shown in turn, on the detector (h, w); a pattern that is seen again is not drawn again."""

@@ -130,6 +130,7 @@ class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One step of steps.toml: what it measures, and what to do where it fails; what it shows, and what it wants back.
 
     `tables` are those of the bench file that it depends on; `writes` has the keys that it may set, `needs` the steps before it.
+    Those of `unless_failed` may be skipped: what the bench file says stands in for them.
     """
 
     measures: str
@@ -137,6 +138,7 @@ class SessionStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     wants: str
     shows: str = ""
     needs: tuple[str, ...] = ()
+    unless_failed: tuple[str, ...] = ()
     tables: tuple[str, ...] = ("monitor", "collimator", "tracker")
     writes: tuple[str, ...] = ()
     name: str = ""
@@ -247,6 +249,10 @@ class FirstLightSession:
         return all(_is_file(path) and sha256_of(path) == digest for path, digest in paths)
 
     def _unmet(self, step: SessionStep) -> str | None:
+        for name in step.unless_failed:
+            record = self.records.get(name)
+            if record is not None and record.verdict == "failed":
+                return name
         for name in step.needs:
             record = self.records.get(name)
             if record is None or record.verdict == "failed" or (record.verdict == "skipped" and name != "display"):

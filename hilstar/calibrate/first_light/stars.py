@@ -54,8 +54,8 @@ def verify(context: StepContext) -> StepOutcome:
     rms = f"{figures['star_rms_px']:.3f} px ({figures['star_rms_arcsec']:.2f} arcsec) rms"
     width_px = context.file.config.tracker.resolution_px[0]
     draw_residuals(picture, seen.place_px, seen.residual_px, width_px, f"{len(seen.place_px)} stars are {rms} from the sky")
-    line = f"{len(seen.place_px)} stars on the screen are {rms} from where the sky has them, of which noise is"
-    line += f" {figures['star_noise_px']:.3f}; beyond it {figures['star_beyond_noise_p95_px']:.3f} px at 95 %"
+    line = f"{len(seen.place_px)} stars on the screen are {rms} from where the sky has them, {noise_words(seen)}"
+    line += f"; beyond it {figures['star_beyond_noise_p95_px']:.3f} px at 95 %"
     pictures = [picture]
     if seen.sure.sum() >= MIN_STARS:
         found, finding = _light_figures(context, seen, light)
@@ -65,7 +65,9 @@ def verify(context: StepContext) -> StepOutcome:
         reasons += [finding] if finding else []
     else:
         line += f"; the light of {int(seen.sure.sum())} can be read, too few to judge it"
-    reasons += place_reasons(seen, context.file.config.verify.centroid_px) + _star_reasons(context, figures)
+    is_scattered = bool(reasons)
+    reasons += place_reasons(seen, context.file.config.verify.centroid_px)
+    reasons += _star_reasons(context, figures, is_scattered=is_scattered)
     context.stage(f"the twin looks at {VERIFY_FIELDS} fields")
     twin = summarise(_twin(context))
     reasons += [f"the twin: {reason}" for reason in twin["reasons"]]
@@ -88,6 +90,15 @@ def verify(context: StepContext) -> StepOutcome:
     error = rms_arcsec / math.sqrt(4 * len(off_px))  # from an rms over two axes
     number = StepNumber(rms_arcsec, error, "arcsec", f"rms distance of {len(off_px)} stars from where the sky has them")
     return StepOutcome(verdict, line, figures, (*pictures, *seen.images), tuple(pictures), number=number)
+
+
+def noise_words(seen: StarsSeen) -> str:
+    """How much of the stars' distances is noise: all of it where they are no farther off than their noise makes them."""
+    rms_px = float(np.sqrt((np.hypot(*seen.residual_px.T) ** 2).mean()))
+    noise_px = math.sqrt(2) * float(np.sqrt((seen.place_noise_px**2).mean()))
+    if noise_px >= rms_px:
+        return f"no more than their noise makes ({noise_px:.3f} px)"
+    return f"of which noise is {noise_px:.3f} px"
 
 
 def _enough_frames(context: StepContext) -> StarsSeen:
@@ -181,12 +192,13 @@ def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tupl
     return figures, scatter.finding
 
 
-def _star_reasons(context: StepContext, figures: dict[str, Figure]) -> list[str]:
-    """The limits of [verify] that the stars miss, with advice."""
+def _star_reasons(context: StepContext, figures: dict[str, Figure], *, is_scattered: bool) -> list[str]:
+    """The limits of [verify] that the stars miss, with advice; not their light again where its scatter has been told."""
     limits, found = context.file.config.verify, []
     if float(figures["lost"]) > LOST_SHARE * (float(figures["lost"]) + float(figures["stars"])):
         found.append(f"{figures['lost']} bright stars are not there")
-    if float(figures.get("flux_beyond_noise_p95_mag", 0.0)) > limits.flux_mag:
+    is_off = float(figures.get("flux_beyond_noise_p95_mag", 0.0)) > limits.flux_mag
+    if is_off and not is_scattered:
         off = f"beyond noise the light of stars is {figures['flux_beyond_noise_p95_mag']:.3f} mag off at 95 %"
         off += f" (limit {limits.flux_mag:g})"
         found.append(f"{off}: measure the response (photometry)")

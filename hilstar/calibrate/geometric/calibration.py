@@ -12,9 +12,9 @@ import numpy as np
 import hilstar
 from hilstar.arrays import BoolArray, FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera, tracker_psf
+from hilstar.bench.cameras import before_detector, bench_camera, ideal_monitor, tracker_camera
 from hilstar.calibrate.geometric import fit as fits
-from hilstar.calibrate.geometric.dots import DOT_PX, MIN_DOTS, DotPlan, SeenScreen, read_plan
+from hilstar.calibrate.geometric.dots import MIN_DOTS, DotPlan, SeenScreen, read_plan
 from hilstar.calibrate.geometric.match import FirstLook, first_look, match_by_geometry, match_by_maps, refuse_motion, turned
 from hilstar.calibrate.geometric.observed import Observed, measure_images, read_observed
 from hilstar.charts import BLUE, SMALL_PT, chart
@@ -27,7 +27,8 @@ from hilstar.units import ARCSEC_PER_RAD
 
 SEED = 1  # for the random samples of dots: one calibration gives one file
 KNOWN_MARGIN = 1.01  # relative to the angle to the corner of the tracker's field
-MIN_CELL_SHARE = 0.33  # share of the dots that should be seen in a part of the screen
+# In a part of the screen, of so many dots that should be seen the share that is: two or three may be lost to neighbours.
+MIN_CELL_DOTS, MIN_CELL_SHARE = 4, 0.33
 CELLS = (("left", "middle", "right"), ("upper", "middle", "lower"))
 SCREEN_PLACES = 17  # along each side of the screen, by which it is known whether the tracker sees all of it
 REACH_PX = 0.5  # tracker px: a centroid this close to a dot's fitted place is that dot
@@ -65,8 +66,13 @@ class Calibrated:
     @property
     def lost(self) -> int:
         """Lit dots in the tracker's field that have no centroid."""
-        expected = sum(int(self.plan.lit[inside].sum()) for inside in _in_view(self.fit, self.plan.x_px, self.plan.y_px))
+        expected = sum(int(self.plan.lit[inside].sum()) for inside in self.measurable)
         return expected - len(self.data)
+
+    @property
+    def measurable(self) -> list[BoolArray]:
+        """For each pose, a mask of the dots (dots,) whose windows are in the tracker's image."""
+        return _in_view(self.fit, self.plan.x_px, self.plan.y_px, self.data.seen.edge_px)
 
     @property
     def false(self) -> int:
@@ -119,15 +125,20 @@ def nominal_of(file: BenchFile) -> fits.Nominal:
 def seen_screen_of(file: BenchFile) -> SeenScreen:
     """What the tracker sees of the screen by a bench file: surely by its geometry file, else about. Raises InputError."""
     tracker = tracker_camera(file.config.tracker, file.folder)
-    return SeenScreen(bench_camera(file.config, file.folder), tracker, is_sure=file.config.collimator.geometry is not None)
+    monitor, is_sure = bench_camera(file.config, file.folder), file.config.collimator.geometry is not None
+    return SeenScreen(monitor, tracker, is_sure, psf_sigma_of(file))
 
 
 def dot_sigma_px(file: BenchFile) -> float:
-    """The sigma of a dot in the tracker's image by the bench file, tracker px: the PSF's and a square's. Raises InputError."""
+    """The sigma of a dot in the tracker's image by the bench file, tracker px. Raises InputError."""
     nominal = nominal_of(file)
-    side_px = DOT_PX * nominal.tracker.focal_length_px / nominal.monitor.focal_length_px
-    psf_px = float(np.mean(tracker_psf(file.config.tracker, file.folder).width_px))
-    return math.hypot(psf_px, side_px / math.sqrt(12))
+    return SeenScreen(nominal.monitor, nominal.tracker, is_sure=False, psf_sigma_px=psf_sigma_of(file)).dot_sigma_px
+
+
+def psf_sigma_of(file: BenchFile) -> float:
+    """How wide the tracker sees a point of the screen by the bench file, its sigma in tracker px. Raises InputError."""
+    psf = before_detector(file.config, file.folder, ideal_monitor(file.config))
+    return float(np.mean(psf.width_px))
 
 
 def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen:
@@ -138,7 +149,7 @@ def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen
     if len(np.unique(data.dot)) < MIN_DOTS:
         raise _too_few(data)
     rough = fits.fit(problem, fits.Model(fits.RADIAL), 0, data).geometry
-    return SeenScreen(rough.monitor, rough.tracker, is_sure=True)
+    return SeenScreen(rough.monitor, rough.tracker, is_sure=True, psf_sigma_px=psf_sigma_of(file))
 
 
 def _too_few(data: fits.MatchedDots) -> InputError:
@@ -226,22 +237,23 @@ def matched(
     return fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX), data
 
 
-def _in_view(fit: fits.Fit, x_px: FloatArray, y_px: FloatArray) -> list[BoolArray]:
-    """For each pose, a mask of the monitor's pixels (n,) in the tracker's field."""
+def _in_view(fit: fits.Fit, x_px: FloatArray, y_px: FloatArray, edge_px: float = 0.0) -> list[BoolArray]:
+    """For each pose, a mask of the monitor's pixels (n,) in the tracker's field, farther than `edge_px` from its edge."""
     geometry = fit.geometry
     directions = geometry.monitor.rays(x_px, y_px)
     width, height = geometry.tracker.resolution_px
     found = []
     for q in geometry.q_poses:
         x, y = geometry.tracker.project(directions @ to_matrix(q).T)
-        found.append((x > 0) & (x < width - 1) & (y > 0) & (y < height - 1))
+        across = (x > edge_px) & (x < width - 1 - edge_px)
+        found.append(across & (y > edge_px) & (y < height - 1 - edge_px))
     return found
 
 
 def _refuse_gaps(calibrated: Calibrated) -> None:
     """Refuse (InputError) a part of the screen in the tracker's field whose dots were not seen."""
     plan, problem = calibrated.plan, calibrated.problem
-    wanted = np.any(_in_view(calibrated.fit, plan.x_px, plan.y_px), axis=0)
+    wanted = np.any(calibrated.measurable, axis=0)
     found = np.zeros(len(plan), dtype=bool)
     found[np.unique(calibrated.data.dot)] = True
     width, height = problem.nominal.monitor.resolution_px
@@ -249,7 +261,7 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
     for r, vertical in enumerate(CELLS[1]):
         for c, sideways in enumerate(CELLS[0]):
             here = (column == c) & (row == r) & wanted
-            if here.sum() >= 2 and found[here].sum() < MIN_CELL_SHARE * here.sum():
+            if here.sum() >= MIN_CELL_DOTS and found[here].sum() < MIN_CELL_SHARE * here.sum():
                 part = "middle" if vertical == sideways else f"{vertical} {sideways}"
                 raise InputError(
                     f"only {found[here].sum()} of {here.sum()} dots were recognised in the {part} of the screen: look for what"

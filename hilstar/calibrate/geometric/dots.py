@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, FloatArray
 from hilstar.bench.config import Monitor
+from hilstar.calibrate.geometric.observed import dot_centroids
 from hilstar.charts import write_csv
 from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError
@@ -29,8 +30,9 @@ TRIES = 400  # random codes for each dot, at each distance
 PLAN_COLUMNS = ("frame", "dot", "x_px", "y_px")
 GOLDEN = 1.32471795724474602596  # the plastic number: its powers spread points evenly over a square (Roberts 2018)
 PLAN_ADVICE = "give the plan.csv that `hilstar calibrate dots` wrote"
-# Tracker px between neighbouring dots of a frame: the dots' own side so many times, and room for their wings.
-MIN_APART_PX, APART_SIDES, WINGS_PX = 40.0, 2.5, 20.0
+# Tracker px between neighbouring dots of a frame: the dots' own side so many times, and room for their wings. They stand by
+# chance, so that half of them have a neighbour at half of it: 9 sigmas, for two windows of 4 and a little light beyond.
+MIN_APART_PX, APART_SIDES, WINGS_PX, WINGS_SIGMAS = 40.0, 2.5, 20.0, 18.0
 MIN_DOTS = 12  # that the fit of a geometry needs
 MIN_LIT_DOTS, MAX_LIT_DOTS = 8, 60  # in a frame: three frames in eight light 21 dots or more
 # A geometry that was not measured: the bench file's lens may look past the screen's middle by so much of the tracker's field.
@@ -98,16 +100,23 @@ class SeenScreen:
     """The part of a screen that a tracker sees: `monitor` and `tracker` map cam to their pixels.
 
     `is_sure` says that this is known: by a fit, or by the figure of the step `orientation`. Else a wider part is taken.
+    `psf_sigma_px` is how wide the tracker sees a point: the window of a dot near the detector's edge would leave the image.
     """
 
     monitor: Camera
     tracker: Camera
     is_sure: bool
+    psf_sigma_px: float
 
     @property
     def tracker_px_a_monitor_px(self) -> float:
         """Tracker pixels per monitor pixel, on the axis."""
         return self.tracker.focal_length_px / self.monitor.focal_length_px
+
+    @property
+    def dot_sigma_px(self) -> float:
+        """The sigma of a dot in the tracker's image: the PSF's and a square's."""
+        return math.hypot(self.psf_sigma_px, DOT_PX * self.tracker_px_a_monitor_px / math.sqrt(12))
 
     @property
     def turn_deg(self) -> float:
@@ -125,9 +134,11 @@ class SeenScreen:
         rays = self.monitor.rays(x_px, y_px)
         u, v = self.tracker.project(rays @ self.tracker.cam_to_image.T)
         wide, high = self.tracker.resolution_px
-        half_dot_px = DOT_PX / 2 * self.tracker_px_a_monitor_px
-        # A dot that reaches the detector's edge has a biased centroid, and is dropped by who measures it.
-        margin_px = -UNSURE_SHARE * max(wide, high) if not self.is_sure else half_dot_px + EDGE_PX
+        margin_px = -UNSURE_SHARE * max(wide, high)
+        if self.is_sure:
+            # A dot whose window leaves the image has a biased centroid, and is dropped by who measures it.
+            half_dot_px = DOT_PX / 2 * self.tracker_px_a_monitor_px
+            margin_px = max(half_dot_px + EDGE_PX, dot_centroids(self.dot_sigma_px).radius_px + 1)
         with np.errstate(invalid="ignore"):
             in_field = (u >= margin_px) & (u <= wide - 1 - margin_px) & (v >= margin_px) & (v <= high - 1 - margin_px)
         return np.asarray(on_screen & in_field)
@@ -153,9 +164,9 @@ class SeenScreen:
 
 
 def lit_for(seen: SeenScreen) -> int:
-    """How many dots of a frame the tracker can tell apart on the part of the screen that it sees."""
+    """How many dots of a frame the tracker can tell apart on the part of the screen that it sees, through its PSF."""
     ratio = seen.tracker_px_a_monitor_px
-    apart_px = max(MIN_APART_PX, APART_SIDES * DOT_PX * ratio + WINGS_PX)
+    apart_px = max(MIN_APART_PX, APART_SIDES * DOT_PX * ratio + max(WINGS_PX, WINGS_SIGMAS * seen.psf_sigma_px))
     low, high = seen.box()
     x, y = (part.ravel() for part in np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))))
     area_px = float(np.prod(high - low)) * float(seen.shows(x, y).mean()) * ratio**2

@@ -1,5 +1,6 @@
 """A bench's geometry fitted to centroids of dots: parameters, robust least squares, choice of a model, uncertainty."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -312,7 +313,9 @@ def noise_of_repeats(data: MatchedDots) -> float | None:
 
 FOLDS = 5
 FIELD_DEGREES = (3, 4, 5, 6, 7)
-GAIN = 0.98  # a larger model is taken where it brings the held-out error below this share of the smaller one's
+# A larger model is taken where it brings the held-out error below this share of the smaller one's, and beyond chance by so
+# many sigmas: of eight models of 50 dots, one is 2 % better than another by chance.
+GAIN, GAIN_SIGMAS = 0.98, 2.5
 CENTROIDS_PER_NUMBER = 3.0
 
 
@@ -349,7 +352,8 @@ def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ..
     for name, names, degree in wanted:
         model = Model(names, tracker_names if names is BROWN_CONRADY else (), poses)
         numbers = model.size + (degree + 1) * (degree + 2)
-        if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers / 2:
+        # A dot has two numbers of its own. Half as many are left over: a field of 55 numbers followed 42 dots' own errors.
+        if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers:
             found.append(held_out(problem, name, model, degree, data))
         if len(found) > 4 and found[-1].rms_arcsec > found[-2].rms_arcsec > found[-3].rms_arcsec:
             break  # larger fields only follow the noise
@@ -378,12 +382,25 @@ def best_of(found: list[Candidate]) -> Candidate:
     """The simplest model whose held-out error no larger model clearly reduces."""
     best = found[0]
     for candidate in found[1:]:
-        if candidate.rms_arcsec < GAIN * best.rms_arcsec:
+        if candidate.rms_arcsec < GAIN * best.rms_arcsec and _is_beyond_chance(best, candidate):
             best = candidate
     return best
 
 
+def _is_beyond_chance(smaller: Candidate, larger: Candidate) -> bool:
+    """Whether the larger model's gain on the held-out dots is more than the dots' scatter makes by chance."""
+    squares = [(each.off_arcsec**2).sum(axis=1) for each in (smaller, larger)]
+    with np.errstate(invalid="ignore"):  # a dot that both put behind the lens
+        gain = np.nan_to_num(squares[0] - squares[1], nan=0.0)
+    # A dot that a model throws far off counts as one dot, not as all of them.
+    limit = HUBER * MAD_TO_SIGMA * float(np.median(np.abs(gain)))
+    gain = np.clip(gain, -limit, limit)
+    chance = float(gain.std()) / math.sqrt(len(gain))
+    return float(gain.mean()) > GAIN_SIGMAS * chance
+
+
 MAP_PLACES = (17, 11)
+FIELD_PLACES = 17  # along each side of the tracker's field
 MODE_SHARE = 1e-6  # a share of the variance over the screen: less is in no interval's digits
 
 
@@ -391,51 +408,105 @@ MODE_SHARE = 1e-6  # a share of the variance over the screen: less is in no inte
 class Uncertainty:
     """One sigma of each parameter, and of a star's place over the screen, edges included: `map_arcsec` (rows, columns).
 
-    `modes_arcsec` (modes, 2 places) times its transpose is the covariance of places along x and y, row by row of the map.
-    The map is NaN where the tracker saw no dots. From the covariance of the fit, scaled up where its residuals exceed the
-    centroids' noise. Errors that no parameter can follow show in the error of held-out dots alone.
+    `field_arcsec` (n,) is that of places that the tracker sees, edges included: it may see 2 % of the screen. `modes_arcsec`
+    (modes, 2 places) times its transpose is the covariance of places along x and y, row by row of the map.
+    The map is NaN where the tracker saw no dots. From the covariance of the whole lens, also where a simpler one was chosen,
+    and from what the whole lens would move each place by: a simple lens is chosen where the dots' noise hides its lack of fit.
+    Scaled up where residuals, or their means over a dot's frames, exceed the centroids' noise. Errors that no parameter can
+    follow show in the error of held-out dots alone.
     """
 
     sigma: dict[str, float]
     map_arcsec: FloatArray
     modes_arcsec: FloatArray
+    field_arcsec: FloatArray
 
     @property
     def rms_arcsec(self) -> float:
-        """Root mean square over the screen."""
-        return float(np.sqrt(np.nanmean(self.map_arcsec**2)))
+        """Root mean square over what the tracker sees of the screen."""
+        return float(np.sqrt(np.mean(self.field_arcsec**2)))
 
     @property
     def max_arcsec(self) -> float:
-        """Largest value on the screen."""
-        return float(np.nanmax(self.map_arcsec))
+        """Largest value on what the tracker sees of the screen."""
+        return float(np.max(self.field_arcsec))
 
 
 def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty:
-    """The uncertainty of a fit to `data`, by its covariance."""
+    """The uncertainty of a fit to `data`, by the covariance of the whole lens and by what that would move."""
     monitor = fit.geometry.monitor
-    rows = _slopes_of_residuals(problem, fit, data)
-    left = np.abs(residuals_sigma(problem, fit.geometry, data))
-    rows *= np.sqrt(np.minimum(1.0, HUBER / np.maximum(left, 1e-12)))[:, None]
+    fit, is_simpler = _with_whole_lens(fit), fit.model.names != BROWN_CONRADY
+    off = residuals_sigma(problem, fit.geometry, data)
+    left = np.abs(off)
+    weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(left, 1e-12)))
+    rows = _slopes_of_residuals(problem, fit, data) * weight[:, None]
     size = fit.model.size
     field_numbers = rows.shape[1] - size
     prior = np.concatenate([np.full(size, PRIOR), np.full(field_numbers, 1 / FIELD_PRIOR_PX)])
     root = np.linalg.inv(np.linalg.qr(np.vstack([rows, np.diag(prior)]))[1])  # times its transpose: the covariance
-    scale = max(1.0, MAD_TO_SIGMA * float(np.median(left)))
+    scale = max(1.0, MAD_TO_SIGMA * float(np.median(left)), _scatter_of_dots(data, off, rows.shape[1]))
+    if is_simpler:
+        # One step of Gauss and Newton from the simple lens to the whole one, as one more error beside the covariance's.
+        downhill = rows.T @ (weight * off) + prior**2 * fit.numbers
+        root = np.column_stack([root, root @ (root.T @ downhill) / scale])
     steps = [STEPS[name] for name in fit.model.names] + [TRACKER_STEPS[name] for name in fit.model.tracker_names]
     spread = scale * np.linalg.norm(root, axis=1)
     names = (*fit.model.names, *fit.model.tracker_names)
     sigma = {name: float(step * s) for name, step, s in zip(names, steps, spread, strict=False)}
     along = (np.linspace(-0.5, size - 0.5, n) for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True))
+    to_arcsec = scale * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px
     place_x, place_y = _slopes_of_places(problem, fit, *(part.ravel() for part in np.meshgrid(*along)))
-    slopes = np.stack([place_x, place_y]) @ root * (scale * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px)
+    slopes = np.stack([place_x, place_y]) @ root * to_arcsec
+    in_field = np.stack(_slopes_of_places(problem, fit, *_seen_places(fit.geometry))) @ root * to_arcsec
     seen = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
     row, column = distance_transform_edt((~seen).astype(np.int64), return_distances=False, return_indices=True)
     slopes = slopes[:, (row * seen.shape[1] + column).ravel()]  # a place that was not seen has those of its neighbour
     variance = np.where(seen, (slopes**2).sum(axis=(0, 2)).reshape(seen.shape), np.nan)
     _, size_of, modes = np.linalg.svd(slopes.reshape(2 * seen.size, -1).T, full_matrices=False)
     modes = (size_of[:, None] * modes)[size_of**2 > MODE_SHARE * (size_of**2).sum()]
-    return Uncertainty(sigma, np.sqrt(variance), modes)
+    return Uncertainty(sigma, np.sqrt(variance), modes, np.sqrt((in_field**2).sum(axis=(0, 2))))
+
+
+def _seen_places(geometry: Geometry) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n,) of the monitor at a grid over the tracker's field in all its poses."""
+    sides = (np.linspace(-0.5, size - 0.5, FIELD_PLACES) for size in geometry.tracker.resolution_px)
+    u_px, v_px = (part.ravel() for part in np.meshgrid(*sides))
+    monitor = geometry.monitor
+    places = []
+    for pose in range(len(geometry.q_poses)):
+        rays = directions_in_cam(geometry, np.full(len(u_px), pose), u_px, v_px)
+        places.append(np.stack(monitor.project(rays @ monitor.cam_to_image.T)))
+    x_px, y_px = np.concatenate(places, axis=1)
+    width, height = monitor.resolution_px
+    with np.errstate(invalid="ignore"):
+        on_screen = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2)
+    return x_px[on_screen], y_px[on_screen]
+
+
+def _scatter_of_dots(data: MatchedDots, off: FloatArray, numbers: int) -> float:
+    """The scatter of dots' mean residuals in sigmas of their noise, of a fit of so many numbers.
+
+    A dot is at one place in all its frames: what a detector's pixels do to it there is no average of the frames.
+    """
+    dots, place, count = np.unique(data.dot, return_inverse=True, return_counts=True)
+    means = [np.bincount(place, part) / np.sqrt(count) for part in np.split(off, 2)]
+    free = max(2 * len(dots) - numbers, 1)
+    typical = MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate(means))))
+    return typical * math.sqrt(2 * len(dots) / free)
+
+
+def _with_whole_lens(fit: Fit) -> Fit:
+    """The same geometry as a fit of the whole lens, whose further parameters are 0."""
+    names, own = fit.model.names, len(fit.model.names)
+    if names == BROWN_CONRADY:
+        return fit
+    by_name = dict(zip(names, fit.numbers[:own], strict=True))
+    whole = [by_name.get(name, 0.0) for name in BROWN_CONRADY]
+    return replace(
+        fit,
+        model=replace(fit.model, names=BROWN_CONRADY),
+        numbers=np.concatenate([whole, fit.numbers[own:]]),
+    )
 
 
 def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:

@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_bac
 MAX_OBSERVED_BYTES = 100_000_000
 MAX_ROWS = 1_000_000
 NEEDED = ("frame", "x_px", "y_px")
+COLUMNS = ("frame", "pose", "x_px", "y_px", "sigma_px")  # of `Observed`
 ADVICE = "write a CSV with the columns frame,x_px,y_px and, where known, flux, sigma_px and pose"
 
 
@@ -27,7 +28,8 @@ ADVICE = "write a CSV with the columns frame,x_px,y_px and, where known, flux, s
 class Observed:
     """Centroids in the tracker's image: frame, pose (0 by default) and place in tracker px, (n,) each.
 
-    `sigma_px` (n,) is each one's own error where the table has it, else 1: only ratios count then.
+    `sigma_px` (n,) is each one's own error where the table has it, else 1: only ratios count then. Nearer than `edge_px` to the
+    detector's edge no dot is measured: its window leaves the image.
     """
 
     frame: IntArray
@@ -35,18 +37,19 @@ class Observed:
     x_px: FloatArray
     y_px: FloatArray
     sigma_px: FloatArray
+    edge_px: float = 0.0
 
     def __len__(self) -> int:
         return len(self.frame)
 
     def at(self, chosen: IntArray) -> "Observed":
         """The centroids at indices `chosen`."""
-        return Observed(self.frame[chosen], self.pose[chosen], self.x_px[chosen], self.y_px[chosen], self.sigma_px[chosen])
+        return replace(self, **{name: getattr(self, name)[chosen] for name in COLUMNS})
 
     def joined(self, other: "Observed") -> "Observed":
         """These centroids and others, of other frames."""
-        names = ("frame", "pose", "x_px", "y_px", "sigma_px")
-        return Observed(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+        joined = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in COLUMNS}
+        return replace(self, **joined, edge_px=max(self.edge_px, other.edge_px))
 
 
 def read_observed(path: Path) -> Observed:
@@ -94,14 +97,20 @@ def measure_images(
     """
     paths_of = numbered(paths)
     under = None if dark is None else read_image(dark, resolution_px)
-    window_sigma_px = max(dot_sigma_px, MIN_WINDOW_SIGMA_PX)
-    places = [_centroids(path, resolution_px, under, window_sigma_px) for path in paths_of.values()]
+    settings = dot_centroids(dot_sigma_px)
+    places = [_centroids(path, resolution_px, under, settings) for path in paths_of.values()]
     count = [len(x) for x, _ in places]
     if not sum(count):
         raise InputError(f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer")
     frame_of, pose_of = (np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True))
     x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
-    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)))
+    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)), edge_px=settings.radius_px)
+
+
+def dot_centroids(dot_sigma_px: float) -> CentroidSettings:
+    """How the places of dots of about `dot_sigma_px` in the tracker's image are measured."""
+    window_sigma_px = max(dot_sigma_px, MIN_WINDOW_SIGMA_PX)
+    return CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=window_sigma_px)
 
 
 def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
@@ -119,7 +128,7 @@ def numbered(paths: Sequence[Path]) -> dict[tuple[int, int], Path]:
 
 
 def _centroids(
-    path: Path, resolution_px: tuple[int, int], under: FloatArray | None, window_sigma_px: float
+    path: Path, resolution_px: tuple[int, int], under: FloatArray | None, settings: CentroidSettings
 ) -> tuple[FloatArray, FloatArray]:
     image = read_image(path, resolution_px)
     top = float(image.max())
@@ -127,7 +136,6 @@ def _centroids(
     if top in FULL_DN and saturated > max(20, SATURATED_SHARE * image.size):
         raise InputError(f"{path}: {saturated} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker")
     above = image if under is None else image - under
-    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=window_sigma_px)
     found = find_stars(above, settings, noisiest_background(above))
     kept = ~found.at_edge
     return found.x_px[kept], found.y_px[kept]

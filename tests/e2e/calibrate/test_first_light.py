@@ -189,6 +189,7 @@ def test_the_commands_of_calibrate_give_the_figures_of_the_steps(whole, tmp_path
     geometry = again_by_hand(folder, "geometric", folder / "bench.toml", *frames, *words)
     assert geometry["model"] == steps["geometry"]["model"]
     assert geometry["held_out"]["rms_arcsec"] == pytest.approx(steps["geometry"]["held_out_rms_arcsec"], rel=SAME)
+    assert geometry["error"]["rms_arcsec"] == pytest.approx(steps["geometry"]["error_rms_arcsec"], rel=SAME)
     focal = geometry["parameters"]["focal_length_px"]["value"]
     assert focal == pytest.approx(steps["geometry"]["focal_length_px"], rel=SAME)
     light = again_by_hand(folder, "photometric", folder / "s" / "measured.csv", "--bits", 10, "-o", tmp_path / "response.toml")

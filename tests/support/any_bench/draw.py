@@ -30,6 +30,8 @@ PANELS = (
 PANEL_WEIGHTS = (0.25, 0.1, 0.2, 0.15, 0.05, 0.25)
 DETECTORS_PX = ((256, 256), (512, 512), (640, 480), (1024, 1024), (1280, 1024), (2048, 2048), (2592, 1944), (4096, 4096))
 DETECTOR_WEIGHTS = (0.12, 0.16, 0.1, 0.22, 0.1, 0.18, 0.07, 0.05)
+# Of small benches, which a test can afford.
+SMALL_PANELS_PX, SMALL_DETECTORS_PX = ((400, 300), (480, 320), (640, 480)), ((160, 160), (200, 150), (256, 256))
 FOCAL_MM, TRACKER_PITCH_UM, PSF_PX = (20.0, 150.0), (2.2, 15.0), (0.35, 3.0)
 F_NUMBERS, COLLIMATORS_MM = (1.0, 4.0), (12.0, 4000.0)
 TRACKER_FIELD_DEG, MAX_SCREEN_DEG = (0.5, 60.0), 80.0
@@ -132,11 +134,14 @@ class DrawnBench:
         return table | {key: getattr(self, key) for key in own} | {"pixel_ratio": self.pixel_ratio}
 
 
-def drawn_bench(seed: int, number: int) -> DrawnBench:
-    """Bench `number` of a seed; the same whatever other benches are drawn."""
+def drawn_bench(seed: int, number: int, *, is_small: bool = False) -> DrawnBench:
+    """Bench `number` of a seed; the same whatever other benches are drawn. A small one has few pixels, and is another."""
     rng = np.random.default_rng((seed, number))
     while True:
         panel, detector = _panel(rng), _detector(rng)
+        if is_small:
+            panel = dataclasses.replace(panel, size_px=SMALL_PANELS_PX[rng.integers(len(SMALL_PANELS_PX))])
+            detector = dataclasses.replace(detector, size_px=SMALL_DETECTORS_PX[rng.integers(len(SMALL_DETECTORS_PX))])
         seen = _log_uniform(rng, SEEN)
         field = math.prod(detector.tangents)
         screen_mm2 = math.prod(panel.size_px) * panel.pitch_um**2 / 4e6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from dataclasses import replace
@@ -11,15 +12,16 @@ import pytest
 from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
+from hilstar.calibrate.first_light import focus as focuses
 from hilstar.calibrate.first_light import session as sessions
-from hilstar.calibrate.first_light.context import FittedFigure, StepContext, StepOutcome
+from hilstar.calibrate.first_light.context import DarkSubtracted, FittedFigure, StepContext, StepOutcome
 from hilstar.calibrate.first_light.focus import seen_sharpness, sharpness
 from hilstar.calibrate.first_light.geometry import UPRIGHT, figure_for, see_figure
 from hilstar.calibrate.first_light.image_sources import ImageSource
 from hilstar.calibrate.first_light.photometry import rounds_alike
 from hilstar.calibrate.first_light.seen_stars import Beyond, StarSpot
 from hilstar.calibrate.first_light.session import FirstLightSession, Progress
-from hilstar.calibrate.first_light.stars import P95_OF_TWO, frames_for, place_reasons
+from hilstar.calibrate.first_light.stars import P95_OF_TWO, frames_for, noise_words, place_reasons
 from hilstar.calibrate.geometric.calibration import calibrate_seen, nominal_of, rough_geometry, seen_screen_of
 from hilstar.calibrate.geometric.dots import DOT_PX, SeenScreen, joined, lit_for, plan_seen_dots
 from hilstar.calibrate.geometric.observed import Observed
@@ -68,7 +70,7 @@ def true_geometry(file, turn_deg):
     monitor = replace(
         nominal.monitor, focal_length_px=1.015 * nominal.monitor.focal_length_px, cam_to_image=to_matrix(q), lens=lens
     )
-    return SeenScreen(monitor, nominal.tracker, is_sure=True)
+    return SeenScreen(monitor, nominal.tracker, is_sure=True, psf_sigma_px=0.5)
 
 
 def observed(plan, real, rng, first=0):
@@ -108,7 +110,7 @@ def test_dots_are_within_the_field_of_a_tracker_that_sees_any_share_of_the_scree
     side_px = 1024
     focal_px = screen.focal_length_px * side_px / math.sqrt(share * 1920 * 1080)
     tracker = replace(screen, resolution_px=(side_px, side_px), focal_length_px=focal_px, principal_point_px=(511.5, 511.5))
-    seen = SeenScreen(screen, tracker, is_sure=True)
+    seen = SeenScreen(screen, tracker, is_sure=True, psf_sigma_px=0.5)
     plan = plan_seen_dots(seen, 16, lit_for(seen), np.random.default_rng(0))
     assert len(plan) >= 21
     assert seen.shows(plan.x_px, plan.y_px).all()
@@ -163,7 +165,9 @@ def test_dots_of_a_turned_screen_are_as_sharp_whoever_says_the_turn(turn_deg):
     """A bench file that states the turn leaves orientation none to find, and a certificate has it from the geometry file."""
     turned = from_rotation_vector(np.radians([0.0, 0.0, turn_deg]))
     monitor = monitor_camera((640, 480), 57.65, 30, turned)
-    seen = SeenScreen(monitor, monitor_camera((500, 500), 13, 25, np.array([1.0, 0.0, 0.0, 0.0])), is_sure=True)
+    seen = SeenScreen(
+        monitor, monitor_camera((500, 500), 13, 25, np.array([1.0, 0.0, 0.0, 0.0])), is_sure=True, psf_sigma_px=0.6
+    )
     assert seen.turn_deg == pytest.approx(-turn_deg, abs=0.01)
     side_px = DOT_PX * seen.tracker_px_a_monitor_px
     image = dots_image(0.6, side_px, seen.turn_deg, np.random.default_rng(4))
@@ -212,6 +216,19 @@ def test_a_session_holds_every_step_to_the_ends_of_its_model(tmp_path, monkeypat
     assert {record.verdict for record in session.records.values()} <= {"failed", "skipped"}
 
 
+@pytest.mark.parametrize(("photometry", "scale"), [("done", "done"), ("skipped", "done"), ("failed", "skipped")])
+def test_no_scale_is_done_by_a_response_that_failed(tmp_path, monkeypatch, photometry, scale):
+    """White was 0.167 mag off with 0.016 stated, by stars in a response that was not measured."""
+    runs = {name: lambda context: StepOutcome("done", "found") for name in sessions.NAMES}
+    runs["photometry"] = lambda context: StepOutcome(photometry, "so it ended")
+    monkeypatch.setattr(sessions, "RUNS", runs)
+    (tmp_path / "bench.toml").write_text(bench_text())
+    (tmp_path / "s").mkdir()
+    session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Dark(), 0)
+    session.run(frozenset(), lambda line: None)
+    assert session.records["scale"].verdict == scale
+
+
 def test_a_step_tells_of_itself_while_it_runs(monkeypatch):
     monkeypatch.setattr(sessions, "PROGRESS_S", 0.01)
     lines: list[str] = []
@@ -228,6 +245,23 @@ def test_a_step_tells_of_itself_while_it_runs(monkeypatch):
             assert told.wait(PATIENCE_S)
             told.clear()
     assert lines[-1].startswith("geometry")
+
+
+def test_a_focus_that_has_not_settled_is_not_done(tmp_path, monkeypatch):
+    """The fit ended after its rounds without a word."""
+    monkeypatch.setattr(focuses, "ROUNDS", 1)
+    file = large_screen(tmp_path)
+    image = np.random.default_rng(4).normal(0, 1.0, (400, 400))
+    for x, y in itertools.product(range(50, 400, 75), repeat=2):
+        image[y : y + 3, x : x + 3] += 300
+    found = sharpness(image, 3.0)
+    assert not found.has_settled
+    dots = focuses.SharpDots(255, found, DarkSubtracted(tmp_path / "dots.png", image, 300.0, 0.0))
+    monkeypatch.setattr(focuses, "sharp_dots", lambda context: dots)
+    context = StepContext(file, tmp_path, tmp_path, ImageSource(), {}, {}, 1)
+    outcome = focuses.focus(context)
+    assert outcome.verdict == "failed"
+    assert "has not settled in 1 rounds" in outcome.line
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 25.0, 44.0, -40.0, 47.0, -48.0])
@@ -281,6 +315,19 @@ def test_what_is_beyond_noise_is_told_from_noise():
     assert alone.high < 0.1
     assert more.low < 0.3 < more.high
     assert more.low > 0.2
+
+
+class Distances:
+    """Stars `off_px` from the sky along x and y, with noise along each axis, for `noise_words`."""
+
+    def __init__(self, off_px, noise_px):
+        self.residual_px, self.place_noise_px = np.full((4, 2), off_px), np.full(4, noise_px)
+
+
+def test_noise_is_never_said_to_be_more_than_the_whole():
+    """A line said that stars were 0.081 px off, of which noise was 0.086."""
+    assert noise_words(Distances(0.1, 0.05)) == "of which noise is 0.071 px"
+    assert noise_words(Distances(0.05, 0.06)) == "no more than their noise makes (0.085 px)"
 
 
 class Places:

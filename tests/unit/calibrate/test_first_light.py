@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from msgspec import structs
+from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
@@ -99,6 +100,15 @@ def test_a_detector_that_is_clipped_at_zero_beyond_the_screen_s_glow_sees_the_fi
     image[:, :60], image[:, 340:], image[:60], image[340:] = 0, 0, 0, 0
     assert (image == 0).mean() > 0.5
     assert see_figure(image, figure, GEOMETRY).way == UPRIGHT
+
+
+@pytest.mark.parametrize("sigma_px", [2.4, 3.5])
+def test_squares_are_told_apart_by_light_through_a_wide_psf(sigma_px):
+    """Of 2.4 px and more spots of squares of 1, 2 and 3 sides have nearly as many pixels above the noise."""
+    figure, noise = figure_for(GEOMETRY), np.random.default_rng(3).normal(0, 1.0, (400, 400))
+    way = (0, -1, 1, 0)
+    image = 6 * gaussian_filter(spots(figure, way), sigma_px) + noise
+    assert see_figure(image, figure, GEOMETRY).way == way
 
 
 def test_an_upright_figure_leaves_the_mounting_alone():

@@ -23,6 +23,7 @@ from hilstar.calibrate.first_light.photometry import (
     response_error_mag,
 )
 from hilstar.calibrate.first_light.stars import scale, trend
+from hilstar.calibrate.geometric.observed import read_image
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import (
@@ -201,6 +202,18 @@ def on_the_twin(tmp_path, step, bench, truth, patches=72):
         return step(StepContext(file, tmp_path, tmp_path / "images", source, {}, {}, patches))
     finally:
         source.close()
+
+
+def test_the_newest_image_of_the_virtual_bench_is_its_file(tmp_path):
+    """It is not read again; an older one is."""
+
+    def images(context):
+        paths = [context.dark(number) for number in range(2)]
+        return [(context.pixels(path), read_image(path)) for path in paths]
+
+    for kept, read in on_the_twin(tmp_path, images, {}, {}):
+        assert kept.dtype == read.dtype
+        assert (kept == read).all()
 
 
 def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):

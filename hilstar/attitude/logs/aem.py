@@ -487,7 +487,7 @@ def _write(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing)
     file.write(aem_text(samples, writing.ending == ".xml", writing.scale).encode())
 
 
-FORMAT = LogFormat(
+log_format = LogFormat(
     "a CCSDS AEM",
     _open,
     listed="CCSDS AEM (KVN or XML)",
@@ -496,4 +496,4 @@ FORMAT = LogFormat(
     endings=(".aem", ".kvn", ".xml"),
     write=_write,
 )
-OTHER = LogFormat("a CCSDS message", _refuse_other, begins=_is_other)
+other_ccsds = LogFormat("a CCSDS message", _refuse_other, begins=_is_other)

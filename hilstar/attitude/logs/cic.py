@@ -69,7 +69,7 @@ def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
     conventions = replace(
         reading.conventions,
         source="CIC AEM (CNES, VTS)",
-        scalar="scalar first (q0, q1, q2, q3), the conjugate of a Hamilton quaternion, as in an AEM",
+        scalar="scalar first (q0, q1, q2, q3), the conjugate of a Hamilton quaternion",
     )
     yield replace(reading, conventions=conventions, told=[*told, *reading.told])
 
@@ -103,7 +103,8 @@ class _CicReading:
     def _marker(self, where: str, line: str) -> None:
         begins = line == "META_START"
         if begins == (self.section == "metadata"):
-            raise AemFaultError(where, f"{line} in the {self.section}; META_START and META_STOP take turns")
+            detail = f"{line} in the {self.section}; META_START and META_STOP take turns"
+            raise AemFaultError(where, detail)
         if begins:
             _check_header(self._header)
             self.segments.append(_CicSegment({}))
@@ -133,9 +134,13 @@ def _keyword(line: str, known: frozenset[str], where: str) -> tuple[str, str]:
     key = key.strip()
     if not equals:
         quoted = line[:MAX_QUOTED_CHARACTERS]
-        raise AemFaultError(where, f"{quoted!r} where a keyword belongs; write KEYWORD = value, or META_STOP before data")
+        raise AemFaultError(
+            where,
+            f"{quoted!r} where a keyword belongs; write KEYWORD = value, or META_STOP before data",
+        )
     if key not in known and not key.startswith(FREE_KEYS):
-        raise AemFaultError(where, f"{key[:40]} is no keyword that is read here; the keywords are {', '.join(sorted(known))}")
+        advice = f"the keywords are {', '.join(sorted(known))}"
+        raise AemFaultError(where, f"{key[:40]} is no keyword that is read here; {advice}")
     return key, ccsds.plain(value)
 
 
@@ -168,7 +173,8 @@ def _epoch(where: str, day_text: str, seconds_text: str) -> str:
     if not day.is_integer():
         raise AemFaultError(where, f"the day {day_text[:40]} is no whole number; {FORM}")
     if int(day) not in DAYS:
-        wrong = f"the day {day_text[:40]} is no modified Julian day from {DAYS.start} (1957) to {DAYS.stop - 1} (2099)"
+        span = f"from {DAYS.start} (1957) to {DAYS.stop - 1} (2099)"
+        wrong = f"the day {day_text[:40]} is no modified Julian day {span}"
         raise AemFaultError(where, f"{wrong}; days from 1950, as CNES counts, are 33282 fewer")
     ns = ns_of_seconds(seconds_text)
     if not 0 <= ns < DAY_SECONDS * NS_PER_S:
@@ -184,13 +190,15 @@ def _block(segment: _CicSegment, told: list[tuple[str, str]]) -> ccsds.Block:
             raise AemFaultError(end, f"{key} is missing in the metadata")
     if meta["ATTITUDE_TYPE"] != ccsds.QUATERNION:
         given = meta["ATTITUDE_TYPE"][:40]
-        raise AemFaultError(end, f"ATTITUDE_TYPE = {given} of a CIC AEM is not read; write {ccsds.QUATERNION}")
+        detail = f"ATTITUDE_TYPE = {given} of a CIC AEM is not read"
+        raise AemFaultError(end, f"{detail}; write {ccsds.QUATERNION}")
     if not segment.rows:
         raise AemFaultError(end, "the segment contains no attitude")
     if meta.get("QUATERNION_TYPE", "FIRST") != "FIRST" and not segment.names_real_part:
         raise AemFaultError(
             segment.lines["QUATERNION_TYPE"],
-            f"QUATERNION_TYPE = {meta['QUATERNION_TYPE'][:40]}, where CIC has the real part first and writers differ;"
+            f"QUATERNION_TYPE = {meta['QUATERNION_TYPE'][:40]}, where CIC has the real part"
+            " first and writers differ;"
             " put the real part first, and write QUATERNION_TYPE = FIRST",
         )
     for key in ("REF_FRAME_A", "REF_FRAME_B"):
@@ -198,11 +206,18 @@ def _block(segment: _CicSegment, told: list[tuple[str, str]]) -> ccsds.Block:
             meta[key] = "SC_BODY"
             told.append(("log-frame", f"{key} = {UNNAMED_BODY} is taken as the spacecraft's body"))
     meta |= {ccsds.VERSION_KEY: "1.0", "QUATERNION_TYPE": "FIRST"}
-    return ccsds.Block(meta, segment.where, segment.epochs, np.array(segment.rows, dtype=np.float64))
+    values = np.array(segment.rows, dtype=np.float64)
+    return ccsds.Block(meta, segment.where, segment.epochs, values)
 
 
 def _begins(beginning: LogHead) -> bool:
     return beginning.word.startswith(VERSION_KEY)
 
 
-FORMAT = LogFormat("a CIC AEM", _open, listed="CIC AEM (CNES, VTS)", uses=frozenset({"mounting"}), begins=_begins)
+log_format = LogFormat(
+    "a CIC AEM",
+    _open,
+    listed="CIC AEM (CNES, VTS)",
+    uses=frozenset({"mounting"}),
+    begins=_begins,
+)

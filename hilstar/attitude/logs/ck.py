@@ -135,7 +135,7 @@ def _conventions(said: dict[str, Any]) -> Conventions:
     )
 
 
-FORMAT = LogFormat(
+log_format = LogFormat(
     "a SPICE CK",
     _open,
     listed="SPICE CKs",

@@ -1,5 +1,5 @@
-"""CSV logs of attitudes: the columns `t_s,qw,qx,qy,qz` in any order and, where known, `rx,ry,rz` (rad/s), `sequence` and
-`discontinuity`.
+"""CSV logs of attitudes: the columns `t_s,qw,qx,qy,qz` in any order and, where known, `rx,ry,rz`
+(rad/s), `sequence` and `discontinuity`.
 """
 
 import contextlib
@@ -81,11 +81,21 @@ def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writ
     file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
     for sample in samples:
         rate = sample.rate_cam_rad_s
-        numbers = [*map(repr, sample.q_icrs_to_cam.tolist()), *(("", "", "") if rate is None else map(repr, rate.tolist()))]
+        numbers = [
+            *map(repr, sample.q_icrs_to_cam.tolist()),
+            *(("", "", "") if rate is None else map(repr, rate.tolist())),
+        ]
         seconds, ns = divmod(abs(sample.t_ns), NS_PER_S)
         t_s = f"{'-' if sample.t_ns < 0 else ''}{seconds}.{ns:09}"
         file.write((",".join((t_s, *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")) + "\n").encode())
 
 
 # What no other format takes is read as CSV.
-FORMAT = LogFormat("CSV", read_csv_log, listed="CSV", uses=LIKE_PACKETS, endings=(".csv",), write=_write_csv)
+log_format = LogFormat(
+    "CSV",
+    read_csv_log,
+    listed="CSV",
+    uses=LIKE_PACKETS,
+    endings=(".csv",),
+    write=_write_csv,
+)

@@ -40,7 +40,7 @@ def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample], writin
         file.write(encoder.encode(form) + b"\n")
 
 
-FORMAT = LogFormat(
+log_format = LogFormat(
     "JSON lines",
     read_json_lines,
     listed="JSON lines",

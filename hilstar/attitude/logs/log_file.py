@@ -1,4 +1,4 @@
-"""Attitude logs of every format, read and written: the samples of one in order of time, and what its numbers mean.
+"""Attitude logs of every format, read and written: samples in order of time, and their meaning.
 
 Which formats there are, and which of them a file is, `log_formats` says.
 
@@ -17,7 +17,14 @@ from pathlib import Path
 from hilstar.attitude.clock.rate_causes import ReadAs
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
-from hilstar.attitude.logs.entries import MAX_SAMPLES, AttitudeLog, LogJoins, LogReading, Stated, log_joins
+from hilstar.attitude.logs.entries import (
+    MAX_SAMPLES,
+    AttitudeLog,
+    LogJoins,
+    LogReading,
+    Stated,
+    log_joins,
+)
 from hilstar.attitude.logs.log_formats import NOTHING_STATED, Writing, check_stated, writer_of
 from hilstar.attitude.logs.log_times import time_notices
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
@@ -65,7 +72,11 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
     return AttitudeLog(samples, conventions, told, read_as)
 
 
-def _samples(path: Path, reading: LogReading, mounting: Mounting) -> tuple[list[AttitudeSample], int]:
+def _samples(
+    path: Path,
+    reading: LogReading,
+    mounting: Mounting,
+) -> tuple[list[AttitudeSample], int]:
     """The camera's samples of a reading, and how many entries without an attitude are before the
     first. Raises InputError.
     """
@@ -82,7 +93,8 @@ def _samples(path: Path, reading: LogReading, mounting: Mounting) -> tuple[list[
             raise InputError(f"{path}{where}: time does not increase ({times}); {reading.advice}")
         samples.append(mounting.sample(event) if reading.conventions.of_body else event)
         if len(samples) > MAX_SAMPLES:
-            raise InputError(f"{path}{where}: more than {MAX_SAMPLES} attitudes; split the log into several")
+            detail = f"more than {MAX_SAMPLES} attitudes; split the log into several"
+            raise InputError(f"{path}{where}: {detail}")
     if not samples and unset:
         raise InputError(f"{path}: no attitude in {unset} entries: {UNSET}; give another log")
     if not samples:

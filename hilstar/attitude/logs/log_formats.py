@@ -55,7 +55,7 @@ class LogHead(NamedTuple):
 
 
 class Writing(NamedTuple):
-    """How a log is written: the ending of its name, and the time scale of its times where it has one."""
+    """How a log is written: the ending of its name, and the scale of its times (None: unknown)."""
 
     ending: str
     scale: str | None = None
@@ -88,7 +88,7 @@ class LogFormat:
     of_ledgers: bool = False
 
     def takes(self, beginning: LogHead) -> bool:
-        """Whether a file is of this format by its beginning. Raises InputError for one that cannot be read."""
+        """Whether a file is of this format by its beginning. Raises InputError."""
         if self.begins is not None:
             return self.begins(beginning)
         return not self.magic or beginning.head.startswith(self.magic)
@@ -113,7 +113,8 @@ def log_formats() -> tuple[LogFormat, ...]:
         if loaded is not None:
             (own if is_own else others).append(loaded)
     if not own:
-        raise MachineError("hilstar's own log formats are not registered; install hilstar again: pip install hilstar")
+        missing = "hilstar's own log formats are not registered"
+        raise MachineError(f"{missing}; install hilstar again: pip install hilstar")
     return tuple(sorted([*own, *others], key=lambda each: each.closeness))
 
 
@@ -133,7 +134,7 @@ def _registered() -> Iterator[tuple[EntryPoint, bool]]:
 
 
 def _of_checkout(path: Path) -> list[EntryPoint]:
-    """The entry points in the pyproject.toml of a checkout of hilstar; none where there is no such file."""
+    """The entry points in the pyproject.toml of a checkout; none where there is none."""
     if not path.is_file():
         return []
     project = tomllib.loads(path.read_text(encoding="utf-8")).get("project", {})
@@ -201,7 +202,7 @@ def check_stated(path: Path, stated: Stated) -> LogFormat:
 
 
 def writer_of(path: Path) -> tuple[Writer, str]:
-    """The writer of a name's ending, and that ending. Raises InputError for an ending that no format writes."""
+    """The writer of a name's ending, and that ending. Raises InputError for any other ending."""
     ending = path.suffix.lower()
     endings: list[str] = []
     for each in log_formats():

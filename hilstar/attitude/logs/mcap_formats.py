@@ -1,5 +1,6 @@
-"""MCAP files as logs: hilstar's own attitudes, and the ledger of a run. Their bytes are `mcap_log`'s, which is imported where
-a file is MCAP: it takes 30 ms.
+"""MCAP files as logs: hilstar's own attitudes, and the ledger of a run.
+
+Their bytes are `mcap_log`'s, which is imported where a file is MCAP: it takes 30 ms.
 """
 
 import contextlib
@@ -68,8 +69,14 @@ def _write(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing)
     write_attitudes(file, samples)
 
 
-LEDGER = LogFormat("the ledger of a run", read_ledger, magic=(MCAP_MAGIC,), begins=_begins_as_ledger, of_ledgers=True)
-FORMAT = LogFormat(
+ledger_format = LogFormat(
+    "the ledger of a run",
+    read_ledger,
+    magic=(MCAP_MAGIC,),
+    begins=_begins_as_ledger,
+    of_ledgers=True,
+)
+log_format = LogFormat(
     "an MCAP file",
     read_mcap,
     listed="MCAP",

@@ -1,5 +1,5 @@
-"""Logs whose entries have the numbers of a packet (CSV, JSON lines, MCAP): their convention, mounting and reference, as the
-user states them.
+"""Logs whose entries have the numbers of a packet (CSV, JSON lines, MCAP): their convention,
+mounting and reference, as the user states them.
 """
 
 import itertools
@@ -12,7 +12,13 @@ from msgspec import structs
 
 from hilstar.attitude.logs.entries import OPTIONS, LogEntry, LogReading, Stated
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.attitude.wire.source import HILSTARS, Convention, Conventions, components, packet_conventions
+from hilstar.attitude.wire.source import (
+    HILSTARS,
+    Convention,
+    Conventions,
+    components,
+    packet_conventions,
+)
 from hilstar.rotation import conjugate, multiply
 from hilstar.units import NS_PER_S
 
@@ -26,7 +32,11 @@ LIKE_PACKETS = LEVEL | {"mounting", "convention"}
 
 
 def of_packets(
-    path: Path, entries: Iterator[LogEntry], source: str, stated: Stated, advice: str = "sort the log by time"
+    path: Path,
+    entries: Iterator[LogEntry],
+    source: str,
+    stated: Stated,
+    advice: str = "sort the log by time",
 ) -> LogReading:
     """The reading of entries that have the numbers of a packet, as they were sent: their
     convention, then their reference.
@@ -57,7 +67,7 @@ def of_packets(
 
 
 def _up_to_first(entries: Iterator[LogEntry]) -> tuple[list[LogEntry], AttitudeSample | None]:
-    """The entries up to the first attitude, and that attitude; None where something else ends them."""
+    """The entries up to the first attitude, and that attitude; None where there is none."""
     begin = []
     for entry in entries:
         begin.append(entry)
@@ -71,7 +81,7 @@ def _up_to_first(entries: Iterator[LogEntry]) -> tuple[list[LogEntry], AttitudeS
 def _by_convention(entries: Iterable[LogEntry], convention: Convention) -> Iterator[LogEntry]:
     for entry in entries:
         event = entry.event
-        yield LogEntry(entry.where, convention.sample(event)) if isinstance(event, AttitudeSample) else entry
+        yield (LogEntry(entry.where, convention.sample(event)) if isinstance(event, AttitudeSample) else entry)
 
 
 def _referred(conventions: Conventions, convention: Convention, reference: "Reference", first_ns: int) -> Conventions:

@@ -476,7 +476,7 @@ def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
         yield read_ros(bag, stated)
 
 
-FORMAT = LogFormat(
+log_format = LogFormat(
     "a ROS bag",
     _open,
     listed="bags of ROS",

@@ -1,4 +1,4 @@
-"""ROS bags as logs: opened by rosbags' `AnyReader`, whatever their storage; `ros` says what their messages mean.
+"""ROS bags, opened by rosbags' `AnyReader`; `ros` says what their messages mean.
 
 A bag is one file (.bag of ROS 1; .db3 or .mcap of ROS 2) or the directory of a bag of ROS 2. Its
 content says which; rosbags goes by the ending, so a file of another name is read by a link to it.
@@ -31,13 +31,14 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no message begins so, in CDR or of ROS 1
 ENDINGS = {ROSBAG_MAGIC: ".bag", SQLITE_MAGIC: ".db3", MCAP_MAGIC: ".mcap"}
 METADATA = "metadata.yaml"
 MAX_METADATA_BYTES = 2_000_000  # a YAML reader's time has no bound
+PACKED = f"its messages are packed; give the bag's directory, whose {METADATA} says so"
 STORED = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 OLD_TF = "tf/msg/tfMessage"
 TF, TF_TEXT = "tf2_msgs/msg/TFMessage", "geometry_msgs/TransformStamped[] transforms"
 
 
 class Message(NamedTuple):
-    """What a bag holds of one message: when it was recorded, ns of the recorder's clock, and its serialised bytes."""
+    """A message: when it was recorded, ns of the recorder's clock, and its serialised bytes."""
 
     receive_ns: int
     data: bytes
@@ -45,7 +46,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BagTopic:
-    """A topic of a bag: `type` as PACKAGE/msg/NAME, and rosbags' connections of it, one of each recording."""
+    """A topic of a bag: `type` as PACKAGE/msg/NAME, and rosbags' connections of it."""
 
     name: str
     type: str
@@ -54,7 +55,7 @@ class BagTopic:
 
 @lru_cache(maxsize=2)
 def own_types(is_ros2: bool) -> "Typestore":
-    """ROS's own types: of rosbags' latest ROS 2 (these have not changed since the first), or of Noetic for ROS 1."""
+    """ROS's own types: of the latest ROS 2 (unchanged since the first), or of Noetic."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     if is_ros2:
@@ -75,16 +76,15 @@ class Bag:
         found: dict[tuple[str, str], list[Connection]] = {}
         for connection in self._reader.connections:
             found.setdefault((connection.topic, connection.msgtype), []).append(connection)
-        return [BagTopic(name, kind, tuple(connections)) for (name, kind), connections in found.items()]
+        named = found.items()
+        return [BagTopic(name, kind, tuple(each)) for (name, kind), each in named]
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic in the order of their times of recording. Raises InputError for damage."""
+        """The messages of a topic in the order of their recording. Raises InputError for damage."""
         with _readable(self.path):
             for _, receive_ns, data in self._reader.messages(topic.connections):
                 if data[:4] == ZSTD_MAGIC:
-                    raise InputError(
-                        f"{self.path}: its messages are packed; give the bag's directory, whose {METADATA} says so"
-                    )
+                    raise InputError(f"{self.path}: {PACKED}")
                 yield Message(receive_ns, data)
 
     def decoded(self, topic: BagTopic, data: bytes) -> Any:
@@ -108,17 +108,20 @@ class Bag:
 
 
 def _inner_types(fields: Any) -> Iterator[str]:
-    """The names of the types within a type's fields, as rosbags has those: nested tuples with a name at their end."""
-    for _, description in fields:
-        while isinstance(description, tuple) and not isinstance(description[-1], str):
-            description = description[-1][0] if isinstance(description[-1], tuple) else description[-1]
-        if isinstance(description, tuple) and isinstance(description[-1], str):
-            yield description[-1]
+    """The names of the types within a type's fields, which rosbags has as nested tuples."""
+    for _, (_, argument) in fields:
+        while isinstance(argument, tuple) and isinstance(argument[0], tuple):  # of an array
+            _, argument = argument[0]
+        if isinstance(argument, str):
+            yield argument
 
 
 def is_bag_directory(path: Path) -> bool:
     """Whether a directory has what a bag of ROS 2 has. Raises OSError where it cannot be listed."""
-    return path.is_dir() and any(file.name == METADATA or file.name.endswith(STORED) for file in path.iterdir())
+    if not path.is_dir():
+        return False
+    names = [file.name for file in path.iterdir()]
+    return METADATA in names or any(name.endswith(STORED) for name in names)
 
 
 @contextlib.contextmanager
@@ -129,23 +132,26 @@ def open_bag(path: Path) -> Iterator[Bag]:
     with temporary_folder("bag") as place, contextlib.ExitStack() as stack:
         named = _directory(path) if path.is_dir() else _by_its_ending(path, place)
         with _readable(path):
-            reader = stack.enter_context(AnyReader([named], default_typestore=own_types(named.suffix != ".bag")))
+            types = own_types(named.suffix != ".bag")
+            reader = stack.enter_context(AnyReader([named], default_typestore=types))
         yield Bag(path, reader)
 
 
 def _directory(path: Path) -> Path:
-    """A bag's directory as it is. Raises InputError where it has no index, or one that nobody writes."""
+    """A bag's directory as it is. Raises InputError where it has no index that anybody wrote."""
     metadata = path / METADATA
     if not metadata.is_file():
-        raise InputError(f"{path}: has no {METADATA} (its recorder was killed?); make one: ros2 bag reindex {path.name}")
+        missing = f"{path}: has no {METADATA} (its recorder was killed?)"
+        raise InputError(f"{missing}; make one: ros2 bag reindex {path.name}")
     size = metadata.stat().st_size
     if size > MAX_METADATA_BYTES:
-        raise InputError(f"{metadata}: has {size_text(size)}; make it anew: ros2 bag reindex {path.name}")
+        too_large = f"{metadata}: has {size_text(size)}"
+        raise InputError(f"{too_large}; make it anew: ros2 bag reindex {path.name}")
     return path
 
 
 def _by_its_ending(path: Path, place: Path) -> Path:
-    """A file under a name whose ending says what it is: its own, or that of a link in `place`. Raises InputError."""
+    """A file whose name ends as its content says, or a link to it in `place`. Raises InputError."""
     with open_regular(path, BAG_ADVICE) as file:
         head = file.read(HEAD_BYTES)
     ending = next(ending for magic, ending in ENDINGS.items() if head.startswith(magic))
@@ -158,11 +164,12 @@ def _by_its_ending(path: Path, place: Path) -> Path:
 
 
 def _refuse_unmerged(path: Path) -> None:
-    """Refuse (InputError) an SQLite file whose last messages lie beside it, since its recorder did not close it."""
+    """Refuse (InputError) an SQLite file whose last messages its recorder left beside it."""
     log = path.with_name(path.name + "-wal")
     if log.is_file() and log.stat().st_size:
         merge = f"sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)'"
-        raise InputError(f"{path}: its recorder did not close it, and {log.name} has the rest; merge it with: {merge}")
+        rest = f"its recorder did not close it, and {log.name} has the rest"
+        raise InputError(f"{path}: {rest}; merge it with: {merge}")
 
 
 @contextlib.contextmanager
@@ -172,20 +179,22 @@ def _readable(path: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except Exception as error:  # its readers pass on what struct, sqlite, yaml and the unpackers raise
+    except Exception as error:  # its readers pass on what struct, sqlite, yaml and others raise
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: rosbags cannot read it ({shortened(reason)}); {_mend(path, reason)}") from error
+        said = f"{path}: rosbags cannot read it ({shortened(reason)})"
+        raise InputError(f"{said}; {_mend(path, reason)}") from error
 
 
 def _mend(path: Path, reason: str) -> str:
     """What to do with a bag that cannot be read."""
     if "Profile" in reason:
-        return "it is MCAP of another kind than ROS 2's; write it again with ros2 bag convert, or give the bag that it is of"
+        other = "it is MCAP of another kind than ROS 2's"
+        return f"{other}; write it again with ros2 bag convert, or give the bag that it is of"
     if path.suffix == ".bag" or reason.startswith("Bag"):
         return f"where its index is missing or damaged: rosbag reindex {path.name} (of ROS 1)"
     return (
-        "where its index is missing or damaged: ros2 bag reindex DIRECTORY (an MCAP file that was cut off, first:"
-        f" mcap recover {path.name} -o NEW.mcap)"
+        "where its index is missing or damaged: ros2 bag reindex DIRECTORY (an MCAP file that was"
+        f" cut off, first: mcap recover {path.name} -o NEW.mcap)"
     )
 
 

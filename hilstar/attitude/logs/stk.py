@@ -1,11 +1,11 @@
 """Attitude files of STK (`.a`), by AGI's description of the format ("Attitude File Format").
 
-1. Whatever its form, an attitude turns from CoordinateAxes to the body. A quaternion is the axis and
-   half the angle by which the axes are turned, so hilstar's is its conjugate: in AGI's own example
-   of AttitudeTimeQuatAngVels, +6 deg/s about z for 10 s is (0, 0, sin 30, cos 30), scalar last.
+1. Whatever its form, an attitude turns from CoordinateAxes to the body. A quaternion is the axis
+   and half the angle by which the axes are turned, so hilstar's is its conjugate: in AGI's own
+   example of AttitudeTimeQuatAngVels, +6 deg/s about z for 10 s is (0, 0, sin 30, cos 30), scalar last.
 2. Angular velocities are deg/s of the body with respect to those axes, in the body's components.
-3. The three Euler angles (degrees) are successive turns of the axes about the axes of Sequence, each
-   about an axis that the turns before it made.
+3. The three Euler angles (degrees) are successive turns of the axes about the axes of Sequence,
+   each about an axis that the turns before it made.
 4. The nine numbers of a matrix are its rows; it turns components of the axes into the body's.
 5. Times are counted from ScenarioEpoch (UTC), in seconds unless TimeFormat says otherwise.
 
@@ -17,7 +17,7 @@ import contextlib
 import difflib
 import io
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from pathlib import Path
@@ -39,9 +39,22 @@ VERSION = "stk.v."
 BEGIN, END = "BEGIN ATTITUDE", "END ATTITUDE"
 MAX_BYTES = 50_000_000
 # Keywords in small letters (STK ignores the case). These change what is read:
-READ = ("numberofattitudepoints", "scenarioepoch", "centralbody", "coordinateaxes", "sequence", "timeformat")
+READ = (
+    "numberofattitudepoints",
+    "scenarioepoch",
+    "centralbody",
+    "coordinateaxes",
+    "sequence",
+    "timeformat",
+)
 # and these do not: how STK interpolates, how it reads, and what it says.
-IGNORED = ("blockingfactor", "interpolationorder", "interpolationmethod", "attitudedeviations", "messagelevel")
+IGNORED = (
+    "blockingfactor",
+    "interpolationorder",
+    "interpolationmethod",
+    "attitudedeviations",
+    "messagelevel",
+)
 NAMES = {
     name.lower(): name
     for name in (
@@ -59,32 +72,50 @@ NAMES = {
     )
 }
 INERTIAL = {"j2000": "EME2000", "icrf": "ICRF"}
-OF_EARTH = {"inertial": "ICRF", "fixed": "ITRF", "meanofdate": "MOD", "trueofdate": "TOD", "temeofdate": "TEME"}
+OF_EARTH = {
+    "inertial": "ICRF",
+    "fixed": "ITRF",
+    "meanofdate": "MOD",
+    "trueofdate": "TOD",
+    "temeofdate": "TEME",
+}
 AXES = INERTIAL | OF_EARTH
+# The forms of the data: the type of an AEM whose numbers each has, and how many numbers a row has.
+TYPES = {
+    "AttitudeTimeQuaternions": ccsds.QUATERNION,
+    "AttitudeTimeQuatScalarFirst": ccsds.QUATERNION,
+    "AttitudeTimeQuatAngVels": ccsds.ANGVEL,
+    "AttitudeTimeEulerAngles": ccsds.EULER,
+    "AttitudeTimeDCM": ccsds.QUATERNION,
+    "AttitudeTimeDCMAngVels": ccsds.ANGVEL,
+}
+COUNTS = {
+    "AttitudeTimeQuaternions": 4,
+    "AttitudeTimeQuatScalarFirst": 4,
+    "AttitudeTimeQuatAngVels": 7,
+    "AttitudeTimeEulerAngles": 3,
+    "AttitudeTimeDCM": 9,
+    "AttitudeTimeDCMAngVels": 12,
+}
+SCALAR_LAST = frozenset({"AttitudeTimeQuaternions", "AttitudeTimeQuatAngVels"})
+MATRICES = frozenset({"AttitudeTimeDCM", "AttitudeTimeDCMAngVels"})
+FORM_OF = {name.lower(): name for name in TYPES}
 # How many seconds the unit of a time is, and the two forms of dates.
 SECONDS = {"epsec": 1, "epmin": 60, "ephr": 3600, "epday": 86_400}
 DATES = frozenset({"utcg", "iso-ymd", "iso-yd"})
 MONTH_NAMES = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 MONTHS = {name: number for number, name in enumerate(MONTH_NAMES, start=1)}
-GREGORIAN = re.compile(r"(\d{1,2}) ([A-Za-z]{3})[a-z]* (\d{4}) (\d{1,2}):(\d{1,2}):(\d{1,2})(\.\d*)?", re.ASCII)
+CLOCK = r"(\d{1,2}):(\d{1,2}):(\d{1,2})(\.\d*)?"
+GREGORIAN = re.compile(rf"(\d{{1,2}}) ([A-Za-z]{{3}})[a-z]* (\d{{4}}) {CLOCK}", re.ASCII)
 DATE_FORM = "write it as 1 Jan 2025 00:00:00.000 or 2025-01-01T00:00:00.000"
 NO_DATE = "seconds of the file, no dates: it states no ScenarioEpoch"
 MAX_OFF = 1e-3  # of a matrix from one whose rows are unit and square to each other
 LAST_TO_FRONT = [3, 0, 1, 2]
 
 
-@dataclass(frozen=True, slots=True)
-class _StkForm:
-    """A form of the data: the type of an AEM whose numbers it has, how many there are, and its way to the AEM's."""
-
-    attitude_type: str
-    count: int
-    values: Callable[["_StkFile", FloatArray], FloatArray]
-
-
 @dataclass(slots=True)
 class _StkFile:
-    """A file as it is read: its keywords, each with its line, the form of its data, and its rows."""
+    """A file as it is read: its keywords, each with its line, the form of its data, its rows."""
 
     keywords: dict[str, str] = field(default_factory=dict)
     lines: dict[str, str] = field(default_factory=dict)
@@ -99,35 +130,27 @@ class _StkFile:
         return self.keywords.get(name, default).strip('"').lower()
 
 
-def _scalar_last(file: _StkFile, values: FloatArray) -> FloatArray:
-    return np.column_stack((values[:, LAST_TO_FRONT], values[:, 4:]))
-
-
-def _as_written(file: _StkFile, values: FloatArray) -> FloatArray:
+def _values(file: _StkFile) -> FloatArray:
+    """The numbers of the rows as an AEM's block has them, scalar first. Raises AemFaultError."""
+    values = np.array(file.rows, dtype=np.float64)
+    if file.form in MATRICES:
+        return np.column_stack((_of_matrices(file, values[:, :9]), values[:, 9:]))
+    if file.form in SCALAR_LAST:
+        return np.column_stack((values[:, LAST_TO_FRONT], values[:, 4:]))
     return values
 
 
-def _of_matrices(file: _StkFile, values: FloatArray) -> FloatArray:
-    matrices = values[:, :9].reshape(-1, 3, 3)
+def _of_matrices(file: _StkFile, rows: FloatArray) -> FloatArray:
+    """The quaternions (n, 4) of matrices by rows (n, 9). Raises AemFaultError for another."""
+    matrices = rows.reshape(-1, 3, 3)
     with np.errstate(all="ignore"):  # of numbers that are not finite
         off = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max(axis=(1, 2))
         wrong = ~(off <= MAX_OFF) | ~(np.linalg.det(matrices) > 0)
     if wrong.any():
         where = file.where[int(wrong.argmax())]
-        raise AemFaultError(where, "the nine numbers are no rotation matrix by rows; write unit rows, square to each other")
-    q = np.array([conjugate(from_matrix(matrix)) for matrix in matrices])
-    return np.column_stack((q, values[:, 9:]))
-
-
-FORMS = {
-    "AttitudeTimeQuaternions": _StkForm(ccsds.QUATERNION, 4, _scalar_last),
-    "AttitudeTimeQuatScalarFirst": _StkForm(ccsds.QUATERNION, 4, _as_written),
-    "AttitudeTimeQuatAngVels": _StkForm(ccsds.ANGVEL, 7, _scalar_last),
-    "AttitudeTimeEulerAngles": _StkForm(ccsds.EULER, 3, _as_written),
-    "AttitudeTimeDCM": _StkForm(ccsds.QUATERNION, 9, _of_matrices),
-    "AttitudeTimeDCMAngVels": _StkForm(ccsds.ANGVEL, 12, _of_matrices),
-}
-FORM_OF = {name.lower(): name for name in FORMS}
+        detail = "the nine numbers are no rotation matrix by rows"
+        raise AemFaultError(where, f"{detail}; write unit rows, square to each other")
+    return np.array([conjugate(from_matrix(matrix)) for matrix in matrices])
 
 
 @contextlib.contextmanager
@@ -150,12 +173,13 @@ def _parsed(text: str) -> _StkFile:
     file, section = _StkFile(), "start"
     for number, raw in enumerate(io.StringIO(text, newline=None), start=1):
         where, line = f":{number}", raw.split("#", 1)[0].strip()
-        if not line or (number == 1 and line.startswith(VERSION)):
+        if not line or (section == "start" and line.startswith(VERSION)):
             continue
         plain = " ".join(line.upper().split())
         if section == "start":
             if plain != BEGIN:
-                raise AemFaultError(where, f"{line[:40]!r} where BEGIN Attitude belongs; only attitude files of STK are read")
+                detail = f"{line[:40]!r} where BEGIN Attitude belongs"
+                raise AemFaultError(where, f"{detail}; only attitude files of STK are read")
             section = "keywords"
         elif plain == END:
             file.has_end, section = True, "end"
@@ -166,7 +190,8 @@ def _parsed(text: str) -> _StkFile:
         else:
             raise AemFaultError(where, f"{line[:40]!r} after END Attitude; delete it")
     if not file.rows:
-        raise AemFaultError("", f"contains no attitude; write one of {', '.join(FORMS)}, and rows below it")
+        forms = ", ".join(TYPES)
+        raise AemFaultError("", f"contains no attitude; write one of {forms}, and rows below it")
     return file
 
 
@@ -178,10 +203,12 @@ def _add_keyword(file: _StkFile, where: str, line: str) -> str:
         file.form = FORM_OF[key]
         return "data"
     if key.startswith("attitudetime"):
-        raise AemFaultError(where, f"{name[:40]} is not read; write one of {', '.join(FORMS)}")
+        raise AemFaultError(where, f"{name[:40]} is not read; write one of {', '.join(TYPES)}")
     if key not in READ and key not in IGNORED:
         near = difflib.get_close_matches(key, NAMES, n=1)
-        advice = f"did you mean {NAMES[near[0]]}?" if near else f"read are {', '.join(NAMES.values())}"
+        advice = f"read are {', '.join(NAMES.values())}"
+        if near:
+            advice = f"did you mean {NAMES[near[0]]}?"
         raise AemFaultError(where, f"{name[:40]} is not read; {advice}")
     if key in file.keywords:
         raise AemFaultError(where, f"{name} is there twice; delete one")
@@ -191,18 +218,19 @@ def _add_keyword(file: _StkFile, where: str, line: str) -> str:
 
 
 def _add_row(file: _StkFile, where: str, line: str) -> None:
-    form = FORMS[file.form]
+    count = COUNTS[file.form]
+    wanted = f"write a time and {count} numbers for {file.form}"
     words = line.split()
-    time_words = words[: len(words) - form.count]
+    time_words = words[: len(words) - count]
     quoted = line[:MAX_QUOTED_CHARACTERS]
     # A date may be several words, and a number of seconds is one.
     is_date = file.value("timeformat", "epsec") in DATES
     if not time_words or (len(time_words) > 1 and not is_date):
-        raise AemFaultError(where, f"{quoted!r}: write a time and {form.count} numbers for {file.form}")
+        raise AemFaultError(where, f"{quoted!r}: {wanted}")
     try:
         file.rows.append([float(word) for word in words[len(time_words) :]])
     except ValueError:
-        raise AemFaultError(where, f"{quoted!r}: write a time and {form.count} numbers for {file.form}") from None
+        raise AemFaultError(where, f"{quoted!r}: {wanted}") from None
     file.times.append(" ".join(time_words))
     file.where.append(where)
 
@@ -218,47 +246,64 @@ def _cut_to_count(file: _StkFile) -> list[tuple[str, str]]:
     except (ValueError, OverflowError):
         stated = -1
     if stated < 1:
-        raise AemFaultError(file.lines["numberofattitudepoints"], "NumberOfAttitudePoints is no count; write a whole number")
+        raise AemFaultError(
+            file.lines["numberofattitudepoints"],
+            "NumberOfAttitudePoints is no count; write a whole number",
+        )
     if count < stated and not file.has_end:
-        raise AemFaultError(file.where[-1], f"ends after {count} of {stated} attitudes; is it cut off?")
+        detail = f"ends after {count} of {stated} attitudes; is it cut off?"
+        raise AemFaultError(file.where[-1], detail)
     for rows in (file.where, file.times, file.rows):
         del rows[stated:]
     if count != stated:
-        return [("log-count", f"NumberOfAttitudePoints is {stated}, and {count} are there; {min(count, stated)} are read")]
+        there = f"NumberOfAttitudePoints is {stated}, and {count} are there"
+        return [("log-count", f"{there}; {min(count, stated)} are read")]
     if not file.has_end and "numberofattitudepoints" not in file.keywords:
-        return [("log-cut", "it has neither END Attitude nor NumberOfAttitudePoints; whether it is whole cannot be told")]
+        unsaid = "it has neither END Attitude nor NumberOfAttitudePoints"
+        return [("log-cut", f"{unsaid}; whether it is whole cannot be told")]
     return []
 
 
 def _block(file: _StkFile) -> ccsds.Block:
     """The file as a block of an AEM 2.0. Raises AemFaultError."""
-    form = FORMS[file.form]
+    attitude_type = TYPES[file.form]
     meta = {
         ccsds.VERSION_KEY: "2.0",
         "REF_FRAME_A": _axes(file),
         "REF_FRAME_B": "SC_BODY",
         "TIME_SYSTEM": "UTC",
-        "ATTITUDE_TYPE": form.attitude_type,
-        "QUATERNION_TYPE": "LAST" if form.values is _scalar_last else "FIRST",  # the block's values have it first
+        "ATTITUDE_TYPE": attitude_type,
+        "QUATERNION_TYPE": _scalar_of(file),
         "ANGVEL_FRAME": "SC_BODY",
     }
-    if form.attitude_type == ccsds.EULER:
+    if attitude_type == ccsds.EULER:
         meta["EULER_ROT_SEQ"] = _sequence(file)
-    values = form.values(file, np.array(file.rows, dtype=np.float64))
-    return ccsds.Block(meta, file.where, _epochs(file), values)
+    return ccsds.Block(meta, file.where, _epochs(file), _values(file))
+
+
+def _scalar_of(file: _StkFile) -> str:
+    """Where the file has the scalar, in the words of an AEM; a block's own values have it first."""
+    return "LAST" if file.form in SCALAR_LAST else "FIRST"
 
 
 def _axes(file: _StkFile) -> str:
     """CoordinateAxes by an AEM's name. Raises AemFaultError."""
     axes, body = file.value("coordinateaxes"), file.value("centralbody", "earth")
-    where, known = file.lines.get("coordinateaxes", ""), "J2000, ICRF, Inertial, Fixed, MeanOfDate, TrueOfDate or TEMEOfDate"
+    where, known = (
+        file.lines.get("coordinateaxes", ""),
+        "J2000, ICRF, Inertial, Fixed, MeanOfDate, TrueOfDate or TEMEOfDate",
+    )
     if not axes:
         raise AemFaultError("", f"states no CoordinateAxes; write CoordinateAxes and {known}")
     if axes not in AXES:
-        raise AemFaultError(where, f"CoordinateAxes {file.keywords['coordinateaxes'][:40]} are not read; write {known}")
+        raise AemFaultError(
+            where,
+            f"CoordinateAxes {file.keywords['coordinateaxes'][:40]} are not read; write {known}",
+        )
     if body != "earth" and axes not in INERTIAL:
         given = file.keywords["centralbody"][:40]
-        raise AemFaultError(where, f"CoordinateAxes {axes} of CentralBody {given} are not read; write J2000 or ICRF")
+        detail = f"CoordinateAxes {axes} of CentralBody {given} are not read"
+        raise AemFaultError(where, f"{detail}; write J2000 or ICRF")
     return AXES[axes]
 
 
@@ -268,7 +313,8 @@ def _sequence(file: _StkFile) -> str:
         ccsds.sequence({"EULER_ROT_SEQ": given.upper()})
     except AemFaultError:
         raise AemFaultError(
-            file.lines.get("sequence", ""), f"Sequence is {given[:40]}; write three axes such as 321, no two alike side by side"
+            file.lines.get("sequence", ""),
+            f"Sequence is {given[:40]}; write three axes such as 321, no two alike side by side",
         ) from None
     return given
 
@@ -277,22 +323,26 @@ def _epochs(file: _StkFile) -> list[str]:
     """The epochs of the rows, of 1970 where the file has no dates. Raises AemFaultError."""
     unit = file.value("timeformat", "epsec")
     if unit in DATES:
-        return [ccsds.epoch_text(_date_ns(where, text)) for where, text in zip(file.where, file.times, strict=True)]
+        dates = zip(file.where, file.times, strict=True)
+        return [ccsds.epoch_text(_date_ns(where, text)) for where, text in dates]
     if unit not in SECONDS:
         known = "EpSec, EpMin, EpHr, EpDay, UTCG, ISO-YMD or ISO-YD"
-        raise AemFaultError(file.lines["timeformat"], f"TimeFormat {unit[:40]} is not read; write {known}")
+        detail = f"TimeFormat {unit[:40]} is not read; write {known}"
+        raise AemFaultError(file.lines["timeformat"], detail)
     begin_ns = 0
     if "scenarioepoch" in file.keywords:
         begin_ns = _date_ns(file.lines["scenarioepoch"], file.keywords["scenarioepoch"])
     elif _axes(file) not in INERTIAL.values():
-        raise AemFaultError("", f"CoordinateAxes {_axes(file)} move, and it states no ScenarioEpoch; {DATE_FORM}")
+        detail = f"CoordinateAxes {_axes(file)} move, and it states no ScenarioEpoch"
+        raise AemFaultError("", f"{detail}; {DATE_FORM}")
     epochs = []
     for where, text in zip(file.where, file.times, strict=True):
         try:
             since_ns = ns_of_seconds(str(Decimal(text) * SECONDS[unit]))
             epochs.append(ccsds.epoch_text(begin_ns + since_ns))
         except (ValueError, ArithmeticError):
-            raise AemFaultError(where, f"the time is {text[:40]!r}; write a number for TimeFormat {unit}") from None
+            detail = f"the time is {text[:40]!r}; write a number for TimeFormat {unit}"
+            raise AemFaultError(where, detail) from None
     return epochs
 
 
@@ -313,8 +363,9 @@ def _date_ns(where: str, text: str) -> int:
 
 def _conventions(conventions: Conventions, file: _StkFile) -> Conventions:
     """What the numbers mean, in the words of the file."""
-    is_last = FORMS[file.form].values is _scalar_last
-    scalar = "scalar last (q1, q2, q3, q4)" if is_last else "scalar first where it has quaternions"
+    scalar = "scalar first where it has quaternions"
+    if file.form in SCALAR_LAST:
+        scalar = "scalar last (q1, q2, q3, q4)"
     named = replace(
         conventions,
         source=f"STK attitude file ({file.form})",
@@ -325,7 +376,7 @@ def _conventions(conventions: Conventions, file: _StkFile) -> Conventions:
     return named if dated else replace(named, time=NO_DATE, scale=None)
 
 
-FORMAT = LogFormat(
+log_format = LogFormat(
     "an STK attitude file",
     _open,
     listed="STK attitude files",

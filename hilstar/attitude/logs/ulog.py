@@ -12,9 +12,9 @@ from hilstar.attitude.logs.log_formats import ALL_STATEMENTS, LogFormat
 from hilstar.errors import InputError
 
 RECIPE = (
-    "pip install pyulog; ulog2csv FILE; of the CSV of vehicle_attitude, write timestamp / 1e6 as t_s and q[0] to q[3] as"
-    " qw,qx,qy,qz; then --convention frame=body,direction=cam_to_icrs --reference ned --place LAT,LON,HEIGHT --epoch-utc"
-    " TIME (docs/sources.md, PX4)"
+    "pip install pyulog; ulog2csv FILE; of the CSV of vehicle_attitude, write timestamp / 1e6 as"
+    " t_s and q[0] to q[3] as qw,qx,qy,qz; then --convention frame=body,direction=cam_to_icrs"
+    " --reference ned --place LAT,LON,HEIGHT --epoch-utc TIME (docs/sources.md, PX4)"
 )
 
 
@@ -22,4 +22,4 @@ def _refuse(path: Path, stated: Stated) -> NoReturn:
     raise InputError(f"{path}: a ULog of PX4, which is not read; {RECIPE}")
 
 
-FORMAT = LogFormat("a ULog of PX4", _refuse, uses=ALL_STATEMENTS, magic=(b"ULog\x01\x12\x35",))
+log_format = LogFormat("a ULog of PX4", _refuse, uses=ALL_STATEMENTS, magic=(b"ULog\x01\x12\x35",))

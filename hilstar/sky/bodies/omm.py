@@ -1,5 +1,6 @@
-"""Element sets as CCSDS Orbit Mean-Elements Messages (502.0-B) in JSON, XML, CSV or KVN, as CelesTrak and
-Space-Track give them; sgp4's own `omm` makes a satellite of each.
+"""Element sets as CCSDS Orbit Mean-Elements Messages (502.0-B) in JSON, XML, CSV or KVN.
+
+CelesTrak and Space-Track give them; sgp4's own `omm` makes a satellite of each.
 
 What SGP4 would turn into another orbit is refused by name: another theory (SGP4-XP's ephemeris type
 4, too), frame, centre or time scale, and elements out of their range.
@@ -17,14 +18,14 @@ if TYPE_CHECKING:
     from sgp4.api import Satrec
 
 KVN_KEY = "CCSDS_OMM_VERS"
-FORM = "give element sets as CelesTrak and Space-Track have them: two lines each, or OMM in JSON, XML or CSV"
+FORM = "give two-line element sets, or OMM in JSON, XML or CSV"
 # What each key has to be where it is there.
 FIXED = {
     "CENTER_NAME": ("EARTH",),
     "REF_FRAME": ("TEME",),
     "TIME_SYSTEM": ("UTC",),
     "MEAN_ELEMENT_THEORY": ("SGP4", "SGP/SGP4", "SGP"),
-    "EPHEMERIS_TYPE": ("0", "2"),
+    "EPHEMERIS_TYPE": ("0", "2", "3"),  # SGP4 itself, and its part for deep space
 }
 # The limits of each element, in the message's units (degrees, revolutions a day, 1/Earth radii).
 LIMITS = {
@@ -53,7 +54,7 @@ MAX_SGP4_NUMBER = 339_999
 
 
 class OmmSet(NamedTuple):
-    """One element set: the satellite's name ("" without one), its catalogue number, and what SGP4 makes of it."""
+    """One element set: its name ("" without one), catalogue number, and what SGP4 makes of it."""
 
     name: str
     number: int
@@ -110,7 +111,8 @@ def _fields(text: str, file: str) -> Iterator[Mapping[str, Any]]:
         else:
             yield from omm.parse_csv(io.StringIO(begin))
     except (ValueError, SyntaxError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"{file}: is no OMM that can be read ({shortened(error)}); {FORM}") from error
+        said = f"{file}: is no OMM that can be read ({shortened(error)})"
+        raise InputError(f"{said}; {FORM}") from error
 
 
 def _dictionaries(sets: list[Any], file: str) -> Iterator[Mapping[str, Any]]:
@@ -139,24 +141,27 @@ def _text(value: Any) -> str:
 
 
 def _check(fields: Mapping[str, str], where: str) -> None:
-    """Refuse (InputError) a set that lacks an element, or has one that SGP4 does not take as it is meant."""
+    """Refuse (InputError) a set without an element, or with one that SGP4 takes otherwise."""
     for name in NEEDED:
         if not fields.get(name):
             raise InputError(f"{where}: {name} is missing; {FORM}")
     for name, allowed in FIXED.items():
         given = fields.get(name, allowed[0])
         if given.upper() not in allowed:
-            raise InputError(f"{where}: {name} is {shortened(given)}, and only {allowed[0]} is read; {FORM}")
+            other = f"{where}: {name} is {shortened(given)}"
+            raise InputError(f"{other}, and only {allowed[0]} is read; {FORM}")
     for name, (low, high) in LIMITS.items():
         try:
             value = float(fields[name])
         except ValueError:
             value = math.nan
         if not low <= value <= high:
-            raise InputError(f"{where}: {name} is {shortened(fields[name])}; it must be from {low:g} to {high:g}")
+            given = f"{where}: {name} is {shortened(fields[name])}"
+            raise InputError(f"{given}; it must be from {low:g} to {high:g}")
     number = fields["NORAD_CAT_ID"]
     if not number.isdecimal() or int(number) > MAX_NUMBER:
-        raise InputError(f"{where}: NORAD_CAT_ID is {shortened(number)}; write a catalogue number, such as 25544")
+        given = f"{where}: NORAD_CAT_ID is {shortened(number)}"
+        raise InputError(f"{given}; write a catalogue number, such as 25544")
 
 
 def _epoch(text: str) -> str:

@@ -127,7 +127,7 @@ def test_a_checkout_reads_its_own_list_whatever_an_older_installation_has_regist
 
 
 def test_an_installed_hilstar_goes_by_its_entry_points(monkeypatch):
-    own = EntryPoint("csv", "hilstar.attitude.logs.csv_log:FORMAT", formats.GROUP)
+    own = EntryPoint("csv", "hilstar.attitude.logs.csv_log:log_format", formats.GROUP)
     own = own._for(type("Installed", (), {"name": "hilstar"})())
     monkeypatch.setattr(formats, "_of_checkout", lambda path: [])
     monkeypatch.setattr(formats, "entry_points", lambda group: [own])

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.attitude.logs.entries import OPTIONS, Stated
 from hilstar.attitude.logs.log_file import open_log, write_log
 from hilstar.attitude.logs.log_formats import check_stated, log_formats
-from hilstar.attitude.logs.mcap_formats import LEDGER
+from hilstar.attitude.logs.mcap_formats import ledger_format
 from hilstar.attitude.logs.mcap_log import attitude_message, register_attitudes
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Convention, Mounting
@@ -105,7 +105,7 @@ FILES: dict[str, tuple[Callable[[Path], Path], Stated]] = {
     "CSV": (written("a.csv"), LEVEL),
     "JSON lines": (written("a.jsonl"), LEVEL),
     "an MCAP file": (written("a.mcap"), LEVEL),
-    LEDGER.name: (ledger, Stated()),
+    ledger_format.name: (ledger, Stated()),
     "a CCSDS AEM": (aem, Stated()),
     "a CCSDS message": (oem, Stated()),
     "a ROS bag": (bag, LEVEL),

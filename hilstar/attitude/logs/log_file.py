@@ -37,6 +37,7 @@ YEAR_NS = 31_557_600 * NS_PER_S
 SECONDS_FORM = "write seconds after its first sample"
 TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 NO_ATTITUDE = "contains no attitude; write a CSV with the header t_s,qw,qx,qy,qz, or JSON lines"
+DROPOUT = "zeros or NaN after an attitude are a dropout: leave those entries out, or cut the log"
 UNSET = "zeros or NaN, from before the estimator ran"
 
 
@@ -85,7 +86,10 @@ def _samples(
     for where, event in reading.entries:
         if isinstance(event, Refusal):
             if samples or not event.unset:
-                raise InputError(f"{path}{where}: {event.detail}")
+                detail = event.detail
+                if event.unset:
+                    detail += f"; {DROPOUT}"
+                raise InputError(f"{path}{where}: {detail}")
             unset += 1
             continue
         if samples and event.t_ns <= samples[-1].t_ns:

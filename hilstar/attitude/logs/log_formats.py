@@ -171,10 +171,10 @@ def readable() -> str:
 
 def kinds() -> dict[bytes, str]:
     """What a file is by its first bytes, of every format that has a magic number."""
-    found: dict[bytes, str] = {}
+    kind_of_magic: dict[bytes, str] = {}
     for each in log_formats():  # of formats with one magic number the last takes any such file
-        found |= dict.fromkeys(each.magic, each.name)
-    return found
+        kind_of_magic |= dict.fromkeys(each.magic, each.name)
+    return kind_of_magic
 
 
 def format_of(path: Path) -> LogFormat:

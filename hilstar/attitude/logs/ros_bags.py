@@ -73,10 +73,10 @@ class Bag:
 
     def topics(self) -> list[BagTopic]:
         """Each topic once for each type of its messages, in the order of the bag."""
-        found: dict[tuple[str, str], list[Connection]] = {}
+        by_name: dict[tuple[str, str], list[Connection]] = {}
         for connection in self._reader.connections:
-            found.setdefault((connection.topic, connection.msgtype), []).append(connection)
-        named = found.items()
+            by_name.setdefault((connection.topic, connection.msgtype), []).append(connection)
+        named = by_name.items()
         return [BagTopic(name, kind, tuple(each)) for (name, kind), each in named]
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:

@@ -100,8 +100,8 @@ def _fields(text: str, file: str) -> Iterator[Mapping[str, Any]]:
     begin = text.lstrip()
     try:
         if begin.startswith(("[", "{")):
-            found = json.loads(text)
-            yield from _dictionaries(found if isinstance(found, list) else [found], file)
+            parsed = json.loads(text)
+            yield from _dictionaries(parsed if isinstance(parsed, list) else [parsed], file)
         elif begin.startswith("<"):
             if "<!DOCTYPE" in text:
                 raise InputError(f"{file}: has a DOCTYPE, which no OMM has; {FORM}")

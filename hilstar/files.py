@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from hilstar.errors import InputError, cannot_write
-from hilstar.reading import CHUNK_BYTES, MAX_TOML_BYTES, MCAP_MAGIC, exists, open_regular, parse_toml, read_text
+from hilstar.reading import CHUNK_BYTES, MAX_TOML_BYTES, exists, open_regular, parse_toml, read_text
 
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 LEDGER_MARK = b"bench_sha256"  # in the head of each ledger
 HEAD_BYTES = 16_384
 MAX_DEPTH = 3  # a bench file names a calibration, which names a table

@@ -9,7 +9,7 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -33,21 +33,11 @@ NOT_FILES = {
     stat.S_ISCHR: "is a device",
     stat.S_ISBLK: "is a device",
 }
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-CK_MAGIC = b"DAF/CK"
-ULOG_MAGIC = b"ULog\x01\x12\x35"
-ROSBAG_MAGIC = b"#ROSBAG V"
-SQLITE_MAGIC = b"SQLite format 3\x00"
 # The first bytes of kinds of files that users have beside attitude logs and bench files.
 MAGIC = {
-    ULOG_MAGIC: "a ULog file",
-    CK_MAGIC: "a SPICE CK kernel",
     b"DAF/": "a SPICE kernel",
     b"DAFETF NAIF": "a SPICE kernel",
     b"NAIF/": "a SPICE kernel",
-    SQLITE_MAGIC: "an SQLite database (a db3 bag of ROS 2)",
-    ROSBAG_MAGIC: "a ROS 1 bag",
-    MCAP_MAGIC: "an MCAP file",
     b"\x89HDF\r\n\x1a\n": "an HDF5 file",
     b"SIMPLE  =": "a FITS file",
     b"PK\x03\x04": "a zip archive",
@@ -71,9 +61,23 @@ MAGIC = {
 }
 
 
+# Where other rooms say what kinds of files they read; asked only where a file is refused.
+_kinds_of_rooms: list[Callable[[], Mapping[bytes, str]]] = []
+
+
+def add_kinds(kinds: Callable[[], Mapping[bytes, str]]) -> None:
+    """Let a room name the kinds of files that it reads: what a file is, by its first bytes."""
+    if kinds not in _kinds_of_rooms:
+        _kinds_of_rooms.append(kinds)
+
+
 def kind_of(head: bytes) -> str | None:
     """What a file is by its first bytes (HEAD_BYTES of them): "a zip archive" or the like; None where that says nothing."""
-    return next((kind for magic, kind in MAGIC.items() if head.startswith(magic)), None)
+    for kinds in (*[room() for room in _kinds_of_rooms], MAGIC):
+        for magic, kind in kinds.items():
+            if head.startswith(magic):
+                return kind
+    return None
 
 
 def size_text(size_bytes: int) -> str:

@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import sys
+from collections.abc import Mapping
 from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any, NoReturn
@@ -18,12 +19,12 @@ from hilstar.console.terminal import fail
 from hilstar.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
 from hilstar.process import interrupts
 from hilstar.process.interrupts import finish_stderr, queue_stderr
-from hilstar.reading import exists
+from hilstar.reading import add_kinds, exists
 
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"
 READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # longest wait for a slow reader of stderr, without and with a signal
-INPUT_ENDINGS = (".toml", ".mcap", ".csv", ".json", ".jsonl", ".fits", ".png", ".aem", ".ulg")
+INPUT_ENDINGS = (".toml", ".mcap", ".csv", ".json", ".jsonl", ".fits", ".png", ".aem")
 NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")  # several numbers, with commas
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")  # a word that a shell makes of numbers with spaces between them
@@ -42,8 +43,15 @@ def main() -> NoReturn:
     interrupts.leave(code)
 
 
+def _kinds_of_logs() -> Mapping[bytes, str]:
+    from hilstar.attitude.logs.log_formats import kinds  # 0.1 s, where a file of another kind is refused
+
+    return kinds()
+
+
 def run_command(words: list[str]) -> int:
     """Run a command line in this process. Returns its exit code; a refusal is one line on stderr."""
+    add_kinds(_kinds_of_logs)
     try:
         if not writes_to_stdout(words):
             return _run(with_values(words))

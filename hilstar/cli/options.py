@@ -59,7 +59,7 @@ CONVENTION_METAVAR = "scalar=last,direction=cam_to_icrs,frame=body"
 CONVENTION_HELP = "What the quaternions of a CSV, JSON lines or an MCAP are, in place of [attitude] convention."
 ConventionText = Annotated[str | None, unsaid("--convention", metavar=CONVENTION_METAVAR, help=CONVENTION_HELP)]
 MAX_SEED = 2**63 - 1  # largest number in a FITS header
-LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, MCAP (a ledger), a SPICE CK, a ROS bag or a PX4 ULog."
+LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS or CIC AEM, STK .a, MCAP (a ledger), a SPICE CK or a ROS bag."
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 MAX_SPIN_RAD_S = 1e6
 SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"

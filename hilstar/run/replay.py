@@ -14,7 +14,8 @@ from msgspec.structs import replace as replaced
 from hilstar.attitude.clock.resolution import coarse_lines
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.logs.entries import Stated
-from hilstar.attitude.logs.log_file import NOTHING_STATED, check_stated, log_timeline, open_log
+from hilstar.attitude.logs.log_file import log_timeline, open_log
+from hilstar.attitude.logs.log_formats import NOTHING_STATED, check_stated
 from hilstar.attitude.logs.log_times import span_line
 from hilstar.attitude.logs.mcap_log import holds_ros, is_mcap, read_attitudes
 from hilstar.attitude.receiver import PacketCounts

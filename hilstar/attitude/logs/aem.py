@@ -22,6 +22,7 @@ Writing: version 1.0, which every AEM reader reads and which states the quaterni
 quaternion derivatives: some readers take QUATERNION/RATE as an angular velocity, others as Euler rates.
 """
 
+import contextlib
 import re
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +30,8 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
+from typing import IO, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -36,13 +39,18 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs import aem_blocks as ccsds
-from hilstar.attitude.logs.entries import LogEntry, LogReading, log_joins
+from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, LogEntry, LogReading, Stated, log_joins
+from hilstar.attitude.logs.log_formats import LogFormat, LogHead, Writing
+from hilstar.attitude.logs.log_times import FIRST_DATE_NS
 from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
 from hilstar.attitude.wire.source import Conventions, components
+from hilstar.errors import InputError
+from hilstar.reading import read_text
 from hilstar.rotation import conjugate, direction_of, frame_turns, multiply, rotate
 from hilstar.units import NS_PER_S
 
 MAX_OVERLAPPING = 1000
+MAX_BYTES = 50_000_000
 # 504.0-B-2's own examples write J2000 for EME2000; the realisations of the ICRF share its axes to 0.1 mas.
 INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000", "J2000"})
 # SANA's registry of spacecraft body frames, whose names end in a label (SC_BODY_1, INSTRUMENT_A), and CAM.
@@ -59,7 +67,7 @@ AMBIGUOUS = (
 )
 QUARTER_TURN_DEG = 90.0
 ADVICE = "sort its lines; leap seconds are not counted, so write TAI across one"
-SCALES = frozenset({"UTC", "TAI", "TT", "TDB", "TCB", "GPS", "UT1", "SCLK"})  # AEM 1.0; other clocks are written as UTC
+SCALES = frozenset({"UTC", "TAI", "TT", "TDB", "TCB", "GPS", "UT1", "SCLK"})  # of AEM 1.0
 COMMENTS = (
     "STARTRACKER_1 is the camera: +z boresight, +x right and +y down in its image.",
     "Epochs are the source's clock from 1970-01-01T00:00:00; leap seconds are not counted.",
@@ -216,7 +224,13 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
 
     Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame and one of those above.
     """
-    blocks = ccsds.xml_blocks(text) if text.lstrip().startswith("<") else ccsds.kvn_blocks(text)
+    is_xml = text.lstrip().startswith("<")
+    blocks = ccsds.xml_blocks(text) if is_xml else ccsds.kvn_blocks(text)
+    return read_blocks(blocks, of_date)
+
+
+def read_blocks(blocks: list[ccsds.Block], of_date: OfDate) -> LogReading:
+    """The attitudes of blocks of an AEM, or of another format whose numbers mean what an AEM's do, as `read_aem` gives them."""
     if len({block.meta["TIME_SYSTEM"] for block in blocks}) > 1:
         raise ccsds.AemFaultError("", "TIME_SYSTEM changes from block to block; write one file for each time system")
     frames = [_frames(block.meta) for block in blocks]
@@ -365,11 +379,22 @@ def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = N
     starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity]
     blocks = [samples[i:j] for i, j in zip(starts, [*starts[1:], len(samples)], strict=True)]
     header = {"CREATION_DATE": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "ORIGINATOR": "HILSTAR"}
-    lines = (_xml if xml else _kvn)(header, [_written_block(block, scale) for block in blocks])
+    time_system = _time_system(samples, scale)
+    lines = (_xml if xml else _kvn)(header, [_written_block(block, time_system) for block in blocks])
     return "\n".join(lines) + "\n"
 
 
-def _written_block(samples: Sequence[AttitudeSample], scale: str | None) -> ccsds.Block:
+def _time_system(samples: Sequence[AttitudeSample], scale: str | None) -> str:
+    """TIME_SYSTEM of times on a scale (None: of a clock that nobody named).
+
+    Times before 2000 of such a clock are no dates: it is then the spacecraft's own, SCLK.
+    """
+    if scale in SCALES:
+        return str(scale)
+    return "UTC" if samples[0].t_ns >= FIRST_DATE_NS else "SCLK"
+
+
+def _written_block(samples: Sequence[AttitudeSample], scale: str) -> ccsds.Block:
     rates = [sample.rate_cam_rad_s for sample in samples if sample.rate_cam_rad_s is not None]
     q = np.array([sample.q_icrs_to_cam for sample in samples])
     values = conjugate(q)
@@ -383,7 +408,7 @@ def _written_block(samples: Sequence[AttitudeSample], scale: str | None) -> ccsd
         "REF_FRAME_A": "ICRF",
         "REF_FRAME_B": "STARTRACKER_1",
         "ATTITUDE_DIR": "A2B",
-        "TIME_SYSTEM": scale if scale in SCALES else "UTC",
+        "TIME_SYSTEM": scale,
         "START_TIME": epochs[0],
         "STOP_TIME": epochs[-1],
         "ATTITUDE_TYPE": ccsds.QUATERNION if values.shape[1] == 4 else ccsds.DERIVATIVE,
@@ -424,3 +449,51 @@ def _xml(header: dict[str, str], segments: list[ccsds.Block]) -> Iterator[str]:
 
 def _elements(indent: int, texts: dict[str, str]) -> Iterator[str]:
     return (f"{' ' * indent}<{key}>{text}</{key}>" for key, text in texts.items())
+
+
+@contextlib.contextmanager
+def faults_named(path: Path) -> Iterator[None]:
+    """What is wrong in a file as an InputError that names the file and the place."""
+    try:
+        yield
+    except ccsds.AemFaultError as fault:
+        raise InputError(f"{path}{fault.where}: {fault}") from fault
+
+
+@contextlib.contextmanager
+def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
+    from hilstar.attitude.logs.earth import q_icrs_to_date  # 30 ms
+
+    text = read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_BYTES)
+    with faults_named(path):
+        reading = read_aem(text, q_icrs_to_date)
+    yield reading
+
+
+def _refuse_other(path: Path, stated: Stated) -> NoReturn:
+    word = LogHead(path, b"").word[:MAX_QUOTED_CHARACTERS]
+    raise InputError(f"{path}: starts with {word}; of the CCSDS messages, only {ccsds.VERSION_KEY} is read")
+
+
+def _is_aem(beginning: LogHead) -> bool:
+    return beginning.word.startswith(("<", ccsds.VERSION_KEY))
+
+
+def _is_other(beginning: LogHead) -> bool:
+    return beginning.word.startswith("CCSDS_") and not _is_aem(beginning)
+
+
+def _write(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing) -> None:
+    file.write(aem_text(samples, writing.ending == ".xml", writing.scale).encode())
+
+
+log_format = LogFormat(
+    "a CCSDS AEM",
+    _open,
+    listed="CCSDS AEM (KVN or XML)",
+    uses=frozenset({"mounting"}),
+    begins=_is_aem,
+    endings=(".aem", ".kvn", ".xml"),
+    write=_write,
+)
+other_ccsds = LogFormat("a CCSDS message", _refuse_other, begins=_is_other)

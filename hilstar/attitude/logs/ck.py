@@ -11,13 +11,14 @@ Rules:
 SPICE runs in a process of its own (`ck_spice`).
 """
 
+import contextlib
 import io
 import json
 import math
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated
+from hilstar.attitude.logs.log_formats import LogFormat, require
 from hilstar.attitude.wire.packet import checked_sample
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.errors import InputError
@@ -59,6 +61,12 @@ def _beside_line(kernels: list[Path]) -> str:
     counting = [last_of_kind[kind] for kind in BESIDE if kinds.count(kind) > 1]
     of_several = f"; where they differ, the last counts ({', '.join(counting)})" if counting else ""
     return f"kernels from beside the CK: {names}{of_several}; --kernel names others"
+
+
+@contextlib.contextmanager
+def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
+    require("spiceypy", "spice", f"{path}: a SPICE CK")
+    yield read_ck(path, stated)
 
 
 def read_ck(path: Path, stated: Stated) -> LogReading:
@@ -125,3 +133,12 @@ def _conventions(said: dict[str, Any]) -> Conventions:
         written=lambda q: f"m2q(C), C from J2000 = {components(q)}",
         scale="TDB",
     )
+
+
+log_format = LogFormat(
+    "a SPICE CK",
+    _open,
+    listed="SPICE CKs",
+    uses=frozenset({"mounting", "kernels", "body"}),
+    magic=(b"DAF/CK",),
+)

@@ -29,6 +29,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns
 from hilstar.attitude.logs.entries import LogEntry, Stated
+from hilstar.attitude.logs.log_times import FIRST_DATE_NS
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError, shortened
 from hilstar.rotation import frame_turns, from_matrix, multiply, normalise, rotate
@@ -53,8 +54,6 @@ EXACT = frozenset({"icrs", "icrf", "gcrs", "gcrf", "j2000", "eme2000"})
 LOOSE = frozenset({"eci", "inertial", "eci_j2000", "j2000_eci", "inertial_frame"})
 KINDS: dict[str, Kind] = {**dict.fromkeys(EXACT | LOOSE, "icrs"), "enu": "enu", "ned": "ned"}
 AXES: dict[Kind, str] = {"icrs": "the ICRS", "enu": "east, north, up", "ned": "north, east, down"}
-# Times before 2000 are those of a simulated clock that began at 0, not dates.
-FIRST_DATE_NS = 946_684_800 * NS_PER_S
 BATCH = 4096
 
 

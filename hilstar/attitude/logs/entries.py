@@ -139,6 +139,8 @@ def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterat
     for number, entry in enumerate(ended):
         if entry is not None:
             if not isinstance(entry.event, AttitudeSample):
+                # What waits is before it; a refusal ends the reading, or is of before the first attitude.
+                yield from (heapq.heappop(waiting)[2] for _ in range(len(waiting)))
                 yield entry
                 continue
             t_ns = entry.event.t_ns

@@ -1,159 +1,44 @@
-"""Attitude logs of every format: the content decides how a file is read, the ending of its name how it is written.
+"""Attitude logs of every format, read and written: samples in order of time, and their meaning.
 
-CSV and JSON lines are read and written here. CSV columns, in any order: `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s),
-`sequence` and `discontinuity`. A JSON line is the wire's JSON form of an attitude. The other formats have a module each.
+Which formats there are, and which of them a file is, `log_formats` says.
 
 What a user states of a log is used or refused:
-1. Each format of FORMATS declares the statements that its reader uses. Any other is refused by
-   name, before the file is read.
+1. Each format declares the statements that its reader uses. Any other is refused by name, before
+   the file is read (`check_stated`).
 2. A statement that a format uses, but not for this file, is refused by the reader
    (`stated_reference` for a place) or, for a mounting where the attitudes are the camera's own, by
    `open_log`.
 """
 
-import contextlib
-import csv
-import importlib.util
-import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from decimal import Decimal
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Literal, NamedTuple
-
-import msgspec
-from msgspec import structs
 
 from hilstar.attitude.clock.rate_causes import ReadAs
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
 from hilstar.attitude.logs.entries import (
-    MAX_QUOTED_CHARACTERS,
     MAX_SAMPLES,
-    OPTIONS,
     AttitudeLog,
-    LogEntry,
     LogJoins,
     LogReading,
     Stated,
     log_joins,
 )
+from hilstar.attitude.logs.log_formats import NOTHING_STATED, Writing, check_stated, writer_of
 from hilstar.attitude.logs.log_times import time_notices
-from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, checked_sample, decode
-from hilstar.attitude.wire.source import HILSTARS, PACKETS, Convention, Conventions, components, packet_conventions
-from hilstar.errors import InputError, MachineError
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.attitude.wire.source import HILSTARS, Mounting
+from hilstar.errors import InputError
 from hilstar.files import whole_file
-from hilstar.reading import (
-    CK_MAGIC,
-    HEAD_BYTES,
-    MCAP_MAGIC,
-    ROSBAG_MAGIC,
-    SQLITE_MAGIC,
-    ULOG_MAGIC,
-    open_lines,
-    open_regular,
-    read_text,
-)
-from hilstar.rotation import conjugate, multiply
 from hilstar.units import NS_PER_S
 
-if TYPE_CHECKING:
-    from hilstar.arrays import FloatArray
-    from hilstar.attitude.logs.earth import Reference
-
-CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
-RATE_COLUMNS = ("rx", "ry", "rz")
-# A JSON number that msgspec takes as an integer: what one format can hold, all can.
-WHOLE_NUMBERS = range(-(2**63), 2**64)
-MAX_NAMED_TOPICS = 12
-MAX_LOG_BYTES = 500_000_000
-MAX_AEM_BYTES = 50_000_000
-NOTHING_STATED = Stated()
-ENDINGS = (".csv", ".jsonl", ".json", ".mcap", ".aem", ".kvn", ".xml")
-READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP, SPICE CKs, bags of ROS and ULogs of PX4"
 YEAR_NS = 31_557_600 * NS_PER_S
 SECONDS_FORM = "write seconds after its first sample"
 TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
-
-
-def _read_csv(lines: Iterable[str], scalar: Literal["first", "last"]) -> Iterator[LogEntry]:
-    """The attitudes of a CSV, each quaternion as it was sent: with the scalar last, its columns
-    count as x, y, z, w in turn.
-    """
-    reader = csv.reader(lines)
-    rows = (row for row in reader if row and not row[0].startswith("#"))
-    header = [name.strip() for name in next(rows, [])]
-    if not header:
-        return
-    needed = CSV_COLUMNS + (RATE_COLUMNS if any(name in header for name in RATE_COLUMNS) else ())
-    missing = [name for name in needed if name not in header]
-    if missing:
-        detail = f"column {missing[0]} is missing; the header must have {','.join(needed)}"
-        if missing[0] == "t_s" and "t_ns" in header:
-            detail = f"column t_ns: a CSV has its times in seconds; divide by 1e9, and write {','.join(needed)}"
-        yield LogEntry(f":{reader.line_num}", Refusal("format", detail))
-        return
-    places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
-    numbers: tuple[str, ...] = CSV_COLUMNS[1:]
-    if scalar == "last":  # whatever the columns are called: a table that says so by its names needs no statement
-        numbers = tuple(sorted(numbers, key=lambda name: places[name]))
-    wanted = f"write finite numbers for {','.join(CSV_COLUMNS)}"
-    if len(places) > len(CSV_COLUMNS):
-        wanted += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
-    for row in rows:
-        try:
-            cells = {name: row[place].strip() for name, place in places.items()}
-            q = tuple(float(cells[name]) for name in numbers)
-            turning = [cells.get(name, "") for name in RATE_COLUMNS]
-            rate = tuple(map(float, turning)) if any(turning) else None
-            sequence = int(cells.get("sequence") or 0)
-            discontinuity = {"": False, "0": False, "1": True}[cells.get("discontinuity", "")]
-            if sequence not in WHOLE_NUMBERS:
-                raise ValueError
-            event = checked_sample(ns_of_seconds(cells["t_s"]), q, rate, sequence, discontinuity)
-        except (ValueError, LookupError, ArithmeticError):
-            event = Refusal("format", f"{','.join(row)[:MAX_QUOTED_CHARACTERS]!r}; {wanted}")
-        yield LogEntry(f":{reader.line_num}", event)
-
-
-def ns_of_seconds(seconds: str) -> int:
-    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns.
-
-    Raises ValueError or ArithmeticError.
-    """
-    value = Decimal(seconds)
-    if not value.is_finite() or value.adjusted() > 40:
-        raise ValueError
-    return int(value.scaleb(9).to_integral_value())
-
-
-def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
-    for sample in samples:
-        rate = sample.rate_cam_rad_s
-        numbers = [*map(repr, sample.q_icrs_to_cam.tolist()), *(("", "", "") if rate is None else map(repr, rate.tolist()))]
-        seconds, ns = divmod(abs(sample.t_ns), NS_PER_S)
-        t_s = f"{'-' if sample.t_ns < 0 else ''}{seconds}.{ns:09}"
-        file.write((",".join((t_s, *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")) + "\n").encode())
-
-
-def _read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
-    for number, line in enumerate(lines, start=1):
-        if line.strip():
-            event = decode(line.strip().encode())
-            if not isinstance(event, AttitudeSample | Refusal):
-                event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
-            yield LogEntry(f":{number}", event)
-
-
-def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    encoder = msgspec.json.Encoder()
-    for sample in samples:
-        form: dict[str, object] = {"t_ns": sample.t_ns, "q": sample.q_icrs_to_cam.tolist()}
-        if sample.rate_cam_rad_s is not None:
-            form["rate"] = sample.rate_cam_rad_s.tolist()
-        form |= {"sequence": sample.sequence, "discontinuity": sample.discontinuity}
-        file.write(encoder.encode(form) + b"\n")
+NO_ATTITUDE = "contains no attitude; write a CSV with the header t_s,qw,qx,qy,qz, or JSON lines"
+DROPOUT = "zeros or NaN after an attitude are a dropout: leave those entries out, or cut the log"
+UNSET = "zeros or NaN, from before the estimator ran"
 
 
 def read_log(path: Path) -> list[AttitudeSample]:
@@ -162,48 +47,63 @@ def read_log(path: Path) -> list[AttitudeSample]:
 
 
 def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
-    """The attitudes of a log in order of time, whatever its name, with what the file means by its numbers.
+    """The attitudes of a log in order of time, with what the file means by its numbers.
 
-    Raises InputError with the line (AEM in XML: the epoch) for anything that is not an attitude: nothing is skipped unless
-    the notices say so. Raises MachineError where the format's library is not installed.
+    Raises InputError with the line (AEM in XML: the epoch) for anything that is not an attitude:
+    nothing is skipped unless the notices say so, as of zeros and NaN before the first attitude.
+    Raises MachineError where the format's library is not installed.
     """
-    samples: list[AttitudeSample] = []
+    mounting = stated.mounting
     try:
-        with _open_log(path, stated) as reading:
-            conventions, mounting = reading.conventions, stated.mounting
+        with check_stated(path, stated).read(path, stated) as reading:
+            conventions = reading.conventions
             if mounting.by_option and not conventions.of_body:
-                own = f"{path}: --mounting: its attitudes are the camera's own ({conventions.source})"
-                raise InputError(f"{own}; leave it out")
-            for where, event in reading.entries:
-                if isinstance(event, Refusal):
-                    raise InputError(f"{path}{where}: {event.detail}")
-                if samples and event.t_ns <= samples[-1].t_ns:
-                    times = f"t_ns {event.t_ns} after {samples[-1].t_ns}"
-                    raise InputError(f"{path}{where}: time does not increase ({times}); {reading.advice}")
-                samples.append(mounting.sample(event) if conventions.of_body else event)
-                if len(samples) > MAX_SAMPLES:
-                    raise InputError(f"{path}{where}: more than {MAX_SAMPLES} attitudes; split the log into several")
-    except (OSError, csv.Error) as error:
+                own = f"{path}: --mounting: its attitudes are the camera's own"
+                raise InputError(f"{own} ({conventions.source}); leave it out")
+            samples, unset = _samples(path, reading, mounting)
+    except OSError as error:
         raise InputError(f"{path}: cannot be read as a log ({error})") from error
-    if not samples:
-        _refuse_other_topics(path)
-        raise InputError(f"{path}: contains no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
     told = [*reading.told, *conventions.mounting_notices(mounting)]
+    if unset:
+        left_out = "1 attitude is" if unset == 1 else f"{unset} attitudes are"
+        told.append(("log-start", f"{left_out} left out at the beginning: {UNSET}"))
     if conventions.of_packets:  # other formats say themselves what their times are
         told += time_notices(samples, conventions.time_unit)
     read_as = ReadAs.of(conventions, stated.convention or HILSTARS, mounting, stated.convention_by)
     return AttitudeLog(samples, conventions, told, read_as)
 
 
-def _refuse_other_topics(path: Path) -> None:
-    """Name the topics of an MCAP file from another program."""
-    from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC, is_mcap, topics_of
-
-    topics = topics_of(path) if is_mcap(path) else []
-    if topics and ATTITUDE_TOPIC not in topics:
-        named = [topic[:MAX_QUOTED_CHARACTERS] for topic in topics[:MAX_NAMED_TOPICS]]
-        names = ", ".join([*named, *(["..."] if len(topics) > MAX_NAMED_TOPICS else [])])
-        raise InputError(f"{path}: contains no attitude; its topics are {names}, and only {ATTITUDE_TOPIC} is read")
+def _samples(
+    path: Path,
+    reading: LogReading,
+    mounting: Mounting,
+) -> tuple[list[AttitudeSample], int]:
+    """The camera's samples of a reading, and how many entries without an attitude are before the
+    first. Raises InputError.
+    """
+    samples: list[AttitudeSample] = []
+    unset = 0
+    for where, event in reading.entries:
+        if isinstance(event, Refusal):
+            if samples or not event.unset:
+                detail = event.detail
+                if event.unset:
+                    detail += f"; {DROPOUT}"
+                raise InputError(f"{path}{where}: {detail}")
+            unset += 1
+            continue
+        if samples and event.t_ns <= samples[-1].t_ns:
+            times = f"t_ns {event.t_ns} after {samples[-1].t_ns}"
+            raise InputError(f"{path}{where}: time does not increase ({times}); {reading.advice}")
+        samples.append(mounting.sample(event) if reading.conventions.of_body else event)
+        if len(samples) > MAX_SAMPLES:
+            detail = f"more than {MAX_SAMPLES} attitudes; split the log into several"
+            raise InputError(f"{path}{where}: {detail}")
+    if not samples and unset:
+        raise InputError(f"{path}: no attitude in {unset} entries: {UNSET}; give another log")
+    if not samples:
+        raise InputError(f"{path}: {NO_ATTITUDE}")
+    return samples, unset
 
 
 def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None = None) -> None:
@@ -213,24 +113,11 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
     where any is missing.
     Raises InputError for another ending, for no samples, and when the file cannot be written.
     """
-    ending = path.suffix.lower()
-    if ending not in ENDINGS:
-        raise InputError(f"{path}: not a log's name; end it in one of {', '.join(ENDINGS)}")
+    write, ending = writer_of(path)
     if not samples:
         raise InputError(f"{path}: no attitude to write")
     with whole_file(path) as file:
-        if ending == ".csv":
-            _write_csv(file, samples)
-        elif ending in {".jsonl", ".json"}:
-            _write_json_lines(file, samples)
-        elif ending == ".mcap":
-            from hilstar.attitude.logs.mcap_log import write_attitudes
-
-            write_attitudes(file, samples)
-        else:
-            from hilstar.attitude.logs.aem import aem_text
-
-            file.write(aem_text(samples, ending == ".xml", scale).encode())
+        write(file, samples, Writing(ending, scale))
 
 
 def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:
@@ -240,238 +127,6 @@ def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins 
     for sample in samples:
         timeline.add(sample)
     return timeline
-
-
-class LogHead(NamedTuple):
-    """The beginning of a log: its first bytes, none of a directory."""
-
-    path: Path
-    head: bytes
-
-    @property
-    def word(self) -> str:
-        """The first word of a text's first line that is no comment; "" where there is none."""
-        with open_lines(self.path, READABLE, MAX_LOG_BYTES) as lines:
-            firsts = (line.split(maxsplit=1)[0] for line in lines if line.strip())
-            return next((first for first in firsts if first != "COMMENT" and not first.startswith("#")), "")
-
-
-Opened = contextlib.AbstractContextManager[LogReading]
-
-
-class LogFormat(NamedTuple):
-    """A format: its name in a message, the statements (fields of `Stated`) that its reader uses,
-    how it is told and opened.
-    """
-
-    name: str
-    uses: frozenset[str]
-    begins: Callable[[LogHead], bool]
-    open: Callable[[Path, Stated], Opened]
-
-
-def check_stated(path: Path, stated: Stated) -> LogFormat:
-    """The format of a log. Raises InputError for a statement that the format does not use, and for
-    a file that is no log.
-    """
-    head = b""
-    if not path.is_dir():
-        with open_regular(path, READABLE) as file:
-            head = file.read(HEAD_BYTES)
-    beginning = LogHead(path, head)
-    log_format = next(each for each in FORMATS if each.begins(beginning))
-    for name, written in stated:
-        if name in log_format.uses or (log_format.name == LEDGER and written != OPTIONS[name]):
-            continue  # what a run's bench file says of its packets, its ledger has already done
-        reason = " has a convention of its own" if name == "convention" else " does not use it"
-        raise InputError(f"{path}: {written}: {log_format.name}{reason}; leave it out")
-    return log_format
-
-
-@contextlib.contextmanager
-def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
-    """The reading of a file, by what it holds. A format's reader, and its library, are imported
-    where a log needs them.
-    """
-    with check_stated(path, stated).open(path, stated) as reading:
-        yield reading
-
-
-def _of_packets(
-    path: Path, entries: Iterator[LogEntry], source: str, stated: Stated, advice: str = "sort the log by time"
-) -> LogReading:
-    """The reading of entries that have the numbers of a packet, as they were sent: their
-    convention, then their reference.
-
-    Rates are with respect to the reference, in the frame's own components.
-    """
-    convention = HILSTARS if stated.convention is None else stated.convention
-    by = [] if stated.convention is None else [stated.convention_by]
-    if stated.mounting.by_option:  # which says that the attitudes are the body's
-        convention, by = structs.replace(convention, frame="body"), [*by, OPTIONS["mounting"]]
-    notices: list[tuple[str, str]] = []
-    if convention != HILSTARS:
-        notices.append(("log-convention", f"read with convention = {convention} ({', '.join(by)})"))
-    if not convention.is_hilstars:
-        entries = _by_convention(entries, convention)
-    conventions = packet_conventions(convention, source)
-    if stated.reference is None and stated.place is None and stated.epoch_utc is None:
-        return LogReading(entries, conventions, advice, notices)
-    from hilstar.attitude.logs.earth import reference_kind, stated_reference, to_icrs  # 30 ms
-
-    kind = reference_kind(path, stated, notices)
-    first = next(entries, None)
-    sample = None if first is None else first.event
-    if first is None or not isinstance(sample, AttitudeSample):  # which is refused when it is read
-        return LogReading([] if first is None else [first], conventions, advice, notices)
-    reference = stated_reference(path, kind, stated, sample.t_ns)
-    turned = to_icrs(itertools.chain([first], entries), reference, False, notices)
-    return LogReading(turned, _referred(conventions, convention, reference, sample.t_ns), advice, notices)
-
-
-def _by_convention(entries: Iterable[LogEntry], convention: Convention) -> Iterator[LogEntry]:
-    for entry in entries:
-        event = entry.event
-        yield LogEntry(entry.where, convention.sample(event)) if isinstance(event, AttitudeSample) else entry
-
-
-def _referred(conventions: Conventions, convention: Convention, reference: "Reference", first_ns: int) -> Conventions:
-    """The conventions of a log whose attitudes refer to a reference; the self-check is for its
-    first time.
-    """
-    if reference.kind == "icrs":
-        return conventions
-
-    def written(q_icrs_to_frame: "FloatArray") -> str:
-        q = multiply(q_icrs_to_frame, conjugate(reference.q_icrs_to_reference([first_ns])[0]))
-        return f"q = {components(convention.as_sent(q))} at {first_ns / NS_PER_S:.9f} s"
-
-    turns = packet_conventions(convention, reference="reference").turns
-    return replace(conventions, turns=f"{turns}; the reference is {reference.words}", written=written)
-
-
-@contextlib.contextmanager
-def _open_ros(path: Path, stated: Stated) -> Iterator[LogReading]:
-    _require("rosbags", "ros", f"{path}: a ROS bag")
-    from hilstar.attitude.logs.ros import read_ros
-    from hilstar.attitude.logs.ros_bags import open_bag
-
-    with open_bag(path) as bag:
-        yield read_ros(bag, stated)
-
-
-@contextlib.contextmanager
-def _open_ulog(path: Path, stated: Stated) -> Iterator[LogReading]:
-    _require("pyulog", "px4", f"{path}: a ULog of PX4")
-    from hilstar.attitude.logs.px4 import read_ulog
-
-    yield read_ulog(path, stated)
-
-
-@contextlib.contextmanager
-def _open_ck(path: Path, stated: Stated) -> Iterator[LogReading]:
-    _require("spiceypy", "spice", f"{path}: a SPICE CK")
-    from hilstar.attitude.logs.ck import read_ck
-
-    yield read_ck(path, stated)
-
-
-@contextlib.contextmanager
-def _open_ledger(path: Path, stated: Stated) -> Iterator[LogReading]:
-    """A run's attitudes as it showed them: its convention and its mounting are in them already."""
-    yield LogReading(_mcap_entries(path), replace(PACKETS, source="MCAP", of_packets=False), RESTARTED)
-
-
-@contextlib.contextmanager
-def _open_mcap(path: Path, stated: Stated) -> Iterator[LogReading]:
-    yield _of_packets(path, _mcap_entries(path), "MCAP", stated, RESTARTED)
-
-
-def _mcap_entries(path: Path) -> Iterator[LogEntry]:
-    from hilstar.attitude.logs.mcap_log import read_attitudes
-
-    for number, sample in enumerate(read_attitudes(path), start=1):
-        yield LogEntry(f", attitude {number}", sample)
-
-
-@contextlib.contextmanager
-def _open_aem(path: Path, stated: Stated) -> Iterator[LogReading]:
-    from hilstar.attitude.logs.aem import read_aem
-    from hilstar.attitude.logs.earth import q_icrs_to_date
-
-    text = read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_AEM_BYTES)
-    try:
-        reading = read_aem(text, q_icrs_to_date)
-    except AemFaultError as fault:
-        raise InputError(f"{path}{fault.where}: {fault}") from fault
-    yield reading
-
-
-@contextlib.contextmanager
-def _open_other_ccsds(path: Path, stated: Stated) -> Iterator[LogReading]:
-    word = LogHead(path, b"").word[:MAX_QUOTED_CHARACTERS]
-    raise InputError(f"{path}: starts with {word}; of the CCSDS messages, only CCSDS_AEM_VERS is read")
-    yield
-
-
-@contextlib.contextmanager
-def _open_json_lines(path: Path, stated: Stated) -> Iterator[LogReading]:
-    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        yield _of_packets(path, _read_json_lines(lines), "JSON lines", stated)
-
-
-@contextlib.contextmanager
-def _open_csv(path: Path, stated: Stated) -> Iterator[LogReading]:
-    scalar = (stated.convention or HILSTARS).scalar
-    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        reading = _of_packets(path, _read_csv(lines, scalar), "CSV", stated)
-        yield replace(reading, conventions=replace(reading.conventions, time_unit="s"))
-
-
-def _is_bag(beginning: LogHead) -> bool:
-    if beginning.head.startswith(MCAP_MAGIC):
-        from hilstar.attitude.logs.mcap_log import holds_ros
-
-        return holds_ros(beginning.path)
-    if beginning.path.is_dir():
-        from hilstar.attitude.logs.ros_bags import is_bag_directory
-
-        return is_bag_directory(beginning.path)
-    return beginning.head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))
-
-
-def _is_ledger(beginning: LogHead) -> bool:
-    from hilstar.attitude.logs.mcap_log import begins_as_ledger
-
-    return beginning.head.startswith(MCAP_MAGIC) and begins_as_ledger(beginning.path)
-
-
-LEDGER = "the ledger of a run"
-RESTARTED = "the sender restarted here; give a log of one run"
-LEVEL = frozenset({"reference", "place", "epoch_utc"})
-LIKE_PACKETS = LEVEL | {"mounting", "convention"}
-# The first that a file begins like is its format; what is none of the others is read as CSV.
-FORMATS = (
-    LogFormat("a ROS bag", LEVEL | {"mounting", "topic", "body"}, _is_bag, _open_ros),
-    LogFormat("a ULog of PX4", LEVEL | {"mounting", "topic"}, lambda log: log.head.startswith(ULOG_MAGIC), _open_ulog),
-    LogFormat("a SPICE CK", frozenset({"mounting", "kernels", "body"}), lambda log: log.head.startswith(CK_MAGIC), _open_ck),
-    LogFormat(LEDGER, frozenset(), _is_ledger, _open_ledger),
-    LogFormat("MCAP", LIKE_PACKETS, lambda log: log.head.startswith(MCAP_MAGIC), _open_mcap),
-    LogFormat(
-        "a CCSDS AEM",
-        frozenset({"mounting"}),
-        lambda log: log.word.startswith(("<", "CCSDS_AEM_VERS")),
-        _open_aem,
-    ),
-    LogFormat("a CCSDS message", frozenset(), lambda log: log.word.startswith("CCSDS_"), _open_other_ccsds),
-    LogFormat("JSON lines", LIKE_PACKETS, lambda log: log.word.startswith("{"), _open_json_lines),
-    LogFormat("CSV", LIKE_PACKETS, lambda log: True, _open_csv),
-)
-
-
-def _require(library: str, extra: str, what: str) -> None:
-    if importlib.util.find_spec(library) is None:
-        raise MachineError(f"{what}; reading it needs {library}: pip install 'hilstar[{extra}]'")
 
 
 def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None) -> int:

@@ -7,6 +7,7 @@ for every interval alike and about the same axis.
 """
 
 from collections.abc import Sequence
+from decimal import Decimal
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,8 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import conjugate, multiply, to_rotation_vector
 from hilstar.units import NS_PER_S
 
+# Times before 2000 are those of a simulated clock that began at 0, not dates.
+FIRST_DATE_NS = 946_684_800 * NS_PER_S
 TIMES = "log-times"  # the kind of these notices
 LOOKED_AT = 2000  # intervals
 MIN_INTERVALS = 5
@@ -102,3 +105,14 @@ def _ratio(turned: FloatArray, by_rate: FloatArray) -> float:
     turned, by_rate, lengths, others = turned[turns], by_rate[turns], lengths[turns], others[turns]
     cosines = (turned * by_rate).sum(axis=1) / (lengths * others)
     return float(np.median(others / lengths)) if np.median(cosines) > MIN_COSINE else float("nan")
+
+
+def ns_of_seconds(seconds: str) -> int:
+    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns.
+
+    Raises ValueError or ArithmeticError.
+    """
+    value = Decimal(seconds)
+    if not value.is_finite() or value.adjusted() > 40:
+        raise ValueError
+    return int(value.scaleb(9).to_integral_value())

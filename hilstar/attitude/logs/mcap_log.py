@@ -39,7 +39,8 @@ from zstandard import ZstdDecompressor as Zstd
 
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.errors import InputError
-from hilstar.reading import MCAP_MAGIC, NOT_JSON, open_regular, size_text
+from hilstar.files import MCAP_MAGIC
+from hilstar.reading import NOT_JSON, open_regular, size_text
 
 Topics = Mapping[int, str]  # by channel
 Messages = list[tuple[int, bytes]]  # channel and content
@@ -548,13 +549,23 @@ def write_attitudes(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
 
 
 def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
-    """The accepted samples in the order of the file; other channels and refused packets are skipped.
+    """The samples of `read_events`. Raises InputError as it does, and for what is no attitude."""
+    for where, event in read_events(path):
+        if isinstance(event, Refusal):
+            raise InputError(f"{path}{where}: {event.detail}")
+        yield event
+
+
+def read_events(path: Path) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
+    """Each message's place, and its sample or why it is none, in the order of the file; other channels and packets that were
+    refused when they came are skipped.
 
     A file whose writer was killed gives everything before its last, unfinished chunk. Raises InputError for damage, and for a
     message that is not an attitude.
     """
     for number, data in enumerate(read_messages(path, ATTITUDE_TOPIC), start=1):
-        where = f"{path}: message {number} of {ATTITUDE_TOPIC}:"
+        place = f": message {number} of {ATTITUDE_TOPIC}"
+        where = f"{path}{place}:"
         try:
             form = _decoder.decode(data)
         except NOT_JSON as error:
@@ -563,7 +574,4 @@ def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
             continue
         if form.t_ns is None or form.q is None:
             raise InputError(f"{where} is accepted, but lacks t_ns or q")
-        sample = checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)
-        if isinstance(sample, Refusal):
-            raise InputError(f"{where} {sample.detail}")
-        yield sample
+        yield place, checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)

@@ -14,17 +14,17 @@ tf is a tree of frames; a chain of transforms gives the attitude of one frame in
 changes is static, whichever topic it comes on. Where several transforms of a chain move, the attitudes have the times of the
 one with the most samples, and the others are interpolated to those (SLERP, as in tf2), never extrapolated.
 
-Type definitions in the bag are compared with those of rosbags and never registered: that would turn them into Python code.
+A type that has the name of ROS's own and other fields is refused.
 """
 
+import contextlib
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from itertools import chain, islice
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +33,6 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.earth import (
     AXES,
     EXACT,
-    FIRST_DATE_NS,
     KINDS,
     Kind,
     Reference,
@@ -42,19 +41,17 @@ from hilstar.attitude.logs.earth import (
     to_icrs,
 )
 from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated, in_order
-from hilstar.attitude.logs.ros_bags import Bag, BagTopic, Encoding
-from hilstar.attitude.wire.packet import Refusal, checked_sample
+from hilstar.attitude.logs.log_formats import LogFormat, require
+from hilstar.attitude.logs.log_times import FIRST_DATE_NS
+from hilstar.attitude.logs.packet_logs import LEVEL
+from hilstar.attitude.logs.ros_bags import ENDINGS, OLD_TF, TF, Bag, BagTopic, is_bag, open_bag
+from hilstar.attitude.wire.packet import Refusal, checked_sample, is_unset
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.errors import InputError, shortened
 from hilstar.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
 from hilstar.units import NS_PER_S
 
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
-TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
-OWN_NAMES = {OLD_TF: TF}  # types that rosbags knows by another name
 TF_TYPES = frozenset({TF, OLD_TF})
 TRANSFORM, IMU, ODOMETRY = "geometry_msgs/msg/TransformStamped", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 # Where each message has its quaternion.
@@ -70,8 +67,6 @@ QUATERNIONS: dict[str, Callable[[Any], Any]] = {
     ODOMETRY: attrgetter("pose.pose.orientation"),
 }
 TYPES = frozenset(QUATERNIONS) | TF_TYPES
-TF_TEXT = "geometry_msgs/TransformStamped[] transforms"
-MAX_DEFINITION_CHARACTERS = 100_000
 Numbers = tuple[float, ...]
 IntArray = npt.NDArray[np.int64]
 MAX_EDGES = 10_000
@@ -82,40 +77,6 @@ MAX_NAMED_TOPICS = 12
 STATIC_TF = "tf_static"
 OPTICAL = ("_optical_frame", "_optical")
 ORDER_ADVICE = "the bag has two attitudes of one time, or its clock was set back; choose one sender, or cut the bag there"
-
-
-@lru_cache(maxsize=2)
-def typestore(encoding: Encoding) -> "Typestore":
-    """ROS's own types: of Noetic for ROS 1, of rosbags's latest ROS 2 (these have not changed since the first)."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    if encoding == "cdr":
-        return get_typestore(Stores.LATEST)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg(TF_TEXT, TF))
-    return store
-
-
-def _decoded(topic: BagTopic, data: bytes) -> Any:
-    store = typestore(topic.encoding)
-    read = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
-    return read(data, OWN_NAMES.get(topic.type, topic.type))
-
-
-def _check_definition(where: str, topic: BagTopic) -> None:
-    """Refuse (InputError) a type that only has the name of ROS's own."""
-    if not topic.definition:
-        return
-    from rosbags.typesys import TypesysError, get_types_from_msg
-
-    text, ours = topic.definition[:MAX_DEFINITION_CHARACTERS], typestore(topic.encoding).fielddefs
-    try:
-        theirs = get_types_from_msg("\n".join(text.splitlines()), OWN_NAMES.get(topic.type, topic.type))
-    except TypesysError:
-        theirs = {}
-    # Some writers leave out the inner types.
-    if not theirs or any(kind in ours and ours[kind][1] != fields for kind, (_, fields) in theirs.items()):
-        raise InputError(f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it")
 
 
 class _RosTurn(NamedTuple):
@@ -365,7 +326,9 @@ class _Heard(NamedTuple):
 def read_ros(bag: Bag, stated: Stated) -> LogReading:
     """The body's attitudes of one topic. Raises InputError where the bag, or what is stated, does not say which they are."""
     topic = _chosen(bag, stated.topic)
-    _check_definition(f"{bag.path}: {topic.name}", topic)
+    if not bag.has_own_fields(topic):
+        where = f"{bag.path}: {topic.name}"
+        raise InputError(f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it")
     told: list[tuple[str, str]] = []
     every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
     first, stamped, heard = _begin(bag, topic, every, stated.body)
@@ -381,13 +344,12 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     # An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would turn it twice.
     if body is not None and body.endswith(OPTICAL) and abs(stated.mounting.q_body_to_cam[0]) < 1:
         told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
-    return LogReading(
-        _with_notices(in_order(entries, told), bag, told), _conventions(topic, first, stamped, reference), ORDER_ADVICE, told
-    )
+    return LogReading(in_order(entries, told), _conventions(topic, first, stamped, reference), ORDER_ADVICE, told)
 
 
 def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None) -> tuple[_Heard, bool, Iterator[_Heard]]:
-    """The first orientation of the stated body, whether the messages have times of their own, and all of its orientations.
+    """The first orientation of the stated body that is set, whether the messages have times of
+    their own, and all of its orientations.
 
     Raises InputError where there are none.
     """
@@ -400,12 +362,19 @@ def _begin(bag: Bag, topic: BagTopic, heard: Iterator[_Heard], body: str | None)
     if body is not None:
         wanted = frame(body)
         heard = (each for each in heard if each.turn.body == wanted)
+    # Zeros and NaN from before an estimator ran may lack stamps and frames, too: what follows them counts.
+    unset = []
+    for each in heard:
+        if not is_unset(each.turn.q):
+            heard = chain([each], heard)
+            break
+        unset.append(each)
     begin = list(islice(heard, 2))
-    if not begin:
+    if not begin and not unset:
         raise InputError(f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has")
     # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
     stamped = any(each.turn.stamp_ns for each in begin)
-    return begin[0], stamped, chain(begin, heard)
+    return [*begin, *unset][0], stamped, chain(unset, begin, heard)
 
 
 def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
@@ -437,7 +406,7 @@ def _of_topic(bag: Bag, topic: BagTopic) -> Iterator[_Heard]:
     for number, message in enumerate(bag.messages(topic), start=1):
         where = f": message {number} of {topic.name}"
         try:
-            found = list(turns(topic.type, _decoded(topic, message.data)))
+            found = list(turns(topic.type, bag.decoded(topic, message.data)))
         except Exception as error:  # rosbags's generated code raises what its bytes lead to
             raise InputError(f"{bag.path}{where} is no {topic.type} ({shortened(error)}); record the bag again") from error
         yield from (_Heard(where, message.receive_ns, turn) for turn in found)
@@ -456,7 +425,7 @@ def _entries(heard: Iterator[_Heard], first: _RosTurn, stamped: bool) -> Iterato
     """Each attitude from the reference to the body, at its time, or why it is none."""
     for each in heard:
         w, x, y, z = each.turn.q
-        fault = _fault(each.turn, first, stamped)
+        fault = None if is_unset(each.turn.q) else _fault(each.turn, first, stamped)
         yield LogEntry(each.where, fault or checked_sample(each.t_ns(stamped), (w, -x, -y, -z), each.turn.rate))
 
 
@@ -470,12 +439,6 @@ def _fault(turn: _RosTurn, first: _RosTurn, stamped: bool) -> Refusal | None:
     if turn.stamp_ns and not stamped:
         return Refusal("time", "some messages have a stamp and some have none (0); set it in all of them")
     return None
-
-
-def _with_notices(entries: Iterator[LogEntry], bag: Bag, told: list[tuple[str, str]]) -> Iterator[LogEntry]:
-    """The entries; what the bag has to say of itself is known at their end."""
-    yield from entries
-    told.extend(bag.told())
 
 
 def _conventions(topic: BagTopic, first: _Heard, stamped: bool, reference: Reference) -> Conventions:
@@ -504,3 +467,20 @@ def _conventions(topic: BagTopic, first: _Heard, stamped: bool, reference: Refer
         written=written,
         scale="UTC" if t_ns >= FIRST_DATE_NS else None,
     )
+
+
+@contextlib.contextmanager
+def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
+    require("rosbags", "ros", f"{path}: a ROS bag")
+    with open_bag(path) as bag:
+        yield read_ros(bag, stated)
+
+
+log_format = LogFormat(
+    "a ROS bag",
+    _open,
+    listed="bags of ROS",
+    uses=LEVEL | {"mounting", "topic", "body"},
+    magic=tuple(ENDINGS),
+    begins=is_bag,
+)

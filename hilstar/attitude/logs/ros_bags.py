@@ -1,405 +1,209 @@
-"""ROS bags of every storage format: one file, or the directory of a ROS 2 bag with its metadata.yaml.
+"""ROS bags, opened by rosbags' `AnyReader`; `ros` says what their messages mean.
 
-- ROS 2 in SQLite (.db3): the tables `topics` and `messages`, and `message_definitions` from Iron on.
-- ROS 2 in MCAP, its default, which other programs write with ROS's schemas too.
-- ROS 1, format 2.0 (wiki.ros.org/Bags/Format/2.0), read from the front in bounded memory. A record is a header of NAME=VALUE
-  fields and its data; chunks hold connections (a topic and its type) and messages. A closed bag repeats its connections in an
-  index at its end. A bag whose recorder was killed has no index and is cut anywhere; all its whole records are read.
+A bag is one file (.bag of ROS 1; .db3 or .mcap of ROS 2) or the directory of a bag of ROS 2. Its
+content says which; rosbags goes by the ending, so a file of another name is read by a link to it.
+Types that a bag does not define are ROS's own.
 
-A bag states the unpacked sizes of its chunks, which may be false: nothing is unpacked beyond the limits below.
+A bag without an index (its recorder was killed) is refused with the command that rebuilds it.
 """
 
 import contextlib
-import io
-import os
-import re
-import sqlite3
-import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import IO, Literal, NamedTuple
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import zstandard
-from mcap.records import Channel, Schema
-from mcap.records import Message as McapMessage
-
-from hilstar.attitude.logs.mcap_log import ROS_ENCODINGS, records_of, unpacked
+from hilstar.attitude.logs.log_formats import LogHead
 from hilstar.errors import InputError, shortened
-from hilstar.files import temporary_folder
-from hilstar.reading import (
-    HEAD_BYTES,
-    MCAP_MAGIC,
-    ROSBAG_MAGIC,
-    SQLITE_MAGIC,
-    by_number,
-    open_regular,
-    read_text,
-    refuse_kind,
-    size_text,
-)
-from hilstar.units import NS_PER_S
+from hilstar.files import MCAP_MAGIC, temporary_folder
+from hilstar.reading import HEAD_BYTES, open_regular, size_text
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
 
 BAG_ADVICE = "give a bag of ROS 1 (.bag) or ROS 2 (.db3, .mcap, or the bag's directory)"
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-MAX_CHUNK_BYTES = 256_000_000  # unpacked; recorders make them of about 1 MB
-MAX_MESSAGE_BYTES = 64_000_000
-MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # limits for a whole file; logs pack to a tenth
-PIECE_BYTES = 1 << 20
-
-Encoding = Literal["ros1", "cdr"]
-MAX_TOPICS = 10_000
-VERSION = b"#ROSBAG V2.0\n"
-MESSAGE, CHUNK, CONNECTION = 2, 5, 7  # operations of records
-MAX_HEADER_BYTES = 1_000_000
-_u32, _u64, _time = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<II")
-# What the bytes of a record that is not one raise, in struct, in the fields and in the unpackers.
-FAULTS = (struct.error, KeyError, ValueError, OSError, EOFError, RuntimeError)
-Fields = dict[bytes, bytes]
+ROSBAG_MAGIC = b"#ROSBAG V"
+SQLITE_MAGIC = b"SQLite format 3\x00"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no message begins so, in CDR or of ROS 1
+ENDINGS = {ROSBAG_MAGIC: ".bag", SQLITE_MAGIC: ".db3", MCAP_MAGIC: ".mcap"}
 METADATA = "metadata.yaml"
-MAX_METADATA_BYTES = 2_000_000
-MAX_FILES = 10_000
-MAX_NAME_CHARACTERS = 255
-FILE_LIST = re.compile(r"^[ ]*relative_file_paths:[ ]*(?:\[([^\]\n]*)\]|\n((?:[ ]*-[ ][^\n]*(?:\n|\Z))+))", re.MULTILINE)
-FILE_NAME = re.compile(r".*\.(db3|mcap)(\.zstd)?")
-
-
-class BagTopic(NamedTuple):
-    """A topic of a bag: `type` as PACKAGE/msg/NAME; `definition` is the type's text in the bag, "" where it has none."""
-
-    name: str
-    type: str
-    encoding: Encoding
-    definition: str = ""
+MAX_METADATA_BYTES = 2_000_000  # a YAML reader's time has no bound
+PACKED = f"its messages are packed; give the bag's directory, whose {METADATA} says so"
+STORED = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+OLD_TF = "tf/msg/tfMessage"
+TF, TF_TEXT = "tf2_msgs/msg/TFMessage", "geometry_msgs/TransformStamped[] transforms"
 
 
 class Message(NamedTuple):
-    """What a bag holds of one message: when it was recorded, ns of the recorder's clock, and its serialised bytes."""
+    """A message: when it was recorded, ns of the recorder's clock, and its serialised bytes."""
 
     receive_ns: int
     data: bytes
 
 
-def type_name(text: str) -> str:
-    """A type as PACKAGE/msg/NAME, however a bag writes it."""
-    parts = text.replace("::", "/").split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else "/".join(parts)
+@dataclass(frozen=True, slots=True)
+class BagTopic:
+    """A topic of a bag: `type` as PACKAGE/msg/NAME, and rosbags' connections of it."""
+
+    name: str
+    type: str
+    connections: "tuple[Connection, ...]"
 
 
-def _message_bytes(data: bytes) -> bytes:
-    """A message's bytes, unpacked where the recorder packed each by itself (no CDR begins as Zstandard does)."""
-    return unpacked(data, "zstd", MAX_CHUNK_BYTES, exact=False) if data[:4] == ZSTD_MAGIC else data
+@lru_cache(maxsize=2)
+def own_types(is_ros2: bool) -> "Typestore":
+    """ROS's own types: of the latest ROS 2 (unchanged since the first), or of Noetic."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-
-def _damaged(path: Path, reason: object, where: str = "") -> InputError:
-    words = shortened(" ".join(str(reason).split()))
-    return InputError(f"{path}: the bag is damaged{where} ({words}); record it again, or repair it with ROS's own tools")
-
-
-class _Db3File:
-    """A .db3 file: topics, messages as recorded, and notices of what is missing. Its methods raise InputError for damage."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def topics(self) -> list[BagTopic]:
-        with self._open() as database:
-            texts = {}
-            if self._tables(database, "message_definitions"):
-                rows = database.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
-                texts = {name: text for name, encoding, text in rows.fetchmany(MAX_TOPICS) if encoding == "ros2msg"}
-            rows = database.execute("SELECT name, type FROM topics WHERE serialization_format = 'cdr' ORDER BY id")
-            found = [
-                BagTopic(str(name), type_name(str(kind)), "cdr", str(texts.get(kind, "")))
-                for name, kind in rows.fetchmany(MAX_TOPICS)
-            ]
-            return list(dict.fromkeys(found))
-
-    def messages(self, topic: BagTopic) -> Iterator[Message]:
-        with self._open() as database:
-            topics = database.execute("SELECT id, name, type FROM topics").fetchmany(MAX_TOPICS)
-            ids = [number for number, name, kind in topics if (name, type_name(str(kind))) == (topic.name, topic.type)]
-            marks = ",".join("?" * len(ids))
-            rows = database.execute(f"SELECT timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id", ids)
-            for receive_ns, data in rows:
-                if not isinstance(receive_ns, int) or not isinstance(data, bytes):
-                    raise _damaged(self._path, "a message without time or bytes")
-                yield Message(receive_ns, _message_bytes(data))
-
-    def told(self) -> list[tuple[str, str]]:
-        log = self._path.with_name(self._path.name + "-wal")
-        if not log.is_file() or not log.stat().st_size:
-            return []
-        advice = f"merge it with: sqlite3 {self._path.name} 'PRAGMA wal_checkpoint'"
-        return [("log-cut", f"what {log.name} has is not read, since its recorder did not close the bag; {advice}")]
-
-    @contextlib.contextmanager
-    def _open(self) -> Iterator[sqlite3.Connection]:
-        place = f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1"
-        try:
-            with contextlib.closing(sqlite3.connect(place, uri=True)) as database:
-                database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
-                database.execute("PRAGMA trusted_schema = off")
-                if self._tables(database, "topics", "messages") != 2:
-                    raise InputError(f"{self._path}: an SQLite database, but no bag of ROS 2: it lacks topics and messages")
-                yield database
-        except (sqlite3.Error, ValueError, OverflowError, zstandard.ZstdError) as error:
-            raise _damaged(self._path, error) from error
-
-    def _tables(self, database: sqlite3.Connection, *names: str) -> int:
-        """How many of the names are tables (a view would run what the file says)."""
-        marks = ",".join("?" * len(names))
-        query = f"SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ({marks})"
-        return int(database.execute(query, names).fetchone()[0])
-
-
-class _McapBag:
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def topics(self) -> list[BagTopic]:
-        return list(dict.fromkeys(found for found in self._records() if isinstance(found, BagTopic)))
-
-    def messages(self, topic: BagTopic) -> Iterator[Message]:
-        for found in self._records(topic):
-            if isinstance(found, Message):
-                yield found
-
-    def told(self) -> list[tuple[str, str]]:
-        with self._path.open("rb") as file:
-            file.seek(-min(len(MCAP_MAGIC), self._path.stat().st_size), os.SEEK_END)
-            if file.read() == MCAP_MAGIC:
-                return []
-        return [("log-cut", f"{self._path} was not closed by its recorder; all chunks that are whole are read")]
-
-    def _records(self, wanted: BagTopic | None = None) -> Iterator[BagTopic | Message]:
-        """Every topic, and each message of the wanted one."""
-        channels: dict[int, BagTopic] = {}
-        schemas: dict[int, Schema] = {}
-        for record in records_of(self._path):
-            if isinstance(record, McapMessage):
-                if wanted is not None and channels.get(record.channel_id) == wanted:
-                    try:
-                        yield Message(record.log_time, _message_bytes(record.data))
-                    except (ValueError, zstandard.ZstdError) as error:
-                        raise _damaged(self._path, error) from error
-            elif isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel) and record.message_encoding in ROS_ENCODINGS and record.schema_id in schemas:
-                schema = schemas[record.schema_id]
-                text = schema.data.decode(errors="replace") if schema.encoding in {"ros2msg", "ros1msg"} else ""
-                encoding: Encoding = "ros1" if record.message_encoding == "ros1" else "cdr"
-                channels[record.id] = BagTopic(record.topic, type_name(schema.name), encoding, text)
-                yield channels[record.id]
-
-
-class _CutError(Exception):
-    """The file ends within a record."""
-
-
-class _BagFile:
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._cut_at: int | None = None
-        self._topics: dict[int, BagTopic] = {}
-
-    def topics(self) -> list[BagTopic]:
-        """The connections of the index; without one, those of all chunks."""
-        for start in (self._index_at(), len(VERSION)):
-            if start and not self._topics:  # an index that names nothing is not where the bag says
-                for _ in self._records(start):
-                    pass
-        return list(dict.fromkeys(self._topics.values()))
-
-    def messages(self, topic: BagTopic) -> Iterator[Message]:
-        for connection, message in self._records(len(VERSION)):
-            if self._topics.get(connection) == topic:
-                yield message
-
-    def told(self) -> list[tuple[str, str]]:
-        if self._cut_at is None:
-            return []
-        return [("log-cut", f"{self._path} ends within a record at byte {self._cut_at}; all that is whole before it is read")]
-
-    def _index_at(self) -> int:
-        """Where the index begins, 0 where the bag has none."""
-        with open_regular(self._path, BAG_ADVICE) as file:
-            if file.readline(len(VERSION)) != VERSION:
-                raise InputError(f"{self._path}: a ROS 1 bag of another version than 2.0; convert it with rosbag's own tools")
-            try:
-                fields, _ = _record(file) or ({b"index_pos": bytes(_u64.size)}, b"")
-                if fields.get(b"encryptor"):
-                    raise InputError(f"{self._path}: an encrypted bag; decrypt it with rosbag's own tools")
-                at: int = _u64.unpack(fields[b"index_pos"])[0]
-            except FAULTS as error:
-                raise _damaged(self._path, error) from error
-            except _CutError:
-                return 0
-        return at if at < self._path.stat().st_size else 0
-
-    def _records(self, start: int) -> Iterator[tuple[int, Message]]:
-        """Every message from byte `start`, with its connection's number; connections are kept as they come."""
-        with open_regular(self._path, BAG_ADVICE) as file:
-            room = FREE_BYTES + MAX_INFLATION * self._path.stat().st_size
-            file.seek(start)
-            try:
-                while (record := _record(file)) is not None:
-                    fields, data = record
-                    if _operation(fields) == CHUNK:
-                        size, compression = _u32.unpack(fields[b"size"])[0], fields[b"compression"].decode()
-                        if size > MAX_CHUNK_BYTES:
-                            raise ValueError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
-                        if compression not in {"none", "bz2", "lz4", "zstd"}:
-                            raise ValueError(f"compression {compression[:20]!r} is not one of bz2, lz4 and zstd")
-                        chunk = unpacked(data, compression, size)
-                        room -= size
-                        if room < 0:
-                            raise ValueError(f"unpacks to more than {MAX_INFLATION} times its size")
-                        yield from self._inside(io.BytesIO(chunk))
-                    elif _operation(fields) == CONNECTION:
-                        self._connect(fields, data)
-            except _CutError:
-                self._cut_at = file.tell()
-            except FAULTS as error:
-                raise _damaged(self._path, error, f" before byte {file.tell()}") from error
-
-    def _inside(self, chunk: IO[bytes]) -> Iterator[tuple[int, Message]]:
-        try:
-            while (record := _record(chunk)) is not None:
-                fields, data = record
-                if _operation(fields) == MESSAGE:
-                    seconds, ns = _time.unpack(fields[b"time"])
-                    yield _u32.unpack(fields[b"conn"])[0], Message(seconds * NS_PER_S + ns, data)
-                elif _operation(fields) == CONNECTION:
-                    self._connect(fields, data)
-        except _CutError as error:
-            raise ValueError("a record is longer than its chunk") from error
-
-    def _connect(self, fields: Fields, data: bytes) -> None:
-        more = _fields(data)
-        name, kind = fields[b"topic"].decode(), type_name(more[b"type"].decode())
-        self._topics[_u32.unpack(fields[b"conn"])[0]] = BagTopic(name, kind, "ros1", more[b"message_definition"].decode())
-
-
-def _record(file: IO[bytes]) -> tuple[Fields, bytes] | None:
-    """The next record, None at the end. Raises CutError where the file ends within it, ValueError for one over the limits."""
-    head = file.read(_u32.size)
-    if not head:
-        return None
-    fields = _fields(_part(file, head, MAX_HEADER_BYTES))
-    return fields, _part(file, file.read(_u32.size), MAX_CHUNK_BYTES)
-
-
-def _part(file: IO[bytes], length: bytes, limit: int) -> bytes:
-    if len(length) < _u32.size:
-        raise _CutError
-    size: int = _u32.unpack(length)[0]
-    if size > limit:
-        raise ValueError(f"a record of {size} bytes; at most {limit} are read")
-    data = file.read(size)
-    if len(data) < size:
-        raise _CutError
-    return data
-
-
-def _fields(data: bytes) -> Fields:
-    fields, place = {}, 0
-    while place < len(data):
-        size = _u32.unpack_from(data, place)[0]
-        place += _u32.size
-        name, equals, value = data[place : place + size].partition(b"=")
-        if not equals or place + size > len(data):
-            raise ValueError("a header's field is not NAME=VALUE")
-        fields[name] = value
-        place += size
-    return fields
-
-
-def _operation(fields: Fields) -> int:
-    return fields[b"op"][0] if fields.get(b"op") else 0
-
-
-Storage = _Db3File | _McapBag | _BagFile  # one file of a bag
+    if is_ros2:
+        return get_typestore(Stores.LATEST)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(TF_TEXT, TF))
+    return store
 
 
 class Bag:
     """A bag that is open for reading."""
 
-    def __init__(self, path: Path, files: list[Storage], told: list[tuple[str, str]]) -> None:
-        self.path, self._files, self._told = path, files, told
-        self._topics: list[BagTopic] | None = None
+    def __init__(self, path: Path, reader: "AnyReader") -> None:
+        self.path, self._reader = path, reader
 
     def topics(self) -> list[BagTopic]:
-        """The topics of all files, each once; the files are looked through once. Raises InputError for damage."""
-        if self._topics is None:
-            self._topics = list(dict.fromkeys(topic for file in self._files for topic in file.topics()))
-        return self._topics
+        """Each topic once for each type of its messages, in the order of the bag."""
+        by_name: dict[tuple[str, str], list[Connection]] = {}
+        for connection in self._reader.connections:
+            by_name.setdefault((connection.topic, connection.msgtype), []).append(connection)
+        named = by_name.items()
+        return [BagTopic(name, kind, tuple(each)) for (name, kind), each in named]
 
     def messages(self, topic: BagTopic) -> Iterator[Message]:
-        """The messages of a topic, file by file. Raises InputError for damage."""
-        for file in self._files:
-            yield from file.messages(topic)
+        """The messages of a topic in the order of their recording. Raises InputError for damage."""
+        with _readable(self.path):
+            for _, receive_ns, data in self._reader.messages(topic.connections):
+                if data[:4] == ZSTD_MAGIC:
+                    raise InputError(f"{self.path}: {PACKED}")
+                yield Message(receive_ns, data)
 
-    def told(self) -> list[tuple[str, str]]:
-        """Notices of what was read so far."""
-        return [*self._told, *(notice for file in self._files for notice in file.told())]
+    def decoded(self, topic: BagTopic, data: bytes) -> Any:
+        """A message of its bytes. Raises what rosbags does for bytes that are none."""
+        return self._reader.deserialize(data, topic.type)
+
+    def has_own_fields(self, topic: BagTopic) -> bool:
+        """Whether the bag defines the topic's type, and all within it, as ROS does."""
+        theirs, ours = self._reader.typestore.fielddefs, own_types(self._reader.is2).fielddefs
+        waiting, seen = [topic.type], set()
+        while waiting:
+            kind = waiting.pop()
+            known = TF if kind == OLD_TF else kind
+            if kind in seen or known not in ours:
+                continue
+            seen.add(kind)
+            if kind not in theirs or theirs[kind][1] != ours[known][1]:
+                return False
+            waiting += _inner_types(theirs[kind][1])
+        return True
+
+
+def _inner_types(fields: Any) -> Iterator[str]:
+    """The names of the types within a type's fields, which rosbags has as nested tuples."""
+    for _, (_, argument) in fields:
+        while isinstance(argument, tuple) and isinstance(argument[0], tuple):  # of an array
+            _, argument = argument[0]
+        if isinstance(argument, str):
+            yield argument
 
 
 def is_bag_directory(path: Path) -> bool:
     """Whether a directory has what a bag of ROS 2 has. Raises OSError where it cannot be listed."""
-    return path.is_dir() and any(file.name == METADATA or FILE_NAME.fullmatch(file.name) for file in path.iterdir())
+    if not path.is_dir():
+        return False
+    names = [file.name for file in path.iterdir()]
+    return METADATA in names or any(name.endswith(STORED) for name in names)
 
 
 @contextlib.contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """A .bag, .db3 or .mcap file, or a directory of the latter two. Raises InputError."""
-    told: list[tuple[str, str]] = []
-    paths = _files_of(path, told) if is_bag_directory(path) else [path]
-    with temporary_folder("bag") as place:
-        yield Bag(path, [_storage(file, place) for file in paths], told)
+    from rosbags.highlevel import AnyReader
+
+    with temporary_folder("bag") as place, contextlib.ExitStack() as stack:
+        named = _directory(path) if path.is_dir() else _by_its_ending(path, place)
+        with _readable(path):
+            types = own_types(named.suffix != ".bag")
+            reader = stack.enter_context(AnyReader([named], default_typestore=types))
+        yield Bag(path, reader)
 
 
-def _files_of(path: Path, told: list[tuple[str, str]]) -> list[Path]:
-    """The files that the bag's metadata names; without it, all of the directory."""
+def _directory(path: Path) -> Path:
+    """A bag's directory as it is. Raises InputError where it has no index that anybody wrote."""
     metadata = path / METADATA
     if not metadata.is_file():
-        told.append(("log-cut", f"{path} has no {METADATA} (its recorder was killed?); all of its bag files are read"))
-        files = [file for file in path.iterdir() if FILE_NAME.fullmatch(file.name)]  # NAME_2 comes before NAME_10
-        return sorted(files, key=by_number)
-    # relative_file_paths, one to a line or in brackets, as ROS 2 writes them; a YAML reader's time has no bound.
-    found = FILE_LIST.search(read_text(metadata, "give a bag of ROS 2", MAX_METADATA_BYTES))
-    if found is None:
-        raise InputError(f"{metadata}: has no relative_file_paths; remove the file to read all of the directory")
-    items = found[1].split(",") if found[1] is not None else [line.strip()[1:] for line in found[2].splitlines()]
-    names = [name for item in items if (name := item.strip().strip("'\""))]
-    if not names or len(names) > MAX_FILES or max(map(len, names)) > MAX_NAME_CHARACTERS:
-        raise InputError(f"{metadata}: names no files of a bag; remove it to read all of the directory")
-    files = [path / Path(name).name for name in names]
-    missing = [file.name for file in files if not file.is_file()]
-    if missing:
-        raise InputError(f"{path}: lacks {shortened(', '.join(missing))}, which its {METADATA} names; copy the whole bag")
-    return files
+        missing = f"{path}: has no {METADATA} (its recorder was killed?)"
+        raise InputError(f"{missing}; make one: ros2 bag reindex {path.name}")
+    size = metadata.stat().st_size
+    if size > MAX_METADATA_BYTES:
+        too_large = f"{metadata}: has {size_text(size)}"
+        raise InputError(f"{too_large}; make it anew: ros2 bag reindex {path.name}")
+    return path
 
 
-def _storage(path: Path, place: Path) -> Storage:
-    """The reader of a file, by its first bytes; what is packed is unpacked into `place` first."""
+def _by_its_ending(path: Path, place: Path) -> Path:
+    """A file whose name ends as its content says, or a link to it in `place`. Raises InputError."""
     with open_regular(path, BAG_ADVICE) as file:
         head = file.read(HEAD_BYTES)
-        if head.startswith(ZSTD_MAGIC):
-            whole, room = place / path.stem, FREE_BYTES + MAX_INFLATION * path.stat().st_size
-            file.seek(0)
-            try:
-                with whole.open("wb") as target, zstandard.ZstdDecompressor().stream_reader(file) as stream:
-                    while piece := stream.read(PIECE_BYTES):
-                        room -= len(piece)
-                        if room < 0:
-                            raise InputError(f"{path}: unpacks to more than {MAX_INFLATION} times its size; {BAG_ADVICE}")
-                        target.write(piece)
-            except zstandard.ZstdError as error:
-                raise _damaged(path, error) from error
-            return _storage(whole, place)
-    for magic, kind in ((ROSBAG_MAGIC, _BagFile), (SQLITE_MAGIC, _Db3File), (MCAP_MAGIC, _McapBag)):
-        if head.startswith(magic):
-            return kind(path)
-    refuse_kind(path, head, BAG_ADVICE)
-    raise InputError(f"{path}: not a file of a bag; {BAG_ADVICE}")
+    ending = next(ending for magic, ending in ENDINGS.items() if head.startswith(magic))
+    _refuse_unmerged(path)
+    if path.suffix == ending:
+        return path
+    link = place / f"bag{ending}"
+    link.symlink_to(path.resolve())
+    return link
+
+
+def _refuse_unmerged(path: Path) -> None:
+    """Refuse (InputError) an SQLite file whose last messages its recorder left beside it."""
+    log = path.with_name(path.name + "-wal")
+    if log.is_file() and log.stat().st_size:
+        merge = f"sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+        rest = f"its recorder did not close it, and {log.name} has the rest"
+        raise InputError(f"{path}: {rest}; merge it with: {merge}")
+
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Whatever rosbags raises over a bag as one line (InputError)."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # its readers pass on what struct, sqlite, yaml and others raise
+        reason = " ".join(str(error).split()) or type(error).__name__
+        said = f"{path}: rosbags cannot read it ({shortened(reason)})"
+        raise InputError(f"{said}; {_mend(path, reason)}") from error
+
+
+def _mend(path: Path, reason: str) -> str:
+    """What to do with a bag that cannot be read."""
+    if "Profile" in reason:
+        other = "it is MCAP of another kind than ROS 2's"
+        return f"{other}; write it again with ros2 bag convert, or give the bag that it is of"
+    if path.suffix == ".bag" or reason.startswith("Bag"):
+        return f"where its index is missing or damaged: rosbag reindex {path.name} (of ROS 1)"
+    return (
+        "where its index is missing or damaged: ros2 bag reindex DIRECTORY (an MCAP file that was"
+        f" cut off, first: mcap recover {path.name} -o NEW.mcap)"
+    )
+
+
+def is_bag(beginning: LogHead) -> bool:
+    """Whether a log is a bag, by its beginning. Raises InputError for damage there."""
+    if beginning.path.is_dir():
+        return is_bag_directory(beginning.path)
+    if beginning.head.startswith(MCAP_MAGIC):
+        from hilstar.attitude.logs.mcap_log import holds_ros
+
+        return holds_ros(beginning.path)
+    return beginning.head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))

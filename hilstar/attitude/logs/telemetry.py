@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.attitude.logs.log_file import ns_of_seconds, read_log
+from hilstar.attitude.logs.log_file import read_log
+from hilstar.attitude.logs.log_formats import format_of
+from hilstar.attitude.logs.log_times import ns_of_seconds
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.csv_tables import finite_numbers, is_valid, read_rows
 from hilstar.errors import InputError, shortened
-from hilstar.reading import MCAP_MAGIC, open_regular
 from hilstar.rotation import normalise
 from hilstar.units import NS_PER_S
 
@@ -40,7 +41,7 @@ class Telemetry:
 
 def read_telemetry(path: Path, rising: bool = True) -> Telemetry:
     """Read telemetry. Raises InputError with the line of what is no attitude and, if `rising`, of a time that does not rise."""
-    if _is_csv(path):
+    if format_of(path).name == "CSV":
         telemetry = _read_csv(path, rising)
     else:
         samples = read_log(path)
@@ -52,19 +53,6 @@ def read_telemetry(path: Path, rising: bool = True) -> Telemetry:
         rows = f"{len(telemetry.t_ns)} rows, none of them valid" if len(telemetry.t_ns) else "no row"
         raise InputError(f"{path}: has {rows}; {ADVICE}")
     return telemetry
-
-
-def _is_csv(path: Path) -> bool:
-    """False where the file begins as a log of attitudes does (MCAP, AEM, JSON lines)."""
-    if path.is_dir():
-        return False
-    with open_regular(path, ADVICE) as file:
-        head = file.read(4096)
-    if head.startswith(MCAP_MAGIC) or b"\0" in head:
-        return False
-    lines = (line.strip() for line in head.splitlines())
-    first = next((line for line in lines if line and not line.startswith((b"#", b"COMMENT"))), b"")
-    return not first.startswith((b"<", b"{", b"CCSDS"))
 
 
 def _read_csv(path: Path, rising: bool) -> Telemetry:

@@ -156,7 +156,7 @@ def _protocol_of_vehicles(data: bytes) -> Likeness | None:
     if data.startswith(UBX):
         return Likeness("u-blox UBX", "a GNSS receiver is on this line; give the simulator's")
     if len(data) > 1 and len(data) - data[1] in MAVLINK.get(data[0], ()):
-        return Likeness("a MAVLink frame", "send hilstar's packets; a PX4 log is replayed with hilstar replay")
+        return Likeness("a MAVLink frame", "send hilstar's packets; docs/sources.md says how to bring a log of PX4")
     return None
 
 

@@ -85,11 +85,13 @@ class Refusal:
     """Why a message is not used as an attitude.
 
     `telling`: the bytes show what was sent in an attitude's place, and `detail` says it with what to send.
+    `unset`: its quaternion is zeros or NaN, as an estimator that has not run yet leaves it.
     """
 
     reason: Reason
     detail: str
     telling: bool = False
+    unset: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +233,11 @@ def _decode_body(kind: int, message: bytes) -> Event:
     return event
 
 
+def is_unset(q: tuple[float, ...]) -> bool:
+    """Whether a quaternion is zeros or NaN, which an estimator that has not run yet leaves."""
+    return not any(q) or any(map(math.isnan, q))
+
+
 def checked_sample(
     t_ns: int, q: tuple[float, ...], rate: tuple[float, ...] | None, sequence: int = 0, discontinuity: bool = False
 ) -> AttitudeSample | Refusal:
@@ -238,12 +245,14 @@ def checked_sample(
     import numpy as np  # 70 ms; a process that only stamps packets never comes here
 
     if not all(map(math.isfinite, (*q, *(rate or ())))):
-        return Refusal("nan", "a quaternion or rate component is not finite")
+        return Refusal("nan", "a quaternion or rate component is not finite", unset=is_unset(q))
     if rate is not None and math.hypot(*rate) > FASTEST_RAD_S:
         return Refusal("format", f"a rate of {math.hypot(*rate):.3g} rad/s; the maximum is {FASTEST_RAD_S:g}")
     norm = math.hypot(*q)
     if abs(norm - 1.0) > NORM_TOLERANCE:
-        return Refusal("norm", f"the quaternion's norm is {norm:.6g}; it must be 1 within {NORM_TOLERANCE:g}")
+        return Refusal(
+            "norm", f"the quaternion's norm is {norm:.6g}; it must be 1 within {NORM_TOLERANCE:g}", unset=is_unset(q)
+        )
     if t_ns not in INT64:
         return Refusal("format", f"t_ns {t_ns} does not fit 64 bits")
     unit = np.array(q, dtype=np.float64)
@@ -273,7 +282,7 @@ def _decode_json(message: bytes) -> AttitudeSample | Refusal:
         form = _json_decoder.decode(message)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
         if b"NaN" in message or b"Infinity" in message:
-            return Refusal("nan", "a number is NaN or Infinity")
+            return Refusal("nan", "a number is NaN or Infinity", unset=b"NaN" in message)
         return Refusal("format", f"{error}; write {JSON_FORM}")
     return checked_sample(form.t_ns, form.q, form.rate, form.sequence, form.discontinuity)
 

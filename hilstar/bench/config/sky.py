@@ -21,8 +21,9 @@ class Bodies(Table, frozen=True):
     sun: bool = False  #: The Sun.
     #: The Earth with its air, seen from an orbit: `[spacecraft] orbit` is then a file or `"source"`. Its night side is dark.
     earth: bool = False
-    #: The path of a list of two-line element sets (TLE), with name lines or without: satellites and debris along their own
-    #: paths, by SGP4, in and out of the Earth's shadow. Default: none
+    #: The path of a list of element sets: two lines each (TLE), with name lines or without, or OMM in
+    #: JSON, XML or CSV. Satellites and debris along their own paths, by SGP4, in and out of the Earth's
+    #: shadow. Default: none
     satellites: str | None = None
     #: The path of a CSV with the columns `norad,standard_mag,period_s,amplitude_mag,flash_s,flash_at_s,size_m`, of which only
     #: the first has to be there: what is known of each satellite's light. Default: none
@@ -88,9 +89,10 @@ class SkySettings(Table, frozen=True):
 class SpacecraftSettings(Table, frozen=True):
     """From where the sky is seen. With this table, or bodies, places are apparent: parallax, light bending and aberration."""
 
-    #: `"geocentre"`, or the path of a file: one two-line element set (TLE), propagated by SGP4, or a CCSDS OEM (KVN; ICRF, GCRF
-    #: or EME2000 about the Earth); `"source"`: where the messages of `[attitude] source = "vizard"` (Basilisk) have the
-    #: spacecraft. Default: none; `"geocentre"` with `[sky.bodies]`
+    #: `"geocentre"`, or the path of a file: one element set (two lines, or OMM in JSON, XML or CSV),
+    #: propagated by SGP4, or a CCSDS OEM (KVN; ICRF, GCRF or EME2000 about the Earth); `"source"`: where
+    #: the messages of `[attitude] source = "vizard"` (Basilisk) have the spacecraft. Default: none;
+    #: `"geocentre"` with `[sky.bodies]`
     orbit: str | None = None
 
 

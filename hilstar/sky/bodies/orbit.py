@@ -1,4 +1,6 @@
-"""Observers: the Earth's centre, or a satellite on a two-line element set, by SGP4 (Vallado et al. 2006, AIAA 2006-6753).
+"""Observers: the Earth's centre, or a satellite on an element set (two lines, or an OMM).
+
+SGP4 is that of Vallado et al. 2006, AIAA 2006-6753.
 
 A spacecraft's orbit by a CCSDS Orbit Ephemeris Message, 1.0 to 3.0 (CCSDS 502.0-B), in KVN.
 
@@ -22,10 +24,11 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, MachineError
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD, Tdb, tdb_of_utc
+from hilstar.sky.bodies.omm import is_omm, read_omm
 from hilstar.units import NS_PER_S
 
 LINE_LENGTH = 69
-TLE_ADVICE = "give a file with one two-line element set"
+TLE_ADVICE = "give a file with one two-line element set, or one OMM in JSON, XML or CSV"
 TURN_NS = 3600 * 10**9  # the equator's axes move by 0.006 arcsec an hour: 0.2 m of a low orbit
 log = logging.getLogger(__name__)
 
@@ -78,8 +81,14 @@ class TleOrbit:
         from sgp4.api import SGP4_ERRORS, Satrec
 
         self._name, self._errors = name, SGP4_ERRORS
-        self._satellite = Satrec.twoline2rv(*_checked(name, text))
-        self.number = int(self._satellite.satnum)
+        if is_omm(text):
+            sets = list(read_omm(text, name))
+            if len(sets) != 1:
+                raise InputError(f"{name}: has {len(sets)} element sets, and an orbit is one; {TLE_ADVICE}")
+            self._satellite, self.number = sets[0].satrec, sets[0].number
+        else:
+            self._satellite = Satrec.twoline2rv(*_checked(name, text))
+            self.number = int(self._satellite.satnum)
 
     def age_days(self, utc_ns: int) -> float:
         """How many days a UTC is after the elements' own date."""

@@ -1,4 +1,4 @@
-"""Lists of two-line element sets, with or without name lines, as CelesTrak and Space-Track give them.
+"""Lists of element sets, as CelesTrak and Space-Track give them: two lines each, with or without names, or OMM (`omm`).
 
 How bright a satellite is: a diffuse sphere in sunlight, in and out of the Earth's shadow, and its flashes.
 
@@ -29,6 +29,7 @@ import numpy as np
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError, MachineError, printable, shortened
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD
+from hilstar.sky.bodies.omm import is_omm, read_omm
 from hilstar.sky.bodies.orbit import TURN_NS, icrs_from_teme
 from hilstar.units import NS_PER_S, flux_ratio
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 LINE_LENGTH = 69  # with its checksum
 MAX_NAME = 24  # characters, as CelesTrak has them
-LIST_FORM = "give a list of two-line element sets, with name lines or without"
+LIST_FORM = "give a list of two-line element sets, with name lines or without, or OMM in JSON, XML or CSV"
 # Numeric columns of each line (from 0), and what they hold.
 NUMBERS = {
     "1": {"epoch's year": (18, 20), "epoch's day": (20, 32), "first derivative of the mean motion": (33, 43)},
@@ -100,13 +101,9 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
     """
     if importlib.util.find_spec("sgp4") is None:
         raise MachineError(f"[sky.bodies] satellites need SGP4; {INSTALL}")
-    from sgp4.api import Satrec
-
     found: dict[int, Satellite] = {}
-    for name, first, second in _sets(text, file):
-        satrec = Satrec.twoline2rv(first, second)
-        number = satrec.satnum
-        one = Satellite(name, number, satrec)
+    for one in _satellites(text, file):
+        number = one.number
         other = found.get(number)
         if other is None or abs(one.age_days(utc_ns)) < abs(other.age_days(utc_ns)):
             found[number] = one
@@ -118,6 +115,19 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
         for one in found.values()
     )
     return [Satellite(name, one.number, one.satrec) for name, one in zip(names, found.values(), strict=True)]
+
+
+def _satellites(text: str, file: str) -> "Iterator[Satellite]":
+    """Each element set of a list, as a satellite with the name that it has there. Raises InputError."""
+    from sgp4.api import Satrec
+
+    if is_omm(text):
+        for each in read_omm(text, file):
+            yield Satellite(_name(each.name), each.number, each.satrec)
+        return
+    for name, first, second in _sets(text, file):
+        satrec = Satrec.twoline2rv(first, second)
+        yield Satellite(name, satrec.satnum, satrec)
 
 
 def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:

@@ -23,14 +23,14 @@ from tests.support.senders import free_port, publisher
 from tests.support.sources import ros_bags
 from tests.support.sources import spice_kernels as ck
 from tests.support.sources.aem_messages import kvn, rows_of
+from tests.support.sources.attitude_texts import cic_text, stk_text
 from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
-from tests.support.sources.ulog_files import ULogWriter
 from tests.support.sources.viz_message import craft, viz_message
 from tests.support.waiting import PATIENCE_S, repeating
 
 MOUNTING = [0.6, 0.48, -0.64, 0.0]
 ALNILAM = 26311
-# The line has seven digits, of MRPs as of quaternions (4e-7 rad at most); a ULog holds single precision (1e-7 rad).
+# The line has seven digits, of MRPs as of quaternions (4e-7 rad at most).
 DIGITS_DEG = np.degrees(5e-7)
 # Alnilam stands 15 arcsec from the place that the line names, and a pixel of the small bench's tracker has 38.
 MIDDLE_PX = 0.5
@@ -68,13 +68,16 @@ def kernel(folder: Path, q: Numbers) -> Path:
     return path
 
 
-def px4(folder: Path, q: Numbers) -> Path:
-    log = ULogWriter()
-    log.topic("vehicle_attitude")
-    for t_us in (7_000_000, 8_000_000):
-        log.add("vehicle_attitude", timestamp=t_us, q=q)
-    (folder / "a.ulg").write_bytes(log.data)
-    return folder / "a.ulg"
+def stk(folder: Path, q: Numbers) -> Path:
+    x, y, z, w = q
+    (folder / "a.a").write_text(stk_text([f"0 {x} {y} {z} {w}", f"1 {x} {y} {z} {w}"]))
+    return folder / "a.a"
+
+
+def cic(folder: Path, q: Numbers) -> Path:
+    numbers = " ".join(map(repr, q))
+    (folder / "a.cic").write_text(cic_text([f"60310 0 {numbers}", f"60310 1 {numbers}"]))
+    return folder / "a.cic"
 
 
 def bag(kind: str, frame: str, release: str, write: Callable[..., Path], name: str) -> Callable[[Path, Numbers], Path]:
@@ -104,7 +107,8 @@ LOGS = {
     "ros1": (bag(ros_bags.POSE_STAMPED, "map", "noetic", write_bag1, ".bag"), "x y z w", ("--reference", "enu", STATED[2])),
     "ros2": (bag(ros_bags.IMU, "", "humble", write_bag2, ""), "x y z w", ("--reference", "icrs")),
     "ros2-mcap": (bag(ros_bags.TF, "gcrf", "jazzy", write_mcap, ".mcap"), "x y z w", ()),
-    "px4": (px4, "q", STATED),
+    "stk": (stk, "Q1 Q2 Q3 QC", ()),
+    "cic": (cic, "QC Q1 Q2 Q3", ()),
 }
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilstar.attitude.logs.log_file import read_log, write_log
+from hilstar.attitude.logs.log_file import open_log, read_log, write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
@@ -342,3 +342,25 @@ def test_quaternions_without_rates_are_written_as_such(tmp_path):
     root = ElementTree.parse(tmp_path / "a.xml").getroot()
     assert root.findtext("body/segment/metadata/ATTITUDE_TYPE") == "QUATERNION"
     assert root.findtext("body/segment/data/attitudeState/quaternionState/EPOCH") == written_epoch(7)
+
+
+@pytest.mark.parametrize(
+    ("begin_s", "scale", "system"),
+    [
+        (0, None, "SCLK"),
+        (-5, None, "SCLK"),
+        (946_684_799, None, "SCLK"),
+        (1_735_689_600, None, "UTC"),
+        (0, "TAI", "TAI"),
+        (0, "UTC", "UTC"),
+    ],
+)
+@pytest.mark.parametrize("ending", ["aem", "xml"])
+def test_a_log_without_dates_is_not_written_as_utc_of_1970(tmp_path, begin_s, scale, system, ending):
+    samples = [AttitudeSample((begin_s + k) * 10**9, np.array([1.0, 0.0, 0.0, 0.0])) for k in range(2)]
+    path = tmp_path / f"a.{ending}"
+    write_log(path, samples, scale)
+    assert re.search(r"TIME_SYSTEM\W+(\w+)", path.read_text())[1] == system
+    again = open_log(path)
+    assert [sample.t_ns for sample in again.samples] == [sample.t_ns for sample in samples]
+    assert again.conventions.scale == system

@@ -254,7 +254,7 @@ GOOD = kvn(rows_of([0, 0, 0, 1], [0, 0, 0, 1]))
         (GOOD.replace("0.0 1.0\n", "0.0 1.0 0.0\n", 1), ":17:", "an epoch and 4 numbers"),
         (GOOD.replace("0.0 1.0\n", "0.0\n", 1), ":17:", "an epoch and 4 numbers"),
         (GOOD.replace("0.0 1.0\n", "0.0 one\n", 1), ":17:", "an epoch and 4 numbers"),
-        (GOOD.replace("0.0 1.0\n", "0.0 nan\n", 1), ":17:", "not finite"),
+        (GOOD.replace("0.0 1.0\n", "0.0 inf\n", 1), ":17:", "not finite"),
         (GOOD.replace("0.0 1.0\n", "0.0 1e308\n", 1), ":17:", "norm"),
         (GOOD.replace("0.0 1.0\n", "0.0 0.5\n", 1), ":17:", "norm"),
         (GOOD.replace(EPOCHS[1], EPOCHS[0]), ":18:", "does not increase"),

@@ -248,8 +248,10 @@ def test_binary_rubbish_is_refused_in_one_line(tmp_path, head):
 
 
 def test_a_name_that_says_no_form_is_refused_with_those_that_do(tmp_path):
-    with pytest.raises(InputError, match=r"\.csv, \.jsonl, \.json, \.mcap, \.aem, \.kvn, \.xml"):
+    with pytest.raises(InputError, match="not a log's name; end it in one of ") as caught:
         write_log(tmp_path / "a.txt", random_samples(np.random.default_rng(0), 1))
+    for ending in FORMS:
+        assert f".{ending}" in str(caught.value)
 
 
 @pytest.mark.parametrize("form", FORMS)

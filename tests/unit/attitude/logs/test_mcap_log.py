@@ -163,7 +163,7 @@ def test_chunks_taken_at_once_read_and_are_refused_as_by_the_library(tmp_path, m
 
 def test_a_sender_that_restarted_is_named_with_its_time(tmp_path):
     (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(sample(t)) for t in (100, 200, 50, 60)]))
-    with pytest.raises(InputError, match=r"attitude 3: time does not increase \(t_ns 50 after 200\); the sender restarted"):
+    with pytest.raises(InputError, match=r"message 3 of /attitude: time does not increase .*; the sender restarted"):
         read_log(tmp_path / "run.mcap")
 
 

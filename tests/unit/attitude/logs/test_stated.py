@@ -13,7 +13,9 @@ from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.entries import OPTIONS, Stated
-from hilstar.attitude.logs.log_file import FORMATS, LEDGER, check_stated, open_log, write_log
+from hilstar.attitude.logs.log_file import open_log, write_log
+from hilstar.attitude.logs.log_formats import check_stated, log_formats
+from hilstar.attitude.logs.mcap_formats import ledger_format
 from hilstar.attitude.logs.mcap_log import attitude_message, register_attitudes
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Convention, Mounting
@@ -22,7 +24,7 @@ from hilstar.rotation import propagate
 from tests.support.sources import ros_bags
 from tests.support.sources import spice_kernels as ck
 from tests.support.sources.aem_messages import kvn
-from tests.support.sources.ulog_files import ULogWriter
+from tests.support.sources.attitude_texts import cic_text, stk_text
 
 ROUNDING = 1e-14  # of four products of unit quaternions
 TURNS = Rotation.from_euler("xyz", [[10, 20, 30 + k] for k in range(3)], degrees=True)
@@ -80,14 +82,14 @@ def bag(folder: Path) -> Path:
     return ros_bags.write_bag2(folder / "bag", sent, "humble")
 
 
-def ulog(folder: Path) -> Path:
-    log = ULogWriter(1_000_000)
-    log.topic("vehicle_attitude", 0)
-    for k, q in enumerate(QUATERNIONS.tolist()):
-        t_us = 2_000_000 + k * 100_000
-        log.add("vehicle_attitude", 0, timestamp=t_us, timestamp_sample=t_us, q=q, quat_reset_counter=0)
-    (folder / "a.ulg").write_bytes(log.data)
-    return folder / "a.ulg"
+def cic(folder: Path) -> Path:
+    (folder / "a.cic").write_text(cic_text(["60310 0.0 1 0 0 0", "60310 1.0 1 0 0 0"]))
+    return folder / "a.cic"
+
+
+def stk(folder: Path) -> Path:
+    (folder / "a.a").write_text(stk_text(["0 0 0 0 1", "1 0 0 0 1"]))
+    return folder / "a.a"
 
 
 def c_kernel(folder: Path) -> Path:
@@ -102,12 +104,13 @@ LEVEL = Stated(reference="enu", place=(48.1, 11.6, 500.0), epoch_utc="2024-07-01
 FILES: dict[str, tuple[Callable[[Path], Path], Stated]] = {
     "CSV": (written("a.csv"), LEVEL),
     "JSON lines": (written("a.jsonl"), LEVEL),
-    "MCAP": (written("a.mcap"), LEVEL),
-    LEDGER: (ledger, Stated()),
+    "an MCAP file": (written("a.mcap"), LEVEL),
+    ledger_format.name: (ledger, Stated()),
     "a CCSDS AEM": (aem, Stated()),
     "a CCSDS message": (oem, Stated()),
     "a ROS bag": (bag, LEVEL),
-    "a ULog of PX4": (ulog, replace(LEVEL, reference=None)),
+    "a CIC AEM": (cic, Stated()),
+    "an STK attitude file": (stk, Stated()),
     "a SPICE CK": (c_kernel, Stated()),
 }
 
@@ -117,7 +120,8 @@ def attitudes(path: Path, stated: Stated) -> np.ndarray:
 
 
 def test_every_format_and_every_statement_is_looked_at_here():
-    assert set(FILES) == {each.name for each in FORMATS}
+    refusing = {"a ULog of PX4"}  # whatever is stated
+    assert set(FILES) == {each.name for each in log_formats()} - refusing
     assert set(STATEMENTS) == set(OPTIONS)
 
 
@@ -127,7 +131,7 @@ def test_a_statement_is_used_or_refused_by_name(tmp_path, name, statement):
     make, needed = FILES[name]
     path = make(tmp_path)
     stated = replace(needed, **{statement: STATEMENTS[statement]})
-    own = next(each for each in FORMATS if each.name == name)
+    own = next(each for each in log_formats() if each.name == name)
     if statement not in own.uses:
         with pytest.raises(InputError, match=f"{path}: {OPTIONS[statement]}: .*; leave it out"):
             open_log(path, stated)
@@ -139,12 +143,10 @@ def test_a_statement_is_used_or_refused_by_name(tmp_path, name, statement):
         said = str(error)
         assert f"{OPTIONS[statement]} " in said or str(STATEMENTS[statement]) in said or "no_such_file" in said
         return
-    if name == "a ULog of PX4" and statement == "reference":  # which it has anyway
-        return
     assert not np.allclose(found, attitudes(path, needed), atol=1e-6), "it was stated, and changed nothing"
 
 
-@pytest.mark.parametrize("name", ["CSV", "JSON lines", "MCAP"])
+@pytest.mark.parametrize("name", ["CSV", "JSON lines", "an MCAP file"])
 @pytest.mark.parametrize("statement", ["place", "epoch_utc"])
 def test_a_place_or_a_date_of_attitudes_in_the_icrs_is_refused(tmp_path, name, statement):
     stated = Stated(**{statement: STATEMENTS[statement]})
@@ -152,7 +154,7 @@ def test_a_place_or_a_date_of_attitudes_in_the_icrs_is_refused(tmp_path, name, s
         open_log(FILES[name][0](tmp_path), stated)
 
 
-@pytest.mark.parametrize("name", ["CSV", "JSON lines", "MCAP"])
+@pytest.mark.parametrize("name", ["CSV", "JSON lines", "an MCAP file"])
 def test_a_mounting_of_the_command_says_that_a_log_is_the_bodys(tmp_path, name):
     path = FILES[name][0](tmp_path)
     found = Rotation.from_quat(attitudes(path, Stated(Mounting(MOUNTING, by_option=True))), scalar_first=True)
@@ -160,7 +162,7 @@ def test_a_mounting_of_the_command_says_that_a_log_is_the_bodys(tmp_path, name):
     assert (found * wanted.inv()).magnitude().max() < ROUNDING
 
 
-@pytest.mark.parametrize("name", ["CSV", "JSON lines", "MCAP"])
+@pytest.mark.parametrize("name", ["CSV", "JSON lines", "an MCAP file"])
 def test_a_mounting_of_the_bench_file_that_turns_nothing_is_told(tmp_path, name):
     log = open_log(FILES[name][0](tmp_path), Stated(Mounting(MOUNTING)))
     assert "[tracker] q_body_to_cam does not turn these attitudes" in dict(log.told)["mounting"]

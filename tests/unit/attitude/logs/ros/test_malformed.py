@@ -1,16 +1,11 @@
-"""Bags that are damaged, or say what is not so: one line each, and neither time nor memory without bound."""
+"""Bags that are damaged, or say what is not so: one line each."""
 
 from __future__ import annotations
 
-import bz2
-import resource
 import sqlite3
-import struct
 
-import lz4.frame
 import numpy as np
 import pytest
-import zstandard
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.entries import Stated
@@ -21,8 +16,6 @@ from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag
 
 ICRS = Stated(reference="icrs")
 MUTATIONS = 40
-# Unpacked, the bombs here would be 2 GB; the process may grow by a tenth of that.
-MAX_GROWTH_KB = 200_000
 
 
 def poses(release, count=5):
@@ -67,10 +60,10 @@ def test_a_damaged_bag_is_refused_in_one_line_or_read(tmp_path, kind):
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
-        ("a.bag", b"#ROSBAG V1.2\n" + bytes(50), "another version than 2.0"),
-        ("a.bag", b"#ROSBAG V2.0\n", "has no topic with attitudes"),
-        ("a.bag", b"#ROSBAG V2.0\n" + b"\xff" * 50, "the bag is damaged"),
-        ("a.db3", b"SQLite format 3\x00" + bytes(100), "the bag is damaged"),
+        ("a.bag", b"#ROSBAG V1.2\n" + bytes(50), "version 102 is not supported"),
+        ("a.bag", b"#ROSBAG V2.0\n", "rosbag reindex a.bag"),
+        ("a.bag", b"#ROSBAG V2.0\n" + b"\xff" * 50, "rosbags cannot read it"),
+        ("a.db3", b"SQLite format 3\x00" + bytes(100), "rosbags cannot read it"),
         ("a.bag", b"", "contains no attitude"),
         ("a.db3", b"\x00" * 100, "not UTF-8|header|t_s"),
     ],
@@ -79,61 +72,6 @@ def test_what_is_no_bag_is_refused(tmp_path, name, content, why):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=why):
         open_log(tmp_path / name)
-
-
-def record(fields, data):
-    head = b"".join(struct.pack("<I", len(name) + 1 + len(value)) + name + b"=" + value for name, value in fields.items())
-    return struct.pack("<I", len(head)) + head + struct.pack("<I", len(data)) + data
-
-
-def bag_of(chunk_fields, data):
-    head = {b"op": b"\x03", b"index_pos": bytes(8), b"conn_count": bytes(4), b"chunk_count": bytes(4)}
-    return b"#ROSBAG V2.0\n" + record(head, b" " * 4000) + record({b"op": b"\x05", **chunk_fields}, data)
-
-
-ZEROS = bytes(2_000_000)
-BOMBS = {
-    b"bz2": lambda: bz2.compress(ZEROS) * 1,
-    b"lz4": lambda: lz4.frame.compress(ZEROS * 100),
-}
-
-
-@pytest.mark.parametrize("compression", BOMBS)
-@pytest.mark.parametrize("claim", [10, 4_000_000_000])
-def test_a_chunk_that_is_not_as_large_as_it_states_is_refused(tmp_path, compression, claim):
-    fields = {b"compression": compression, b"size": struct.pack("<I", claim)}
-    (tmp_path / "a.bag").write_bytes(bag_of(fields, BOMBS[compression]()))
-    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(InputError, match=r"more than the 10 bytes that it states|at most 256 MB are unpacked"):
-        open_log(tmp_path / "a.bag")
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < MAX_GROWTH_KB
-
-
-@pytest.mark.parametrize("fields", [{}, {b"conn": bytes(4)}, {b"conn": b"", b"time": bytes(8)}, {b"time": bytes(8)}])
-def test_a_message_record_without_its_fields_is_refused(tmp_path, fields):
-    chunk = record({b"op": b"\x02", **fields}, bytes(10))
-    whole = write_bag1(tmp_path / "whole.bag", poses("noetic")).read_bytes()
-    begun = bag_of({b"compression": b"none", b"size": struct.pack("<I", len(chunk))}, chunk)
-    (tmp_path / "a.bag").write_bytes(begun + whole[len(b"#ROSBAG V2.0\n") + 4096 :])
-    with pytest.raises(InputError, match="the bag is damaged"):
-        open_log(tmp_path / "a.bag")
-
-
-@pytest.mark.parametrize("size", [2**31, 2**32 - 1])
-def test_a_record_of_billions_is_not_waited_for(tmp_path, size):
-    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + struct.pack("<I", size) + bytes(100))
-    with pytest.raises(InputError, match=r"a record of [0-9]+ bytes; at most"):
-        open_log(tmp_path / "a.bag")
-
-
-def test_a_packed_file_that_unpacks_without_end_is_refused(tmp_path):
-    bag = write_bag2(tmp_path / "a", poses("jazzy"), compression="file")
-    (bag / "a.db3.zstd").write_bytes(zstandard.compress(ZEROS * 100))
-    with pytest.raises(InputError, match="unpacks to more than 100 times its size"):
-        open_log(bag)
-    (bag / "a.db3.zstd").write_bytes(zstandard.compress(ZEROS)[:-4])
-    with pytest.raises(InputError, match=r"the bag is damaged|not a file of a bag"):
-        open_log(bag)
 
 
 def test_a_message_that_is_cut_or_counts_in_billions_is_refused_with_its_number(tmp_path):
@@ -146,34 +84,20 @@ def test_a_message_that_is_cut_or_counts_in_billions_is_refused_with_its_number(
             open_log(bag)
 
 
-def test_a_view_in_place_of_a_table_is_not_run(tmp_path):
-    with sqlite3.connect(tmp_path / "a.db3") as database:
-        database.execute("CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
-        database.execute("INSERT INTO topics VALUES (1, '/pose', 'geometry_msgs/msg/PoseStamped', 'cdr')")
-        endless = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
-        columns = "i AS id, 1 AS topic_id, i AS timestamp, x'' AS data"
-        database.execute(f"CREATE VIEW messages AS {endless} SELECT {columns} FROM n")
-    database.close()
-    with pytest.raises(InputError, match="no bag of ROS 2: it lacks topics and messages"):
-        open_log(tmp_path / "a.db3")
-
-
 @pytest.mark.parametrize(
-    ("text", "why"),
+    "text",
     [
-        ("", "has no relative_file_paths"),
-        ("relative_file_paths: 7", "has no relative_file_paths"),
-        ("relative_file_paths: []", "names no files of a bag"),
-        ("relative_file_paths: [../../../etc/passwd]", "lacks passwd, which its metadata.yaml names"),
-        ("relative_file_paths:\n  - ../a.bag\n  - 'b.db3'\nversion: 9", "lacks a.bag, b.db3, which"),
-        ("[" * 1_000_000, "has no relative_file_paths"),
-        ("relative_file_paths:\n" + " -" * 900_000, "names no files of a bag"),
+        "",
+        "relative_file_paths: 7",
+        "rosbag2_bagfile_information: {version: 10}",
+        "[" * 10_000,
+        "# " + "long" * 600_000,
     ],
 )
-def test_metadata_that_is_none_is_refused(tmp_path, text, why):
+def test_metadata_that_is_none_is_refused(tmp_path, text):
     bag = write_bag2(tmp_path / "a", poses("jazzy"))
     (bag / "metadata.yaml").write_text(text)
-    with pytest.raises(InputError, match=why):
+    with pytest.raises(InputError, match="ros2 bag reindex"):
         open_log(bag)
 
 

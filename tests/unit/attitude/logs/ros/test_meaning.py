@@ -247,13 +247,35 @@ def test_a_type_that_only_has_the_name_of_ross_own_is_refused(tmp_path):
         open_log(tmp_path / "a.mcap")
 
 
+def test_a_type_whose_inner_type_has_other_fields_is_refused(tmp_path):
+    from mcap.writer import Writer
+
+    inner = "=" * 80 + "\nMSG: geometry_msgs/Quaternion\nfloat64 w\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    text = f"std_msgs/Header header\ngeometry_msgs/Quaternion quaternion\n{inner}" + "=" * 80
+    text += "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" + "=" * 80
+    text += "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("geometry_msgs/msg/QuaternionStamped", "ros2msg", text.encode())
+        writer.add_message(writer.register_channel("/q", "cdr", schema), 0, b"\0\1\0\0", 0)
+        writer.finish()
+    with pytest.raises(InputError, match="/q: its geometry_msgs/msg/QuaternionStamped is not ROS's own"):
+        open_log(tmp_path / "a.mcap")
+
+
 # Times
+
+
+def recorded_in_turn(sent):
+    """Messages whose recorder's clock is right, whatever their stamps say: rosbags gives them in its order."""
+    return [(topic, kind, START_NS + k * 10**8, message) for k, (topic, kind, _, message) in enumerate(sent)]
 
 
 def test_messages_out_of_order_and_doubled_are_put_right_and_said(bag):
     sent = list(poses("icrs", rotations(6)))
     shuffled = [sent[0], sent[2], sent[1], sent[1], *sent[3:], sent[5]]
-    log = open_log(bag(shuffled))
+    log = open_log(bag(recorded_in_turn(shuffled)))
     assert (attitudes(log) * rotations(6)).magnitude() == pytest.approx(0, abs=ROUNDING)
     told = dict(log.told)
     assert told["log-order"] == "2 attitudes came out of order, by up to 0.1 s, and are sorted"
@@ -269,7 +291,7 @@ def test_two_attitudes_of_one_time_are_refused(bag):
 def test_a_clock_that_was_set_back_is_refused(bag):
     again = [*poses("icrs", rotations(30)), *poses("icrs", rotations(3, seed=8), start_ns=START_NS + 1)]
     with pytest.raises(InputError, match=r"time does not increase .* or its clock was set back"):
-        open_log(bag(again))
+        open_log(bag(recorded_in_turn(again)))
 
 
 def test_messages_without_a_stamp_take_the_recorders_clock_and_say_so(bag):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from hilstar.errors import InputError
+from hilstar.sky.bodies.orbit import TleOrbit
 from hilstar.sky.bodies.satellites import read_satellites
 from tests.support.satellites import element_set, with_checksum
 from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
@@ -71,3 +74,122 @@ def test_a_number_beyond_99999_is_one_with_a_letter():
 def test_a_wrong_line_is_named(text, said):
     with pytest.raises(InputError, match=said):
         read_satellites(text, "tles.txt", UTC_NS)
+
+
+# One set in each form of an OMM: sgp4's own reader of each is the authority for what it means.
+FIELDS = {
+    "OBJECT_NAME": "ISS (ZARYA)",
+    "OBJECT_ID": "1998-067A",
+    "EPOCH": "2008-09-20T12:25:40.104192",
+    "MEAN_MOTION": 15.72125391,
+    "ECCENTRICITY": 0.0006703,
+    "INCLINATION": 51.6416,
+    "RA_OF_ASC_NODE": 247.4627,
+    "ARG_OF_PERICENTER": 130.5360,
+    "MEAN_ANOMALY": 325.0288,
+    "EPHEMERIS_TYPE": 0,
+    "CLASSIFICATION_TYPE": "U",
+    "NORAD_CAT_ID": 25544,
+    "ELEMENT_SET_NO": 292,
+    "REV_AT_EPOCH": 56353,
+    "BSTAR": -0.11606e-4,
+    "MEAN_MOTION_DOT": -0.2182e-4,
+    "MEAN_MOTION_DDOT": 0,
+}
+MEAN = ("EPOCH", "MEAN_MOTION", "ECCENTRICITY", "INCLINATION", "RA_OF_ASC_NODE", "ARG_OF_PERICENTER", "MEAN_ANOMALY")
+META = {"CENTER_NAME": "EARTH", "REF_FRAME": "TEME", "TIME_SYSTEM": "UTC", "MEAN_ELEMENT_THEORY": "SGP4"}
+SAME_KM = 1e-3  # sgp4 rounds an OMM's epoch to a microsecond, in which a low orbit goes 8 mm
+
+
+def as_json(fields):
+    return json.dumps([fields], indent=1)
+
+
+def as_text_json(fields):
+    """As Space-Track writes it: every value is text."""
+    return json.dumps([{key: str(value) for key, value in (META | fields).items()}])
+
+
+def as_csv(fields):
+    return ",".join(fields) + "\n" + ",".join(map(str, fields.values())) + "\n"
+
+
+def as_xml(fields):
+    parts = {"metadata": ["OBJECT_NAME", "OBJECT_ID"], "meanElements": MEAN}
+    named = {name for names in parts.values() for name in names}
+    parts["tleParameters"] = [name for name in fields if name not in named]
+    inner = {
+        part: "".join(f"<{name}>{fields[name]}</{name}>" for name in names if name in fields) for part, names in parts.items()
+    }
+    data = "".join(f"<{part}>{inner[part]}</{part}>" for part in ("meanElements", "tleParameters"))
+    segment = f"<segment><metadata>{inner['metadata']}</metadata><data>{data}</data></segment>"
+    return f'<?xml version="1.0"?><ndm><omm id="CCSDS_OMM_VERS" version="2.0"><body>{segment}</body></omm></ndm>'
+
+
+def as_kvn(fields):
+    return "CCSDS_OMM_VERS = 2.0\n" + "".join(f"{key} = {value}\n" for key, value in (META | fields).items())
+
+
+FORMS = [as_json, as_text_json, as_csv, as_xml, as_kvn]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_an_omm_is_the_satellite_of_its_two_lines(form):
+    (wanted,) = read_satellites(STATION_TLE, "tles.txt", UTC_NS)
+    (found,) = read_satellites(form(FIELDS), "omm", UTC_NS)
+    assert (found.name, found.number) == (wanted.name, wanted.number)
+    assert found.age_days(UTC_NS) == pytest.approx(wanted.age_days(UTC_NS), abs=1e-9)
+    for minutes in (0, 90, 1440):
+        jd = wanted.satrec.jdsatepoch, wanted.satrec.jdsatepochF + minutes / 1440
+        error, place_km, _ = found.satrec.sgp4(*jd)
+        assert error == 0
+        assert place_km == pytest.approx(wanted.satrec.sgp4(*jd)[1], abs=SAME_KM)
+    orbit = TleOrbit(form(FIELDS), "omm")
+    assert orbit.number == 25544
+    assert orbit.state(UTC_NS)[0] == pytest.approx(TleOrbit(STATION_TLE, "tle").state(UTC_NS)[0], abs=SAME_KM)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"EPHEMERIS_TYPE": 4}, "EPHEMERIS_TYPE is 4, and only 0 is read"),
+        ({"MEAN_MOTION": "fast"}, "MEAN_MOTION is fast; it must be from 0.001 to 20"),
+        ({"ECCENTRICITY": 1.5}, "ECCENTRICITY is 1.5; it must be from 0"),
+        ({"INCLINATION": "nan"}, "INCLINATION is nan; it must be from 0 to 180"),
+        ({"EPOCH": "2008-09-31T00:00:00"}, "element set 1: .*day"),
+        ({"EPOCH": ""}, "EPOCH is missing"),
+        ({"NORAD_CAT_ID": "-7"}, "NORAD_CAT_ID is -7; write a catalogue number"),
+    ],
+)
+def test_an_element_that_sgp4_would_take_otherwise_is_refused_by_name(form, change, said):
+    with pytest.raises(InputError, match=f"omm: element set 1.*{said}|omm: {said}"):
+        read_satellites(form(FIELDS | change), "omm", UTC_NS)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("REF_FRAME", "EME2000"), ("MEAN_ELEMENT_THEORY", "SGP4-XP"), ("CENTER_NAME", "MOON")]
+)
+def test_another_theory_or_frame_is_refused_by_name(key, value):
+    with pytest.raises(InputError, match=f"{key} is {value}, and only "):
+        read_satellites(as_kvn(FIELDS).replace(f"{key} = {META[key]}", f"{key} = {value}"), "omm", UTC_NS)
+
+
+def test_what_writers_leave_out_and_numbers_of_nine_digits_are_read():
+    few = {name: FIELDS[name] for name in (*MEAN, "OBJECT_NAME", "BSTAR")}
+    few |= {"NORAD_CAT_ID": 799_500_123, "EPOCH": "2008-09-20T12:25:40Z"}
+    (found,) = read_satellites(as_json(few), "omm", UTC_NS)
+    assert found.number == 799_500_123
+
+
+@pytest.mark.parametrize(
+    "text", ["[", "{}", "[1]", '<omm id="x">', "<!DOCTYPE a><omm/>", "EPOCH,MEAN_MOTION\n1,2\n", "[" * 10_000]
+)
+def test_what_is_no_omm_is_refused_in_one_line(text):
+    with pytest.raises(InputError, match=r"^omm: (?!.*\n)"):
+        read_satellites(text, "omm", UTC_NS)
+
+
+def test_an_orbit_is_one_element_set():
+    with pytest.raises(InputError, match="omm: has 2 element sets, and an orbit is one"):
+        TleOrbit(json.dumps([FIELDS, FIELDS]), "omm")

@@ -30,6 +30,8 @@ MATERIALS = {
     "FSILICA": "main/SiO2/Malitson.yml",
     "CAF2": "main/CaF2/Malitson.yml",
 }
+# Old glasses that the database lacks, and whose n_d and V_d the new one has to the last digit of Schott's data sheets.
+SAME_GLASSES = {"bk7": "nbk7"}
 GLASS_GROUP = "glass"
 FURTHER_FOLDER = "misc"  # of a maker's glasses beside its catalogue, such as Schott's B270
 FIELD_NAMES = {"angle": "angle", "paraxial_image_height": "paraxial_image_height", "real_image_height": "real_image_height"}
@@ -175,11 +177,17 @@ def find_glass(glass: Glass, label: str) -> tuple[GlassFile, list[str]]:
         filename = MATERIALS[glass.name]
         return next(file for file in _database() if file.filename == filename), []
     glasses = sorted((file for file in by_name if file.is_glass), key=_place_in_order)
+    if name in SAME_GLASSES and not glasses:
+        same = next(file for file in _database() if file.name == SAME_GLASSES[name])
+        return same, [f"{label}: {glass.name} is taken as N-{glass.name}, whose n_d and V_d are the same"]
     if not glasses:
         raise InputError(f"{label}: the glass {glass.name} is in no catalogue{_where(glass)}; {_instead(glass.name, name)}")
     if listed:
-        where = ", ".join(glass.catalogues)
-        return glasses[0], [f"{label}: {glass.name} is not of {where}: taken as {glasses[0].catalogue}'s"]
+        makers = ", ".join(file.catalogue for file in glasses)
+        raise InputError(
+            f"{label}: the glass {glass.name} is not of {', '.join(glass.catalogues)}, but of {makers};"
+            " name that catalogue beside it, or write the glass's n and V"
+        )
     return glasses[0], [f"{label}: {glass.name} is taken as {glasses[0].catalogue}'s"]
 
 

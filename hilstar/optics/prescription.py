@@ -315,6 +315,8 @@ def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, 
     axis_light: dict[float, float] = {}
     for um in lens.wavelengths_um:
         axis_light[um] = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
+        if axis_light[um] <= 0:
+            raise InputError("no ray of its field's middle reaches the image; do apertures lie beside the beam?")
         for place, field, chief in zip(places, fields, lens.chiefs(fields, um)[1], strict=True):
             slopes = _slopes(lens, field, um)
             light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light[um]

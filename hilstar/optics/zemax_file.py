@@ -27,6 +27,7 @@ from hilstar.optics.lens_data import (
 
 MM_PER_UNIT = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "METER": 1000.0, "M": 1000.0}
 FIELD_KINDS: dict[int, FieldKind] = {0: "angle", 2: "paraxial_image_height", 3: "real_image_height"}
+UNNAMED_GLASS = "___BLANK"
 MODEL_GLASS, OFFSET_GLASS = 1, 4  # kinds of GLAS's solve; the others write the glass's own name
 MAX_EVEN_TERMS, MAX_ODD_TERMS = 8, 8
 BREAK_STEPS = 6
@@ -393,7 +394,8 @@ class _Reader:
         kind = int(line.value(1)) if len(line.words) > 1 else 0
         if kind == OFFSET_GLASS:
             line.refuse(f"at surface {surface.number} offsets the index of {name}", "write the glass's own, or a model glass")
-        if kind == MODEL_GLASS:
+        # A pickup of a model glass has its numbers, too.
+        if kind == MODEL_GLASS or name == UNNAMED_GLASS:
             numbers = [line.value(place) if place < len(line.words) else 0.0 for place in (3, 4, 5)]
             index_d, abbe, anomaly = numbers
             if index_d < 1 or abbe < 0:

@@ -251,7 +251,8 @@ def test_the_pupil_of_an_obstructed_lens_is_lit_in_part(tmp_path, name, data):
     ("glass", "words"),
     [
         ("ZZ9PLURAL", "the glass ZZ9PLURAL is in no catalogue"),
-        ("BK7", r"the glass BK7 is in no catalogue.*N-BK7 \(schott\) is another glass"),
+        ("SK19", r"the glass SK19 is in no catalogue"),
+        ("H-K9L", r"the glass H-K9L is not of SCHOTT, but of cdgm"),
     ],
 )
 def test_a_glass_that_no_catalogue_has_is_refused_by_name(tmp_path, glass, words):
@@ -272,6 +273,9 @@ def test_an_old_glass_is_not_its_successor(tmp_path):
     for name in ("SF11", "N-SF11"):
         file, notes = find_glass(Stated(name, ("SCHOTT",)), "surface 1")
         assert file.filename == f"glass/schott/{name}.yml" and not notes
+    file, notes = find_glass(Stated("BK7", ("SCHOTT",)), "surface 1")
+    assert file.filename == "glass/schott/N-BK7.yml"
+    assert notes == ["surface 1: BK7 is taken as N-BK7, whose n_d and V_d are the same"]
     _, notes = find_glass(Stated("SF11"), "surface 1")
     assert notes == ["surface 1: SF11 is taken as schott's"]
 
@@ -306,3 +310,18 @@ def test_vignetting_moves_the_lit_part_of_the_pupil(tmp_path, monkeypatch):
     px, py = seen[0]
     assert (px.min(), px.max()) == pytest.approx((-1, 1), abs=0.02)
     assert (py.min(), py.max()) == pytest.approx((-1, 0.6), abs=0.02)
+
+
+def test_a_beam_that_no_aperture_lets_through_is_refused(tmp_path):
+    pytest.importorskip("optiland", reason=WHY_SKIPPED)
+    result = traced_here(tmp_path, "lens.zmx", zmx(more={1: ["  CLAP 0 3 0", "  OBDC 20 0"]}))
+    assert_refused(result, 2, "no ray of its field's middle reaches the image")
+
+
+def test_a_constant_index_and_a_glass_without_numbers_are_traced(tmp_path):
+    """V = 0 is a constant index; GLAS with a name alone is that glass."""
+    pytest.importorskip("optiland", reason=WHY_SKIPPED)
+    data = zmx(more={1: ["  GLAS ___BLANK 1 0 1.5168 0"], 2: ["  GLAS N-SF5"]})
+    result = traced_here(tmp_path, "lens.zmx", data, "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["focal_length_mm"] == pytest.approx(100.031, abs=1e-3)

@@ -167,6 +167,11 @@ def test_a_model_glass_has_its_numbers():
     assert second.model_index(np.array([0.4, 0.9])).tolist() == [1.67271, 1.67271]
 
 
+def test_a_picked_up_model_glass_has_its_numbers():
+    lens = read_zemax(zmx(more={2: ["  GLAS ___BLANK 2 0 1.67271 32.25 0 0 0"]}))
+    assert (lens.surfaces[1].glass.index_d, lens.surfaces[1].glass.abbe) == (1.67271, 32.25)
+
+
 def test_a_glass_keeps_its_name_and_its_catalogues():
     lens = read_zemax(zmx().replace(b"GLAS N-SF5", b"GLAS SF11"))
     assert lens.surfaces[1].glass.name == "SF11"

@@ -1,8 +1,8 @@
-"""What a FITS header says of its image: exposure, time, mosaic and order of rows; the one reader of it.
+"""What a FITS header says of its image: exposure, time, mosaic and order of rows.
 
 Keywords are those of the FITS standard 4.0 (section 9, time coordinates), and those that cameras'
-software writes: MaxIm DL, INDI, N.I.N.A., ASIAIR, Siril. An image in an extension inherits what only
-the primary header says, unless its own INHERIT is F. What is said and not used is a note.
+software writes: MaxIm DL, INDI, N.I.N.A., ASIAIR, Siril. An image in an extension inherits what
+only the primary header says, unless its own INHERIT is F. What is said and not used is a note.
 """
 
 import math
@@ -74,12 +74,15 @@ UNIT_IN_COMMENT = re.compile(r"[\[(] *([a-z\u00b5]+) *[\])]|\bin ([a-z]+)\b", re
 NUMBER_WITH_UNIT = re.compile(r"([-+0-9.eE]+) *([a-z\u00b5]*)", re.IGNORECASE)
 
 PATTERN_KEYS = ("BAYERPAT", "BAYRPAT", "BAYERPATTERN", "CFAPAT", "CFA-PAT", "CFATYPE")
-VAGUE_PATTERN_KEYS = ("COLORTYP", "FILTER")  # hold a pattern in some software, another word in other
+VAGUE_PATTERN_KEYS = (
+    "COLORTYP",
+    "FILTER",
+)  # hold a pattern in some software, another word in other
 PATTERNS = frozenset({"RGGB", "BGGR", "GRBG", "GBRG"})
 NO_PATTERN = frozenset({"", "NONE", "NO", "MONO", "MONOCHROME", "GREY", "GRAY", "FALSE", "F", "0", "N/A"})
 OFFSET_KEYS = (("XBAYROFF", "BAYOFFX", "XBAYOFF"), ("YBAYROFF", "BAYOFFY", "YBAYOFF"))
 TOP_DOWN, BOTTOM_UP = "TOP-DOWN", "BOTTOM-UP"
-PATTERN_ADVICE = "write BAYERPAT as RGGB, BGGR, GRBG or GBRG, or give one colour's pixels as a grey image"
+PATTERN_ADVICE = "write RGGB, BGGR, GRBG or GBRG, or give one colour's pixels as a grey image"
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +229,7 @@ def _middle_ns(header: Any, exposure_s: float | None, notes: list[str]) -> int |
 
 
 def _moments(header: Any, notes: list[str]) -> Iterator[tuple[str, str, int]]:
-    """Keywords with a date and a time, whether they are of the start, middle or end, and the UTC, ns since 1970."""
+    """Keywords with a moment: of the start, middle or end, and the UTC, ns since 1970."""
     scale = str(header.get("TIMESYS", "")).strip().upper()
     found_none = True
     for key in _stated(header, DATE_KEYS):
@@ -235,9 +238,11 @@ def _moments(header: Any, notes: list[str]) -> Iterator[tuple[str, str, int]]:
         if naive_ns is None:
             continue
         is_local = LOCAL.search(header.comments[key]) is not None
-        utc_at_ns = _utc_ns(naive_ns, offset_s, "LOCAL" if is_local else scale)
+        own_scale = "LOCAL" if is_local else scale
+        utc_at_ns = _utc_ns(naive_ns, offset_s, own_scale)
         if utc_at_ns is None:
-            notes.append(f"{key} is in {'local time' if is_local else scale}, which is no known time from UTC: undated")
+            words = "local time" if is_local else scale
+            notes.append(f"{key} is in {words}, which is no known time from UTC: undated")
             return
         found_none = False
         yield key, role, utc_at_ns
@@ -247,7 +252,10 @@ def _moments(header: Any, notes: list[str]) -> Iterator[tuple[str, str, int]]:
         except (TypeError, ValueError):
             days = math.nan
         # A float64 has a day of this age to 1 us.
-        utc_at_ns = _utc_ns(round((days - MJD_OF_1970) * SECONDS_A_DAY * 1e6) * 1000, None, scale) if days > 0 else None
+        utc_at_ns = None
+        if days > 0:
+            naive_ns = round((days - MJD_OF_1970) * SECONDS_A_DAY * 1e6) * 1000
+            utc_at_ns = _utc_ns(naive_ns, None, scale)
         if utc_at_ns is None:
             notes.append(f"{key} = {shortened(header[key])} is no date of UTC, and is not used")
             continue
@@ -270,7 +278,7 @@ def _role(role: str, comment: str) -> str:
 
 
 def _date_time(key: str, header: Any, notes: list[str]) -> tuple[int | None, float | None]:
-    """Date and time of a keyword, ns since 1970 in its own scale, and how far that is ahead of UTC, s, if it says so."""
+    """A moment, ns since 1970 in its own scale, and s that it is ahead of UTC, if it says so."""
     text = str(header[key]).strip()
     match = DATE_TIME.fullmatch(text)
     old = OLD_DATE.fullmatch(text)
@@ -293,7 +301,7 @@ def _date_time(key: str, header: Any, notes: list[str]) -> tuple[int | None, flo
 
 
 def _time_beside(key: str, header: Any) -> str | None:
-    """The time of day that stands in a keyword of its own, beside a date of the exposure's start."""
+    """The time of day in a keyword of its own, beside a date of the exposure's start."""
     if DATE_KEYS[key] != START:
         return None
     for name in _stated(header, TIME_KEYS):
@@ -314,7 +322,7 @@ def _ahead_s(zone: str | None) -> float | None:
 
 
 def _utc_ns(naive_ns: int, ahead_s: float | None, scale: str) -> int | None:
-    """UTC, ns since 1970 in days of 86400 s, of a time in a scale; None for one that is no known time from UTC."""
+    """UTC, ns since 1970, of a moment in a scale; None for one not known from UTC."""
     if ahead_s is not None:
         return naive_ns - round(ahead_s * NS_PER_S)
     if scale in UTC_NAMES:
@@ -341,7 +349,10 @@ def utc_ns(text: str) -> int | None:
 
 
 def _row_order(header: Any) -> str:
-    """Which row comes first in the file. Cameras' software writes the top one, where it does not say."""
+    """Which row comes first in the file.
+
+    Cameras' software writes the top one, where it does not say.
+    """
     text = str(header.get("ROWORDER", TOP_DOWN)).strip().upper() or TOP_DOWN
     if text not in {TOP_DOWN, BOTTOM_UP}:
         raise InputError(f"ROWORDER is {shortened(text)}; write {TOP_DOWN} or {BOTTOM_UP}")
@@ -349,10 +360,10 @@ def _row_order(header: Any) -> str:
 
 
 def _bayer(header: Any) -> str:
-    """The pattern of the mosaic from its top left pixel, "" for none. Raises InputError for one that is not read.
+    """The mosaic's pattern from its top left pixel, "" for none. Raises InputError for another kind.
 
-    Of pixel (row, column) the colour is pattern[(row + YBAYROFF) % 2][(column + XBAYROFF) % 2], rows
-    from the top (MaxIm DL, INDI; CCDciel and Siril for ROWORDER).
+    Of pixel (row, column) the colour is pattern[(row + YBAYROFF) % 2][(column + XBAYROFF) % 2],
+    rows from the top (MaxIm DL, INDI; CCDciel and Siril for ROWORDER).
     """
     pattern = ""
     for key in _stated(header, PATTERN_KEYS):

@@ -1,8 +1,8 @@
-"""Reads .seq of CODE V: lenses, by a list of commands that are used and one of those that no star shows.
+"""Reads .seq of CODE V, by a list of commands that are used and one of those ignored.
 
-A command on neither list is refused by its line: what it does to light is not known. Commands are those of CODE V's reference
-manual; names have three letters, of which longer ones are forms (TITLE). The file's own solves and pickups are passed over, as
-it has the values that they gave.
+A command on neither list is refused by its line: what it does to light is not known. Commands are
+those of CODE V's reference manual; names have three letters, of which longer ones are forms
+(TITLE). The file's own solves and pickups are passed over, as it has the values that they gave.
 """
 
 import re
@@ -17,6 +17,7 @@ from hilstar.errors import InputError, shortened
 from hilstar.optics.lens_data import (
     AIR,
     MIRROR,
+    NEAR_OBJECT,
     Aperture,
     FieldKind,
     FieldPoint,
@@ -28,6 +29,7 @@ from hilstar.optics.lens_data import (
     PupilKind,
     Shape,
     glass_of_code,
+    nth,
 )
 
 MM_PER_UNIT = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
@@ -56,9 +58,37 @@ KINDS_OF_EDGE = frozenset({"OBS", "HOL", "EDG", "CLR"})
 # What no star's light shows. Each group has its reason.
 IGNORED = frozenset(
     {
-        *("LEN", "TIT", "INI", "SLB", "GO", "END", "COM", "CLS", "OUT", "VER"),  # words for people, drawings, the end
-        *("WTW", "WTF", "DER", "TOL", "CA", "DEL"),  # weights, tolerances, and the rule of apertures that are not stated
-        *("CCY", "THC", "GLC", "KC", "CUC", "PIK", "PIM", "HMY", "RDC"),  # which values may vary; solves, whose values are here
+        *(
+            "LEN",
+            "TIT",
+            "INI",
+            "SLB",
+            "GO",
+            "END",
+            "COM",
+            "CLS",
+            "OUT",
+            "VER",
+        ),  # words for people, drawings, the end
+        *(
+            "WTW",
+            "WTF",
+            "DER",
+            "TOL",
+            "CA",
+            "DEL",
+        ),  # weights, tolerances, and the rule of apertures that are not stated
+        *(
+            "CCY",
+            "THC",
+            "GLC",
+            "KC",
+            "CUC",
+            "PIK",
+            "PIM",
+            "HMY",
+            "RDC",
+        ),  # which values may vary; solves, whose values are here
         *(f"{term}C" for term in TERMS),
         *("XDC", "YDC", "ZDC", "ADC", "BDC", "CDC"),
         *("CUM", "THM"),  # a mirror's back
@@ -67,9 +97,11 @@ IGNORED = frozenset(
 # Those that are 0 where they change nothing.
 IGNORED_AT_ZERO = frozenset({"CUF", "IC", "XOD", "YOD", "ZOD"})
 STANDARD_C = 20.0
-MIN_RADIUS_OF_THICKNESS = 0.05  # a smaller radius than that of the thickness behind it, where no RDM says what the number is
+# A smaller radius, by the thickness behind it, is refused where no RDM says what the number is.
+MIN_RADIUS_OF_THICKNESS = 0.05
 PRIVATE_START, PRIVATE_END = "PRV", "END"
 ADVICE = "save the lens without it"
+CAN_WRITE = "save it from CODE V as a sequence file (.seq)"
 
 
 @dataclass(slots=True)
@@ -95,7 +127,10 @@ def read_codev(data: bytes) -> LensPrescription:
 
 
 def _statements(data: bytes) -> Iterator[LensLine]:
-    """Commands with their words: `;` ends one, `&` at a line's end goes on, `!` begins a comment; quoted words are whole."""
+    """Commands with their words.
+
+    `;` ends one, `&` at a line's end goes on, `!` begins a comment; quoted words are whole.
+    """
     text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     before = ""
     start = 0
@@ -133,7 +168,7 @@ class _Reader:
         for line in lines:
             self._take(line)
         if not self.surfaces or self.surfaces[0].line.keyword != "SO":
-            raise InputError("it has no object surface (SO); save it from CODE V as a sequence file (.seq)")
+            raise InputError(f"it has no object surface (SO); {CAN_WRITE}")
         self.mm = self._unit_mm()
         self.has_radii = self._radius_mode()
         self._check_system()
@@ -151,8 +186,12 @@ class _Reader:
             self._take_of_surface(line)
 
     def _is_ignored(self, line: LensLine) -> bool:
-        """Whether no star shows it. `THI HMY 0` states how a thickness came about that the surface's own line has."""
-        is_solve = line.keyword in {"THI", "CUY", "RDY"} and len(line.words) > 1 and line.words[0].isalpha()
+        """Whether no star shows it.
+
+        `THI HMY 0` states how a thickness came about that the surface's own line has.
+        """
+        is_named = len(line.words) > 1 and line.words[0].isalpha()
+        is_solve = is_named and line.keyword in {"THI", "CUY", "RDY"}
         is_nothing = line.keyword in IGNORED_AT_ZERO and line.is_zero()
         return line.keyword in IGNORED or is_solve or is_nothing
 
@@ -179,7 +218,7 @@ class _Reader:
     def _unit_mm(self) -> float:
         line = self.system.get("DIM")
         if line is None:
-            self.notes.append("it says no DIM: its lengths are taken as mm, as CODE V's own lenses are")
+            self.notes.append("it says no DIM: its lengths are taken as mm, CODE V's default")
             return 1.0
         unit = line.words[0].upper() if line.words else ""
         if unit not in MM_PER_UNIT:
@@ -190,7 +229,7 @@ class _Reader:
         """Whether surfaces have radii; without RDM they have curvatures, which is CODE V's rule."""
         line = self.system.get("RDM")
         if line is None:
-            self.notes.append("it says no RDM: the first number of its surfaces is taken as a curvature, as CODE V does")
+            self.notes.append("it says no RDM: its surfaces have curvatures, CODE V's default")
             return False
         mode = line.words[0].upper() if line.words else "Y"
         if mode not in {"Y", "N", "YES", "NO"}:
@@ -200,18 +239,21 @@ class _Reader:
     def _check_system(self) -> None:
         heat = self.system.get("TEM")
         if heat is not None and heat.value() != STANDARD_C:
-            heat.refuse(f"puts the lens at {heat.value():g} C", "save it at 20 C, of which catalogues give their indices")
+            heat.refuse(
+                f"puts the lens at {heat.value():g} C",
+                "save it at 20 C, of which catalogues give their indices",
+            )
         light = self.system.get("POL")
         if light is not None and light.words and light.words[0].upper().startswith("Y"):
-            light.refuse("asks for polarised rays", "write POL N: a star's light has no polarisation")
+            light.refuse("asks for polarised rays", "write POL N")
 
     def lens(self) -> LensPrescription:
         """The whole. Raises InputError."""
         start = self.surfaces[0]
         if self._thickness(start) != np.inf:
-            raise InputError(f"{start.label}: its object is near; write a lens whose object is at infinity, as stars are")
+            raise InputError(f"{start.label}: {NEAR_OBJECT}")
         if self.surfaces[-1].line.keyword != "SI":
-            raise InputError("it has no image surface (SI); save it from CODE V as a sequence file (.seq)")
+            raise InputError(f"it has no image surface (SI); {CAN_WRITE}")
         kind, pupil = self._pupil()
         waves, primary = self._wavelengths()
         lens = LensPrescription(
@@ -230,7 +272,8 @@ class _Reader:
         stated = [self.system[key] for key in ("EPD", "FNO", "NA", "NAO") if key in self.system]
         if len(stated) != 1:
             names = ", ".join(line.keyword for line in stated) or "none"
-            raise InputError(f"its aperture is stated {len(stated)} times ({names}); write one of EPD, FNO and NA")
+            times = f"{len(stated)} times ({names})"
+            raise InputError(f"its aperture is stated {times}; write one of EPD, FNO and NA")
         line = stated[0]
         if line.keyword == "NAO":
             line.refuse("is of a near object", "write EPD, FNO or NA, as for stars")
@@ -250,7 +293,8 @@ class _Reader:
         reference = self.system.get("REF")
         number = int(reference.value()) - 1 if reference is not None else len(waves) // 2
         if not 0 <= number < len(waves):
-            raise InputError(f"REF names wavelength {number + 1} of {len(waves)}; write one that there is")
+            which = f"wavelength {number + 1} of {len(waves)}"
+            raise InputError(f"REF names {which}; write one that there is")
         distinct = tuple(dict.fromkeys(waves))
         return distinct, distinct.index(waves[number])
 
@@ -260,7 +304,7 @@ class _Reader:
             if any(name in self.system for name in names):
                 kinds.append(kind)
         if len(kinds) > 1:
-            raise InputError("its field is stated in angles and in image heights; write one of them")
+            raise InputError("its field is in angles and in image heights; write one of them")
         return kinds[0] if kinds else "angle"
 
     def _fields(self) -> Iterator[FieldPoint]:
@@ -270,7 +314,7 @@ class _Reader:
         lists = {name: self.system[name].numbers() if name in self.system else () for name in names}
         x_name, y_name = FIELD_LISTS[kind]
         for number in range(max(1, len(lists[x_name]), len(lists[y_name]))):
-            at = {name: values[number] if number < len(values) else 0.0 for name, values in lists.items()}
+            at = {name: nth(values, number) for name, values in lists.items()}
             # VU and VL are the parts of the pupil that are cut off above and below.
             compression = (at["VUX"] + at["VLX"]) / 2, (at["VUY"] + at["VLY"]) / 2
             shift = (at["VLX"] - at["VUX"]) / 2, (at["VLY"] - at["VUY"]) / 2
@@ -319,13 +363,14 @@ class _Reader:
     def _finite_thickness(self, surface: _Surface) -> float:
         thickness = self._thickness(surface)
         if not np.isfinite(thickness):
-            surface.line.refuse(f"at {surface.label} has no end", "write the distance to the next surface")
+            surface.line.refuse(f"at {surface.label} has no end", "write its distance to the next")
         return thickness
 
     def _turn(self, surface: _Surface) -> FloatArray:
-        """ADE, BDE and CDE turn about x, the new y and the newer z; the first two are left-handed."""
+        """ADE, BDE, CDE turn about x, the new y, the newer z; the first two are left-handed."""
         alpha, beta, gamma = (surface.number_of(name) for name in ("ADE", "BDE", "CDE"))
-        return np.asarray(Rotation.from_euler("XYZ", [-alpha, -beta, gamma], degrees=True).as_matrix())
+        turn = Rotation.from_euler("XYZ", [-alpha, -beta, gamma], degrees=True)
+        return np.asarray(turn.as_matrix())
 
     def _surface(self, surface: _Surface, frame: Frame) -> LensSurface:
         return LensSurface(
@@ -353,7 +398,8 @@ class _Reader:
     def _glass(self, surface: _Surface) -> Glass:
         words = surface.line.words[2:]
         if len(words) > 1:
-            surface.line.refuse(f"at {surface.label} has {shortened(' '.join(words[1:]))} behind its glass", ADVICE)
+            more = shortened(" ".join(words[1:]))
+            surface.line.refuse(f"at {surface.label} has {more} behind its glass", ADVICE)
         if not words or words[0].upper() == "AIR":
             return AIR
         if words[0].upper() in {"REFL", "REFR"}:
@@ -362,7 +408,8 @@ class _Reader:
         if name.upper() in self.private:
             line = self.private[name.upper()]
             surface.line.refuse(
-                f"at {surface.label} has the private glass {name} (line {line})", "write a catalogue's glass, or its n and V"
+                f"at {surface.label} has the private glass {name} (line {line})",
+                "write a catalogue's glass, or its n and V",
             )
         index, colon, abbe = name.partition(":")
         if colon:
@@ -378,9 +425,15 @@ class _Reader:
         try:
             index_d, abbe_d = float(index), float(abbe)
         except ValueError:
-            surface.line.refuse(f"at {surface.label} has the glass {index}:{abbe}", "write n:V, such as 1.5168:64.17")
+            surface.line.refuse(
+                f"at {surface.label} has the glass {index}:{abbe}",
+                "write n:V, such as 1.5168:64.17",
+            )
         if index_d < 1 or abbe_d < 0:
-            surface.line.refuse(f"at {surface.label} has the glass {index}:{abbe}", "write n:V, such as 1.5168:64.17")
+            surface.line.refuse(
+                f"at {surface.label} has the glass {index}:{abbe}",
+                "write n:V, such as 1.5168:64.17",
+            )
         return Glass(f"{index}:{abbe}", index_d=index_d, abbe=abbe_d)
 
     def _apertures(self, surface: _Surface) -> Iterator[Aperture]:
@@ -396,13 +449,15 @@ class _Reader:
             is_second = keyword in {"REY", "ELY"}
             # The edge is where the glass ends, outside of what is clear.
             if kind != "EDG" and not is_second:
-                yield Aperture(SHAPES[keyword], (half_mm, other_mm), kind == "CLR", centre_mm=centre)
+                half = half_mm, other_mm
+                yield Aperture(SHAPES[keyword], half, kind == "CLR", centre_mm=centre)
 
     def _other_half(self, surface: _Surface, keyword: str, kind: str, halves: dict[tuple[str, str], float]) -> float:
         """The half-width across: a circle's own; the other command's, where there are two."""
         other = OTHER_COMMANDS.get(keyword, keyword)
         if (other, kind) not in halves:
-            raise InputError(f"{surface.label}: {keyword} has no {other} beside it; write both half-widths")
+            lacks = f"{keyword} has no {other} beside it"
+            raise InputError(f"{surface.label}: {lacks}; write both half-widths")
         return halves[other, kind]
 
     def _edge(self, surface: _Surface, line: LensLine) -> tuple[str, float]:

@@ -1,4 +1,4 @@
-"""A lens as a file states it: surfaces, glasses, apertures, fields and wavelengths, in mm, whatever its format.
+"""A lens as a file states it, in mm: surfaces, glasses, apertures, fields and wavelengths.
 
 Readers of formats (`zemax_file.py`, `codev_file.py`) make one; `optiland_lens.py` traces it.
 """
@@ -14,16 +14,23 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 
-MIN_INFINITE = 1e10  # lens units: an object this far is at infinity (OpticStudio's rule; CODE V writes 1e11 and more)
+# Lens units: an object this far is at infinity (OpticStudio's rule; CODE V writes 1e11 and more).
+MIN_INFINITE = 1e10
 LINES_UM = {"d": 0.5875618, "F": 0.4861327, "C": 0.6562725, "g": 0.4358343}
-# Schott's normal line: the partial dispersion P_g,F of glasses without anomalous dispersion (TIE-29).
+# Schott's normal line: the partial dispersion P_g,F of glasses without anomalous dispersion
+# (TIE-29).
 NORMAL_P_GF, NORMAL_P_GF_PER_ABBE = 0.6438, -0.001682
 CONRADY_POWER = 3.5
-DIGITS_OF_CODE = 1000.0
+NEAR_OBJECT = "its object is near; write a lens whose object is at infinity, as stars are"
 
 PupilKind = Literal["diameter", "f_number", "stop"]
 FieldKind = Literal["angle", "paraxial_image_height", "real_image_height"]
 Shape = Literal["circle", "rectangle", "ellipse", "spider"]
+
+
+def nth(values: Sequence[float], number: int) -> float:
+    """A value of a list that may end earlier; 0 behind its end."""
+    return values[number] if number < len(values) else 0.0
 
 
 class LensLine:
@@ -48,8 +55,11 @@ class LensLine:
         return self._parsed(self.words[place])
 
     def length(self, place: int = 0) -> float:
-        """The number at a place, where a distance of MIN_INFINITE and more, or a word for it, is inf."""
-        if place < len(self.words) and self.words[place].lstrip("+-").upper() in {"INF", "INFINITY"}:
+        """The number at a place; inf for MIN_INFINITE and more, or for a word of it."""
+        if place < len(self.words) and self.words[place].lstrip("+-").upper() in {
+            "INF",
+            "INFINITY",
+        }:
             return math.inf
         value = self.value(place)
         return math.inf if abs(value) >= MIN_INFINITE else value
@@ -74,10 +84,10 @@ class LensLine:
 
 @dataclass(frozen=True, slots=True)
 class Glass:
-    """What light goes through behind a surface: air, a mirror's reflection, a catalogue's glass, or an index of its own.
+    """What light meets at a surface: air, a mirror, a catalogue's glass, or an index of its own.
 
-    `catalogues` are searched in their order; none: all. `index_d` is given of a model glass alone; `abbe` 0 is a constant
-    index, and `anomaly` is its distance from the normal line of P_g,F.
+    `catalogues` are searched in their order; none: all. `index_d` is given of a model glass alone;
+    `abbe` 0 is a constant index, and `anomaly` is its distance from the normal line of P_g,F.
     """
 
     name: str = ""
@@ -97,7 +107,10 @@ class Glass:
         return not self.name and self.index_d is None
 
     def model_index(self, um: float | FloatArray) -> FloatArray:
-        """The index of a model glass at wavelengths, um: Conrady's n0 + a/l + b/l^3.5 through n_d, V_d and P_g,F."""
+        """The index of a model glass at wavelengths, um.
+
+        Conrady's n0 + a/l + b/l^3.5 through n_d, V_d and P_g,F.
+        """
         if self.index_d is None:
             raise InputError(f"the glass {self.name} has no index of its own")
         wavelength = np.asarray(um, dtype=np.float64)
@@ -123,7 +136,7 @@ MIRROR = Glass("MIRROR")
 
 
 def glass_of_code(code: str) -> Glass | None:
-    """A glass of a code such as 517642 or 516800.641700 (n_d - 1 and V_d, after the point tenfold); None for another name."""
+    """A glass of a code such as 517642 or 516800.641700: n_d - 1 and V_d; None for another name."""
     index, _, abbe = code.partition(".")
     if not code.replace(".", "", 1).isdigit():
         return None
@@ -137,10 +150,11 @@ def glass_of_code(code: str) -> Glass | None:
 
 @dataclass(frozen=True, slots=True)
 class Aperture:
-    """A part of a surface, mm, from its vertex: clear (light passes within it alone) or not (none passes within it).
+    """A part of a surface, mm, from its vertex: where light passes alone, or where none passes.
 
-    A circle lies between `smallest_mm` and `half_mm[0]`; a rectangle and an ellipse have half-widths along x and y; a spider
-    `arms` of width 2 `half_mm[0]`, the first along +x, evenly in angle.
+    A circle lies between `smallest_mm` and `half_mm[0]`; a rectangle and an ellipse have
+    half-widths along x and y; a spider `arms` of width 2 `half_mm[0]`, the first along +x, evenly
+    in angle.
     """
 
     shape: Shape
@@ -207,7 +221,8 @@ class LensSurface:
 class FieldPoint:
     """A point of the field: degrees, or mm of image height; and how much of its pupil is lit.
 
-    The pupil's coordinates p (x, y; 1 at its edge) of what is lit are `shift` + p (1 - `compression`), along x and y.
+    The pupil's coordinates p (x, y; 1 at its edge) of what is lit are `shift` + p (1 -
+    `compression`), along x and y.
     """
 
     x: float
@@ -225,8 +240,9 @@ class FieldPoint:
 class LensPrescription:
     """A lens for an object at infinity; its last surface is the image.
 
-    `pupil` is the entrance pupil's diameter (mm), the F-number, or the stop's diameter (mm), by `pupil_kind`. `notes` are
-    lines for the person: what was taken where the file says nothing, and what it says that no star's light shows.
+    `pupil` is the entrance pupil's diameter (mm), the F-number, or the stop's diameter (mm), by
+    `pupil_kind`. `notes` are lines for the person: what was taken where the file says nothing, and
+    what it says that no star's light shows.
     """
 
     surfaces: tuple[LensSurface, ...]
@@ -245,9 +261,10 @@ class LensPrescription:
         if not self.wavelengths_um or min(self.wavelengths_um) <= 0:
             raise InputError("it has no wavelength above 0; write those of its light")
         if not 0 <= self.primary < len(self.wavelengths_um):
-            raise InputError(f"its primary wavelength is number {self.primary + 1} of {len(self.wavelengths_um)}")
+            count = len(self.wavelengths_um)
+            raise InputError(f"its primary wavelength is number {self.primary + 1} of {count}")
         if self.pupil <= 0:
-            raise InputError("it has no aperture above 0; write the entrance pupil's diameter or the F-number")
+            raise InputError("it has no aperture above 0; write the pupil's diameter or the F-number")
         if sum(surface.is_stop for surface in self.surfaces) > 1:
             raise InputError("it has two stops; write one")
         self._check_pupil_fits()
@@ -260,13 +277,13 @@ class LensPrescription:
         if self.pupil / 2 * abs(first.curvature_per_mm) * math.sqrt(1 + first.conic) >= 1:
             radius_mm = 1 / first.curvature_per_mm
             raise InputError(
-                f"{first.label} has a radius of {radius_mm:.4g} mm, and the pupil is {self.pupil:.4g} mm wide: no ray at its"
-                " edge meets it; are radii and curvatures, or the lengths' unit, mixed up?"
+                f"{first.label} has a radius of {radius_mm:.4g} mm, and the pupil is {self.pupil:.4g} mm"
+                " wide: no ray at its edge meets it; are radii and curvatures, or units, mixed up?"
             )
 
 
 class Frame:
-    """The axes of the surface that a reader has come to, by those of the lens: turned and moved as it goes."""
+    """The axes of the surface that a reader has come to, by those of the lens."""
 
     def __init__(self) -> None:
         self.turn: FloatArray = np.eye(3)

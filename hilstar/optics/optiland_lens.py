@@ -1,7 +1,7 @@
-"""A lens as optiland's, made of what a file states: each surface in its own axes, each glass by its exact name.
+"""A lens as optiland's, made of what a file states: surfaces in their axes, glasses by name.
 
-optiland finds glasses by likeness (SF11 as N-SF11), and takes AIR or a placeholder for what it does not find. So its database
-is searched here, by name and catalogue.
+optiland finds glasses by likeness (SF11 as N-SF11), and takes AIR or a placeholder for what it does
+not find. So its database is searched here, by name and catalogue.
 """
 
 import csv
@@ -21,8 +21,9 @@ from hilstar.optics.lens_data import Aperture, Glass, LensPrescription, LensSurf
 
 # Where a name stands in several catalogues and the file names none of them: the order of searching.
 CATALOGUE_ORDER = ("schott", "ohara", "hoya", "cdgm", "hikari", "sumita")
-# Materials that catalogues of Zemax (MISC, INFRARED) and of CODE V have under names of their own, with the published formula
-# that those have: Malitson 1965 and 1963. Corning states n_d = 1.458467 for its 7980, Malitson 1.458464 for fused silica.
+# Materials that catalogues of Zemax (MISC, INFRARED) and of CODE V have under names of their own,
+# with the published formula that those have: Malitson 1965 and 1963. Corning states n_d = 1.458467
+# for its 7980, Malitson 1.458464 for fused silica.
 MATERIALS = {
     "C79-80": "main/SiO2/Malitson.yml",
     "F_SILICA": "main/SiO2/Malitson.yml",
@@ -30,17 +31,22 @@ MATERIALS = {
     "FSILICA": "main/SiO2/Malitson.yml",
     "CAF2": "main/CaF2/Malitson.yml",
 }
-# Old glasses that the database lacks, and whose n_d and V_d the new one has to the last digit of Schott's data sheets.
+# Old glasses that the database lacks, and whose n_d and V_d the new one has to the last digit of
+# Schott's data sheets.
 SAME_GLASSES = {"bk7": "nbk7"}
 GLASS_GROUP = "glass"
 FURTHER_FOLDER = "misc"  # of a maker's glasses beside its catalogue, such as Schott's B270
-FIELD_NAMES = {"angle": "angle", "paraxial_image_height": "paraxial_image_height", "real_image_height": "real_image_height"}
+FIELD_NAMES = {
+    "angle": "angle",
+    "paraxial_image_height": "paraxial_image_height",
+    "real_image_height": "real_image_height",
+}
 PUPIL_NAMES = {"diameter": "EPD", "f_number": "imageFNO", "stop": "float_by_stop_size"}
 
 
 @dataclass(frozen=True, slots=True)
 class GlassFile:
-    """A material of optiland's database: its name and catalogue in small letters and digits, and where it is known."""
+    """A material of optiland's database; name and catalogue are in small letters and digits."""
 
     name: str
     catalogue: str
@@ -51,7 +57,10 @@ class GlassFile:
 
 
 def optic_of(lens: LensPrescription) -> tuple[Any, tuple[str, ...]]:
-    """optiland's Optic, and notes for the person. Raises InputError for a glass that no catalogue has."""
+    """optiland's Optic, and notes for the person.
+
+    Raises InputError for a glass that no catalogue has.
+    """
     from optiland.optic import Optic
 
     optic = Optic()
@@ -77,7 +86,15 @@ def _geometry(surface: LensSurface) -> dict[str, Any]:
     rx, ry, rz = _euler_rad(surface.turn)
     curvature = surface.curvature_per_mm
     radius_mm = 1 / curvature if curvature else np.inf
-    made: dict[str, Any] = {"x": x_mm, "y": y_mm, "z": z_mm, "rx": rx, "ry": ry, "rz": rz, "radius": radius_mm}
+    made: dict[str, Any] = {
+        "x": x_mm,
+        "y": y_mm,
+        "z": z_mm,
+        "rx": rx,
+        "ry": ry,
+        "rz": rz,
+        "radius": radius_mm,
+    }
     if surface.paraxial_focal_mm is not None:
         made |= {"surface_type": "paraxial", "f": surface.paraxial_focal_mm}
     else:
@@ -164,7 +181,10 @@ def _model(glass: Glass) -> Any:
 
 
 def find_glass(glass: Glass, label: str) -> tuple[GlassFile, list[str]]:
-    """The file of a catalogue's glass, by its exact name, and notes. Raises InputError where none has it."""
+    """The file of a catalogue's glass, by its exact name, and notes.
+
+    Raises InputError where none has it.
+    """
     name = _plain(glass.name)
     by_name = [file for file in _database() if file.name == name]
     listed = [_plain(catalogue) for catalogue in glass.catalogues]
@@ -225,7 +245,8 @@ def _read_database() -> Iterator[GlassFile]:
         for row in csv.DictReader(file):
             parts = row["filename"].removesuffix(".yml").split("/")
             parts = [part for part in parts if part != FURTHER_FOLDER]
-            # glass/MAKER/NAME, and main/MATERIAL/AUTHOR; deeper ones are forms of a glass (melts, infrared parts).
+            # glass/MAKER/NAME, and main/MATERIAL/AUTHOR; deeper ones are forms of a glass (melts,
+            # infrared parts).
             if len(parts) != 3:
                 continue
             is_glass = parts[0] == GLASS_GROUP

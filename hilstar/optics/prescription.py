@@ -13,7 +13,7 @@ import contextlib
 import io
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -33,6 +33,7 @@ from hilstar.scene.camera import Lens
 
 CAN_INSTALL = "pip install 'hilstar[lens]'"
 ADVICE = "give a lens file: .zmx of Zemax, .seq of CODE V, or .json of optiland"
+ENDINGS = frozenset({".zmx", ".seq", ".json"})
 MAX_BYTES = 50_000_000
 POINTS = 5  # field points along each side
 MIN_RAYS, MAX_RAYS, GEOMETRIC_RAYS = 96, 384, 400  # across the pupil
@@ -94,13 +95,12 @@ def glass_of_prescription(path: Path, plate: Plate, per_px: int | None, toleranc
 
 
 def _read(path: Path) -> "_Lens":
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
+    if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path}: no lens file by its name; {ADVICE}")
     data = read_bytes(path, ADVICE, MAX_BYTES)
     try:
         # What the file states is read first: a refusal of it needs no optiland.
-        prescription = reader(data)
+        prescription = _stated(path, data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     try:
@@ -118,15 +118,13 @@ def _read(path: Path) -> "_Lens":
     return replace(lens, notes=(*lens.notes, *said))
 
 
-def _no_prescription(data: bytes) -> None:
-    """optiland's own files are its to read."""
-
-
-READERS: dict[str, Callable[[bytes], LensPrescription | None]] = {
-    ".zmx": read_zemax,
-    ".seq": read_codev,
-    ".json": _no_prescription,
-}
+def _stated(path: Path, data: bytes) -> LensPrescription | None:
+    """What a file states; None for optiland's own, which are its to read."""
+    if path.suffix.lower() == ".zmx":
+        return read_zemax(data)
+    if path.suffix.lower() == ".seq":
+        return read_codev(data)
+    return None
 
 
 def _of_prescription(lens: LensPrescription) -> "_Lens":

@@ -1,11 +1,11 @@
-"""Reads .zmx of Zemax OpticStudio: sequential lenses, by a list of keywords that are used and one of those that no star shows.
+"""Reads .zmx of Zemax OpticStudio, by a list of keywords that are used and one of those ignored.
 
-A keyword on neither list is refused by its line: what it does to light is not known. The file's own solves and pickups are
-passed over, as it has the values that they gave.
+A keyword on neither list is refused by its line: what it does to light is not known. The file's own
+solves and pickups are passed over, as it has the values that they gave.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 from scipy.spatial.transform import Rotation
@@ -14,6 +14,7 @@ from hilstar.errors import InputError, shortened
 from hilstar.optics.lens_data import (
     AIR,
     MIRROR,
+    NEAR_OBJECT,
     Aperture,
     FieldKind,
     FieldPoint,
@@ -23,13 +24,16 @@ from hilstar.optics.lens_data import (
     LensPrescription,
     LensSurface,
     PupilKind,
+    nth,
 )
 
 MM_PER_UNIT = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "METER": 1000.0, "M": 1000.0}
 FIELD_KINDS: dict[int, FieldKind] = {0: "angle", 2: "paraxial_image_height", 3: "real_image_height"}
 UNNAMED_GLASS = "___BLANK"
+FIELD_LISTS = ("XFL", "YFL", "VCX", "VCY", "VDX", "VDY")  # with N behind, and D in older files
 MODEL_GLASS, OFFSET_GLASS = 1, 4  # kinds of GLAS's solve; the others write the glass's own name
-MAX_EVEN_TERMS, MAX_ODD_TERMS = 8, 8
+# Kinds of surfaces and how many parameters each has: coefficients of r^2n and of r^n; a focal length and how its path counts.
+SURFACE_KINDS = {"STANDARD": 0, "EVENASPH": 8, "ODDASPHE": 8, "PARAXIAL": 2}
 BREAK_STEPS = 6
 STANDARD_C, STANDARD_ATM = 20.0, 1.0  # at which catalogues give their indices
 
@@ -55,14 +59,52 @@ REFUSED_UNLESS_ZERO = frozenset({"ZVCX", "ZVCY", "ZVDX", "ZVDY"})
 IGNORED_SYSTEM = frozenset(
     {
         *("VERS", "DBDT", "NAME", "NOTE", "AUTH", "LANG", "FILE", "TITL"),  # words for people
-        *("COFN", "GLRS", "SDMA", "PICB", "PFIL", "NSCD", "GSTD", "ROPD", "PUSH", "POLS", "HYPR"),  # of other analyses
-        *("FWGN", "MOFF", "VDSZ", "OMMA", "STUD", "RCMF", "IWDP", "SSID", "LUID", "EERA"),  # of optimisation and editors
+        *(
+            "COFN",
+            "GLRS",
+            "SDMA",
+            "PICB",
+            "PFIL",
+            "NSCD",
+            "GSTD",
+            "ROPD",
+            "PUSH",
+            "POLS",
+            "HYPR",
+        ),  # of other analyses
+        *(
+            "FWGN",
+            "MOFF",
+            "VDSZ",
+            "OMMA",
+            "STUD",
+            "RCMF",
+            "IWDP",
+            "SSID",
+            "LUID",
+            "EERA",
+        ),  # of optimisation and editors
     }
 )
 IGNORED_SURFACE = frozenset(
     {
-        *("COMM", "HIDE", "SLAB", "MIRR", "POPS", "FIMP", "NOTE", "CHZN"),  # names, drawings, and physical optics
-        *("MEMA", "OEMA", "MAZH", "CHIP", "VDSZ"),  # the mechanical edge, which is outside the clear aperture
+        *(
+            "COMM",
+            "HIDE",
+            "SLAB",
+            "MIRR",
+            "POPS",
+            "FIMP",
+            "NOTE",
+            "CHZN",
+        ),  # names, drawings, and physical optics
+        *(
+            "MEMA",
+            "OEMA",
+            "MAZH",
+            "CHIP",
+            "VDSZ",
+        ),  # the mechanical edge, which is outside the clear aperture
         *(
             "VPAR",
             "PPAR",
@@ -74,14 +116,22 @@ IGNORED_SURFACE = frozenset(
             "VDIS",
             "PZUP",
         ),  # variables and pickups, whose values are here
-        *("COAT", "TCED", "TCE", "IGNM"),  # a coating's loss, and expansion: the bench file's transmission has the light
+        *(
+            "COAT",
+            "TCED",
+            "TCE",
+            "IGNM",
+        ),  # a coating's loss, and expansion: the bench file's transmission has the light
     }
 )
-# Behind the last surface: editors' lists, of tolerances and of the merit function, whose operands have a word of four
-# capitals, and numbers. They stand at the line's beginning, where a surface's own lines are indented.
+# Behind the last surface: editors' lists, of tolerances and of the merit function, whose operands
+# have a word of four capitals, and numbers. They stand at the line's beginning, where a surface's
+# own lines are indented.
 EDITOR_LISTS = frozenset({"TOL", "TCMM", "MNUM", "MOFF", "BLNK", "DMFS"})
 OPERAND = re.compile(r"[A-Z][A-Z0-9_]{2,3}( +[-+0-9.eE]+){6,} *")
 ADVICE = "save the lens without it"
+BEAM_NOTE = "GFAC weights the pupil of a laser's beam; a star's light fills it evenly"
+AIMING_NOTE = "RAIM aims at the stop's edge; rays are aimed at the paraxial entrance pupil's"
 CAN_WRITE = "save it from OpticStudio as a sequential lens (.zmx)"
 
 
@@ -170,7 +220,10 @@ class _Reader:
     def _take_list(self, line: LensLine) -> None:
         is_several = line.keyword == "MNUM" and line.words and line.value() > 1
         if is_several:
-            line.refuse(f"says {line.words[0]} configurations", "save the one that is used as a lens of its own")
+            line.refuse(
+                f"says {line.words[0]} configurations",
+                "save the one that is used as a lens of its own",
+            )
 
     def _take_surface(self, line: LensLine) -> bool:
         """Whether a line belongs to the last surface."""
@@ -228,25 +281,26 @@ class _Reader:
         if air is not None and len(air.words) > 2 and air.value(2):
             at_c, at_atm = air.value(0), air.value(1)
             if (at_c, at_atm) != (STANDARD_C, STANDARD_ATM):
-                air.refuse(f"adjusts indices to {at_c:g} C and {at_atm:g} atm", "write those of 20 C and 1 atm")
+                air.refuse(
+                    f"adjusts indices to {at_c:g} C and {at_atm:g} atm",
+                    "write those of 20 C and 1 atm",
+                )
         angle = self.head.get("VANN") or self.head.get("VAND")
         if angle is not None and not angle.is_zero():
             angle.refuse("turns the vignetted pupil", "write the surfaces' apertures (CLAP) instead")
         beam = self.head.get("GFAC")
         if beam is not None and len(beam.words) > 1 and beam.value(0) and beam.value(1):
-            self.notes.append(f"line {beam.number}: GFAC weights the pupil of a laser's beam; a star's light fills it evenly")
+            self.notes.append(f"line {beam.number}: {BEAM_NOTE}")
         aiming = self.head.get("RAIM")
         if aiming is not None and len(aiming.words) > 1 and aiming.value(1):
-            self.notes.append(
-                f"line {aiming.number}: RAIM aims rays at the stop's edge; they are aimed at the paraxial entrance pupil's"
-            )
+            self.notes.append(f"line {aiming.number}: {AIMING_NOTE}")
 
     def lens(self) -> LensPrescription:
         """The whole. Raises InputError."""
         start = self.surfaces[0]
         far = start.values.get("DISZ")
         if far is None or far.length() != float("inf"):
-            raise InputError(f"{start.label}: its object is near; write a lens whose object is at infinity, as stars are")
+            raise InputError(f"{start.label}: {NEAR_OBJECT}")
         kind, pupil = self._pupil()
         waves, primary = self._wavelengths()
         lens = LensPrescription(
@@ -265,7 +319,8 @@ class _Reader:
         stated = [self.head[key] for key in ("ENPD", "FNUM", "FLOA", "OBNA") if key in self.head]
         if len(stated) != 1:
             names = ", ".join(line.keyword for line in stated) or "none"
-            raise InputError(f"its aperture is stated {len(stated)} times ({names}); write one of ENPD, FNUM and FLOA")
+            times = f"{len(stated)} times ({names})"
+            raise InputError(f"its aperture is stated {times}; write one of ENPD, FNUM and FLOA")
         line = stated[0]
         if line.keyword == "OBNA":
             line.refuse("is of a near object", "write ENPD, FNUM or FLOA, as for stars")
@@ -282,8 +337,10 @@ class _Reader:
                 semi_diameter = surface.number_of("DIAM")
                 if semi_diameter > 0:
                     return semi_diameter
-                raise InputError(f"{surface.label}: FLOA takes the aperture from its DIAM, which is 0; write ENPD or FNUM")
-        raise InputError("FLOA takes the aperture from the stop, and no surface says STOP; write ENPD or FNUM")
+                no_size = "FLOA takes the aperture from its DIAM, which is 0"
+                raise InputError(f"{surface.label}: {no_size}; write ENPD or FNUM")
+        no_stop = "FLOA takes the aperture from the stop, and no surface says STOP"
+        raise InputError(f"{no_stop}; write ENPD or FNUM")
 
     def _field_type(self) -> LensLine | None:
         return self.head.get("FTYP")
@@ -294,9 +351,15 @@ class _Reader:
             return "angle"
         kind = int(line.value())
         if kind not in FIELD_KINDS:
-            line.refuse(f"has fields of kind {kind} (object heights are 1)", "write angles (0) or image heights (2, 3)")
+            line.refuse(
+                f"has fields of kind {kind} (object heights are 1)",
+                "write angles (0) or image heights (2, 3)",
+            )
         if len(line.words) > 1 and line.value(1):
-            line.refuse("says that the object's side is telecentric", "write a lens for an object at infinity")
+            line.refuse(
+                "says that the object's side is telecentric",
+                "write a lens for an object at infinity",
+            )
         return FIELD_KINDS[kind]
 
     def _count(self, place: int, known: int) -> int:
@@ -310,14 +373,15 @@ class _Reader:
         return () if line is None else line.numbers()
 
     def _fields(self) -> Iterator[FieldPoint]:
-        lists = {name: self._list(f"{name}N", f"{name}D") for name in ("XFL", "YFL", "VCX", "VCY", "VDX", "VDY")}
+        lists = {name: self._list(f"{name}N", f"{name}D") for name in FIELD_LISTS}
         longest = max(1, len(lists["XFL"]), len(lists["YFL"]))
         # Angles are degrees, image heights lengths.
         scale = 1.0 if self._field_kind() == "angle" else self.mm
         for number in range(self._count(2, longest)):
-            at = {name: values[number] if number < len(values) else 0.0 for name, values in lists.items()}
-            place = at["XFL"] * scale, at["YFL"] * scale
-            yield FieldPoint(*place, compression=(at["VCX"], at["VCY"]), shift=(at["VDX"], at["VDY"]))
+            x, y, *vignetting = (nth(values, number) for values in lists.values())
+            compression_x, compression_y, shift_x, shift_y = vignetting
+            compression, shift = (compression_x, compression_y), (shift_x, shift_y)
+            yield FieldPoint(x * scale, y * scale, compression, shift)
 
     def _wavelengths(self) -> tuple[tuple[float, ...], int]:
         every = tuple(line.value(1) for line in self.waves)
@@ -326,7 +390,8 @@ class _Reader:
         primary = self.head.get("PWAV")
         number = int(primary.value()) - 1 if primary is not None else 0
         if not 0 <= number < max(count, 1):
-            raise InputError(f"PWAV names wavelength {number + 1} of {count}; write one that there is")
+            which = f"wavelength {number + 1} of {count}"
+            raise InputError(f"PWAV names {which}; write one that there is")
         # Wavelengths that are listed twice are one; the primary keeps its value.
         distinct = tuple(dict.fromkeys(every[:count]))
         return distinct, distinct.index(every[number]) if every else 0
@@ -347,10 +412,8 @@ class _Reader:
                 frame.move(0.0, 0.0, gap.value() * self.mm)
 
     def _break(self, surface: _Surface, frame: Frame) -> None:
-        """OpticStudio's order: shift, then turns about x, the new y and the newer z; with PARM 6 all of it backwards."""
-        extra = [line for number, line in surface.parameters.items() if number > BREAK_STEPS and line.value(1)]
-        if extra:
-            extra[0].refuse("of a COORDBRK is not known", ADVICE)
+        """Shift, then turns about x, the new y and the newer z; with PARM 6 all of it backwards."""
+        _refuse_parameters(surface, BREAK_STEPS)
         if "STOP" in surface.values:
             surface.values["STOP"].refuse("is at a COORDBRK", "put it on the surface beside it")
         x_mm, y_mm = surface.parameter(1) * self.mm, surface.parameter(2) * self.mm
@@ -363,11 +426,11 @@ class _Reader:
             frame.rotate(Rotation.from_euler("XYZ", turns_deg, degrees=True).as_matrix())
 
     def _surface(self, surface: _Surface, frame: Frame, glass: Glass) -> LensSurface:
-        shape = SURFACE_KINDS.get(surface.kind)
-        if shape is None:
+        if surface.kind not in SURFACE_KINDS:
             known = ", ".join(SURFACE_KINDS)
             surface.values["TYPE"].refuse(
-                f"at surface {surface.number} is {shortened(surface.kind)}", f"write one of {known} or COORDBRK"
+                f"at surface {surface.number} is {shortened(surface.kind)}",
+                f"write one of {known} or COORDBRK",
             )
         if any(_numbers_of(word for line in surface.extra for word in line.words[1:2])):
             surface.extra[0].refuse(f"at surface {surface.number} gives further coefficients", ADVICE)
@@ -375,14 +438,17 @@ class _Reader:
             label=surface.label,
             curvature_per_mm=surface.number_of("CURV") / self.mm,
             conic=surface.number_of("CONI"),
-            polynomial=tuple(shape(surface, self.mm)),
+            polynomial=tuple(_terms(surface, self.mm)),
             glass=glass,
             apertures=tuple(self._apertures(surface)),
             is_stop="STOP" in surface.values,
             turn=frame.turn,
             origin_mm=frame.origin_mm,
-            paraxial_focal_mm=surface.parameter(1) * self.mm if surface.kind == "PARAXIAL" else None,
+            paraxial_focal_mm=self._paraxial_focal_mm(surface),
         )
+
+    def _paraxial_focal_mm(self, surface: _Surface) -> float | None:
+        return surface.parameter(1) * self.mm if surface.kind == "PARAXIAL" else None
 
     def _glass(self, surface: _Surface) -> Glass:
         line = surface.values.get("GLAS")
@@ -393,13 +459,19 @@ class _Reader:
             return MIRROR
         kind = int(line.value(1)) if len(line.words) > 1 else 0
         if kind == OFFSET_GLASS:
-            line.refuse(f"at surface {surface.number} offsets the index of {name}", "write the glass's own, or a model glass")
+            line.refuse(
+                f"at surface {surface.number} offsets the index of {name}",
+                "write the glass's own, or a model glass",
+            )
         # A pickup of a model glass has its numbers, too.
         if kind == MODEL_GLASS or name == UNNAMED_GLASS:
             numbers = [line.value(place) if place < len(line.words) else 0.0 for place in (3, 4, 5)]
             index_d, abbe, anomaly = numbers
             if index_d < 1 or abbe < 0:
-                line.refuse(f"at surface {surface.number} is a model of n = {index_d:g}, V = {abbe:g}", "write its own numbers")
+                line.refuse(
+                    f"at surface {surface.number} is a model of n = {index_d:g}, V = {abbe:g}",
+                    "write its own numbers",
+                )
             return Glass(name, index_d=index_d, abbe=abbe, anomaly=anomaly)
         listed = self.head.get("GCAT")
         catalogues = () if listed is None else tuple(word.upper() for word in listed.words)
@@ -407,20 +479,22 @@ class _Reader:
 
     def _apertures(self, surface: _Surface) -> Iterator[Aperture]:
         moved = surface.values.get("OBDC")
-        centre = (0.0, 0.0) if moved is None else (moved.value(0) * self.mm, moved.value(1) * self.mm)
+        centre = 0.0, 0.0
+        if moved is not None:
+            centre = moved.value(0) * self.mm, moved.value(1) * self.mm
         for line in surface.apertures:
             first, second = line.value(0) * self.mm, line.value(1) * self.mm
             is_clear = line.keyword in {"CLAP", "FLAP", "SQAP", "ELAP"}
             if line.keyword == "SPID":
                 arms = int(line.value(1))
-                yield Aperture("spider", (first / 2, 0.0), is_clear=False, centre_mm=centre, arms=arms)
+                yield Aperture("spider", (first / 2, 0.0), False, centre_mm=centre, arms=arms)
                 continue
             if second <= 0 or first < 0:
                 line.refuse(f"at surface {surface.number} has no size", "write the half-widths or radii")
             if line.keyword in {"CLAP", "FLAP", "OBSC"}:
                 # A floating aperture is the surface's own edge, so it is not moved.
                 place = (0.0, 0.0) if line.keyword == "FLAP" else centre
-                yield Aperture("circle", (second, second), is_clear, smallest_mm=first, centre_mm=place)
+                yield Aperture("circle", (second, second), is_clear, first, place)
             else:
                 is_square = line.keyword.startswith("SQ")
                 whole = Aperture("rectangle", (first, second), is_clear, centre_mm=centre)
@@ -435,31 +509,17 @@ def _numbers_of(words: Iterable[str]) -> Iterator[float]:
             yield 1.0
 
 
-def _no_terms(surface: _Surface, mm: float) -> Iterator[float]:
-    """A sphere or a conic: a parameter that is not 0 is not its own."""
-    _refuse_parameters(surface, 0)
-    yield from ()
-
-
-def _even_terms(surface: _Surface, mm: float) -> Iterator[float]:
-    """PARM n is the coefficient of r^2n."""
-    _refuse_parameters(surface, MAX_EVEN_TERMS)
-    for number in range(1, MAX_EVEN_TERMS + 1):
-        yield 0.0
-        yield surface.parameter(number) * mm ** (1 - 2 * number)
-
-
-def _odd_terms(surface: _Surface, mm: float) -> Iterator[float]:
-    """PARM n is the coefficient of r^n."""
-    _refuse_parameters(surface, MAX_ODD_TERMS)
-    for number in range(1, MAX_ODD_TERMS + 1):
-        yield surface.parameter(number) * mm ** (1 - number)
-
-
-def _paraxial(surface: _Surface, mm: float) -> Iterator[float]:
-    """PARM 1 is the focal length; PARM 2, how its path is counted, is no shape."""
-    _refuse_parameters(surface, 2)
-    yield from ()
+def _terms(surface: _Surface, mm: float) -> Iterator[float]:
+    """Coefficients of r, r^2, ... in mm. A parameter that is not 0, and not of the kind, is refused."""
+    count = SURFACE_KINDS[surface.kind]
+    _refuse_parameters(surface, count)
+    for number in range(1, count + 1):
+        if surface.kind == "EVENASPH":
+            # PARM n is the coefficient of r^2n.
+            yield 0.0
+            yield surface.parameter(number) * mm ** (1 - 2 * number)
+        elif surface.kind == "ODDASPHE":
+            yield surface.parameter(number) * mm ** (1 - number)
 
 
 def _refuse_parameters(surface: _Surface, count: int) -> None:
@@ -467,11 +527,3 @@ def _refuse_parameters(surface: _Surface, count: int) -> None:
         is_own = 1 <= number <= count
         if not is_own and line.value(1):
             line.refuse(f"{number} of surface {surface.number} ({surface.kind}) is not known", ADVICE)
-
-
-SURFACE_KINDS: dict[str, Callable[[_Surface, float], Iterator[float]]] = {
-    "STANDARD": _no_terms,
-    "EVENASPH": _even_terms,
-    "ODDASPHE": _odd_terms,
-    "PARAXIAL": _paraxial,
-}

@@ -15,11 +15,24 @@ DOUBLET = ((61.47, 6.0, "N-BK7"), (-44.64, 2.5, "N-SF5"), (-129.94, 95.952, ""))
 
 
 def zmx(
-    *system: str, surfaces=DOUBLET, more: dict[int, list[str]] | None = None, unit="MM", mm=1.0, far="INFINITY", behind=()
+    *system: str,
+    surfaces=DOUBLET,
+    more: dict[int, list[str]] | None = None,
+    unit="MM",
+    mm=1.0,
+    far="INFINITY",
+    behind=(),
 ) -> bytes:
     """The doublet as a .zmx file. `system` lines stand in place of ENPD's, `more` has lines of surfaces by their numbers."""
     head = system or (f"ENPD {20 / mm}",)
-    lines = ["VERS 140124 258 36214", "MODE SEQ", f"UNIT {unit} X W X CM MR CPMM", *head, "ENVD 20 1 0", "GCAT SCHOTT"]
+    lines = [
+        "VERS 140124 258 36214",
+        "MODE SEQ",
+        f"UNIT {unit} X W X CM MR CPMM",
+        *head,
+        "ENVD 20 1 0",
+        "GCAT SCHOTT",
+    ]
     lines += ["FTYP 0 0 2 1 0 0 0", "XFLN 0 0", "YFLN 0 1", "WAVM 1 0.5875618 1", "PWAV 1"]
     lines += ["SURF 0", "  TYPE STANDARD", '  CURV 0 0 0 0 0 ""', f"  DISZ {far}"]
     for number, (radius, thickness, glass) in enumerate(surfaces, 1):
@@ -27,7 +40,13 @@ def zmx(
         lines += [f'  CURV {mm / radius!r} 0 0 0 0 ""', f"  DISZ {thickness / mm!r}"]
         lines += [f"  GLAS {glass} 0 0 1.5 40 0 0 0 0 0 0"] if glass else []
         lines += (more or {}).get(number, [])
-    lines += [f"SURF {len(surfaces) + 1}", "  TYPE STANDARD", '  CURV 0 0 0 0 0 ""', "  DISZ 0", *behind]
+    lines += [
+        f"SURF {len(surfaces) + 1}",
+        "  TYPE STANDARD",
+        '  CURV 0 0 0 0 0 ""',
+        "  DISZ 0",
+        *behind,
+    ]
     return "\r\n".join(lines).encode()
 
 
@@ -38,10 +57,18 @@ def seq(*system: str, surfaces=DOUBLET, more: dict[int, list[str]] | None = None
     lines += [] if "RDM" in said else ["RDM;LEN"]
     lines += [] if "DIM" in said else ["DIM M"]
     lines += [] if said & {"EPD", "FNO", "NA", "NAO"} else [f"EPD {20 / mm!r}"]
-    lines += ["WL 587.5618", "REF 1", *([] if "YAN" in said else ["XAN 0.0 0.0", "YAN 0.0 1.0"]), f"SO 0.0 {far}"]
+    lines += [
+        "WL 587.5618",
+        "REF 1",
+        *([] if "YAN" in said else ["XAN 0.0 0.0", "YAN 0.0 1.0"]),
+        f"SO 0.0 {far}",
+    ]
     for number, (radius, thickness, glass) in enumerate(surfaces, 1):
         name = f"{glass.replace('-', '')}_SCHOTT" if glass else ""
-        lines += [f"S {radius / mm!r} {thickness / mm!r} {name}", *(["  STO"] if number == 1 else [])]
+        lines += [
+            f"S {radius / mm!r} {thickness / mm!r} {name}",
+            *(["  STO"] if number == 1 else []),
+        ]
         lines += (more or {}).get(number, [])
     return "\n".join([*lines, "SI 0.0 0.0", "GO"]).encode()
 

@@ -149,7 +149,10 @@ def test_gps_is_18_s_ahead_of_utc():
     [
         ({"DATE-OBS": "2024-03-01"}, "DATE-OBS = 2024-03-01 tells no time of day"),
         ({"DATE-OBS": "2024-03-01", "UT": 20.5}, "tells no time of day"),
-        ({"DATE-OBS": EIGHT_PM, "TIMESYS": "LOCAL"}, "DATE-OBS is in LOCAL, which is no known time from UTC: undated"),
+        (
+            {"DATE-OBS": EIGHT_PM, "TIMESYS": "LOCAL"},
+            "DATE-OBS is in LOCAL, which is no known time from UTC: undated",
+        ),
         ({"DATE-OBS": (EIGHT_PM, "local time of start")}, "DATE-OBS is in local time"),
         ({"DATE-OBS": "1 March 2024"}, "DATE-OBS = 1 March 2024 is no date"),
         ({"DATE-OBS": "2024-13-41T20:00:00"}, "DATE-OBS = 2024-13-41T20:00:00 is no date"),
@@ -207,7 +210,10 @@ def test_a_grey_image_is_one_plane(value):
 def test_a_mosaic_of_another_kind_is_refused(tmp_path: Path, value):
     path = tmp_path / "mosaic.fits"
     path.write_bytes(file_of(image({"BAYERPAT": value})))
-    with pytest.raises(InputError, match=r"mosaic\.fits: BAYERPAT is .*a mosaic of a kind that is not read; write BAYERPAT"):
+    with pytest.raises(
+        InputError,
+        match=r"mosaic\.fits: BAYERPAT is .*a mosaic of a kind that is not read; write RGGB",
+    ):
         read_photographs(path, None)
 
 
@@ -230,7 +236,11 @@ def test_an_extension_inherits_what_the_primary_header_says(own):
     primary = fits.PrimaryHDU()
     primary.header.update(KEYS)
     found = read_fits_image(file_of(primary, own(mosaic("RGGB"))))
-    assert (found.bayer, found.exposure_s, found.t_ns) == ("RGGB", 10.0, utc_ns("2024-03-01T20:00:05"))
+    assert (found.bayer, found.exposure_s, found.t_ns) == (
+        "RGGB",
+        10.0,
+        utc_ns("2024-03-01T20:00:05"),
+    )
 
 
 @pytest.mark.parametrize("own", [fits.ImageHDU, fits.CompImageHDU])

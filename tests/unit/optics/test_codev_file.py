@@ -18,7 +18,15 @@ SINGLET = ((51.68, 4.0, "N-BK7"), (1e12, 97.363, ""))
 
 
 @pytest.mark.parametrize(
-    ("dim", "mm"), [("DIM M", 1.0), ("DIM I", 25.4), ("DIM C", 10.0), ("dim i", 25.4), ("DIM MM", 1.0), ("DIM IN", 25.4)]
+    ("dim", "mm"),
+    [
+        ("DIM M", 1.0),
+        ("DIM I", 25.4),
+        ("DIM C", 10.0),
+        ("dim i", 25.4),
+        ("DIM MM", 1.0),
+        ("DIM IN", 25.4),
+    ],
 )
 def test_units_are_scaled(dim, mm):
     lens = read_codev(seq(dim, mm=mm, more={1: ["ASP", f"A {-7e-7 * mm**3!r}", f"CIR {8 / mm!r}"]}))
@@ -48,7 +56,10 @@ def test_curvatures_are_curvatures():
 
 
 def test_radii_without_rdm_are_refused():
-    with pytest.raises(InputError, match=r"surface 1 \(line \d+\) has 61.47, which without RDM is a curvature.*write RDM Y"):
+    with pytest.raises(
+        InputError,
+        match=r"surface 1 \(line \d+\) has 61.47, which without RDM is a curvature.*write RDM Y",
+    ):
         read_codev(seq("RDM").replace(b"RDM\n", b""))
 
 
@@ -90,7 +101,8 @@ def test_a_moved_aperture_is_moved():
 
 
 @pytest.mark.parametrize(
-    ("system", "kind", "pupil"), [("EPD 20", "diameter", 20.0), ("FNO 5", "f_number", 5.0), ("NA 0.1", "f_number", 5.0)]
+    ("system", "kind", "pupil"),
+    [("EPD 20", "diameter", 20.0), ("FNO 5", "f_number", 5.0), ("NA 0.1", "f_number", 5.0)],
 )
 def test_the_aperture_is_as_stated(system, kind, pupil):
     lens = read_codev(seq(system))
@@ -141,7 +153,12 @@ def test_what_a_system_line_says_is_used_or_refused(line, words):
 
 @pytest.mark.parametrize(
     ("code", "index_d", "abbe"),
-    [("516800.641700", 1.5168, 64.17), ("517.642", 1.517, 64.2), ("517642", 1.517, 64.2), ("1.5168:64.17", 1.5168, 64.17)],
+    [
+        ("516800.641700", 1.5168, 64.17),
+        ("517.642", 1.517, 64.2),
+        ("517642", 1.517, 64.2),
+        ("1.5168:64.17", 1.5168, 64.17),
+    ],
 )
 def test_codes_of_glasses_keep_their_digits(code, index_d, abbe):
     glass = read_codev(seq().replace(b"NBK7_SCHOTT", code.encode())).surfaces[0].glass
@@ -171,7 +188,19 @@ def test_lines_go_on_and_comments_end_them():
 
 def test_a_fold_mirror_bends_the_axis():
     """A flat mirror at 45 degrees with BEN: the axis behind it stands at a right angle, and the light runs along it."""
-    lines = ["RDM", "DIM M", "EPD 10", "WL 587.5618", "YAN 0", "SO 0 1e11", "S 0 50", "S 0 -30 REFL", "ADE 45", "BEN", "SI 0 0"]
+    lines = [
+        "RDM",
+        "DIM M",
+        "EPD 10",
+        "WL 587.5618",
+        "YAN 0",
+        "SO 0 1e11",
+        "S 0 50",
+        "S 0 -30 REFL",
+        "ADE 45",
+        "BEN",
+        "SI 0 0",
+    ]
     lens = read_codev("\n".join(lines).encode())
     ray = real_rays(lens, np.array([[0.0], [0.0], [-10.0]]), np.array([[0.0], [0.0], [1.0]]))
     assert ray[0][:, 0] == pytest.approx([0, 0, 0], abs=1e-9)
@@ -182,7 +211,21 @@ def test_a_fold_mirror_bends_the_axis():
 
 def test_a_decentre_with_return_leaves_the_axis():
     """A parabola of 100 mm moved by 40 mm with DAR: the star's image is on the moved axis."""
-    lines = ["RDM", "DIM M", "EPD 10", "WL 550", "YAN 0", "SO 0 1e11", "S 0 0", "S -200 -100 REFL", "CON; K -1", "DAR; YDE 40"]
+    lines = [
+        "RDM",
+        "DIM M",
+        "EPD 10",
+        "WL 550",
+        "YAN 0",
+        "SO 0 1e11",
+        "S 0 0",
+        "S -200 -100 REFL",
+        "CON; K -1",
+        "DAR; YDE 40",
+    ]
     lens = read_codev("\n".join([*lines, "SI 0 0"]).encode())
-    at, along = np.array([[1.0, -3.0], [2.0, -4.0], [-150.0, -150.0]]), np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
+    at, along = (
+        np.array([[1.0, -3.0], [2.0, -4.0], [-150.0, -150.0]]),
+        np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]]),
+    )
     assert real_rays(lens, at, along)[0][:2] == pytest.approx(np.array([[0, 0], [40, 40]]), abs=1e-9)

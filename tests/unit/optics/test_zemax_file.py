@@ -57,7 +57,11 @@ def test_a_near_object_is_refused():
     [
         (("ENPD 20",), "diameter", 20.0),
         (("FNUM 5 0",), "f_number", 5.0),
-        (("FNUM 5 1",), "f_number", 5.0),  # the paraxial working F-number, which is the same for a far object
+        (
+            ("FNUM 5 1",),
+            "f_number",
+            5.0,
+        ),  # the paraxial working F-number, which is the same for a far object
         (("FLOA",), "stop", 20.0),  # DIAM 10 is a semi-diameter
     ],
 )
@@ -121,7 +125,10 @@ def test_a_moved_obstruction_is_moved():
         ("  XDAT 1 3.0 0 0 1 0 0", "XDAT at surface 1 gives further coefficients"),
         ("  PARM 2 1e-5", r"PARM 2 of surface 1 \(STANDARD\) is not known"),
         ("  FRNL 3 4", "FRNL at surface 1 is not known"),
-        ("FRNL 3 4 5 6 7 8 9", "FRNL at surface 1 is not known"),  # not indented, as an operand of the merit function
+        (
+            "FRNL 3 4 5 6 7 8 9",
+            "FRNL at surface 1 is not known",
+        ),  # not indented, as an operand of the merit function
         ("  CLAP 0 0 0", "CLAP at surface 1 has no size"),
         ("  TYPE DGRATING", r"TYPE at surface 1 is DGRATING; write one of STANDARD"),
         ("  GLAS ___BLANK 1 0 0.5 40", "GLAS at surface 1 is a model of n = 0.5"),
@@ -151,14 +158,26 @@ def test_what_a_system_line_says_is_used_or_refused(line, words):
 
 
 def test_the_editors_lists_behind_the_lens_are_passed_over():
-    behind = ["EFLY 2 13 0 0 0 0 4.94E+1 9.9E+1 0 0", "TOL TOFF   0   0   0   0   0 0 0", "MNUM 1 1", 'MOFF   0   1 "" 0 0 0']
+    behind = [
+        "EFLY 2 13 0 0 0 0 4.94E+1 9.9E+1 0 0",
+        "TOL TOFF   0   0   0   0   0 0 0",
+        "MNUM 1 1",
+        'MOFF   0   1 "" 0 0 0',
+    ]
     assert focal_length_mm(read_zemax(zmx(behind=behind))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
     with pytest.raises(InputError, match="MNUM says 3 configurations"):
         read_zemax(zmx(behind=["MNUM 3 1"]))
 
 
 def test_a_model_glass_has_its_numbers():
-    lens = read_zemax(zmx(more={1: ["  GLAS ___BLANK 1 0 1.5168 64.17 0.0"], 2: ["  GLAS ___BLANK 1 0 1.67271 0 0"]}))
+    lens = read_zemax(
+        zmx(
+            more={
+                1: ["  GLAS ___BLANK 1 0 1.5168 64.17 0.0"],
+                2: ["  GLAS ___BLANK 1 0 1.67271 0 0"],
+            }
+        )
+    )
     first, second = (surface.glass for surface in lens.surfaces[:2])
     assert float(first.model_index(0.5875618)) == pytest.approx(1.5168)
     dispersion = float(first.model_index(0.4861327) - first.model_index(0.6562725))
@@ -192,5 +211,8 @@ def test_utf_16_and_bytes_that_are_no_text_are_read_or_refused():
 
 
 def test_a_wide_pupil_on_a_small_sphere_is_refused():
-    with pytest.raises(InputError, match=r"surface 1 \(line \d+\) has a radius of 61.47 mm, and the pupil is 200 mm wide"):
+    with pytest.raises(
+        InputError,
+        match=r"surface 1 \(line \d+\) has a radius of 61.47 mm, and the pupil is 200 mm wide",
+    ):
         read_zemax(zmx("ENPD 200"))

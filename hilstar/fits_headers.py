@@ -55,6 +55,7 @@ MJD_KEYS = {
     "MJD-OBS": START,
     "MJD-END": END,
 }
+NO_DATE = "is no date such as 2024-03-01T20:00:00, and is not used"
 MJD_OF_1970, SECONDS_A_DAY = 40587, 86400
 UTC_NAMES = frozenset({"", "UTC", "UT", "UT1", "GMT", "Z", "ZULU", "UTC(NTP)"})
 # Scales that are a known time from UTC: Astropy's name, and seconds to add first.
@@ -66,7 +67,8 @@ SCALES = {
     "TDB": ("tdb", 0.0),
     "GPS": ("tai", 19.0),
 }
-DATE_TIME = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:\.\d*)?)?) ?(Z|UTC?|[+-]\d\d:?\d\d)?)?")
+CLOCK, ZONE = r"\d\d:\d\d(?::\d\d(?:\.\d*)?)?", r"Z|UTC?|[+-]\d\d:?\d\d"
+DATE_TIME = re.compile(rf"(\d{{4}}-\d\d-\d\d)(?:[T ]({CLOCK}) ?({ZONE})?)?")
 OLD_DATE = re.compile(r"(\d\d)/(\d\d)/(\d\d)")  # of the standard before 2000: days of 19yy
 TIME_OF_DAY = re.compile(r"(\d\d?)[:h ](\d\d?)(?:[:m ](\d\d?(?:\.\d*)?)s?)?")
 LOCAL = re.compile(r"\blocal\b|\bcivil\b", re.IGNORECASE)
@@ -79,7 +81,7 @@ VAGUE_PATTERN_KEYS = (
     "FILTER",
 )  # hold a pattern in some software, another word in other
 PATTERNS = frozenset({"RGGB", "BGGR", "GRBG", "GBRG"})
-NO_PATTERN = frozenset({"", "NONE", "NO", "MONO", "MONOCHROME", "GREY", "GRAY", "FALSE", "F", "0", "N/A"})
+NO_PATTERN = frozenset({"", "NONE", "NO", "N/A", "MONO", "MONOCHROME", "GREY", "GRAY", "FALSE", "F", "0"})
 OFFSET_KEYS = (("XBAYROFF", "BAYOFFX", "XBAYOFF"), ("YBAYROFF", "BAYOFFY", "YBAYOFF"))
 TOP_DOWN, BOTTOM_UP = "TOP-DOWN", "BOTTOM-UP"
 PATTERN_ADVICE = "write RGGB, BGGR, GRBG or GBRG, or give one colour's pixels as a grey image"
@@ -161,7 +163,8 @@ def _exposure_s(header: Any, notes: list[str]) -> float | None:
     for key in _stated(header, keys):
         value_s = _seconds(key, header[key], header.comments[key])
         if value_s is None:
-            notes.append(f"{key} = {shortened(header[key])} is no exposure in seconds, and is not used")
+            stated = f"{key} = {shortened(header[key])}"
+            notes.append(f"{stated} is no exposure in seconds, and is not used")
         else:
             seconds[key] = value_s
     if not seconds:
@@ -230,49 +233,59 @@ def _middle_ns(header: Any, exposure_s: float | None, notes: list[str]) -> int |
 
 def _moments(header: Any, notes: list[str]) -> Iterator[tuple[str, str, int]]:
     """Keywords with a moment: of the start, middle or end, and the UTC, ns since 1970."""
-    scale = str(header.get("TIMESYS", "")).strip().upper()
-    found_none = True
+    count = len(notes)
+    moments = [*_of_dates(header, notes), *_of_days(header, notes)]
+    stated = list(_stated(header, DATE_KEYS))
+    is_explained = len(notes) > count
+    if stated and not moments and not is_explained:
+        date = f"{stated[0]} = {shortened(header[stated[0]])}"
+        notes.append(f"{date} tells no time of day, nor does another keyword: undated")
+    yield from moments
+
+
+def _scale(header: Any) -> str:
+    return str(header.get("TIMESYS", "")).strip().upper()
+
+
+def _of_dates(header: Any, notes: list[str]) -> Iterator[tuple[str, str, int]]:
     for key in _stated(header, DATE_KEYS):
         naive_ns, offset_s = _date_time(key, header, notes)
-        role = _role(DATE_KEYS[key], header.comments[key])
         if naive_ns is None:
             continue
-        is_local = LOCAL.search(header.comments[key]) is not None
-        own_scale = "LOCAL" if is_local else scale
-        utc_at_ns = _utc_ns(naive_ns, offset_s, own_scale)
+        comment = header.comments[key]
+        is_local = LOCAL.search(comment) is not None
+        scale = "LOCAL" if is_local else _scale(header)
+        utc_at_ns = _utc_ns(naive_ns, offset_s, scale)
         if utc_at_ns is None:
-            words = "local time" if is_local else scale
-            notes.append(f"{key} is in {words}, which is no known time from UTC: undated")
-            return
-        found_none = False
-        yield key, role, utc_at_ns
+            clock = "local time" if is_local else scale
+            notes.append(f"{key} is in {clock}, which is no known time from UTC: undated")
+            continue
+        yield key, _role(DATE_KEYS[key], comment), utc_at_ns
+
+
+def _of_days(header: Any, notes: list[str]) -> Iterator[tuple[str, str, int]]:
+    """Modified Julian days; a float64 has one of this age to 1 us."""
     for key in _stated(header, MJD_KEYS):
         try:
             days = float(header[key])
         except (TypeError, ValueError):
             days = math.nan
-        # A float64 has a day of this age to 1 us.
         utc_at_ns = None
         if days > 0:
             naive_ns = round((days - MJD_OF_1970) * SECONDS_A_DAY * 1e6) * 1000
-            utc_at_ns = _utc_ns(naive_ns, None, scale)
+            utc_at_ns = _utc_ns(naive_ns, None, _scale(header))
         if utc_at_ns is None:
             notes.append(f"{key} = {shortened(header[key])} is no date of UTC, and is not used")
             continue
-        found_none = False
         yield key, MJD_KEYS[key], utc_at_ns
-    stated = list(_stated(header, DATE_KEYS))
-    if found_none and stated:
-        key = stated[0]
-        notes.append(f"{key} = {shortened(header[key])} tells no time of day, nor does another keyword: undated")
 
 
 def _role(role: str, comment: str) -> str:
     """Some write the middle or the end, and say so in the comment."""
-    words = comment.lower()
-    if "mid" in words:
+    text = comment.lower()
+    if "mid" in text:
         return MIDDLE
-    if "end of" in words:
+    if "end of" in text:
         return END
     return role
 
@@ -283,7 +296,7 @@ def _date_time(key: str, header: Any, notes: list[str]) -> tuple[int | None, flo
     match = DATE_TIME.fullmatch(text)
     old = OLD_DATE.fullmatch(text)
     if match is None and old is None:
-        notes.append(f"{key} = {shortened(text)} is no date such as 2024-03-01T20:00:00, and is not used")
+        notes.append(f"{key} = {shortened(text)} {NO_DATE}")
         return None, None
     if old is not None:
         date, time, zone = f"19{old[3]}-{old[2]}-{old[1]}", None, None
@@ -296,7 +309,7 @@ def _date_time(key: str, header: Any, notes: list[str]) -> tuple[int | None, flo
         return None, None
     naive_ns = utc_ns(f"{date}T{time}")
     if naive_ns is None:
-        notes.append(f"{key} = {shortened(text)} is no date such as 2024-03-01T20:00:00, and is not used")
+        notes.append(f"{key} = {shortened(text)} {NO_DATE}")
     return naive_ns, _ahead_s(zone)
 
 
@@ -360,7 +373,7 @@ def _row_order(header: Any) -> str:
 
 
 def _bayer(header: Any) -> str:
-    """The mosaic's pattern from its top left pixel, "" for none. Raises InputError for another kind.
+    """The mosaic's pattern from its top left pixel, "" for none. Raises InputError for others.
 
     Of pixel (row, column) the colour is pattern[(row + YBAYROFF) % 2][(column + XBAYROFF) % 2],
     rows from the top (MaxIm DL, INDI; CCDciel and Siril for ROWORDER).
@@ -388,7 +401,8 @@ def _pattern(key: str, value: Any) -> str:
     if text in PATTERNS:
         return text
     if text not in NO_PATTERN:
-        raise InputError(f"{key} is {shortened(value)}: a mosaic of a kind that is not read; {PATTERN_ADVICE}")
+        mosaic = f"{key} is {shortened(value)}: a mosaic of a kind that is not read"
+        raise InputError(f"{mosaic}; {PATTERN_ADVICE}")
     return ""
 
 

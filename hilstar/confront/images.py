@@ -149,18 +149,20 @@ def _planes(found: Photograph, pattern: str) -> Iterator[Photograph]:
 
 def _fits(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tuple[npt.NDArray[Any], _Facts]:
     try:
-        found = read_fits_image(data, resolution_px)
+        fits_image = read_fits_image(data, resolution_px)
     except (InputError, ImageSizeError) as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # whatever a damaged file makes astropy raise
         raise InputError(f"{path}: cannot be read as FITS ({one_line(str(error))}); {ADVICE}") from error
-    if set(found.header) >= MAP_KEYS:
+    if set(fits_image.header) >= MAP_KEYS:
         raise InputError(
             f"{path}: has the direction of each pixel of an all-sky camera ({', '.join(sorted(MAP_KEYS))}), and"
             " is no photograph; leave it out"
         )
     # An exposure of 0 s is that of a bias, or was never filled in.
-    return found.pixels, _Facts(found.t_ns, found.exposure_s or None, found.bayer, found.notes)
+    exposure_s = fits_image.exposure_s or None
+    facts = _Facts(fits_image.t_ns, exposure_s, fits_image.bayer, fits_image.notes)
+    return fits_image.pixels, facts
 
 
 def _picture(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tuple[npt.NDArray[Any], _Facts]:

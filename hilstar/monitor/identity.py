@@ -133,8 +133,8 @@ def _is_placeholder_word(text: str, plain: str) -> bool:
     letters = "".join(character for character in plain if not character.isdigit())
     if not plain or letters in NO_SERIAL_WORDS:
         return True
-    words = re.findall(r"[a-z]+|[0-9]+", text.casefold())
-    return bool(words) and all(word in NO_SERIAL_WORDS for word in words)
+    parts = set(re.findall(r"[a-z]+|[0-9]+", text.casefold()))
+    return bool(parts) and parts <= NO_SERIAL_WORDS
 
 
 def _is_no_serial(number: int) -> bool:

@@ -15,8 +15,6 @@ from scipy.spatial.transform import Rotation
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, shortened
 from hilstar.optics.lens_data import (
-    AIR,
-    MIRROR,
     NEAR_OBJECT,
     Aperture,
     FieldKind,
@@ -32,6 +30,7 @@ from hilstar.optics.lens_data import (
     nth,
 )
 
+AIR, MIRROR = Glass(), Glass("MIRROR")
 MM_PER_UNIT = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
 NM_PER_UM = 1000.0
 LONG_FORMS = {"TITLE": "TIT", "STOP": "STO"}
@@ -54,6 +53,7 @@ SHAPES: dict[str, Shape] = {
     "ELY": "ellipse",
 }
 OTHER_COMMANDS = {"REX": "REY", "REY": "REX", "ELX": "ELY", "ELY": "ELX"}
+Halves = dict[tuple[str, str], float]
 KINDS_OF_EDGE = frozenset({"OBS", "HOL", "EDG", "CLR"})
 # What no star's light shows. Each group has its reason.
 IGNORED = frozenset(
@@ -142,10 +142,10 @@ def _statements(data: bytes) -> Iterator[LensLine]:
             continue
         before = ""
         for part in _parts(whole):
-            words = re.findall(r"'[^']*'|\"[^\"]*\"|\S+", part)
-            if words:
-                keyword = words[0].upper()
-                yield LensLine(start, LONG_FORMS.get(keyword, keyword), words[1:], part)
+            items = re.findall(r"'[^']*'|\"[^\"]*\"|\S+", part)
+            if items:
+                keyword = items[0].upper()
+                yield LensLine(start, LONG_FORMS.get(keyword, keyword), items[1:], part)
 
 
 def _without_comment(line: str) -> str:
@@ -337,7 +337,7 @@ class _Reader:
         smallest_radius = MIN_RADIUS_OF_THICKNESS * abs(self._finite_thickness(surface))
         if not is_stated and abs(curvature) * smallest_radius > 1:
             surface.line.refuse(
-                f"at {surface.label} has {curvature:g}, which without RDM is a curvature: a radius of {1 / curvature:.3g}",
+                f"at {surface.label} has {curvature:g}, which without RDM is a curvature (a radius of {1 / curvature:.3g})",
                 "write RDM Y where these numbers are radii, RDM N where they are curvatures",
             )
 
@@ -396,15 +396,15 @@ class _Reader:
             yield surface.number_of(term) * self.mm ** (1 - power)
 
     def _glass(self, surface: _Surface) -> Glass:
-        words = surface.line.words[2:]
-        if len(words) > 1:
-            more = shortened(" ".join(words[1:]))
+        items = surface.line.words[2:]
+        if len(items) > 1:
+            more = shortened(" ".join(items[1:]))
             surface.line.refuse(f"at {surface.label} has {more} behind its glass", ADVICE)
-        if not words or words[0].upper() == "AIR":
+        if not items or items[0].upper() == "AIR":
             return AIR
-        if words[0].upper() in {"REFL", "REFR"}:
-            return MIRROR if words[0].upper() == "REFL" else AIR
-        name = words[0].strip("'\"")
+        if items[0].upper() in {"REFL", "REFR"}:
+            return MIRROR if items[0].upper() == "REFL" else AIR
+        name = items[0].strip("'\"")
         if name.upper() in self.private:
             line = self.private[name.upper()]
             surface.line.refuse(
@@ -440,7 +440,7 @@ class _Reader:
         centre = surface.number_of("ADX") * self.mm, surface.number_of("ADY") * self.mm
         if surface.number_of("ARO"):
             surface.values["ARO"].refuse(f"at {surface.label} turns the aperture", ADVICE)
-        halves: dict[tuple[str, str], float] = {}
+        halves: Halves = {}
         for line in surface.apertures:
             kind, half_mm = self._edge(surface, line)
             halves[line.keyword, kind] = half_mm
@@ -452,7 +452,7 @@ class _Reader:
                 half = half_mm, other_mm
                 yield Aperture(SHAPES[keyword], half, kind == "CLR", centre_mm=centre)
 
-    def _other_half(self, surface: _Surface, keyword: str, kind: str, halves: dict[tuple[str, str], float]) -> float:
+    def _other_half(self, surface: _Surface, keyword: str, kind: str, halves: Halves) -> float:
         """The half-width across: a circle's own; the other command's, where there are two."""
         other = OTHER_COMMANDS.get(keyword, keyword)
         if (other, kind) not in halves:

@@ -131,10 +131,6 @@ def _conrady(um: float | FloatArray) -> tuple[float, FloatArray, FloatArray]:
     return 1.0, 1 / wavelength, wavelength**-CONRADY_POWER
 
 
-AIR = Glass()
-MIRROR = Glass("MIRROR")
-
-
 def glass_of_code(code: str) -> Glass | None:
     """A glass of a code such as 517642 or 516800.641700: n_d - 1 and V_d; None for another name."""
     index, _, abbe = code.partition(".")
@@ -264,7 +260,7 @@ class LensPrescription:
             count = len(self.wavelengths_um)
             raise InputError(f"its primary wavelength is number {self.primary + 1} of {count}")
         if self.pupil <= 0:
-            raise InputError("it has no aperture above 0; write the pupil's diameter or the F-number")
+            raise InputError("it has no aperture above 0; write the pupil's diameter, or F-number")
         if sum(surface.is_stop for surface in self.surfaces) > 1:
             raise InputError("it has two stops; write one")
         self._check_pupil_fits()
@@ -275,10 +271,10 @@ class LensPrescription:
         if self.pupil_kind != "diameter" or first.conic <= -1:
             return
         if self.pupil / 2 * abs(first.curvature_per_mm) * math.sqrt(1 + first.conic) >= 1:
-            radius_mm = 1 / first.curvature_per_mm
+            radius = f"a radius of {1 / first.curvature_per_mm:.4g} mm"
             raise InputError(
-                f"{first.label} has a radius of {radius_mm:.4g} mm, and the pupil is {self.pupil:.4g} mm"
-                " wide: no ray at its edge meets it; are radii and curvatures, or units, mixed up?"
+                f"{first.label} has {radius}, and the pupil is {self.pupil:.4g} mm wide: no ray at its"
+                " edge meets it; are radii and curvatures, or units, mixed up?"
             )
 
 

@@ -156,8 +156,9 @@ def _material(surface: LensSurface, wavelengths_um: Sequence[float]) -> tuple[An
     for um in wavelengths_um:
         if not file.shortest_um <= um <= file.longest_um:
             raise InputError(
-                f"{surface.label}: {glass.name} is known from {file.shortest_um:g} to {file.longest_um:g} um, and the lens is"
-                f" for {um:g} um; write a wavelength within, or another glass"
+                f"{surface.label}: {glass.name} is known from {file.shortest_um:g} to"
+                f" {file.longest_um:g} um, and the lens is for {um:g} um; write a wavelength within,"
+                " or another glass"
             )
     from optiland.materials.material_file import MaterialFile
 
@@ -199,14 +200,16 @@ def find_glass(glass: Glass, label: str) -> tuple[GlassFile, list[str]]:
     glasses = sorted((file for file in by_name if file.is_glass), key=_place_in_order)
     if name in SAME_GLASSES and not glasses:
         same = next(file for file in _database() if file.name == SAME_GLASSES[name])
-        return same, [f"{label}: {glass.name} is taken as N-{glass.name}, whose n_d and V_d are the same"]
+        taken = f"{glass.name} is taken as N-{glass.name}, whose n_d and V_d are the same"
+        return same, [f"{label}: {taken}"]
     if not glasses:
-        raise InputError(f"{label}: the glass {glass.name} is in no catalogue{_where(glass)}; {_instead(glass.name, name)}")
+        unknown = f"the glass {glass.name} is in no catalogue{_where(glass)}"
+        raise InputError(f"{label}: {unknown}; {_instead(glass.name, name)}")
     if listed:
         makers = ", ".join(file.catalogue for file in glasses)
         raise InputError(
-            f"{label}: the glass {glass.name} is not of {', '.join(glass.catalogues)}, but of {makers};"
-            " name that catalogue beside it, or write the glass's n and V"
+            f"{label}: the glass {glass.name} is not of {', '.join(glass.catalogues)}, but of"
+            f" {makers}; name that catalogue beside it, or write the glass's n and V"
         )
     return glasses[0], [f"{label}: {glass.name} is taken as {glasses[0].catalogue}'s"]
 
@@ -217,11 +220,13 @@ def _where(glass: Glass) -> str:
 
 def _instead(written: str, plain: str) -> str:
     """What to write: makers have new glasses of old names (N-SF11 for SF11), which are others."""
-    successors = sorted({file.filename for file in _database() if file.is_glass and file.name == f"n{plain}"})
-    if successors:
-        return f"N-{written} ({successors[0].split('/')[1]}) is another glass: write it, or the glass's own n and V"
-    names = {file.name.upper() for file in _database() if file.is_glass}
-    return f"{did_you_mean(written, names)}write a glass of a maker's catalogue, or its n and V (a model glass)"
+    glasses = [file for file in _database() if file.is_glass]
+    for file in glasses:
+        if file.name == f"n{plain}":
+            newer = f"N-{written} ({file.catalogue})"
+            return f"{newer} is another glass: write it, or the glass's own n and V"
+    likely = did_you_mean(written, {file.name.upper() for file in glasses})
+    return f"{likely}write a glass of a maker's catalogue, or its n and V (a model glass)"
 
 
 def _place_in_order(file: GlassFile) -> int:

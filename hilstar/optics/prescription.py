@@ -57,7 +57,7 @@ class Plate:
 
 @dataclass(frozen=True, slots=True)
 class Traced:
-    """The glass of a prescription, its focal length and F-number, and what is to be said of how it was read."""
+    """The glass of a prescription, its focal length and F-number, and what was taken for granted."""
 
     glass: Glass
     focal_length_mm: float
@@ -104,18 +104,18 @@ def _read(path: Path) -> "_Lens":
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     try:
-        with _quiet() as said:
+        with _quiet() as warned:
             import optiland  # noqa: F401
     except ImportError as error:
         raise MachineError(f"hilstar optics lens needs optiland: {CAN_INSTALL}") from error
     try:
-        with _quiet() as said:
+        with _quiet() as warned:
             lens = _optiland_s_own(path) if prescription is None else _of_prescription(prescription)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # optiland raises whatever a broken file causes in its layers
         raise InputError(f"{path}: optiland cannot read it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}") from error
-    return replace(lens, notes=(*lens.notes, *said))
+    return replace(lens, notes=(*lens.notes, *warned))
 
 
 def _stated(path: Path, data: bytes) -> LensPrescription | None:
@@ -151,13 +151,13 @@ def _fields_of(optic: Any) -> tuple[FieldPoint, ...]:
 @contextlib.contextmanager
 def _quiet() -> Iterator[list[str]]:
     """Keeps what optiland prints from stdout; its own warnings are put into the list, those of numba's compiler are not."""
-    said: list[str] = []
+    warned: list[str] = []
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        yield said
+        yield warned
     for warning in caught:
         if issubclass(warning.category, UserWarning) and "numba" not in str(warning.filename):
-            said.append(f"optiland: {one_line(str(warning.message))}")
+            warned.append(f"optiland: {one_line(str(warning.message))}")
 
 
 def traced(optic: Any, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
@@ -167,9 +167,9 @@ def traced(optic: Any, plate: Plate, per_px: int | None, tolerance: float, made_
 
 def _traced(lens: _Lens, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
     try:
-        with _quiet() as said:
+        with _quiet() as warned:
             made = _glass(_LensRays(lens.optic, lens.fields), plate, per_px, tolerance, made_by)
-        return replace(made, notes=(*lens.notes, *said))
+        return replace(made, notes=(*lens.notes, *warned))
     except InputError:
         raise
     except Exception as error:  # as in `_read`

@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.errors import InputError, shortened
 from hilstar.optics.lens_data import (
-    AIR,
-    MIRROR,
     NEAR_OBJECT,
     Aperture,
     FieldKind,
@@ -27,12 +25,14 @@ from hilstar.optics.lens_data import (
     nth,
 )
 
+AIR, MIRROR = Glass(), Glass("MIRROR")
 MM_PER_UNIT = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "METER": 1000.0, "M": 1000.0}
 FIELD_KINDS: dict[int, FieldKind] = {0: "angle", 2: "paraxial_image_height", 3: "real_image_height"}
 UNNAMED_GLASS = "___BLANK"
 FIELD_LISTS = ("XFL", "YFL", "VCX", "VCY", "VDX", "VDY")  # with N behind, and D in older files
 MODEL_GLASS, OFFSET_GLASS = 1, 4  # kinds of GLAS's solve; the others write the glass's own name
-# Kinds of surfaces and how many parameters each has: coefficients of r^2n and of r^n; a focal length and how its path counts.
+# Kinds of surfaces, and how many parameters each has: coefficients of r^2n and of r^n; a focal
+# length and how its path counts.
 SURFACE_KINDS = {"STANDARD": 0, "EVENASPH": 8, "ODDASPHE": 8, "PARAXIAL": 2}
 BREAK_STEPS = 6
 STANDARD_C, STANDARD_ATM = 20.0, 1.0  # at which catalogues give their indices
@@ -175,9 +175,9 @@ def _lines(data: bytes) -> Iterator[LensLine]:
     else:
         text = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     for number, line in enumerate(text.splitlines(), 1):
-        words = line.split()
-        if words:
-            yield LensLine(number, words[0].upper(), words[1:], line)
+        items = line.split()
+        if items:
+            yield LensLine(number, items[0].upper(), items[1:], line)
 
 
 class _Reader:
@@ -247,7 +247,8 @@ class _Reader:
         # A tilt and a decentre of 0 change nothing.
         if line.keyword == "SCBD" and not any(_numbers_of(line.words[1:])):
             return
-        line.refuse(f"at surface {self.surfaces[-1].number} {REFUSED_SURFACE[line.keyword]}", ADVICE)
+        why = REFUSED_SURFACE[line.keyword]
+        line.refuse(f"at surface {self.surfaces[-1].number} {why}", ADVICE)
 
     def _take_operand(self, line: LensLine) -> None:
         if line.keyword in IGNORED_SYSTEM:
@@ -287,7 +288,7 @@ class _Reader:
                 )
         angle = self.head.get("VANN") or self.head.get("VAND")
         if angle is not None and not angle.is_zero():
-            angle.refuse("turns the vignetted pupil", "write the surfaces' apertures (CLAP) instead")
+            angle.refuse("turns the vignetted pupil", "write surfaces' apertures (CLAP)")
         beam = self.head.get("GFAC")
         if beam is not None and len(beam.words) > 1 and beam.value(0) and beam.value(1):
             self.notes.append(f"line {beam.number}: {BEAM_NOTE}")
@@ -433,7 +434,8 @@ class _Reader:
                 f"write one of {known} or COORDBRK",
             )
         if any(_numbers_of(word for line in surface.extra for word in line.words[1:2])):
-            surface.extra[0].refuse(f"at surface {surface.number} gives further coefficients", ADVICE)
+            more = f"at surface {surface.number} gives further coefficients"
+            surface.extra[0].refuse(more, ADVICE)
         return LensSurface(
             label=surface.label,
             curvature_per_mm=surface.number_of("CURV") / self.mm,
@@ -490,7 +492,7 @@ class _Reader:
                 yield Aperture("spider", (first / 2, 0.0), False, centre_mm=centre, arms=arms)
                 continue
             if second <= 0 or first < 0:
-                line.refuse(f"at surface {surface.number} has no size", "write the half-widths or radii")
+                line.refuse(f"at surface {surface.number} has no size", "write its half-width")
             if line.keyword in {"CLAP", "FLAP", "OBSC"}:
                 # A floating aperture is the surface's own edge, so it is not moved.
                 place = (0.0, 0.0) if line.keyword == "FLAP" else centre
@@ -510,7 +512,7 @@ def _numbers_of(words: Iterable[str]) -> Iterator[float]:
 
 
 def _terms(surface: _Surface, mm: float) -> Iterator[float]:
-    """Coefficients of r, r^2, ... in mm. A parameter that is not 0, and not of the kind, is refused."""
+    """Coefficients of r, r^2, ... in mm. A parameter that is not of the kind, and not 0, is refused."""
     count = SURFACE_KINDS[surface.kind]
     _refuse_parameters(surface, count)
     for number in range(1, count + 1):
@@ -526,4 +528,5 @@ def _refuse_parameters(surface: _Surface, count: int) -> None:
     for number, line in surface.parameters.items():
         is_own = 1 <= number <= count
         if not is_own and line.value(1):
-            line.refuse(f"{number} of surface {surface.number} ({surface.kind}) is not known", ADVICE)
+            where = f"surface {surface.number} ({surface.kind})"
+            line.refuse(f"{number} of {where} is not known", ADVICE)

@@ -173,8 +173,8 @@ def read_frame_fits(path: Path) -> FloatArray:
     wanted = "give the FITS that `hilstar frame -o OUT.fits` writes"
     data = read_bytes(path, wanted, MAX_FITS_BYTES)
     try:
-        found = read_fits_image(unpacked(data, MAX_FITS_BYTES))
-        image, header = found.pixels, found.header
+        fits_image = read_fits_image(unpacked(data, MAX_FITS_BYTES))
+        image, header = fits_image.pixels, fits_image.header
     except (InputError, ImageSizeError) as error:
         raise InputError(f"{path}: {error}; {wanted}") from error
     except Exception as error:  # astropy raises whatever a broken header causes in its layers

@@ -165,6 +165,16 @@ def test_an_image_without_a_time_is_undated_and_said(cards, words):
     assert any(words in note for note in found.notes), found.notes
 
 
+def test_an_undated_image_is_said_beside_what_else_is():
+    found = read({"DATE-OBS": "2024-03-01", "EXPTIME": "long"})
+    assert len(found.notes) == 2 and "tells no time of day" in found.notes[1]
+
+
+def test_local_time_gives_way_to_days_of_utc():
+    found = read({"DATE-OBS": (EIGHT_PM, "local time"), "MJD-OBS": 60370.5, "EXPTIME": 10.0})
+    assert found.t_ns == pytest.approx(utc_ns("2024-03-01T12:00:05"), abs=UTC_TOLERANCE_NS)
+
+
 def test_what_contradicts_or_is_assumed_is_said():
     apart = read({"DATE-OBS": EIGHT_PM, "MJD-OBS": 60370.5, "EXPTIME": 1.0})
     assert apart.t_ns == utc_ns("2024-03-01T20:00:00.5")

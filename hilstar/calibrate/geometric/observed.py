@@ -146,8 +146,8 @@ def read_exposed(
     exposure_s = None
     # A grabbing script may write FITS under any name.
     if path.suffix.lower() in FITS_ENDINGS or is_fits(data):
-        found = _fits(path, data, advice, resolution_px)
-        image, exposure_s = found.pixels, found.exposure_s
+        fits_image = _fits(path, data, advice, resolution_px)
+        image, exposure_s = fits_image.pixels, fits_image.exposure_s
     else:
         image = _picture(path, data, advice, resolution_px)
     if image.ndim != 2:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -284,6 +285,28 @@ def test_what_a_file_leaves_open_is_said(tmp_path):
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
     result = traced_here(tmp_path, "lens.seq", seq().replace(b"DIM M\n", b""))
     assert result.returncode == 0 and "no DIM: its lengths are taken as mm" in result.stderr
+
+
+def test_optiland_s_warnings_are_notes():
+    with prescription._quiet() as warned:
+        warnings.warn("resolved to 'N-SF11'", UserWarning, stacklevel=1)
+        warnings.warn("an old name", DeprecationWarning, stacklevel=1)
+    assert warned == ["optiland: resolved to 'N-SF11'"]
+
+
+def test_optiland_s_own_file_with_one_field_is_traced(tmp_path):
+    pytest.importorskip("optiland", reason=WHY_SKIPPED)
+    from optiland.fileio import save_optiland_file
+    from optiland.samples.objectives import CookeTriplet
+
+    lens = CookeTriplet()
+    for field in lens.fields.fields:
+        field.x = field.y = 0.0
+    save_optiland_file(lens, str(tmp_path / "axis.json"))
+    result = traced_here(tmp_path, "axis.json", (tmp_path / "axis.json").read_bytes(), "--json")
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert found["points"] == 1 and found["focal_length_mm"] == pytest.approx(50.0, abs=0.01)
 
 
 def test_a_file_is_refused_before_optiland_is_needed(tmp_path, monkeypatch):

@@ -34,6 +34,8 @@ MATERIALS = {
 # Old glasses that the database lacks, and whose n_d and V_d the new one has to the last digit of
 # Schott's data sheets.
 SAME_GLASSES = {"bk7": "nbk7"}
+# Of a conic's series: at 0.8 of the radius where it stands upright, the next is 1e-8 of the first.
+SERIES_TERMS = 40
 GLASS_GROUP = "glass"
 FURTHER_FOLDER = "misc"  # of a maker's glasses beside its catalogue, such as Schott's B270
 FIELD_NAMES = {
@@ -84,7 +86,8 @@ def optic_of(lens: LensPrescription) -> tuple[Any, tuple[str, ...]]:
 def _geometry(surface: LensSurface) -> dict[str, Any]:
     x_mm, y_mm, z_mm = surface.origin_mm.tolist()
     rx, ry, rz = _euler_rad(surface.turn)
-    curvature = surface.curvature_per_mm
+    # optiland's paraxial rays see the base sphere alone: a term in r^2 is made part of it.
+    curvature = surface.paraxial_curvature_per_mm
     radius_mm = 1 / curvature if curvature else np.inf
     made: dict[str, Any] = {
         "x": x_mm,
@@ -105,12 +108,37 @@ def _geometry(surface: LensSurface) -> dict[str, Any]:
 
 
 def _shape(surface: LensSurface) -> dict[str, Any]:
-    terms = np.array(surface.polynomial)
+    terms = _terms_beside_base(surface)
     if not terms.any():
         return {"surface_type": "standard"}
     if terms[::2].any():
         return {"surface_type": "odd_asphere", "coefficients": terms.tolist()}
     return {"surface_type": "even_asphere", "coefficients": terms[1::2].tolist()}
+
+
+def _terms_beside_base(surface: LensSurface) -> FloatArray:
+    """Coefficients of r, r^2, ... beside a base with the surface's curvature at its vertex, mm."""
+    terms = np.array(surface.polynomial)
+    if len(terms) < 2 or not terms[1]:
+        return terms
+    stated = _conic_series(surface.curvature_per_mm, surface.conic)
+    base = _conic_series(surface.paraxial_curvature_per_mm, surface.conic)
+    whole = np.zeros(2 * SERIES_TERMS)
+    whole[: len(terms)] = terms
+    whole[1::2] += stated - base
+    whole[1] = 0.0
+    return whole
+
+
+def _conic_series(curvature_per_mm: float, conic: float) -> FloatArray:
+    """Coefficients of r^2, r^4, ... of a conic's height: the binomial series of its root."""
+    binomial = 1.0
+    coefficients = []
+    for number in range(1, SERIES_TERMS + 1):
+        binomial *= (1.5 - number) / number
+        scale = (1 + conic) ** (number - 1) * curvature_per_mm ** (2 * number - 1)
+        coefficients.append(-binomial * (-1.0) ** number * scale)
+    return np.array(coefficients)
 
 
 def _euler_rad(turn: FloatArray) -> list[float]:

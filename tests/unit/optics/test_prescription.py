@@ -19,7 +19,7 @@ from hilstar.optics.psf_file import Glass, read_glass
 from hilstar.optics.zemax_file import read_zemax
 from hilstar.resources import resource_path
 from tests.support.commands import assert_refused, run_hilstar_here
-from tests.support.lenses import SCHOTT, lit_share, seq, zmx
+from tests.support.lenses import SCHOTT, focal_length_mm, lit_share, rms_radius_um, seq, zmx
 
 SIZE, PITCH_UM = "101,81", 20.0
 # Measured: 0.002 px and 0.7 %; diffraction's wings beyond the stamp are what is left.
@@ -285,6 +285,23 @@ def test_what_a_file_leaves_open_is_said(tmp_path):
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
     result = traced_here(tmp_path, "lens.seq", seq().replace(b"DIM M\n", b""))
     assert result.returncode == 0 and "no DIM: its lengths are taken as mm" in result.stderr
+
+
+@pytest.mark.parametrize(("curvature", "second"), [(0.0, 0.5 / 51.68), (1 / 51.68, 1e-3), (1 / 40.0, -2e-3)])
+def test_a_term_in_r_squared_bends_paraxial_rays(tmp_path, curvature, second):
+    """PARM 1: focal length and spot are those of the own trace of the surface as it is stated."""
+    pytest.importorskip("optiland", reason=WHY_SKIPPED)
+    surfaces = [(51.68, 4.0, "N-BK7"), (1e12, 97.363, "")]
+    data = zmx(surfaces=surfaces, more={1: [f"  CURV {curvature!r}", "  CONI -0.4", f"  PARM 1 {second!r}"]})
+    (tmp_path / "lens.zmx").write_bytes(data.replace(b"TYPE STANDARD", b"TYPE EVENASPH"))
+    stated = read_zemax((tmp_path / "lens.zmx").read_bytes())
+    lens = prescription._read(tmp_path / "lens.zmx")
+    rays = prescription._LensRays(lens.optic, lens.fields)
+    assert rays.focal_length_mm == pytest.approx(focal_length_mm(stated), rel=1e-9)
+    bundle = rays.bundle(np.zeros(2), 0.5875618, 200)
+    lit = bundle.light > 0
+    rms_um = float(np.sqrt((bundle.x[lit] ** 2 + bundle.y[lit] ** 2).mean())) * 1e3
+    assert rms_um == pytest.approx(rms_radius_um(stated), rel=0.02)
 
 
 def test_optiland_s_warnings_are_notes():

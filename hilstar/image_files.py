@@ -4,15 +4,19 @@ A picture of 170 kB may unpack to gigabytes, and Pillow knows formats that other
 whatever its name ends with). So a picture is opened in FORMATS alone, and its size is compared first.
 """
 
+import gzip
 import io
 import math
 import warnings
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+
+from hilstar.reading import size_text
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -21,7 +25,7 @@ if TYPE_CHECKING:
 FORMATS = ("PNG", "TIFF", "JPEG", "WEBP", "BMP", "PPM")  # several pictures in one JPEG (MPO) are opened as JPEG
 MAX_PIXELS = 1 << 26  # where no size is known: 8192 x 8192, half a GB as float64
 MAX_UNPACKED_BYTES = 8 * MAX_PIXELS
-FITS_MAGIC = b"SIMPLE"
+FITS_MAGIC, GZIP_MAGIC = b"SIMPLE", b"\x1f\x8b"
 NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -52,14 +56,40 @@ def opened_picture(
             yield picture
 
 
+def unpacked(data: bytes, limit_bytes: int = MAX_UNPACKED_BYTES) -> bytes:
+    """A file's bytes, without gzip around them. Raises ImageSizeError for more than `limit_bytes`, or a damaged file."""
+    if not data.startswith(GZIP_MAGIC):
+        return data
+    try:
+        with gzip.open(io.BytesIO(data)) as file:
+            plain = file.read(limit_bytes + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise ImageSizeError("is a damaged gzip file") from error
+    if len(plain) > limit_bytes:
+        raise ImageSizeError(f"unpacks to more than {size_text(limit_bytes)}")
+    return plain
+
+
+def is_fits(data: bytes) -> bool:
+    """Whether a file's bytes are FITS, packed by gzip or not."""
+    if not data.startswith(GZIP_MAGIC):
+        return data.startswith(FITS_MAGIC)
+    try:
+        with gzip.open(io.BytesIO(data)) as file:
+            return file.read(len(FITS_MAGIC)) == FITS_MAGIC
+    except (OSError, EOFError, zlib.error):
+        return False
+
+
 @contextmanager
 def opened_fits(data: bytes, size_px: tuple[int, int] | None = None) -> Iterator["fits.HDUList"]:
     """A FITS file, whose images are not decoded yet; the first has this (width, height) if any is wanted.
 
-    Raises ImageSizeError, also for a compressed file, which astropy would unpack, and whatever astropy does.
+    It may be packed by gzip. Raises ImageSizeError, also for a file of another compression, and whatever astropy does.
     """
     from astropy.io import fits
 
+    data = unpacked(data)
     if not data.startswith(FITS_MAGIC):
         raise ImageSizeError("is not a FITS image: it does not begin as FITS does; unpack it first, if it is a compressed one")
     with warnings.catch_warnings():

@@ -17,7 +17,7 @@ import numpy as np
 
 from hilstar import charts
 from hilstar.arrays import FloatArray
-from hilstar.calibrate.geometric.observed import read_image
+from hilstar.calibrate.geometric.observed import read_exposed, read_image
 from hilstar.csv_tables import finite_numbers, read_rows
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
@@ -28,7 +28,8 @@ MAX_EMVA_BYTES = 1_000_000
 FRAME_ADVICE = "give raw frames as FITS or PNG, 8 to 16 bits of grey"
 EMVA_ADVICE = "write rows quantity,value,unit, such as K,0.25,DN/e- and eta@530nm,62,%"
 ICE_K = 273.15
-MAX_EXPOSURE_S = 1e6
+EXPOSURE_KEY = "EXPTIME"
+DARK_SPREAD = 0.5  # of the temporal noise: means of one level drift by less, and 128 x 128 px tell them to 0.01
 ROUNDING_DN2 = 1 / 12
 LINEAR_SHARE = 0.7  # share of saturation: the standard's range for the slope of variance over signal
 
@@ -179,8 +180,7 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
         raise InputError(f"{what}: {len(paths)} frames; give two of each exposure, one after the other")
     rows, largest_dn, shape = [], 0.0, read_image(paths[0], advice=FRAME_ADVICE).shape
     for first, second in zip(paths[::2], paths[1::2], strict=True):
-        a, b = (read_image(path, advice=FRAME_ADVICE) for path in (first, second))
-        seconds, again = _exposure_s(first), _exposure_s(second)
+        (a, seconds), (b, again) = _exposed(first), _exposed(second)
         if not (a.shape == b.shape == shape and (seconds == again or (math.isnan(seconds) and math.isnan(again)))):
             raise InputError(f"{second}: its size or EXPTIME is not that of {first}; give two frames of each exposure")
         pattern = float(np.mean((a - a.mean()) * (b - b.mean())))
@@ -189,18 +189,26 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
         rows.append(((a.mean() + b.mean()) / 2, float((a - b).var()) / 2, pattern, seconds))
         largest_dn = max(largest_dn, float(a.max()), float(b.max()))
     mean, temporal, spatial, exposure_s = np.array(sorted(rows)).T
+    if 0 < np.isnan(exposure_s).sum() < len(exposure_s):
+        raise InputError(f"{what}: some frames say no exposure and some do; write {EXPOSURE_KEY} into all of them")
     return Levels(mean, temporal, spatial, exposure_s, largest_dn, shape)
 
 
-def _exposure_s(path: Path) -> float:
-    """EXPTIME of a FITS file; NaN where there is none."""
-    from astropy.io import fits
+def _exposed(path: Path) -> tuple[FloatArray, float]:
+    """A frame, and its exposure, s; NaN where it says none."""
+    image, exposure_s = read_exposed(path, advice=FRAME_ADVICE)
+    return image, math.nan if exposure_s is None else exposure_s
 
-    try:
-        exposure_s = float(fits.getheader(path)["EXPTIME"])
-    except (OSError, KeyError, TypeError, ValueError):
-        return math.nan
-    return exposure_s if 0 <= exposure_s <= MAX_EXPOSURE_S else math.nan
+
+def _refuse_unlike_darks(dark: Levels) -> None:
+    """Without exposures darks count as repeats of one level: those of several exposures are not."""
+    noise_dn = math.sqrt(float(dark.temporal_dn2.mean()))
+    spread_dn = float(np.ptp(dark.mean_dn))
+    if np.isnan(dark.exposure_s).any() and spread_dn > DARK_SPREAD * noise_dn:
+        raise InputError(
+            f"--darks: their means differ by {spread_dn:.3g} DN, and no header says their exposures; write them,"
+            f" in seconds, as {EXPOSURE_KEY}, or give darks of one exposure"
+        )
 
 
 def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
@@ -211,6 +219,7 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
     light, dark = read_levels(flats, "FLATS"), read_levels(darks, "--darks")
     if light.shape != dark.shape:
         raise InputError("--darks: not of the flats' size; give frames of one sensor")
+    _refuse_unlike_darks(dark)
     pixels, flat_s = math.prod(dark.shape), np.nan_to_num(light.exposure_s)
     noise_dn = np.sqrt(dark.temporal_dn2 / 2 + np.maximum(dark.spatial_dn2, 0.0))
     mean, mean_error = dark.line("mean_dn", 1, noise_dn)

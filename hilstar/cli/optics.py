@@ -1,13 +1,13 @@
 """hilstar optics: the file of a tracker's glass, from a prescription, a map of images, or a pupil's aberrations."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
 
 from hilstar.cli.options import Json, check_files, parse_numbers
-from hilstar.console.terminal import print_found
+from hilstar.console.terminal import print_found, say
 from hilstar.errors import InputError
 from hilstar.files import FITS, check_ending
 
@@ -102,14 +102,17 @@ def lens(
         raise InputError("a lens's PSFs need the tracker's pixels; add --bench BENCH.toml, or --pitch-um and --resolution W,H")
     focuses = parse_numbers(focuses_um, focuses_um.count(",") + 1, "--focuses-um", "--focuses-um in um, such as -20,0,20")
     found = glass_of_prescription(prescription, Plate(size, pitch_um, tuple(focuses), half_px), oversampling, tolerance)
-    _tell(output, found.glass, as_json, {"focal_length_mm": found.focal_length_mm, "f_number": found.f_number})
+    for note in found.notes:
+        say(f"{prescription}: {note}")
+    facts: dict[str, Any] = {"focal_length_mm": found.focal_length_mm, "f_number": found.f_number}
+    _tell(output, found.glass, as_json, {**facts, "notes": list(found.notes)})
     if not as_json:
         typer.echo(
             f"in the bench file, under [tracker]: focal_length_mm = {found.focal_length_mm:.6g}  # F/{found.f_number:.3g}"
         )
 
 
-def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, float] | None = None) -> None:
+def _tell(output: Path, glass: "Glass", as_json: bool, more: dict[str, Any] | None = None) -> None:
     import numpy as np
 
     from hilstar.optics.psf_file import write_glass

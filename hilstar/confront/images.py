@@ -13,20 +13,15 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, one_line, shortened
-from hilstar.image_files import ImageSizeError, opened_fits, opened_picture
+from hilstar.fits_headers import read_fits_image, utc_ns
+from hilstar.image_files import ImageSizeError, is_fits, opened_picture
 from hilstar.reading import read_bytes
 from hilstar.units import NS_PER_S
 
 ADVICE = "give a raw frame as FITS, TIFF or PNG, 8 to 16 bits of grey"
-FITS_MAGIC = b"SIMPLE  ="
 MAX_BYTES = 500_000_000
-BAYER = re.compile(r"^(RGGB|BGGR|GRBG|GBRG)$")
-BAYER_KEYS = ("BAYERPAT", "COLORTYP", "FILTER")
 MAP_KEYS = {"CENTAZ", "CENTEL"}  # in DASC's maps of azimuth and elevation
-DATE_KEYS = ("DATE-OBS", "DATE-BEG", "OBSDATE")
-EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE", "XPOSURE")
 EXIF_IFD, EXIF_DATE, EXIF_OFFSET, EXIF_EXPOSURE = 0x8769, 0x9003, 0x9011, 0x829A
-UTC = re.compile(r"^\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\.\d+)?)?)?Z?$")
 NAMED_TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:_]?(\d\d)[-:_]?(\d\d)")
 MIN_SIDE_PX = 64
 BRIGHT_SHARE, GREY_SPREAD = 1e-3, 0.05  # an RGB picture's brightest pixels, and how far channels of a grey one may differ there
@@ -73,8 +68,8 @@ def paged(array: FloatArray) -> FloatArray:
 def read_photographs(path: Path, resolution_px: tuple[int, int] | None, at_ns: int | None = None) -> list[Photograph]:
     """The image of a file, or the planes of a mosaic, of this (width, height). Raises InputError: what and what to do."""
     data = read_bytes(path, ADVICE, MAX_BYTES)
-    is_fits = data.startswith(FITS_MAGIC)
-    pixels, facts = _fits(path, data, resolution_px) if is_fits else _picture(path, data, resolution_px)
+    read = _fits if is_fits(data) else _picture
+    pixels, facts = read(path, data, resolution_px)
     dn = _grey(path, pixels, facts)
     size = dn.shape[1], dn.shape[0]
     if min(size) < MIN_SIDE_PX:
@@ -153,40 +148,21 @@ def _planes(found: Photograph, pattern: str) -> Iterator[Photograph]:
 
 
 def _fits(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tuple[npt.NDArray[Any], _Facts]:
-    from astropy.io import fits
-
-    kinds = fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU
     try:
-        with opened_fits(data, resolution_px) as hdus:
-            images = [hdu for hdu in hdus if isinstance(hdu, kinds) and hdu.data is not None]
-            if not images:
-                raise InputError(f"{path}: has no image; {ADVICE}")
-            pixels, header = np.asarray(images[0].data), images[0].header
-            if set(header) >= MAP_KEYS:
-                raise InputError(
-                    f"{path}: has the direction of each pixel of an all-sky camera ({', '.join(sorted(MAP_KEYS))}), and"
-                    " is no photograph; leave it out"
-                )
-            facts = _fits_facts(header)
-    except InputError:
-        raise
-    except ImageSizeError as error:
+        fits_image = read_fits_image(data, resolution_px)
+    except (InputError, ImageSizeError) as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # whatever a damaged file makes astropy raise
         raise InputError(f"{path}: cannot be read as FITS ({one_line(str(error))}); {ADVICE}") from error
-    return pixels, facts
-
-
-def _fits_facts(header: Any) -> _Facts:
-    exposure = next((header[key] for key in EXPOSURE_KEYS if isinstance(header.get(key), int | float)), None)
-    exposure_s = float(exposure) if exposure is not None and 0 < exposure < 1e6 else None
-    date = next((str(header[key]).strip() for key in DATE_KEYS if header.get(key)), "")
-    if len(date) == 10 and header.get("OBSSTART"):
-        date += f"T{str(header['OBSSTART']).strip()}"
-    begin_ns = utc_ns(date)
-    t_ns = None if begin_ns is None else begin_ns + round((exposure_s or 0.0) / 2 * NS_PER_S)
-    bayer = next((str(header[key]).strip() for key in BAYER_KEYS if BAYER.match(str(header.get(key, "")).strip())), "")
-    return _Facts(t_ns, exposure_s, bayer)
+    if set(fits_image.header) >= MAP_KEYS:
+        raise InputError(
+            f"{path}: has the direction of each pixel of an all-sky camera ({', '.join(sorted(MAP_KEYS))}), and"
+            " is no photograph; leave it out"
+        )
+    # An exposure of 0 s is that of a bias, or was never filled in.
+    exposure_s = fits_image.exposure_s or None
+    facts = _Facts(fits_image.t_ns, exposure_s, fits_image.bayer, fits_image.notes)
+    return fits_image.pixels, facts
 
 
 def _picture(path: Path, data: bytes, resolution_px: tuple[int, int] | None) -> tuple[npt.NDArray[Any], _Facts]:
@@ -223,16 +199,6 @@ def _exif(exif: Any) -> tuple[int | None, float | None]:
         ahead_s = (int(match[2]) * 60 + int(match[3])) * 60
         begin_ns -= (-1 if match[1] == "-" else 1) * ahead_s * NS_PER_S
     return begin_ns, float(exposure) if exposure else None
-
-
-def utc_ns(text: str) -> int | None:
-    """A UTC as ns since 1970 of days of 86400 s; None where it is none."""
-    if not UTC.match(text):
-        return None
-    try:
-        return int(np.datetime64(text.rstrip("Z").replace(" ", "T"), "ns").astype(np.int64))
-    except (ValueError, OverflowError):
-        return None
 
 
 def parse_utc(text: str) -> int:

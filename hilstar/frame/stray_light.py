@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, cannot_read
+from hilstar.fits_headers import read_fits_image
 from hilstar.frame.fault_kinds import Gradient, MeasuredMap
-from hilstar.image_files import ImageSizeError, npy_array, opened_fits, opened_picture
+from hilstar.image_files import ImageSizeError, is_fits, npy_array, opened_picture
 from hilstar.reading import read_bytes
 from hilstar.scene.camera import Camera
 
@@ -112,9 +113,10 @@ def _decoded(path: Path, raw: bytes) -> npt.NDArray[Any]:
         if raw.startswith(b"\x89PNG"):
             with opened_picture(raw, formats=("PNG",)) as picture:
                 return np.asarray(picture)
-        if raw.startswith(b"SIMPLE  ="):
-            with opened_fits(raw) as units:
-                return next(np.asarray(unit.data) for unit in units if getattr(unit, "data", None) is not None)
+        if is_fits(raw):
+            return read_fits_image(raw).pixels
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     except ImageSizeError as error:
         raise InputError(f"{path}: {error}; {MAP_ADVICE}") from error
     except Exception as error:  # each library raises its own for a damaged file

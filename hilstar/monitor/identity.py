@@ -1,6 +1,7 @@
 """Which monitor, in which mode and with which settings: what calibration files carry, and how two of them differ."""
 
 import hashlib
+import re
 import struct
 from collections.abc import Iterator
 from typing import Any
@@ -16,11 +17,14 @@ STRAIGHT = "straight"
 # apart from a count by its size; digits in a row; words, with or without digits behind them.
 NO_SERIALS = frozenset({0, 1})
 DIGITS_IN_A_ROW = ("01234567890", "12345678901234567890", "9876543210")
+LETTERS_IN_A_ROW = ("abcdefghijklmnopqrstuvwxyz", "0123456789abcdef")
+SAMPLE_NUMBERS = frozenset({0xDEADBEEF, 0x12345678})
 MIN_IN_A_ROW = 4  # characters: fewer are a count
 SERIAL_BYTES = 4  # of the number in an EDID's head
 NO_SERIAL_WORDS = frozenset(
     {
         *("na", "none", "null", "nil", "no", "unknown", "undefined", "default", "empty", "blank", "tbd"),
+        *("system", "string", "default", "value"),
         *("serial", "serialno", "serialnumber", "sn", "number", "monitor", "display"),
         *("demo", "demoset", "sample", "test", "dummy", "tobefilledbyoem"),
         *("notavailable", "notapplicable", "notspecified", "notset"),
@@ -103,24 +107,42 @@ def edid_identity(edid: bytes) -> MonitorIdentity:
 def _stated_serial(text: str) -> str:
     """The serial number that a text holds; "" where it is a placeholder, which each monitor of its kind has."""
     plain = "".join(character for character in text.casefold() if character.isalnum())
-    number_text, base = (plain[2:], 16) if plain.startswith("0x") else (plain, 10)
-    try:
-        is_placeholder = _is_no_serial(int(number_text, base))
-    except ValueError:
-        letters = "".join(character for character in plain if not character.isdigit())
-        is_placeholder = not plain or letters in NO_SERIAL_WORDS
+    is_placeholder = _is_placeholder_number(plain) or _is_placeholder_word(text, plain)
     if len(plain) >= MIN_IN_A_ROW:
         is_one_character = len(set(plain)) == 1
-        is_row = any(plain in row for row in DIGITS_IN_A_ROW)
+        is_row = any(plain in row for row in (*DIGITS_IN_A_ROW, *LETTERS_IN_A_ROW))
         is_placeholder = is_placeholder or is_one_character or is_row
     return "" if is_placeholder else text
+
+
+def _is_placeholder_number(plain: str) -> bool:
+    """Whether a text is a number that is none: in decimal; or in hex, as 0x01010101, 01010101h, or its eight digits."""
+    try:
+        if plain.startswith("0x"):
+            return _is_no_serial(int(plain[2:], 16))
+        if plain.endswith("h"):
+            return _is_no_serial(int(plain[:-1], 16))
+        is_hex = len(plain) == 2 * SERIAL_BYTES and _is_no_serial(int(plain, 16))
+        return is_hex or _is_no_serial(int(plain, 10))
+    except ValueError:
+        return False
+
+
+def _is_placeholder_word(text: str, plain: str) -> bool:
+    """Whether a text is words that say that there is no number, with or without digits behind them."""
+    letters = "".join(character for character in plain if not character.isdigit())
+    if not plain or letters in NO_SERIAL_WORDS:
+        return True
+    parts = set(re.findall(r"[a-z]+|[0-9]+", text.casefold()))
+    return bool(parts) and parts <= NO_SERIAL_WORDS
 
 
 def _is_no_serial(number: int) -> bool:
     """Whether a number is what makers write who number nothing."""
     size_bytes = (number.bit_length() + 7) // 8
     repeated = number.to_bytes(size_bytes, "little")
-    return number in NO_SERIALS or (size_bytes == SERIAL_BYTES and len(set(repeated)) == 1)
+    is_known = number in NO_SERIALS or number in SAMPLE_NUMBERS
+    return is_known or (size_bytes == SERIAL_BYTES and len(set(repeated)) == 1)
 
 
 def _plain(text: str) -> str:

@@ -12,24 +12,29 @@ field's middle, its axes the surface's own.
 import contextlib
 import io
 import math
-import re
-import tempfile
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import lru_cache, partial
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, MachineError
+from hilstar.errors import InputError, MachineError, one_line
+from hilstar.optics.codev_file import read_codev
+from hilstar.optics.lens_data import FieldPoint, LensPrescription
+from hilstar.optics.optiland_lens import optic_of
 from hilstar.optics.psf_file import Glass, Stack, glass_of
+from hilstar.optics.zemax_file import read_zemax
+from hilstar.reading import read_bytes
 from hilstar.scene.camera import Lens
 
 CAN_INSTALL = "pip install 'hilstar[lens]'"
-ADVICE = "give a lens file that optiland reads: .zmx of Zemax, .seq of CODE V, or .json of optiland"
+ADVICE = "give a lens file: .zmx of Zemax, .seq of CODE V, or .json of optiland"
+ENDINGS = frozenset({".zmx", ".seq", ".json"})
+MAX_BYTES = 50_000_000
 POINTS = 5  # field points along each side
 MIN_RAYS, MAX_RAYS, GEOMETRIC_RAYS = 96, 384, 400  # across the pupil
 MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does not say
@@ -52,11 +57,21 @@ class Plate:
 
 @dataclass(frozen=True, slots=True)
 class Traced:
-    """The glass of a prescription, its focal length and F-number."""
+    """The glass of a prescription, its focal length and F-number, and what was taken for granted."""
 
     glass: Glass
     focal_length_mm: float
     f_number: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Lens:
+    """optiland's lens, its field points with their vignetting, and notes."""
+
+    optic: Any
+    fields: tuple[FieldPoint, ...]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,88 +87,89 @@ class _Bundle:
 
 def glass_of_prescription(path: Path, plate: Plate, per_px: int | None, tolerance: float) -> Traced:
     """The glass of a lens file. Raises InputError, and MachineError without optiland."""
-    optic = _read(path)
+    lens = _read(path)
     try:
-        return traced(optic, plate, per_px, tolerance, f"hilstar optics lens of {path.name}")
+        return _traced(lens, plate, per_px, tolerance, f"hilstar optics lens of {path.name}")
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def _read(path: Path) -> Any:
+def _read(path: Path) -> "_Lens":
+    if path.suffix.lower() not in ENDINGS:
+        raise InputError(f"{path}: no lens file by its name; {ADVICE}")
+    data = read_bytes(path, ADVICE, MAX_BYTES)
     try:
-        with _quiet():
-            from optiland import fileio
+        # What the file states is read first: a refusal of it needs no optiland.
+        prescription = _stated(path, data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    try:
+        with _quiet() as warned:
+            import optiland  # noqa: F401
     except ImportError as error:
         raise MachineError(f"hilstar optics lens needs optiland: {CAN_INSTALL}") from error
-    readers = {
-        ".zmx": partial(_zemax, fileio.load_zemax_file),
-        ".seq": fileio.load_codev_file,
-        ".json": fileio.load_optiland_file,
-    }
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(f"{path}: no lens file by its name; {ADVICE}")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; {ADVICE}")
     try:
-        with _quiet():
-            return reader(str(path))
+        with _quiet() as warned:
+            lens = _optiland_s_own(path) if prescription is None else _of_prescription(prescription)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # optiland raises whatever a broken file causes in its layers
         raise InputError(f"{path}: optiland cannot read it ({type(error).__name__}: {str(error)[:80]}); {ADVICE}") from error
+    return replace(lens, notes=(*lens.notes, *warned))
 
 
-def _zemax(read: Callable[[str], Any], path: str) -> Any:
-    """Read a file of Zemax's whose coordinate breaks have one turn each: optiland turns about z first, and in one order."""
-    raw = Path(path).read_bytes()
-    text = raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1")
-    with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / "lens.zmx"
-        plain.write_text(one_turn_a_break(text), encoding="utf-8")
-        return read(str(plain))
+def _stated(path: Path, data: bytes) -> LensPrescription | None:
+    """What a file states; None for optiland's own, which are its to read."""
+    if path.suffix.lower() == ".zmx":
+        return read_zemax(data)
+    if path.suffix.lower() == ".seq":
+        return read_codev(data)
+    return None
 
 
-def one_turn_a_break(text: str) -> str:
-    """The text of a .zmx file with each COORDBRK as up to four of one turn or shift each, in Zemax's order.
+def _of_prescription(lens: LensPrescription) -> "_Lens":
+    optic, notes = optic_of(lens)
+    return _Lens(optic, lens.fields, (*lens.notes, *notes))
 
-    That is: shift, then turns about x, the new y and the newer z; with the order flag all of it backwards. Raises InputError
-    for lengths that are not in mm, which optiland would take for mm.
-    """
-    head, *surfaces = re.split(r"(?m)^SURF +\d+.*\n", text.replace("\r\n", "\n"))
-    unit = re.search(r"(?m)^UNIT +(\w+)", head)
-    if unit is not None and unit[1].upper() != "MM":
-        raise InputError(f"its lengths are in {unit[1]} (UNIT); write them in MM")
-    found: list[str] = []
-    for surface in surfaces:
-        if not re.search(r"(?m)^ *TYPE +COORDBRK", surface):
-            found.append(surface)
-            continue
-        given = {int(k): float(value) for k, value in re.findall(r"(?m)^ *PARM +(\d+) +(\S+)", surface)}
-        steps = [(1, 2), (3,), (4,), (5,)]
-        kept = [step for step in (steps[::-1] if given.get(6) else steps) if any(given.get(k) for k in step)] or steps[:1]
-        far = re.search(r"(?m)^ *DISZ +(\S+)", surface)
-        for step in kept:
-            last = step is kept[-1] and far is not None
-            parts = [f"  PARM {k} {given.get(k, 0.0)!r}" for k in step]
-            found.append("\n".join(["  TYPE COORDBRK", *parts, f"  DISZ {far[1] if last and far else 0}", ""]))
-    return head + "".join(f"SURF {number}\n{surface}" for number, surface in enumerate(found))
+
+def _optiland_s_own(path: Path) -> "_Lens":
+    from optiland import fileio
+
+    optic = fileio.load_optiland_file(str(path))
+    return _Lens(optic, _fields_of(optic))
+
+
+def _fields_of(optic: Any) -> tuple[FieldPoint, ...]:
+    """The field points of optiland's lens, whose vignetting is symmetrical."""
+    points = []
+    for point in optic.fields.fields:
+        compression = float(point.vx), float(point.vy)
+        points.append(FieldPoint(float(point.x), float(point.y), compression))
+    return tuple(points)
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """optiland prints on stdout, and numba warns."""
-    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+def _quiet() -> Iterator[list[str]]:
+    """Keeps what optiland prints from stdout; its own warnings are put into the list, those of numba's compiler are not."""
+    warned: list[str] = []
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield warned
+    for warning in caught:
+        if issubclass(warning.category, UserWarning) and "numba" not in str(warning.filename):
+            warned.append(f"optiland: {one_line(str(warning.message))}")
 
 
 def traced(optic: Any, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
     """The glass of an optic of optiland's, at its wavelengths and within its field. Raises InputError."""
+    return _traced(_Lens(optic, _fields_of(optic)), plate, per_px, tolerance, made_by)
+
+
+def _traced(lens: _Lens, plate: Plate, per_px: int | None, tolerance: float, made_by: str) -> Traced:
     try:
-        with _quiet():
-            lens = _LensRays(optic)
-            return _glass(lens, plate, per_px, tolerance, made_by)
+        with _quiet() as warned:
+            made = _glass(_LensRays(lens.optic, lens.fields), plate, per_px, tolerance, made_by)
+        return replace(made, notes=(*lens.notes, *warned))
     except InputError:
         raise
     except Exception as error:  # as in `_read`
@@ -163,15 +179,13 @@ def traced(optic: Any, plate: Plate, per_px: int | None, tolerance: float, made_
 class _LensRays:
     """Rays through an optic, with its vignetting factors interpolated over the field; optiland takes the nearest."""
 
-    def __init__(self, optic: Any) -> None:
+    def __init__(self, optic: Any, points: tuple[FieldPoint, ...]) -> None:
         if not optic.object_surface.is_infinite:
             raise InputError("its object is near; write a lens whose object is at infinity, as stars are")
         self.optic = optic
-        fields = optic.fields.fields
         self.max_field = float(optic.fields.max_field)
-        order = sorted((math.hypot(float(f.x), float(f.y)), float(f.vx), float(f.vy)) for f in fields)
-        self._vignetting = np.array(order).T
-        for field in fields:
+        self._vignetting = _vignetting(points)
+        for field in optic.fields.fields:
             field.vx = field.vy = 0.0
         self.wavelengths_um = sorted({float(w.value) for w in optic.wavelengths.wavelengths})
         self.primary_um = float(optic.primary_wavelength)
@@ -188,7 +202,8 @@ class _LensRays:
             raise InputError(
                 "the chief ray of its field's middle is lost; is a surface tilted too far, or its aperture beside it?"
             )
-        self.sign = float(np.sign((tangents[1] - tangents[0]) @ (places[1] - places[0])))
+        # A lens with one field, on the axis, has no direction in which its image could be turned round.
+        self.sign = float(np.sign((tangents[1] - tangents[0]) @ (places[1] - places[0]))) or 1.0
         self.centre_mm = places[0]
 
     def at_image(self, rays: Any) -> tuple[FloatArray, FloatArray]:
@@ -209,6 +224,8 @@ class _LensRays:
 
     def fields_at(self, places_mm: FloatArray, camera: "_Chiefs") -> FloatArray:
         """The fields (n, 2) whose stars a camera has at places (n, 2), mm."""
+        if self.max_field == 0:
+            return np.zeros_like(places_mm)
         tangents = self.chiefs(np.array([[0.0, 0.0], [0.0, EDGE]]), self.primary_um)[0]
         slope_mm = camera.focal_length_mm * float(tangents[1, 1] - tangents[0, 1]) / EDGE
         fields = places_mm / slope_mm
@@ -222,12 +239,15 @@ class _LensRays:
         across, down = np.meshgrid(at, at)
         filled = _filled(rays)
         radius = float(np.hypot(*field))
-        vx, vy = (np.interp(radius * self.max_field, self._vignetting[0], part) for part in self._vignetting[1:])
+        at_field = radius * self.max_field
+        beside_cut, along_cut, shift = (np.interp(at_field, self._vignetting[0], part) for part in self._vignetting[1:])
         turn = field / radius if radius else np.array([0.0, 1.0])  # the field's direction is the factors' y
         along = across * turn[0] + down * turn[1]
         beside = across * turn[1] - down * turn[0]
-        px = np.clip(across - vy * along * turn[0] - vx * beside * turn[1], -1, 1)  # beyond it only where no light is
-        py = np.clip(down - vy * along * turn[1] + vx * beside * turn[0], -1, 1)
+        moved_along = shift - along_cut * along
+        moved_beside = beside_cut * beside
+        px = np.clip(across + moved_along * turn[0] - moved_beside * turn[1], -1, 1)  # beyond it only where no light is
+        py = np.clip(down + moved_along * turn[1] + moved_beside * turn[0], -1, 1)
         hx, hy = np.full(px.size, field[0]), np.full(px.size, field[1])
         generate = self.optic.ray_tracer.ray_generator.generate_rays
         first = generate(hx, hy, px.ravel(), py.ravel(), um)
@@ -240,6 +260,31 @@ class _LensRays:
         path = path + l0 * x0 + m0 * y0 + n0 * z0
         area = np.abs(_determinant(x0, y0)) * np.abs(n0)
         return _Bundle(x, y, cosines, path, np.where(good, np.nan_to_num(light) * area * filled, 0.0))
+
+
+def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
+    """Field radii, and there: how much of the pupil is cut off across the field's direction and along it, and its shift.
+
+    Shape (4, n). Factors are of the pupil's x and y, so a field's direction has to be one of them. Raises InputError.
+    """
+    rows = []
+    for point in points:
+        radius = math.hypot(point.x, point.y)
+        beside, along = point.compression
+        beside_shift, along_shift = point.shift
+        sign = math.copysign(1.0, point.y)
+        if point.x and not point.y:
+            beside, along = along, beside
+            beside_shift, along_shift = along_shift, beside_shift
+            sign = math.copysign(1.0, point.x)
+        is_even = beside == along and not point.shift[0] and not point.shift[1]
+        is_diagonal = bool(point.x and point.y)
+        if point.is_vignetted and (beside_shift or (is_diagonal and not is_even)):
+            raise InputError(
+                f"its field at {point.x:g}, {point.y:g} is vignetted along neither x nor y; write apertures of surfaces instead"
+            )
+        rows.append((radius, beside, along, along_shift * sign))
+    return np.array(sorted(rows)).T
 
 
 @lru_cache(maxsize=4)
@@ -268,6 +313,8 @@ def _glass(lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, 
     axis_light: dict[float, float] = {}
     for um in lens.wavelengths_um:
         axis_light[um] = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
+        if axis_light[um] <= 0:
+            raise InputError("no ray of its field's middle reaches the image; do apertures lie beside the beam?")
         for place, field, chief in zip(places, fields, lens.chiefs(fields, um)[1], strict=True):
             slopes = _slopes(lens, field, um)
             light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light[um]

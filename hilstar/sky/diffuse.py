@@ -4,8 +4,6 @@ Each WCS image of a file becomes a tangent (gnomonic) image of its own resolutio
 middle, or a HEALPix map, becomes the six faces of a cube. Between pixels all are bilinear.
 """
 
-import gzip
-import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,7 +14,7 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, MachineError, cannot_read
-from hilstar.image_files import ImageSizeError, opened_fits
+from hilstar.image_files import ImageSizeError, opened_fits, unpacked
 from hilstar.reading import read_bytes
 from hilstar.sky.electrons import VEGA_V0_W_M2_M
 
@@ -87,9 +85,7 @@ def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
     """The map in a FITS file. Raises InputError, and MachineError where a HEALPix map needs its library."""
     raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
     try:
-        if raw[:2] == b"\x1f\x8b":
-            raw = _unzipped(path, raw)
-        with opened_fits(raw) as units:
+        with opened_fits(unpacked(raw, MAX_FILE_BYTES)) as units:
             table = next((unit for unit in units if unit.header.get("PIXTYPE") == "HEALPIX"), None)
             images = [unit for unit in units if unit.is_image and unit.data is not None]
             if table is not None:
@@ -103,14 +99,6 @@ def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
     except Exception as error:  # each library raises its own for a damaged file
         raise cannot_read(path, f"{type(error).__name__}: {error}", MAP_ADVICE) from error
     raise InputError(f"{path}: has neither an image nor a HEALPix table; {MAP_ADVICE}")
-
-
-def _unzipped(path: Path, raw: bytes) -> bytes:
-    with gzip.open(io.BytesIO(raw)) as file:
-        found = file.read(MAX_FILE_BYTES + 1)
-    if len(found) > MAX_FILE_BYTES:
-        raise InputError(f"{path}: has more than {MAX_FILE_BYTES:g} bytes unpacked; give a smaller map")
-    return found
 
 
 def brightness(path: Path, values: Any, unit_name: str | None) -> FloatArray:

@@ -5,6 +5,7 @@ Which column of a table is which: the names of Gaia, Tycho-2, Hipparcos and this
 Tables of stars as files: FITS, VOTable, ECSV and CSV through Astropy, only the columns that are used.
 """
 
+import io
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +21,8 @@ from numpy.polynomial.polynomial import polyval
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, cannot_read, shortened
-from hilstar.reading import HEAD_BYTES, kind_of, open_regular, size_text
+from hilstar.image_files import ImageSizeError, is_fits, unpacked
+from hilstar.reading import HEAD_BYTES, kind_of, open_regular, read_bytes, size_text
 from hilstar.sky.catalog import load_catalog
 
 # BT - VT to V - VT, and to (B - V) - (BT - VT) in the blue and in the red: Mamajek, Meyer and Liebert 2002, AJ 124, 1670,
@@ -256,11 +258,13 @@ def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawT
     with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
         head = file.read(4096)
     kind = kind_of(head[:HEAD_BYTES])
+    if kind == "a gzip file" and is_fits(packed := read_bytes(path, FILE_WANTED, MAX_TABLE_BYTES)):
+        return _read_packed_fits(path, packed, roles)
     if kind is not None and kind != "a FITS file":
         raise cannot_read(path, f"it is {kind}", "unpack it first" if kind.endswith("zip file") else FILE_WANTED)
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     if kind == "a FITS file":
-        return _read_fits(path, roles)
+        return _read_fits(path, path, roles)
     if text[:5] == b"<?xml" or text[:8].upper() == b"<VOTABLE":
         return _read_votable(path, roles)
     if not text:
@@ -283,10 +287,18 @@ def _quiet(path: Path) -> Iterator[None]:
         raise cannot_read(path, f"{type(error).__name__}: {error}".rstrip(": "), FILE_WANTED) from error
 
 
-def _read_fits(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
+def _read_packed_fits(path: Path, packed: bytes, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
+    try:
+        data = unpacked(packed, MAX_TABLE_BYTES)
+    except ImageSizeError as error:
+        raise InputError(f"{path}: {error}; {FILE_WANTED}") from error
+    return _read_fits(path, io.BytesIO(data), roles)
+
+
+def _read_fits(path: Path, source: Path | io.BytesIO, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
     from astropy.io import fits
 
-    with _quiet(path), fits.open(path, memmap=True) as hdus:
+    with _quiet(path), fits.open(source, memmap=isinstance(source, Path)) as hdus:
         table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)), None)
         if table is None:
             raise InputError(f"{path}: holds no table; {FILE_WANTED}")

@@ -5,11 +5,8 @@ fit, that star's limits are wider.
 """
 
 import csv
-import gzip
 import io
 import math
-import warnings
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +14,10 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, cannot_read
+from hilstar.fits_headers import read_fits_image
 from hilstar.frame.truth import TRUTH_DTYPE
-from hilstar.reading import read_bytes, read_text, size_text
+from hilstar.image_files import ImageSizeError, unpacked
+from hilstar.reading import read_bytes, read_text
 from hilstar.scene.psf import Psf
 from hilstar.testing import star_fit
 from hilstar.testing.sky_comparison import Limits, SkyComparison, StarDifference, common_change
@@ -171,36 +170,21 @@ def read_frame_fits(path: Path) -> FloatArray:
 
     Raises InputError for another file.
     """
-    from astropy.io import fits
-
     wanted = "give the FITS that `hilstar frame -o OUT.fits` writes"
-    raw = _inflated(path, read_bytes(path, wanted, MAX_FITS_BYTES), wanted)
+    data = read_bytes(path, wanted, MAX_FITS_BYTES)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # astropy warns about cards; those that matter are checked below
-            image, header = fits.getdata(io.BytesIO(raw), header=True)
+        fits_image = read_fits_image(unpacked(data, MAX_FITS_BYTES))
+        image, header = fits_image.pixels, fits_image.header
+    except (InputError, ImageSizeError) as error:
+        raise InputError(f"{path}: {error}; {wanted}") from error
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: not a FITS image; {wanted}") from error
-    if header.get("BUNIT") != UNIT or image is None or image.ndim not in (2, 3) or image.dtype.kind != "f":
+    if header.get("BUNIT") != UNIT or image.ndim not in (2, 3) or image.dtype.kind != "f":
         raise InputError(f"{path}: not a linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")
     light = np.asarray(image, dtype=np.float64)
     if (np.abs(light[np.isfinite(light)]) > MAX_E_PER_S).any():
         raise InputError(f"{path}: a pixel has more than {MAX_E_PER_S:g} {UNIT}; {wanted}")
     return light
-
-
-def _inflated(path: Path, raw: bytes, wanted: str) -> bytes:
-    """A file's bytes, unpacked where they are a gzip file's, up to the size that a FITS may have. Raises InputError."""
-    if raw[:2] != b"\x1f\x8b":
-        return raw
-    try:
-        with gzip.open(io.BytesIO(raw)) as file:
-            plain = file.read(MAX_FITS_BYTES + 1)
-    except (OSError, EOFError, zlib.error) as error:
-        raise cannot_read(path, "it is a damaged gzip file", wanted) from error
-    if len(plain) > MAX_FITS_BYTES:
-        raise InputError(f"{path}: unpacks to more than {size_text(MAX_FITS_BYTES)}; {wanted}")
-    return plain
 
 
 def read_truth_csv(path: Path) -> star_fit.Truth:

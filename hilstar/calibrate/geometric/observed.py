@@ -13,7 +13,8 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError
-from hilstar.image_files import ImageSizeError, opened_fits, opened_picture
+from hilstar.fits_headers import FitsImage, read_fits_image
+from hilstar.image_files import ImageSizeError, is_fits, opened_picture
 from hilstar.reading import read_bytes
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
@@ -75,7 +76,6 @@ def read_observed(path: Path) -> Observed:
 
 
 FITS_ENDINGS = (".fits", ".fit", ".fts")
-FITS_MAGIC = b"SIMPLE  ="
 MAX_IMAGE_BYTES = 500_000_000
 SATURATED_SHARE = 1e-5  # share of pixels at the image's largest possible value: a few hot pixels do not matter
 FULL_DN = {2.0**bits - 1 for bits in (8, 10, 12, 14, 16)}
@@ -143,31 +143,36 @@ def _centroids(
 
 def read_image(path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE) -> FloatArray:
     """A grey image (h, w) as float64, first row at the top, of this (width, height) if any. Raises InputError."""
+    return read_exposed(path, resolution_px, advice)[0]
+
+
+def read_exposed(
+    path: Path, resolution_px: tuple[int, int] | None = None, advice: str = IMAGE_ADVICE
+) -> tuple[FloatArray, float | None]:
+    """A grey image as `read_image` gives it, and its exposure, s, where a FITS header says it. Raises InputError."""
     data = read_bytes(path, advice, MAX_IMAGE_BYTES)
+    exposure_s = None
     # A grabbing script may write FITS under any name.
-    is_fits = path.suffix.lower() in FITS_ENDINGS or data.startswith(FITS_MAGIC)
-    image = _fits(path, data, advice, resolution_px) if is_fits else _picture(path, data, advice, resolution_px)
+    if path.suffix.lower() in FITS_ENDINGS or is_fits(data):
+        fits_image = _fits(path, data, advice, resolution_px)
+        image, exposure_s = fits_image.pixels, fits_image.exposure_s
+    else:
+        image = _picture(path, data, advice, resolution_px)
     if image.ndim != 2:
         raise InputError(f"{path}: is no grey image of one plane; {advice}")
     if resolution_px is not None and (image.shape[1], image.shape[0]) != resolution_px:
         sizes = "is {1} x {0} px, and [tracker] resolution_px is {2} x {3}".format(*image.shape, *resolution_px)
         raise InputError(f"{path}: {sizes}; give whole images, or set the key")
-    return np.asarray(image, dtype=np.float64)
+    return np.asarray(image, dtype=np.float64), exposure_s
 
 
-def _fits(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None) -> npt.NDArray[Any]:
-    from astropy.io import fits
-
+def _fits(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None) -> FitsImage:
     try:
-        with opened_fits(data, size_px) as hdus:
-            planes = [hdu.data for hdu in hdus if isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU) and hdu.data is not None]
-    except ImageSizeError as error:
+        return read_fits_image(data, size_px)
+    except (ImageSizeError, InputError) as error:
         raise InputError(f"{path}: {error}") from error
     except (OSError, ValueError, TypeError, IndexError) as error:
         raise InputError(f"{path}: cannot be read as FITS ({error}); {advice}") from error
-    if not planes:
-        raise InputError(f"{path}: has no image; {advice}")
-    return np.asarray(planes[0])
 
 
 def _picture(path: Path, data: bytes, advice: str, size_px: tuple[int, int] | None) -> npt.NDArray[Any]:

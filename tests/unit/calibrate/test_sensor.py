@@ -14,6 +14,7 @@ from PIL import Image
 from hilstar.bench.build import bench_optics
 from hilstar.bench.config import read_config
 from hilstar.calibrate.sensor import import_emva, measure_sensor, write_sensor
+from hilstar.errors import InputError
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import SMALL_BENCH
@@ -69,6 +70,40 @@ def test_frames_of_the_virtual_detector_give_its_settings_back(tmp_path):
     # The flat before saturation, of levels 3000 e- apart.
     assert found.keys["full_well_e"] == pytest.approx(30_000.0, abs=4000.0)
     assert found.keys["bits"] == math.ceil(math.log2(200 + 30_000 / 1.5 + 60))
+
+
+@pytest.mark.parametrize(("key", "in_extension"), [("EXPOSURE", False), ("EXPTIME", True), ("EXPOINUS", False)])
+def test_exposures_are_read_wherever_they_stand(tmp_path, key, in_extension):
+    """The same frames with their exposure under another keyword, or in a header that fpack's image has."""
+    flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:4])
+    expected = measure_sensor(flats, darks)
+    for path in (*flats, *darks):
+        with fits.open(path) as hdus:
+            seconds, frame = hdus[0].header["EXPTIME"], hdus[0].data.copy()
+        scale = 1e6 if key == "EXPOINUS" else 1.0
+        kind = fits.CompImageHDU if in_extension else fits.PrimaryHDU
+        kind(frame, fits.Header({key: seconds * scale})).writeto(path, overwrite=True)
+    found = measure_sensor(flats, darks)
+    assert found.keys == pytest.approx(expected.keys)
+    assert "dark_e_per_s" in found.keys
+
+
+def test_darks_of_unknown_exposures_are_no_repeats_of_one_level(tmp_path):
+    flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:4])
+    for path in (*flats, *darks):
+        fits.delval(path, "EXPTIME")
+    with pytest.raises(InputError, match=r"--darks: their means differ by .* DN, and no header says their exposures.*EXPTIME"):
+        measure_sensor(flats, darks)
+    # Darks of one exposure are repeats, whatever it was.
+    assert "dark_e_per_s" not in measure_sensor(flats, darks[:2]).keys
+
+
+def test_frames_of_which_some_say_an_exposure_are_refused(tmp_path):
+    flats, darks = write_frames(tmp_path, SENSOR, LEVELS_E[:4])
+    for path in darks[:2]:
+        fits.delval(path, "EXPTIME")
+    with pytest.raises(InputError, match="--darks: some frames say no exposure and some do"):
+        measure_sensor(flats, darks)
 
 
 def test_frames_by_plain_numpy_give_back_what_made_them(tmp_path):

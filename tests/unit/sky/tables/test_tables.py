@@ -107,6 +107,9 @@ def test_tycho_2_has_its_own_names_epoch_and_second_places(tmp_path):
     assert catalog.ra_deg[[stars["HIP 77"], stars["TYC 9537-12121-3"]]].tolist() == [2.25, 4.0]
     assert (catalog.epoch_jyear == 2000.0).all()
     assert np.isnan(catalog.vi_mag).all()
+    # Packed by gzip it is the same table.
+    (tmp_path / "tyc2.fits.gz").write_bytes(gzip.compress((tmp_path / "tyc2.fits").read_bytes()))
+    assert (read(tmp_path / "tyc2.fits.gz").ra_deg == catalog.ra_deg).all()
 
 
 def test_units_are_the_table_s(tmp_path):

@@ -1,0 +1,306 @@
+"""What a FITS header says of its image, by the standard and by the software of cameras; each case as a small file."""
+
+from __future__ import annotations
+
+import gzip
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+
+from hilstar.calibrate.geometric.observed import read_exposed
+from hilstar.confront.images import read_photographs
+from hilstar.errors import InputError
+from hilstar.fits_headers import read_fits_image, utc_ns
+from hilstar.image_files import ImageSizeError
+
+SIDE_PX = 64
+EIGHT_PM = "2024-03-01T20:00:00"
+LEVELS = {"R": 1000, "G": 2000, "B": 3000}
+UTC_TOLERANCE_NS = 1000  # Astropy's text has ns; an MJD as float64 has a microsecond
+
+
+def mosaic(pattern: str) -> np.ndarray:
+    """An image whose levels say the colour of a pattern from its first pixel, and a little noise."""
+    cell = np.array([LEVELS[colour] for colour in pattern]).reshape(2, 2)
+    noise = np.random.default_rng(1).integers(0, 50, (SIDE_PX, SIDE_PX))
+    return (np.tile(cell, (SIDE_PX // 2, SIDE_PX // 2)) + noise).astype(np.uint16)
+
+
+def file_of(*hdus) -> bytes:
+    buffer = io.BytesIO()
+    fits.HDUList(list(hdus)).writeto(buffer)
+    return buffer.getvalue()
+
+
+def image(cards: dict | list, pattern: str = "RGGB", kind=fits.PrimaryHDU) -> fits.PrimaryHDU:
+    made = kind(mosaic(pattern))
+    for key, value in dict(cards).items():
+        made.header[key] = value
+    return made
+
+
+def read(cards: dict, pattern: str = "RGGB"):
+    return read_fits_image(file_of(image(cards, pattern)))
+
+
+@pytest.mark.parametrize(
+    ("cards", "seconds"),
+    [
+        ({"EXPTIME": 10.0}, 10.0),
+        ({"EXPOSURE": 10.0}, 10.0),
+        ({"XPOSURE": 10.0}, 10.0),
+        ({"TEXPOSUR": 10.0}, 10.0),
+        ({"EXP_TIME": 10.0}, 10.0),
+        ({"EXPTIME": 10}, 10.0),
+        ({"EXPTIME": "10.0"}, 10.0),
+        ({"EXPTIME": "10 s"}, 10.0),
+        ({"EXPTIME": "250 ms"}, 0.25),
+        ({"EXPTIME": (250.0, "[ms] exposure time")}, 0.25),
+        ({"EXPTIME": (250.0, "Exposure time (ms)")}, 0.25),
+        ({"EXPOSURE": (250.0, "exposure in milliseconds")}, 0.25),
+        ({"EXPTIME": (250000, "[us]")}, 0.25),
+        ({"EXPTIME": (10.0, "[s] time in seconds")}, 10.0),
+        ({"EXPTIME": (10.0, "Exposure time")}, 10.0),
+        ({"EXPTIME": (10.0, "in total")}, 10.0),
+        ({"EXPOINUS": 250000}, 0.25),
+        ({"EXPTIME": 0.25, "EXPOINUS": 250000}, 0.25),
+        ({"EXPTIME": 0.0}, 0.0),
+        ({}, None),
+    ],
+)
+def test_an_exposure_is_in_seconds(cards, seconds):
+    found = read(cards)
+    assert found.exposure_s == (None if seconds is None else pytest.approx(seconds))
+    assert not found.notes
+
+
+@pytest.mark.parametrize("value", ["long", "1/200 s", -1.0, True, "10 parsec"])
+def test_an_exposure_that_is_none_is_said(value):
+    found = read({"EXPTIME": value})
+    assert found.exposure_s is None
+    assert "EXPTIME" in found.notes[0] and "no exposure in seconds" in found.notes[0]
+
+
+def test_two_exposures_that_differ_are_said():
+    found = read({"EXPTIME": 10.0, "EXPOSURE": 20.0})
+    assert found.exposure_s == 10.0
+    assert found.notes == ("EXPTIME says 10 s and EXPOSURE 20 s: EXPTIME is taken",)
+
+
+def astropy_ns(text: str, scale: str) -> int:
+    """UTC of a time in another scale, by Astropy."""
+    at = Time(text, scale=scale, precision=9).utc.isot
+    return int(np.datetime64(at, "ns").astype(np.int64))
+
+
+@pytest.mark.parametrize(
+    ("cards", "expected"),
+    [
+        ({"DATE-OBS": EIGHT_PM}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": EIGHT_PM + "Z"}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": "2024-03-01 20:00:00"}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": EIGHT_PM + ".250"}, "2024-03-01T20:00:05.25"),
+        ({"DATE-OBS": EIGHT_PM + "+01:00"}, "2024-03-01T19:00:05"),
+        ({"DATE-OBS": EIGHT_PM + "-0530"}, "2024-03-02T01:30:05"),
+        ({"DATE-BEG": EIGHT_PM}, "2024-03-01T20:00:05"),
+        ({"DATE-AVG": EIGHT_PM}, "2024-03-01T20:00:00"),
+        ({"DATE-END": EIGHT_PM}, "2024-03-01T19:59:55"),
+        ({"DATE-OBS": (EIGHT_PM, "UTC of mid exposure")}, "2024-03-01T20:00:00"),
+        ({"DATE-OBS": (EIGHT_PM, "end of exposure")}, "2024-03-01T19:59:55"),
+        ({"DATE-OBS": EIGHT_PM, "DATE-END": "2024-03-01T20:00:10"}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": "2024-03-01", "TIME-OBS": "20:00:00"}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": "2024-03-01", "UT": "20:00:00.5"}, "2024-03-01T20:00:05.5"),
+        ({"DATE-OBS": "2024-03-01", "UTSTART": "20 00 00"}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": "2024-03-01", "TIME": "20:00"}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": "2024-03-01", "OBSSTART": "20:00:00"}, "2024-03-01T20:00:05"),
+        ({"DATE-OBS": "2024-03-01", "MJD-OBS": 60370.5}, "2024-03-01T12:00:05"),
+        ({"MJD-OBS": 60370.5}, "2024-03-01T12:00:05"),
+        ({"MJD-AVG": 60370.5}, "2024-03-01T12:00:00"),
+        ({"MJD-END": 60370.5}, "2024-03-01T11:59:55"),
+        ({"DATE-OBS": "01/03/99", "TIME-OBS": "20:00:00"}, "1999-03-01T20:00:05"),
+        ({"DATE-OBS": EIGHT_PM, "TIMESYS": "UTC"}, "2024-03-01T20:00:05"),
+    ],
+)
+def test_a_time_is_the_middle_of_the_exposure(cards, expected):
+    found = read({**cards, "EXPTIME": 10.0})
+    assert found.t_ns == pytest.approx(utc_ns(expected), abs=UTC_TOLERANCE_NS)
+    assert not found.notes
+
+
+@pytest.mark.parametrize(("name", "scale"), [("TAI", "tai"), ("TT", "tt"), ("TDB", "tdb"), ("tai", "tai")])
+def test_scales_are_turned_into_utc(name, scale):
+    found = read({"DATE-OBS": EIGHT_PM, "TIMESYS": name, "EXPTIME": 0.0})
+    assert found.t_ns == pytest.approx(astropy_ns(EIGHT_PM, scale), abs=UTC_TOLERANCE_NS)
+
+
+def test_gps_is_18_s_ahead_of_utc():
+    found = read({"DATE-OBS": EIGHT_PM, "TIMESYS": "GPS", "EXPTIME": 0.0})
+    assert found.t_ns == pytest.approx(utc_ns("2024-03-01T19:59:42"), abs=UTC_TOLERANCE_NS)
+    by_days = read({"MJD-OBS": 60370.5, "TIMESYS": "TAI", "EXPTIME": 0.0})
+    assert by_days.t_ns == pytest.approx(utc_ns("2024-03-01T11:59:23"), abs=UTC_TOLERANCE_NS)
+
+
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({"DATE-OBS": "2024-03-01"}, "DATE-OBS = 2024-03-01 tells no time of day"),
+        ({"DATE-OBS": "2024-03-01", "UT": 20.5}, "tells no time of day"),
+        (
+            {"DATE-OBS": EIGHT_PM, "TIMESYS": "LOCAL"},
+            "DATE-OBS is in LOCAL, which is no known time from UTC: undated",
+        ),
+        ({"DATE-OBS": (EIGHT_PM, "local time of start")}, "DATE-OBS is in local time"),
+        ({"DATE-OBS": "1 March 2024"}, "DATE-OBS = 1 March 2024 is no date"),
+        ({"DATE-OBS": "2024-13-41T20:00:00"}, "DATE-OBS = 2024-13-41T20:00:00 is no date"),
+        ({"MJD-OBS": "yesterday"}, "MJD-OBS = yesterday is no date"),
+    ],
+)
+def test_an_image_without_a_time_is_undated_and_said(cards, words):
+    found = read({**cards, "EXPTIME": 10.0})
+    assert found.t_ns is None
+    assert any(words in note for note in found.notes), found.notes
+
+
+def test_an_undated_image_is_said_beside_what_else_is():
+    found = read({"DATE-OBS": "2024-03-01", "EXPTIME": "long"})
+    assert len(found.notes) == 2 and "tells no time of day" in found.notes[1]
+
+
+def test_local_time_gives_way_to_days_of_utc():
+    found = read({"DATE-OBS": (EIGHT_PM, "local time"), "MJD-OBS": 60370.5, "EXPTIME": 10.0})
+    assert found.t_ns == pytest.approx(utc_ns("2024-03-01T12:00:05"), abs=UTC_TOLERANCE_NS)
+
+
+def test_what_contradicts_or_is_assumed_is_said():
+    apart = read({"DATE-OBS": EIGHT_PM, "MJD-OBS": 60370.5, "EXPTIME": 1.0})
+    assert apart.t_ns == utc_ns("2024-03-01T20:00:00.5")
+    assert apart.notes == ("MJD-OBS is -28800 s off DATE-OBS, which is taken",)
+    unknown = read({"DATE-OBS": EIGHT_PM})
+    assert unknown.t_ns == utc_ns(EIGHT_PM)
+    assert unknown.notes == ("no exposure is known: DATE-OBS, its start, is taken for its middle",)
+    both = read({"DATE-BEG": EIGHT_PM, "DATE-END": "2024-03-01T20:00:08"})
+    assert both.t_ns == utc_ns("2024-03-01T20:00:04") and not both.notes
+
+
+@pytest.mark.parametrize(
+    ("pixels", "cards"),
+    [
+        ("RGGB", {"BAYERPAT": "RGGB"}),
+        ("RGGB", {"BAYERPAT": "rggb"}),
+        ("RGGB", {"BAYERPAT": "'RGGB'"}),
+        ("RGGB", {"COLORTYP": "RGGB"}),
+        ("GBRG", {"CFATYPE": "GBRG"}),
+        ("GRBG", {"BAYERPAT": "RGGB", "XBAYROFF": 1, "YBAYROFF": 0}),
+        ("GBRG", {"BAYERPAT": "RGGB", "XBAYROFF": 0, "YBAYROFF": 1}),
+        ("BGGR", {"BAYERPAT": "RGGB", "XBAYROFF": 1, "YBAYROFF": 1}),
+        ("RGGB", {"BAYERPAT": "RGGB", "XBAYROFF": 2, "YBAYROFF": -2}),
+        ("GRBG", {"BAYERPAT": "RGGB", "BAYOFFX": 1.0, "BAYOFFY": 0.0}),
+        ("BGGR", {"BAYERPAT": "BGGR", "ROWORDER": "TOP-DOWN"}),
+        # From the bottom: the pattern is that of the picture, whose top row is the last of 64.
+        ("GBRG", {"BAYERPAT": "RGGB", "ROWORDER": "BOTTOM-UP"}),
+    ],
+)
+def test_planes_have_the_names_of_their_colours(tmp_path: Path, pixels, cards):
+    path = tmp_path / "mosaic.fits"
+    path.write_bytes(file_of(image(cards, pixels)))
+    planes = {photo.plane: int(photo.dn.mean()) // 1000 for photo in read_photographs(path, None)}
+    assert planes == {"r": 1, "g1": 2, "g2": 2, "b": 3}
+
+
+@pytest.mark.parametrize("value", [None, "NONE", "mono", False, "", "N/A"])
+def test_a_grey_image_is_one_plane(value):
+    assert read({} if value is None else {"BAYERPAT": value}).bayer == ""
+
+
+@pytest.mark.parametrize("value", ["GGRGGBGGBGGRBRGRBGGGBGGRGGRGGBRBGBRG", "TRUE", True, "X-TRANS", "CYGM", "RGBG"])
+def test_a_mosaic_of_another_kind_is_refused(tmp_path: Path, value):
+    path = tmp_path / "mosaic.fits"
+    path.write_bytes(file_of(image({"BAYERPAT": value})))
+    with pytest.raises(
+        InputError,
+        match=r"mosaic\.fits: BAYERPAT is .*a mosaic of a kind that is not read; write RGGB",
+    ):
+        read_photographs(path, None)
+
+
+@pytest.mark.parametrize("cards", [{"XBAYROFF": 0.5}, {"YBAYROFF": "one"}, {"ROWORDER": "SIDEWAYS"}])
+def test_a_layout_that_is_none_is_refused(cards):
+    with pytest.raises(InputError, match=next(iter(cards))):
+        read({"BAYERPAT": "RGGB", **cards})
+
+
+def test_rows_from_the_bottom_are_turned_over():
+    given = image({"ROWORDER": "BOTTOM-UP"})
+    assert (read_fits_image(file_of(given)).pixels == given.data[::-1]).all()
+
+
+KEYS = {"BAYERPAT": "RGGB", "DATE-OBS": EIGHT_PM, "EXPTIME": 10.0}
+
+
+@pytest.mark.parametrize("own", [fits.ImageHDU, fits.CompImageHDU])
+def test_an_extension_inherits_what_the_primary_header_says(own):
+    primary = fits.PrimaryHDU()
+    primary.header.update(KEYS)
+    found = read_fits_image(file_of(primary, own(mosaic("RGGB"))))
+    assert (found.bayer, found.exposure_s, found.t_ns) == (
+        "RGGB",
+        10.0,
+        utc_ns("2024-03-01T20:00:05"),
+    )
+
+
+@pytest.mark.parametrize("own", [fits.ImageHDU, fits.CompImageHDU])
+def test_an_extension_s_own_keywords_count_first(own):
+    primary = fits.PrimaryHDU()
+    primary.header.update(KEYS)
+    mine = own(mosaic("RGGB"))
+    mine.header["EXPTIME"] = 4.0
+    assert read_fits_image(file_of(primary, mine)).exposure_s == 4.0
+    apart = fits.ImageHDU(mosaic("RGGB"))
+    apart.header["INHERIT"] = False
+    found = read_fits_image(file_of(primary, apart))
+    assert (found.bayer, found.exposure_s, found.t_ns) == ("", None, None)
+
+
+def test_the_first_of_several_images_is_taken_and_said():
+    found = read_fits_image(file_of(image({}), fits.ImageHDU(np.zeros((8, 8), dtype=np.uint8))))
+    assert found.pixels.shape == (SIDE_PX, SIDE_PX)
+    assert found.notes == ("holds 2 images, of which the first is taken",)
+
+
+@pytest.mark.parametrize("reader", [lambda path: read_photographs(path, None)[0].dn, lambda path: read_exposed(path)[0]])
+def test_a_packed_file_is_the_same_image(tmp_path: Path, reader):
+    plain, packed = tmp_path / "a.fits", tmp_path / "a.fits.gz"
+    plain.write_bytes(file_of(image({})))
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    assert (reader(plain) == reader(packed)).all()
+    packed.write_bytes(gzip.compress(plain.read_bytes())[:-40])
+    with pytest.raises(InputError, match="a damaged gzip file"):
+        reader(packed)
+
+
+def test_scaled_levels_are_the_image_s():
+    stored = fits.PrimaryHDU(mosaic("RGGB").astype(np.int16))
+    stored.header["BSCALE"], stored.header["BZERO"] = 1.0, 0.0
+    assert (read_fits_image(file_of(stored)).pixels == mosaic("RGGB")).all()
+    halves = fits.PrimaryHDU(mosaic("RGGB") / 2)
+    halves.scale("int16", bscale=0.5)
+    assert read_fits_image(file_of(halves)).pixels == pytest.approx(mosaic("RGGB") / 2)
+
+
+def test_pixels_without_a_value_are_refused():
+    """BLANK is stored before BZERO: 0 of an unsigned 16-bit image is stored as -32768."""
+    unsigned = fits.PrimaryHDU(mosaic("RGGB"))
+    unsigned.data[3, :5] = 0
+    unsigned.header["BLANK"] = -32768
+    with pytest.raises(InputError, match=r"5 pixels have no value \(BLANK = -32768\)"):
+        read_fits_image(file_of(unsigned))
+
+
+def test_what_is_no_fits_is_told():
+    with pytest.raises(ImageSizeError, match="not a FITS image"):
+        read_fits_image(b"BZh91AY")

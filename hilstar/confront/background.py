@@ -46,6 +46,8 @@ class FixedPattern:
         """What was found, or under what it is (two sigmas)."""
         said = []
         for name, square, error, rms in zip(NAMES, self.squares, self.errors, self.rms, strict=True):
+            if not math.isfinite(error):
+                continue
             times, unit = (100, "%") if name == NAMES[0] else (1, "DN")
             found = f"{times * rms:.3g} +- {times * error / (2 * rms):.2g}" if rms else ""
             said.append(f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'} {unit}")
@@ -78,6 +80,13 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
     (column, column_error), (row, row_error), (both, both_error), (share, share_error) = (
         one.mean() for one in (columns, rows, pixels, shares)
     )
+    # the mean of a column, or a row, has a share of its pixels' own patterns
+    height, width = use.shape[0], use.shape[1] + 1
+    column = (column - both / height) / (1 - 1 / height)
+    pixel = max(both - column, 0.0)
+    row -= pixel / width
+    column_error = math.hypot(column_error, math.sqrt(2 / width) * pixel / height)
+    row_error = math.hypot(row_error, math.sqrt(2 / height) * pixel / width)
     lit, dim = light.mean()[0], inverse.mean()[0]
     both, share = both - max(column, 0.0), share - max(column, 0.0) * dim
     # both = response^2 lit + offsets^2, share = response^2 + offsets^2 dim

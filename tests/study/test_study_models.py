@@ -14,7 +14,8 @@ from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
-from hilstar.study.models import rapp_ratios, running_percentiles, torres2010_k, zero_points
+from hilstar.study.models import running_percentiles, torres2010_k, zero_points
+from hilstar.study.rapp import rapp_ratios
 from hilstar.study.settings import held_out_errors, study_optics
 from tests.support.commands import run_hilstar_here
 from tests.support.waiting import PATIENCE_S

@@ -46,6 +46,7 @@ from hilstar.sky.synthetic import VEGA_V_MAG, ZERO_W_M2_M, curve_mean, vega
 from hilstar.sky.zodiacal import NEAR_SLOPES, relative_spectrum
 from hilstar.study.rapp import SENSORS, WEIGHTINGS, ChartFinding, rapp
 from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_by_type, held_out_errors, study_optics
+from hilstar.study.sky_figures import FIGURES as SKY_FIGURES
 from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import LIGHT_M_S, flux_ratio, magnitude
 
@@ -459,6 +460,8 @@ def running_percentiles(bv_mag: FloatArray, value: FloatArray, at_bv_mag: FloatA
 def run(directory: Path) -> list[ChartFinding]:
     """Write every chart and its table (CSV) into `directory`, and `findings.csv`. Raises InputError."""
     findings = [rapp(directory, sensor) for sensor in SENSORS]
-    findings += [chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES)]
+    findings += [
+        chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES, *SKY_FIGURES)
+    ]
     write_csv(directory / "findings.csv", ("figure", "finding"), [(f.figure, f.text) for f in findings])
     return findings

@@ -88,19 +88,9 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     given_tables = parse_toml(session.file.path, session.file.text)
     detector = _detector(session, given_tables["tracker"].get("detector", {}))
     tables: dict[str, Any] = {"tracker": table | {"optics": {"psf": NAMES[3]}, "detector": detector}}
-    sky = dict(given_tables.get("sky", {}))
-    dated = session.shots[0].sky
-    for key in ("epoch_utc", "epoch_jyear", "observer_velocity_km_s"):
-        sky.pop(key, None)
-    first_ns = session.shots[0].photo.t_ns
-    if session.air is not None and first_ns is not None:
-        sky["epoch_utc"] = f"{np.datetime64(first_ns, 'ns').astype('datetime64[ms]')}Z"
+    sky = _dated_sky(session, given_tables)
+    if session.air is not None and session.shots[0].photo.t_ns is not None:
         tables["site"] = {k: v for k, v in given_tables.get("site", {}).items() if not k.startswith("sky_")}
-    else:
-        sky["epoch_jyear"] = round(dated.epoch_jyear, 6)
-    if session.air is None and dated.velocity_km_s is not None and not sky.get("bodies"):
-        sky["observer_velocity_km_s"] = [round(float(v), 4) for v in dated.velocity_km_s]
-    sky.setdefault("faintest_v_mag", 10.0)
     tables["sky"] = sky
     level = float(np.median([np.median(shot.level.level) for shot in session.shots]))
     tables["background"] = {"electrons_per_px": max((level - pixels.pedestal_dn) * pixels.gain_e_per_dn, 0.0)}
@@ -125,6 +115,29 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     text = "".join(f"# {note}\n" for note in notes) + "\n".join(_toml(_absolute(tables, session.file.folder)))
     write_whole(path, text + "\n")
     return path
+
+
+def _dated_sky(session: Session, given: dict[str, Any]) -> dict[str, Any]:
+    """The keys of [sky], those that were given, at the time of the first photograph.
+
+    Air and bodies need a date: the photograph's, else the one that was given.
+    """
+    sky = dict(given.get("sky", {}))
+    given_utc = sky.pop("epoch_utc", None)
+    for key in ("epoch_jyear", "observer_velocity_km_s"):
+        sky.pop(key, None)
+    first_ns, dated = session.shots[0].photo.t_ns, session.shots[0].sky
+    bodies = bool(sky.get("bodies"))
+    if first_ns is not None and (session.air is not None or bodies):
+        sky["epoch_utc"] = f"{np.datetime64(first_ns, 'ns').astype('datetime64[ms]')}Z"
+    elif bodies and given_utc is not None:
+        sky["epoch_utc"] = given_utc
+    else:
+        sky["epoch_jyear"] = round(dated.epoch_jyear, 6)
+    if session.air is None and dated.velocity_km_s is not None and not bodies:
+        sky["observer_velocity_km_s"] = [round(float(v), 4) for v in dated.velocity_km_s]
+    sky.setdefault("faintest_v_mag", 10.0)
+    return sky
 
 
 def _detector(session: Session, given: dict[str, Any]) -> dict[str, Any]:

@@ -1,16 +1,17 @@
 """The detector behind photographs by their background: gain, pedestal and read noise, by photon transfer.
 
-Shot noise goes as the light, and the pixels' response (PRNU) as its square: both are noise about the neighbours in one
-photograph, and only what several photographs have in common tells them apart, or levels that differ widely. A gain that
-they leave open is the bench file's.
+Shot noise goes as the light, and the pixels' response (PRNU) as its square: both are noise about
+the neighbours in one photograph, and only what several photographs have in common tells them apart,
+or levels that differ widely. A gain that they leave open is the bench file's.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, FloatArray
 from hilstar.confront.background import NO_PATTERN, FixedPattern
@@ -21,7 +22,8 @@ BLOCK_PX = 32
 CLIP, ROUNDS = 3.5, 8
 MIN_VARIANCE_DN2 = 1e-9
 MIN_POINTS = 4  # for a curve of three numbers
-SKY_CURVATURE = 0.03  # by how much the shade of the sky's light differs from one photograph to another beyond a slope
+# by how much the shade of the sky's light differs from one photograph to another beyond a slope
+SKY_CURVATURE = 0.03
 MIN_LEVEL_RANGE = 1.25  # ratio of background levels from which their noise tells the gain
 TOLD_SIGMAS = 5.0  # a gain is told where shot noise is so many of its sigmas
 MAX_GAIN_ERROR = 0.1  # and at one level, where its sigma is no larger share of it
@@ -32,8 +34,8 @@ READ_NOISE_SHARE = 0.5  # one sigma of a read noise that is assumed, as a share 
 class PixelFit:
     """What pixels tell of the detector: gain, pedestal, read noise, with one sigma where known, and the points (n, 2) of it.
 
-    Points are the background's level and its variance, DN, DN^2. `notes` say what was assumed. `gain_told` is whether the
-    gain is the photographs' own; else it is the bench file's.
+    Points are the background's level and its variance, DN, DN^2. `notes` say what was assumed.
+    `gain_told` is whether the gain is the photographs' own; else it is the bench file's.
     """
 
     gain_e_per_dn: float
@@ -68,16 +70,17 @@ def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> Float
     off = dn - level
     free = ~star
     parts = []
-    for one, two, both in (
+    for first, second, both in (
         (off[:, 1:], off[:, :-1], free[:, 1:] & free[:, :-1]),
         (off[1:], off[:-1], free[1:] & free[:-1]),
     ):
-        height, width = (size // BLOCK_PX * BLOCK_PX for size in one.shape)
+        height, width = (size // BLOCK_PX * BLOCK_PX for size in first.shape)
         shape = height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX
-        difference = ((one - two)[:height, :width]).reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
-        use = both[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
-        middle = level[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2).mean(axis=1)
-        spread = np.sqrt(np.maximum((difference**2 * use).sum(axis=1) / np.maximum(use.sum(axis=1), 1), 1e-12))
+        difference = _in_blocks((first - second)[:height, :width], shape)
+        use = _in_blocks(both[:height, :width], shape)
+        middle = _in_blocks(level[:height, :width], shape).mean(axis=1)
+        squares = (difference**2 * use).sum(axis=1) / np.maximum(use.sum(axis=1), 1)
+        spread = np.sqrt(np.maximum(squares, 1e-12))
         use &= np.abs(difference) < 4 * spread[:, None]
         count = use.sum(axis=1)
         variance = (difference**2 * use).sum(axis=1) / np.maximum(count, 1) / 2
@@ -86,8 +89,17 @@ def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> Float
     return np.concatenate(parts)
 
 
+def _in_blocks(values: npt.NDArray[Any], shape: tuple[int, int, int, int]) -> npt.NDArray[Any]:
+    """Values (height, width) by block: (blocks, BLOCK_PX^2)."""
+    return values.reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
+
+
 def fit_pixels(
-    points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: DetectorSettings, pattern: FixedPattern
+    points: FloatArray,
+    step_dn: float,
+    pedestal: tuple[float, float] | None,
+    assumed: DetectorSettings,
+    pattern: FixedPattern,
 ) -> PixelFit:
     """The detector by photon transfer, that of the bench file where photographs cannot tell it.
 
@@ -110,17 +122,26 @@ def fit_pixels(
         notes=(note,) if note else (),
     )
     several = math.isfinite(pattern.errors[0])
-    told = _by_levels(bench, light, variance, several=several)
-    told = told or _by_one_level(bench, light, variance, several=several)
-    return told or _by_response(bench, light, variance, assumed.dsnu_e / bench.gain_e_per_dn)
+    own_gain = _by_levels(bench, light, variance, several=several)
+    own_gain = own_gain or _by_one_level(bench, light, variance, several=several)
+    return own_gain or _by_response(bench, light, variance, assumed.dsnu_e / bench.gain_e_per_dn)
 
 
-def _of_bench(assumed: DetectorSettings, step_dn: float, points: FloatArray, pattern: FixedPattern) -> PixelFit:
+def _of_bench(
+    assumed: DetectorSettings,
+    step_dn: float,
+    points: FloatArray,
+    pattern: FixedPattern,
+) -> PixelFit:
     gain, read_e = assumed.gain_e_per_dn, assumed.read_noise_e
     return PixelFit(gain, assumed.offset_dn, read_e, step_dn, {}, points, (), pattern)
 
 
-def _pedestal(level: FloatArray, pedestal: tuple[float, float] | None, assumed: DetectorSettings) -> tuple[float, float, str]:
+def _pedestal(
+    level: FloatArray,
+    pedestal: tuple[float, float] | None,
+    assumed: DetectorSettings,
+) -> tuple[float, float, str]:
     """The pedestal, its sigma, DN, and where it is from, if it is the bench file's."""
     bench = assumed.offset_dn
     whose = f"the pedestal is the bench file's, {bench:g} DN"
@@ -133,7 +154,13 @@ def _pedestal(level: FloatArray, pedestal: tuple[float, float] | None, assumed: 
     return offset, sigma, ""
 
 
-def _by_levels(bench: PixelFit, light: FloatArray, variance: FloatArray, *, several: bool) -> PixelFit | None:
+def _by_levels(
+    bench: PixelFit,
+    light: FloatArray,
+    variance: FloatArray,
+    *,
+    several: bool,
+) -> PixelFit | None:
     """The gain by the slope of the variance over levels that differ; None where they do not tell it.
 
     In one photograph the pixels' response is unknown: a square is fitted beside the slope.
@@ -154,11 +181,24 @@ def _by_levels(bench: PixelFit, light: FloatArray, variance: FloatArray, *, seve
     pattern = bench.pattern
     if not several and line.square > 0:
         pattern = _response_alone(line.square, line.square_sigma)
-    return replace(bench, gain_e_per_dn=gain, read_noise_e=read_dn * gain, sigma=sigma, pattern=pattern, gain_told=True)
+    return replace(
+        bench,
+        gain_e_per_dn=gain,
+        read_noise_e=read_dn * gain,
+        sigma=sigma,
+        pattern=pattern,
+        gain_told=True,
+    )
 
 
-def _by_one_level(bench: PixelFit, light: FloatArray, variance: FloatArray, *, several: bool) -> PixelFit | None:
-    """The gain by the shot noise of one level, whose fixed pattern several photographs told; None where they do not tell it."""
+def _by_one_level(
+    bench: PixelFit,
+    light: FloatArray,
+    variance: FloatArray,
+    *,
+    several: bool,
+) -> PixelFit | None:
+    """The gain by the shot noise of one level; None where its fixed pattern is not known."""
     signal = float(np.median(light))
     noise2 = float(np.median(variance)) - bench.step_dn**2 / 12
     if not several or signal <= 0 or noise2 <= 0:
@@ -172,15 +212,21 @@ def _by_one_level(bench: PixelFit, light: FloatArray, variance: FloatArray, *, s
     if error > MAX_GAIN_ERROR:
         return None
     note = (
-        f"the background has one level: the gain takes the bench file's pedestal, {bench.pedestal_dn:g} DN, and"
+        "the background has one level: the gain takes the bench file's pedestal,"
+        f" {bench.pedestal_dn:g} DN, and"
         f" read noise, {read_e:g} e-"
     )
     sigma = bench.sigma | {"gain_e_per_dn": gain * error}
     return replace(bench, gain_e_per_dn=gain, sigma=sigma, notes=(*bench.notes, note), gain_told=True)
 
 
-def _by_response(bench: PixelFit, light: FloatArray, variance: FloatArray, offsets_dn: float) -> PixelFit:
-    """The bench file's gain, and what noise is left as read noise, or beside pixels' offsets as their response."""
+def _by_response(
+    bench: PixelFit,
+    light: FloatArray,
+    variance: FloatArray,
+    offsets_dn: float,
+) -> PixelFit:
+    """The bench file's gain; the noise left over is read noise, or the pixels' response."""
     signal = float(np.median(light))
     noise2 = float(np.median(variance)) - bench.step_dn**2 / 12
     gain = bench.gain_e_per_dn
@@ -192,21 +238,24 @@ def _by_response(bench: PixelFit, light: FloatArray, variance: FloatArray, offse
     left2 = noise2 - shot2 - offsets_dn**2
     error2 = _median_error(variance)
     note = (
-        "these photographs do not tell the gain, which is the bench file's: one level of background has shot noise and the"
+        "these photographs do not tell the gain, which is the bench file's: one level of"
+        " background has shot noise and the"
         " pixels' response in one"
     )
     if left2 < -TOLD_SIGMAS * error2:
         least = signal / max(noise2, MIN_VARIANCE_DN2)
         note += (
             f"; but the noise, {math.sqrt(max(noise2, 0.0)):.3g} DN, is less than its shot noise,"
-            f" {math.sqrt(shot2):.3g} DN: write [tracker.detector] gain_e_per_dn = {least:.3g} or more"
+            f" {math.sqrt(shot2):.3g} DN: write [tracker.detector] gain_e_per_dn = {least:.3g} or"
+            f" more"
         )
         return replace(bench, notes=(*bench.notes, note))
     if math.isfinite(bench.pattern.errors[0]):
         return replace(bench, notes=(*bench.notes, note))
     pattern = _response_alone(left2 / signal**2, error2 / signal**2, offsets_dn)
     if pattern.rms[0]:
-        note += f"; the rest of the noise is a response of {100 * pattern.rms[0]:.2g} %, if no more of it are offsets"
+        percent = 100 * pattern.rms[0]
+        note += f"; the rest of the noise is a response of {percent:.2g} %, if no more are offsets"
     return replace(bench, pattern=pattern, notes=(*bench.notes, note))
 
 
@@ -245,28 +294,28 @@ NO_CURVE = _Curve(*[math.nan] * 6)
 
 
 def _curve(x: FloatArray, y: FloatArray, *, square: bool) -> _Curve:
-    """Slope, value at 0 and the square's share, none below 0, with their sigmas, without what lies far off; errors go as y."""
+    """Slope, value at 0 and share of the square, with sigmas, without outliers; errors go as y."""
     columns = [x, np.ones_like(x)]
     if square:
         columns.append(x**2)
     whole = np.column_stack(columns)
-    kept = np.ones(len(x), dtype=bool)
+    near = np.ones(len(x), dtype=bool)
     scale = np.maximum(np.maximum(np.median(y) * 0.5, y), MIN_VARIANCE_DN2)
     values: FloatArray = np.zeros(3)
     sigma = np.full(3, math.nan)
     for _ in range(ROUNDS):
-        if kept.sum() < MIN_POINTS:  # levels without noise
+        if near.sum() < MIN_POINTS:  # levels without noise
             return NO_CURVE
-        weight = 1 / scale[kept]
-        design = whole[kept] * weight[:, None]
+        weight = 1 / scale[near]
+        design = whole[near] * weight[:, None]
         size = np.linalg.norm(design, axis=0)
         least_squares = _not_below_zero if square else _free
-        values = least_squares(design / size, y[kept] * weight) / size
+        values = least_squares(design / size, y[near] * weight) / size
         off = y - whole @ values
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept] * weight)))
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(off[near] * weight)))
         normal = np.linalg.pinv((design / size).T @ (design / size))
         sigma = spread * np.sqrt(np.diag(normal)) / size
-        kept = np.abs(off) < CLIP * spread * scale
+        near = np.abs(off) < CLIP * spread * scale
     squares = (float(values[2]), float(sigma[2])) if square else (0.0, 0.0)
     return _Curve(float(values[0]), float(values[1]), squares[0], float(sigma[0]), float(sigma[1]), squares[1])
 
@@ -274,10 +323,11 @@ def _curve(x: FloatArray, y: FloatArray, *, square: bool) -> _Curve:
 def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[float, float] | None:
     """The level without light, and its sigma, by skies of different brightness; None where they cannot tell.
 
-    `levels` (blocks,) of each photograph at `places` (blocks, 2). A sky's light is one shade over the image, common to all
-    photographs, times a slope of its own. Sigma is by leaving out a photograph at a time.
+    `levels` (blocks,) of each photograph at `places` (blocks, 2). A sky's light is one shade over
+    the image, common to all photographs, times a slope of its own. Sigma is by leaving out a
+    photograph at a time.
     """
-    medians = [float(np.median(one)) for one in levels]
+    medians = [float(np.median(level)) for level in levels]
     if len(levels) < 2 or max(medians) < MIN_LEVEL_RANGE * max(min(medians), 1e-9):
         return None
     from scipy.optimize import minimize_scalar
@@ -285,7 +335,7 @@ def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[floa
     plane = np.column_stack([np.ones(len(places)), places])
 
     def best(some: Sequence[FloatArray]) -> float:
-        lowest = min(float(one.min()) for one in some)
+        lowest = min(float(level.min()) for level in some)
 
         def loss(pedestal: float) -> float:
             logs = np.log(np.array(some) - pedestal)

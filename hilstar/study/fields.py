@@ -1,11 +1,11 @@
-"""The three fields of the thesis's simulations (tables 5.2 to 5.4), in which any bench is shown, and a field of one's own."""
+"""The three fields of the thesis's simulations (tables 5.2 to 5.4), and a field of one's own."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A field: the stem of its files, its name, where it is, and the star in the middle of the thesis's zoom."""
+    """A field: stem of its files, name, place, and the star in the middle of the thesis's zoom."""
 
     stem: str
     name: str
@@ -28,4 +28,7 @@ def fields_of(radec_roll_deg: tuple[float, float, float] | None) -> tuple[Field,
     if radec_roll_deg is None:
         return three
     ra_deg, dec_deg, roll_deg = radec_roll_deg
-    return (*three, Field(OWN, f"RA {ra_deg:g}, Dec {dec_deg:g}, roll {roll_deg:g}°", radec_roll_deg))
+    return (
+        *three,
+        Field(OWN, f"RA {ra_deg:g}, Dec {dec_deg:g}, roll {roll_deg:g}°", radec_roll_deg),
+    )

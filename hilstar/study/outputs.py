@@ -1,7 +1,7 @@
-"""The seven outputs of chapter 5: centroids, magnitudes, temperatures, images without and with noise and a part of each.
+"""The seven outputs of chapter 5: three plots of the stars, two images and a part of each.
 
-Of the three simulations that the thesis has, as they were published and with their errors mended; or of a bench, for the same
-three fields and any other.
+Of the three simulations that the thesis has, as they were published and with their errors mended;
+or of a bench, for the same three fields and any other.
 """
 
 import math
@@ -33,13 +33,14 @@ SHOWN_SIGMAS = 10.0  # of the sky's noise, at least, from black to white
 HEIGHT_INCH = 8.4
 PUBLISHED = "_as_published"
 WITHOUT_NOISE = "_without_noise"
+DECIMALS = {"mag": 2, "K": 0}  # of a mean
 # The thesis's figures of each field.
 FIGURES = {"orion": "5.3 to 5.7", "lyra": "5.8 to 5.12", "rosetta": "5.14 to 5.18"}
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A field before a camera: its file names' stem, the title of its chart, and the star of its zoom (None: the brightest)."""
+    """A field before a camera: stem of its files, title, and star of its zoom (None: the brightest)."""
 
     stem: str
     title: str
@@ -65,7 +66,11 @@ class Outputs:
         return self.noisy.truth
 
 
-def run(directory: Path, file: BenchFile | None = None, radec_roll_deg: tuple[float, float, float] | None = None) -> list[str]:
+def run(
+    directory: Path,
+    file: BenchFile | None = None,
+    radec_roll_deg: tuple[float, float, float] | None = None,
+) -> list[str]:
     """Write each scene's figure, images (FITS) and truth (CSV); a line for each. Raises InputError."""
     if file is not None:
         chosen = fields_of(radec_roll_deg)
@@ -73,7 +78,10 @@ def run(directory: Path, file: BenchFile | None = None, radec_roll_deg: tuple[fl
     lines = []
     for field in FIELDS:
         published = Scene(
-            field.stem + PUBLISHED, f"{field.name} as published (thesis figures {FIGURES[field.stem]})", field, field.zoom_hip
+            field.stem + PUBLISHED,
+            f"{field.name} as published (thesis figures {FIGURES[field.stem]})",
+            field,
+            field.zoom_hip,
         )
         mended = Scene(field.stem, f"{field.name} with the thesis's errors mended", field, field.zoom_hip)
         for scene, suffix in ((published, "-as-published"), (mended, "")):
@@ -89,7 +97,7 @@ def output_files(fields: tuple[Field, ...]) -> list[str]:
 
 
 def thesis_total_e(detector: DetectorSettings, light_e: float, exposure_s: float) -> float:
-    """The n_TOT of the thesis's table 4.1 and eq. 4.14 as printed, with the roots of PRNU and DSNU that have no dimension."""
+    """The n_TOT of table 4.1 and eq. 4.14 as printed, whose PRNU and DSNU have no dimension."""
     fixed_e2 = light_e * detector.prnu + detector.dsnu_e_per_s * exposure_s
     return math.sqrt(
         light_e + detector.dark_e_per_s * exposure_s + fixed_e2 + detector.adc_noise_e**2 + detector.read_noise_e**2
@@ -107,9 +115,9 @@ def _output(directory: Path, file: BenchFile, scene: Scene) -> str:
         sky_e = float(np.median(clean.mean_e))
         noise_e = math.sqrt(simulator.detector.settings.noise(sky_e, exposure_s).total_e2)
         inside = simulator.camera.contains_px(noisy.truth["x_px"], noisy.truth["y_px"])
-        words = _camera_words(file, simulator.camera, sky_e, noise_e)
+        camera_text = _camera_words(file, simulator.camera, sky_e, noise_e)
         gain = simulator.detector.settings.gain_e_per_dn
-        outputs = Outputs(clean, noisy, inside, sky_e, noise_e, gain, words)
+        outputs = Outputs(clean, noisy, inside, sky_e, noise_e, gain, camera_text)
         write_exposure_fits(directory / f"{scene.stem}.fits", simulator, noisy, noise)
         without = FrameNoise("none", SEED)
         write_exposure_fits(directory / f"{scene.stem}{WITHOUT_NOISE}.fits", simulator, clean, without)
@@ -121,7 +129,8 @@ def _output(directory: Path, file: BenchFile, scene: Scene) -> str:
 
 def _found(outputs: Outputs) -> str:
     """Stars, temperatures and sky of a scene in words."""
-    sky = f"sky {np.median(outputs.noisy.dn):.0f} DN; n_TOT of a pixel of sky {outputs.noise_e:.0f} e-"
+    level_dn = np.median(outputs.noisy.dn)
+    sky = f"sky {level_dn:.0f} DN; n_TOT of a pixel of sky {outputs.noise_e:.0f} e-"
     truth = outputs.truth
     if not len(truth):
         return f"no star; {sky}"
@@ -134,7 +143,8 @@ def _found(outputs: Outputs) -> str:
         heat = f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
         heat += f" ({np.nanmean(kelvin[outputs.inside]):.0f} K on the image)" if beyond else ""
     return (
-        f"{int(outputs.inside.sum())} stars{edge}, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f}{heat};"
+        f"{int(outputs.inside.sum())} stars{edge}, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean"
+        f" {v_mag.mean():.2f}{heat};"
         f" {int(truth['clipped'].sum())} stars saturated; {sky}"
     )
 
@@ -164,8 +174,8 @@ def _field_rad(camera: Camera) -> tuple[float, float]:
 
 
 def _angle_rad(rays: FloatArray) -> float:
-    one, other = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    return math.acos(float(np.clip(one @ other, -1, 1)))
+    first, last = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return math.acos(float(np.clip(first @ last, -1, 1)))
 
 
 def _figure(path: Path, scene: Scene, outputs: Outputs) -> None:
@@ -198,14 +208,15 @@ def _draw_property(axes: "Axes", values: FloatArray, name: str, unit: str) -> No
     title = f"{name}, no star"
     if known.any():
         mean = float(values[known].mean())
-        title = f"{name}, mean {mean:.0f} {unit}" if unit == "K" else f"{name}, mean {mean:.2f} {unit}"
+        decimals = DECIMALS[unit]
+        title = f"{name}, mean {mean:.{decimals}f} {unit}"
         axes.plot(np.arange(1, len(values) + 1), values, ".", color=INK, ms=3)
         axes.axhline(mean, color=MUTED, lw=1)
     axes.set(xlabel="star", title=title, ylabel=f"{name} [{unit}]")
 
 
 def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
-    """The images without and with noise, each with its zoom beside it; the colour bar and the camera in the third column."""
+    """The images without and with noise, each with its zoom, and beside them scale and camera."""
     star, (x_px, y_px) = _zoom(scene, outputs)
     low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT)
     least = low + max(SHOWN_SIGMAS * outputs.noise_e / outputs.gain_e_per_dn, 1.0)
@@ -217,7 +228,10 @@ def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
         axes.grid(False)
         axes.set(xlabel="x [px]", ylabel="y [px]", title=title)
     for zoomed in (drawn[1], drawn[3]):
-        zoomed.set(xlim=(x_px - ZOOM_PX / 2, x_px + ZOOM_PX / 2), ylim=(y_px + ZOOM_PX / 2, y_px - ZOOM_PX / 2))
+        zoomed.set(
+            xlim=(x_px - ZOOM_PX / 2, x_px + ZOOM_PX / 2),
+            ylim=(y_px + ZOOM_PX / 2, y_px - ZOOM_PX / 2),
+        )
     facts, scale = panels[2], panels[5]
     facts.text(0, 1, outputs.camera_words, va="top", transform=facts.transAxes, fontsize=SMALL_PT)
     for axes in (facts, scale):
@@ -226,7 +240,7 @@ def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
 
 
 def _zoom(scene: Scene, outputs: Outputs) -> tuple[str, tuple[float, float]]:
-    """The name and place of the star in the middle of a zoom; without a star the middle of the image."""
+    """The name and place of the star in a zoom's middle; without one the image's middle."""
     stars = outputs.truth[outputs.inside]
     if scene.zoom_hip is not None:
         stars = stars[stars["hip"] == scene.zoom_hip]

@@ -1,7 +1,7 @@
-"""RAPP 1 to 3 (thesis eq. 5.1 to 5.3): the spectral model over the average one in irradiance, photons and electrons.
+"""RAPP 1 to 3 (thesis eq. 5.1 to 5.3): the spectral model of light over the average one.
 
-They depend on the sensor: of the two that the thesis has (figures 5.19 and 5.22), and of a bench's own, with the stars that
-it sees in the thesis's three fields and in any other.
+They depend on the sensor: of the two that the thesis has (figures 5.19 and 5.22), and of a bench's
+own, with the stars that it sees in the thesis's three fields and in any other.
 """
 
 from dataclasses import dataclass
@@ -45,7 +45,13 @@ SAID_OF_THESIS = {  # section 5.4, of figures 5.19 and 5.22
     "kai-4021": "; RAPP1 at 50000 K is {:.2f}, and {:.2f} with any curve from 300 to 1050 nm (thesis: the CCD47-20's)",
 }
 RATIOS = ("irradiance", "photons", "electrons")
-BENCH_FILES = ("rapp_bench.png", "rapp_bench.svg", "rapp_bench.csv", "rapp_stars.csv", "findings.csv")
+BENCH_FILES = (
+    "rapp_bench.png",
+    "rapp_bench.svg",
+    "rapp_bench.csv",
+    "rapp_stars.csv",
+    "findings.csv",
+)
 STAR_COLUMNS = ("field", "hip", "v_mag", "bv_mag", "temperature_k", "rapp3")
 
 
@@ -59,7 +65,7 @@ class ChartFinding:
 
 @dataclass(frozen=True, slots=True)
 class FieldRatios:
-    """The stars (n,) of a field: which, and the electrons of each by the bench's spectra over those by the average model."""
+    """The stars (n,) of a field, and the electrons of each by its spectrum over the average model's."""
 
     field: Field
     star: npt.NDArray[np.intp]
@@ -71,11 +77,12 @@ class FieldRatios:
         if not len(self.star):
             return f"{self.field.name}: no star"
         low, middle, high = np.percentile(self.ratio, (5, 50, 95))
-        return f"{self.field.name}: {len(self.star)} stars, median {middle:.2f}, 90 % from {low:.2f} to {high:.2f}"
+        spread = f"median {middle:.2f}, 90 % from {low:.2f} to {high:.2f}"
+        return f"{self.field.name}: {len(self.star)} stars, {spread}"
 
 
 def rapp_ratios(temperature_k: FloatArray, optics: Optics, weighting: Weighting) -> FloatArray:
-    """RAPP1, RAPP2 and RAPP3, shape (3, n): DGS over AGS in irradiance, photons and electrons (thesis eq. 5.1 to 5.3)."""
+    """RAPP1, RAPP2 and RAPP3, shape (3, n): DGS over AGS in irradiance, photons and electrons."""
     photometry = Photometry(weighting=weighting)
     wavelength_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
     low_nm, high_nm = optics.range_nm
@@ -100,15 +107,18 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
     optics = study_optics(sensor)
     kelvin = _temperatures_k()
     ratios = {weighting: rapp_ratios(kelvin, optics, weighting) for weighting in WEIGHTINGS}
-    in_full_range = rapp_ratios(kelvin[-1:], study_optics("ccd47-20"), "energy")  # which the range of wavelengths alone makes
+    # which the range of wavelengths alone makes
+    in_full_range = rapp_ratios(kelvin[-1:], study_optics("ccd47-20"), "energy")
     coolest, cool, hot, hottest = _quoted(kelvin, ratios["energy"])
     text = (
-        f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the average one at 3000 K,"
-        f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by {100 * (hottest - 1):+.1f} %"
-        + SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
+        f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the"
+        f" average one at 3000 K,"
+        f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by"
+        f" {100 * (hottest - 1):+.1f} %" + SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
     )
     title = (
-        f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the average model,"
+        f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the"
+        f" average model,"
         f" one of 5000 K {cool:.2f} times"
     )
     _draw(directory / f"rapp_{sensor}", title, optics, ratios, "energy")
@@ -119,29 +129,32 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
 def bench_rapp(
     directory: Path, file: BenchFile, radec_roll_deg: tuple[float, float, float] | None = None
 ) -> list[ChartFinding]:
-    """The three ratios of a bench's tracker, and RAPP3 of the stars that it sees in the thesis's fields and one of one's own.
+    """The three ratios of a bench's tracker, and RAPP3 of the stars that it sees.
 
-    The curves are of black bodies; the stars have the spectra that the bench gives them. Raises InputError.
+    The stars are those of the thesis's fields, and of one of one's own. The curves are of black
+    bodies; the stars have the spectra that the bench gives them. Raises InputError.
     """
     optics = bench_optics(file.config.tracker, file.folder)
     weighting = file.config.sky.passband_weighting
     kelvin = _temperatures_k()
-    ratios = {one: rapp_ratios(kelvin, optics, one) for one in WEIGHTINGS}
+    ratios = {name: rapp_ratios(kelvin, optics, name) for name in WEIGHTINGS}
     coolest, cool, hot, hottest = _quoted(kelvin, ratios[weighting])
     text = (
-        f"By {file.path.name} a black body of 3000 K gives {coolest:.2f} times the electrons of the average model, one of"
+        f"By {file.path.name} a black body of 3000 K gives {coolest:.2f} times the electrons of"
+        f" the average model, one of"
         f" 5000 K {cool:.2f}, 9000 K {hot:.2f}, 50000 K {hottest:.2f}"
     )
     stars, ratio = _star_ratios(file)
     camera = tracker_camera(file.config.tracker, file.folder)
-    seen = [_in_field(field, stars, ratio, camera) for field in fields_of(radec_roll_deg)]
-    _draw(directory / "rapp_bench", text, optics, ratios, weighting, (stars, seen))
+    fields = [_in_field(field, stars, ratio, camera) for field in fields_of(radec_roll_deg)]
+    _draw(directory / "rapp_bench", text, optics, ratios, weighting, (stars, fields))
     _write(directory / "rapp_bench.csv", kelvin, ratios)
-    rows = [row for one in seen for row in _star_rows(one, stars)]
+    rows = [row for field in fields for row in _star_rows(field, stars)]
     write_csv(directory / "rapp_stars.csv", STAR_COLUMNS, rows)
     findings = [ChartFinding("rapp_bench", text)]
-    findings += [ChartFinding("rapp_stars", f"RAPP3 of the stars of {one.text}") for one in seen]
-    write_csv(directory / "findings.csv", ("figure", "finding"), [(one.figure, one.text) for one in findings])
+    findings += [ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}") for field in fields]
+    table = [(finding.figure, finding.text) for finding in findings]
+    write_csv(directory / "findings.csv", ("figure", "finding"), table)
     return findings
 
 
@@ -156,7 +169,7 @@ def _quoted(kelvin: FloatArray, ratios: FloatArray) -> FloatArray:
 
 
 def _star_ratios(file: BenchFile) -> tuple[Stars, FloatArray]:
-    """The stars of a bench, and the electrons of each (n,) by its spectrum over those by the average model."""
+    """The stars of a bench, and the electrons of each (n,) over those by the average model."""
     config = file.config
     spectral, average = (
         bench_stars(structs.replace(config, sky=structs.replace(config.sky, brightness=model)), file.folder)
@@ -176,10 +189,11 @@ def _in_field(field: Field, stars: Stars, ratio: FloatArray, camera: Camera) -> 
     return FieldRatios(field, star, ratio[star])
 
 
-def _star_rows(seen: FieldRatios, stars: Stars) -> list[tuple[object, ...]]:
-    columns = [values[seen.star].tolist() for values in (stars.hip, stars.v_mag, stars.bv_mag, stars.temperature_k)]
-    stems = [seen.field.stem] * len(seen.star)
-    return list(zip(stems, *columns, seen.ratio.tolist(), strict=True))
+def _star_rows(in_field: FieldRatios, stars: Stars) -> list[tuple[object, ...]]:
+    properties = (stars.hip, stars.v_mag, stars.bv_mag, stars.temperature_k)
+    columns = [values[in_field.star].tolist() for values in properties]
+    stems = [in_field.field.stem] * len(in_field.star)
+    return list(zip(stems, *columns, in_field.ratio.tolist(), strict=True))
 
 
 def _draw(
@@ -190,7 +204,7 @@ def _draw(
     solid: Weighting,
     stars: tuple[Stars, list[FieldRatios]] | None = None,
 ) -> None:
-    """The ratios over temperature, those of the weighting `solid` with solid lines; below, the stars of fields."""
+    """The ratios over temperature, solid by the weighting `solid`; below, the stars of fields."""
     kelvin = _temperatures_k()
     (dotted,) = set(WEIGHTINGS) - {solid}
     low_nm, high_nm = optics.range_nm
@@ -202,14 +216,16 @@ def _draw(
             axes[0].loglog(kelvin, ratios[dotted][k], ":", color=colour, label="_dotted")
         axes[0].set(ylabel="ratio of the models [1]")
         if stars is not None:
-            known, seen = stars
-            for one, colour in zip(seen, SERIES, strict=False):
-                axes[1].loglog(known.temperature_k[one.star], one.ratio, ".", ms=4, color=colour, label=one.field.name)
+            catalogue, fields = stars
+            for field, colour in zip(fields, SERIES, strict=False):
+                kelvin_of_stars = catalogue.temperature_k[field.star]
+                name = field.field.name
+                axes[1].loglog(kelvin_of_stars, field.ratio, ".", ms=4, color=colour, label=name)
             axes[1].set(ylabel="electrons of stars [1]")
             axes[1].legend(loc="upper right")
-        for each in axes:
-            each.axhline(1, color=MUTED, lw=1)
-            each.set_xlim(kelvin[0], kelvin[-1])
+        for panel in axes:
+            panel.axhline(1, color=MUTED, lw=1)
+            panel.set_xlim(kelvin[0], kelvin[-1])
         axes[-1].set(xlabel="black-body temperature [K]")
         plain_ticks(axes[-1].xaxis, TICKS_K)
         label_ends(axes[0])

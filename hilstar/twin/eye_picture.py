@@ -1,7 +1,7 @@
-"""A tracker's frame as a picture for people: light above the sky, stretched, with a disc for each star.
+"""A tracker's frame as a picture for people: light above the sky, with a disc for each star.
 
-Saturated pixels cannot tell bright stars apart: a disc does. What is wide enough to be seen by itself, such as the Moon or
-the trail of a star, has none.
+Saturated pixels cannot tell bright stars apart: a disc does. What is wide enough to be seen by
+itself, such as the Moon or the trail of a star, has none.
 """
 
 from typing import NamedTuple
@@ -15,10 +15,12 @@ from hilstar.units import MAD_TO_SIGMA
 
 DigitalNumbers = npt.NDArray[np.uint16]
 
-BOX_PX = 5  # side of the square over which a star's light is summed: where the middle is full, the wings still grow
+# side of the square over which a star's light is summed: where the middle is full, the wings still
+# grow
+BOX_PX = 5
 MAX_RADIUS_PX = 8  # radius of the brightest star's disc
-# A disc's radius goes with this power of the star's share of the brightest: enough for a sum that saturates, in which five
-# magnitudes are only a factor of ten.
+# A disc's radius goes with this power of the star's share of the brightest: enough for a sum that
+# saturates, in which five magnitudes are only a factor of ten.
 RADIUS_POWER = 0.77
 STAR_SIGMA = 8.0  # a box sum this many sigmas above its surroundings is a star
 PIXEL_GREY = 0.7  # the brightest grey of a pixel that no disc covers
@@ -26,13 +28,15 @@ MIN_NOISE_DN = 1.0
 MIN_TOP_SIGMA = 50.0  # the stretch goes up to this at least: noise alone stays dark
 
 MAX_BLOCK_PX, MIN_BLOCK_PX, BLOCKS_A_SIDE = 64, 8, 16
-# The sky starts from this share of the blocks, the darkest, which a body that covers less than the rest does not touch.
+# The sky starts from this share of the blocks, the darkest, which a body that covers less than the
+# rest does not touch.
 DARKEST_SHARE = 0.5
 SKY_ROUNDS = 10
 SKY_SIGMA = 4.0  # a block farther from the surface is no sky
 
 RING_PX = 25  # side of the square whose median is a star's surroundings
-WIDE_SHARE = 0.5  # a peak whose light has this share of its height as far off as MAX_RADIUS_PX is no star's
+# a peak whose light has this share of its height as far off as MAX_RADIUS_PX is no star's
+WIDE_SHARE = 0.5
 
 
 class Sky(NamedTuple):
@@ -43,7 +47,7 @@ class Sky(NamedTuple):
 
 
 class _Blocks(NamedTuple):
-    """Medians and noise (n,) of an image's blocks, and their middles (n,) as shares of its sides, -1 to 1."""
+    """Medians and noise (n,) of an image's blocks, and their middles (n,), -1 to 1 over its sides."""
 
     level: FloatArray
     noise: FloatArray
@@ -52,9 +56,10 @@ class _Blocks(NamedTuple):
 
 
 def exposure_picture(dn: DigitalNumbers, full_dn: int) -> npt.NDArray[np.uint8]:
-    """Greys (height, width), uint8, of a frame in DN: asinh of the light above the sky, and a disc for each star.
+    """Greys (height, width) of a frame in DN: asinh of light above the sky, a disc for each star.
 
-    The sky is a smooth surface over the frame. A pixel at `full_dn`, where the detector saturates, is white.
+    The sky is a smooth surface over the frame. A pixel at `full_dn`, where the detector saturates,
+    is white.
     """
     sky = sky_under(dn)
     light = dn.astype(np.float64) - sky.level_dn
@@ -73,27 +78,27 @@ def exposure_picture(dn: DigitalNumbers, full_dn: int) -> npt.NDArray[np.uint8]:
 
 
 def sky_under(dn: DigitalNumbers) -> Sky:
-    """The sky of a frame (height, width): a surface of second degree through the blocks that a body or stars leave dark.
+    """The sky of a frame (height, width): a surface of second degree through its dark blocks.
 
     It takes a gradient of stray light away, and leaves what has a shape: a body, a galaxy, a limb.
     """
     blocks = _blocks(dn)
     noise_dn = max(float(np.median(blocks.noise)), MIN_NOISE_DN)
-    kept = blocks.level <= np.quantile(blocks.level, DARKEST_SHARE)
+    chosen = blocks.level <= np.quantile(blocks.level, DARKEST_SHARE)
     terms = _terms(blocks.across, blocks.down)
-    shape = _fitted(terms, blocks.level, kept)
+    shape = _fitted(terms, blocks.level, chosen)
     for _ in range(SKY_ROUNDS):
         off = np.abs(blocks.level - terms @ shape)
-        spread = MAD_TO_SIGMA * float(np.median(off[kept]))
+        spread = MAD_TO_SIGMA * float(np.median(off[chosen]))
         near = off <= SKY_SIGMA * max(spread, noise_dn / 2)
-        if np.array_equal(near, kept) or not near.any():
+        if np.array_equal(near, chosen) or not near.any():
             break
-        kept = near
-        shape = _fitted(terms, blocks.level, kept)
+        chosen = near
+        shape = _fitted(terms, blocks.level, chosen)
     height, width = dn.shape
     across = np.linspace(-1, 1, width)
     down = np.linspace(-1, 1, height)
-    rows = [_terms(across, np.full(width, one)) @ shape for one in down]
+    rows = [_terms(across, np.full(width, row)) @ shape for row in down]
     return Sky(np.array(rows), noise_dn)
 
 
@@ -120,10 +125,10 @@ def _terms(across: FloatArray, down: FloatArray) -> FloatArray:
     return np.column_stack([ones, across, down, across**2, across * down, down**2])
 
 
-def _fitted(terms: FloatArray, level: FloatArray, kept: BoolArray) -> FloatArray:
-    """The surface's coefficients (6,) by the kept blocks; with few of them, or few rows of them, the smallest that fit."""
-    found, *_ = np.linalg.lstsq(terms[kept], level[kept], rcond=1e-6)
-    return np.asarray(found)
+def _fitted(terms: FloatArray, level: FloatArray, chosen: BoolArray) -> FloatArray:
+    """The surface's coefficients (6,) by the chosen blocks; with few, the smallest that fit."""
+    shape, *_ = np.linalg.lstsq(terms[chosen], level[chosen], rcond=1e-6)
+    return np.asarray(shape)
 
 
 def _stretched(light: FloatArray, noise: float) -> FloatArray:
@@ -132,7 +137,7 @@ def _stretched(light: FloatArray, noise: float) -> FloatArray:
 
 
 def _star_places(box_sum: FloatArray, box_noise: float) -> tuple[IntArray, IntArray]:
-    """Rows and columns (n,) of stars: peaks of the light of a box above their surroundings, which end within a disc."""
+    """Rows and columns (n,) of stars: peaks above their surroundings that end within a disc."""
     peak = box_sum == ndimage.maximum_filter(box_sum, BOX_PX)
     peak &= box_sum > STAR_SIGMA * box_noise
     row, column = np.nonzero(peak)
@@ -151,13 +156,18 @@ def _is_wide(patch: FloatArray) -> bool:
     inner = slice(middle - MAX_RADIUS_PX, middle + MAX_RADIUS_PX + 1)
     near = patch[inner, inner]
     bright, _ = ndimage.label(near > WIDE_SHARE * near[MAX_RADIUS_PX, MAX_RADIUS_PX])
-    own = bright == bright[MAX_RADIUS_PX, MAX_RADIUS_PX]
-    edge = own[0].any() or own[-1].any() or own[:, 0].any() or own[:, -1].any()
+    star = bright == bright[MAX_RADIUS_PX, MAX_RADIUS_PX]
+    edge = star[0].any() or star[-1].any() or star[:, 0].any() or star[:, -1].any()
     return bool(edge)
 
 
-def _discs(shape: tuple[int, ...], place: tuple[IntArray, IntArray], radius_px: FloatArray, grey: FloatArray) -> FloatArray:
-    """Discs about places (rows, columns) on black (height, width); where two overlap the brighter one shows."""
+def _discs(
+    shape: tuple[int, ...],
+    place: tuple[IntArray, IntArray],
+    radius_px: FloatArray,
+    grey: FloatArray,
+) -> FloatArray:
+    """Discs about places (rows, columns) on black (height, width); of two the brighter shows."""
     picture = np.zeros(shape)
     height, width = shape
     reach = np.arange(-MAX_RADIUS_PX, MAX_RADIUS_PX + 1)

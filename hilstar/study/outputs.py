@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 SEED = 1
 ZOOM_PX = 160
 STRETCH_PERCENT = (1, 99.8)
-SHOWN_SIGMAS = 10.0  # of the sky's noise, at least, from black to white
+# From black to white, in sigmas of the sky's noise: at least, and at most where a body fills pixels.
+MIN_SIGMAS, MAX_SIGMAS = 10.0, 300.0
 HEIGHT_INCH = 8.4
 PUBLISHED = "_as_published"
 WITHOUT_NOISE = "_without_noise"
@@ -219,12 +220,13 @@ def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
     """The images without and with noise, each with its zoom, and beside them scale and camera."""
     star, (x_px, y_px) = _zoom(scene, outputs)
     low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT)
-    least = low + max(SHOWN_SIGMAS * outputs.noise_e / outputs.gain_e_per_dn, 1.0)
+    noise_dn = max(outputs.noise_e / outputs.gain_e_per_dn, 0.1)
+    high = float(np.clip(high, low + MIN_SIGMAS * noise_dn, low + MAX_SIGMAS * noise_dn))
     images = (outputs.clean, outputs.clean, outputs.noisy, outputs.noisy)
     titles = ("Without noise", f"The same, {star}", "With noise", f"The same, {star}")
     drawn = [panels[0], panels[1], panels[3], panels[4]]
     for axes, exposure, title in zip(drawn, images, titles, strict=True):
-        image = axes.imshow(exposure.dn, cmap="gray", vmin=low, vmax=max(high, least), interpolation="nearest")
+        image = axes.imshow(exposure.dn, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
         axes.grid(False)
         axes.set(xlabel="x [px]", ylabel="y [px]", title=title)
     for zoomed in (drawn[1], drawn[3]):

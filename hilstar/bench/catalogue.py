@@ -26,6 +26,12 @@ MIN_PARALLAX_SIGMAS = 5.0  # beyond which a distance is within 20 %
 FAINTER_MAG = 3.0  # by this a neighbour may be fainter
 COLOUR_STEP_MAG = 0.01  # step of the derivative of a rate by a colour
 DECIMALS = 9  # places in degrees: 4 microarcseconds
+PASSBANDS = {"u": "Bessell's U", "b": "Bessell's B", "r": "Bessell's R", "i": "Bessell's I", "g": "Gaia's G"}
+# A star's spectrum is chosen by its V-I, or its type: what it has in B is then not what was measured.
+NOT_MEASURED = {
+    "b": "; not V + (B-V), which is b_measured_mag: the spectrum is chosen by V-I or by type",
+    "i": "; V - (V-I) is i_measured_mag",
+}
 ENDINGS = (".csv", ".fits", ".parquet", ".vot")
 PARQUET = "parquet needs pyarrow: pip install 'hilstar[campaign]', or write .csv, .fits or .vot"
 
@@ -146,11 +152,11 @@ def _light(file: BenchFile, stars: Catalog, facts: dict[str, Any]) -> tuple[dict
         )
     }
     for band in BANDS:
-        words = "Gaia's G" if band == "g" else f"Bessell's {band.upper()}"
         values = stars.v_mag + colour[band](stars.bv_mag, stars.vi_mag, kind)
-        columns[f"{band}_mag"] = Column(
-            values, "mag", f"phot.mag;em.opt.{band.upper()}", f"synthetic, its spectrum through {words}"
-        )
+        words = f"synthetic, its spectrum through {PASSBANDS[band]}{NOT_MEASURED.get(band, '')}"
+        columns[f"{band}_mag"] = Column(values, "mag", f"phot.mag;em.opt.{band.upper()}", words)
+    columns["b_measured_mag"] = Column(stars.v_mag + stars.bv_mag, "mag", "phot.mag;em.opt.B", "V + (B-V), as measured")
+    columns["i_measured_mag"] = Column(stars.v_mag - stars.vi_mag, "mag", "phot.mag;em.opt.I", "V - (V-I), as measured")
     bolometric = stars.v_mag + colour["bolometric"](stars.bv_mag, stars.vi_mag, kind)
     columns["bolometric_mag"] = Column(bolometric, "mag", "phot.mag.bc", "apparent bolometric magnitude (IAU 2015)")
     columns["electrons_per_s"] = Column(rate, "1/s", "phot.count", "electrons per second in this tracker")

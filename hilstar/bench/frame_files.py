@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.bench.certificate import certificate_number
 from hilstar.bench.frame import Bench, Frame
 from hilstar.files import as_text, whole_file, written
@@ -36,6 +36,11 @@ AFTER_HEADER = 33  # bytes of a PNG up to the end of its first chunk
 PREVIEW_RADIUS_PX = 9  # the brightest star's
 PREVIEW_BLUR_PX = 0.7
 PREVIEW_POWER = 0.35
+# Light as bright over a square of this side is a body's or a map's, which is drawn as it is: at its size. A star's
+# brightest pixels are fewer.
+BODY_SIDE_PX = 9
+BODY_EDGE_PX = 3  # a round limb goes beyond the squares within it by so much
+BODY_SHARE = 1.5  # to this multiple of the square's light
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +255,7 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:
-    """A preview for the eye: each star a disc that grows with its code, as on a star chart.
+    """A preview for the eye: each star a disc that grows with its code, as on a star chart; a body has its own size.
 
     It is stretched to the brightest pixel of the frame.
     """
@@ -262,6 +267,15 @@ def write_preview_png(path: Path, codes: Codes) -> None:
     written(path, lambda file: file.write(png_of((255 * np.clip(smooth, 0, 1)).astype(np.uint8))))
 
 
+def _bodies(signal: Float32Array) -> BoolArray:
+    """Which pixels of (height, width) are of light wider than a star's."""
+    from scipy.ndimage import grey_opening, maximum_filter
+
+    wide = grey_opening(signal, (BODY_SIDE_PX, BODY_SIDE_PX), mode="constant")
+    reached = maximum_filter(wide, 2 * BODY_EDGE_PX + 1)
+    return np.asarray((signal > 0) & (signal <= BODY_SHARE * reached))
+
+
 def _discs(signal: Float32Array) -> Float32Array:
     """Each pixel of (height, width), 0 to 1, as a disc of its value; the brightest of those that overlap.
 
@@ -269,7 +283,9 @@ def _discs(signal: Float32Array) -> Float32Array:
     """
     edge, reach = PREVIEW_RADIUS_PX, range(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
     picture = np.zeros_like(signal, shape=(signal.shape[0] + 2 * edge, signal.shape[1] + 2 * edge))
-    row, column = np.nonzero(signal)
+    body = _bodies(signal)
+    picture[edge:-edge, edge:-edge] = np.where(body, signal, 0)
+    row, column = np.nonzero(np.where(body, 0, signal))
     value = signal[row, column]
     for down in reach:
         for right in reach:

@@ -76,7 +76,7 @@ def simulate(
         if output is not None:
             files.write_exposure_fits(output, simulator, exposure, frame_noise)
         if png is not None:
-            files.write_exposure_png(png, exposure.dn)
+            files.write_exposure_png(png, exposure.dn, file.config.tracker.detector)
         if dn_png is not None:
             files.write_dn_picture(dn_png, exposure.dn)
         summary: dict[str, Any] = {

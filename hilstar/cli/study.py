@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from typer import Argument, Option
 
-from hilstar.cli.options import Json, check_files
+from hilstar.cli.options import Json, check_files, parse_radec
 from hilstar.console.terminal import print_found, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
@@ -31,6 +31,8 @@ Study = Literal[
 ]
 
 ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file
+OF_A_BENCH = {"chain", "models", "outputs"}
+OF_A_FIELD = {"models", "outputs"}
 CHAIN_SCENES = 5
 
 
@@ -38,7 +40,14 @@ def study(
     what: Annotated[Study, Argument(help="The study.")],
     output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Directory for charts and tables.")],
     bench: Annotated[
-        Path | None, Argument(metavar="[BENCH.toml]", help="The bench file of `chain`.", show_default=False)
+        Path | None,
+        Argument(
+            metavar="[BENCH.toml]", help="The bench file of `chain`; of `models` and `outputs` one's own.", show_default=False
+        ),
+    ] = None,
+    radec: Annotated[
+        str | None,
+        Option(metavar="RA,DEC,ROLL", help="Of `models` and `outputs` of a bench: a field of one's own, beside the three."),
     ] = None,
     quick: Annotated[bool, Option("--quick", help="Fewer rounds, where a full study takes minutes.")] = False,
     images: Annotated[
@@ -48,17 +57,10 @@ def study(
 ) -> None:
     """Draw charts and tables of what each choice costs in accuracy and in time, and of where methods fail."""
     check_directory("-o", output)
-    if what == "chain" and bench is None:
-        raise InputError("study chain: is of a bench; write hilstar study chain BENCH.toml -o DIR")
-    if what != "chain" and bench is not None:
-        raise InputError(f"study {what}: has benches of its own; leave out {bench}")
-    if (what == "confront") != (images is not None):
-        raise InputError(
-            "study confront: is of photographs; add --images DIR"
-            if images is None
-            else f"study {what}: has no photographs; leave out --images"
-        )
-    with progress(f"study {what}", math.inf if bench is None else CHAIN_SCENES) as advance:
+    refuse_unused(what, bench, radec, images)
+    place = None if radec is None else parse_radec(radec)
+    steps = CHAIN_SCENES if what == "chain" else math.inf
+    with progress(f"study {what}", steps) as advance:
         if images is not None:
             from hilstar.study.confront import run as confront_set
 
@@ -66,10 +68,29 @@ def study(
             lines, right = confront_set(output, images, quick), None
         elif bench is None:
             lines, right = study_lines(what, output, quick)
-        else:
+        elif what == "chain":
             lines, right = chain_lines(bench, output, quick, advance)
+        else:
+            lines, right = thesis_lines(what, bench, output, place), True
     told = {"study": what, "right": right, "findings": lines, "directory": str(output)}
     print_found(as_json, told, [*lines, f"figures and tables in {output}"])
+
+
+def refuse_unused(what: str, bench: Path | None, radec: str | None, images: Path | None) -> None:
+    """Refuse (InputError) what a study does not use, and what it lacks."""
+    if what == "chain" and bench is None:
+        raise InputError("study chain: is of a bench; write hilstar study chain BENCH.toml -o DIR")
+    if bench is not None and what not in OF_A_BENCH:
+        raise InputError(f"study {what}: has benches of its own; leave out {bench}")
+    if radec is not None and what not in OF_A_FIELD:
+        raise InputError(f"study {what}: has fields of its own; leave out --radec")
+    if radec is not None and bench is None:
+        example = f"hilstar study {what} BENCH.toml --radec {radec}"
+        raise InputError(f"study {what} --radec: a field is seen by a bench; write {example}")
+    if what == "confront" and images is None:
+        raise InputError("study confront: is of photographs; add --images DIR")
+    if what != "confront" and images is not None:
+        raise InputError(f"study {what}: has no photographs; leave out --images")
 
 
 def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:
@@ -80,6 +101,21 @@ def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int],
     file = read_bench_file(bench)
     check_files([bench], [output / name for name in OUTPUTS], file)
     return run(file, output, quick, advance)
+
+
+def thesis_lines(what: str, bench: Path, output: Path, place: tuple[float, float, float] | None) -> list[str]:
+    """Run the study of `models` or `outputs` with a bench, in the thesis's fields and at a place; what it found."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.study import outputs, rapp
+    from hilstar.study.fields import fields_of
+
+    file = read_bench_file(bench)
+    names = rapp.BENCH_FILES if what == "models" else outputs.output_files(fields_of(place))
+    check_files([bench], [output / name for name in names], file)
+    make_directory(output)
+    if what == "models":
+        return [f"{finding.figure}: {finding.text}" for finding in rapp.bench_rapp(output, file, place)]
+    return outputs.run(output, file, place)
 
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool | None]:

@@ -46,6 +46,8 @@ class FixedPattern:
         """What was found, or under what it is (two sigmas)."""
         said = []
         for name, square, error, rms in zip(NAMES, self.squares, self.errors, self.rms, strict=True):
+            if not math.isfinite(error):
+                continue
             times, unit = (100, "%") if name == NAMES[0] else (1, "DN")
             found = f"{times * rms:.3g} +- {times * error / (2 * rms):.2g}" if rms else ""
             said.append(f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'} {unit}")
@@ -78,6 +80,8 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
     (column, column_error), (row, row_error), (both, both_error), (share, share_error) = (
         one.mean() for one in (columns, rows, pixels, shares)
     )
+    height, width = use.shape[0], use.shape[1] + 1
+    (column, column_error), (row, row_error) = _lines_alone((column, column_error), (row, row_error), both, (height, width))
     lit, dim = light.mean()[0], inverse.mean()[0]
     both, share = both - max(column, 0.0), share - max(column, 0.0) * dim
     # both = response^2 lit + offsets^2, share = response^2 + offsets^2 dim
@@ -90,6 +94,22 @@ def fixed_pattern(photographs: Iterable[tuple[FloatArray, FloatArray, BoolArray]
     if offset < FOUND_SIGMAS * offset_error:
         response, response_error = both / lit, both_error / lit
     return FixedPattern((response, offset, column, row), (response_error, offset_error, column_error, row_error))
+
+
+def _lines_alone(
+    column: tuple[float, float], row: tuple[float, float], both: float, size: tuple[int, int]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Squares of columns and rows, with their errors, without the share that pixels' own patterns leave in their means.
+
+    `both` is the square of pixels and columns together, `size` (height, width).
+    """
+    height, width = size
+    of_columns = (column[0] - both / height) / (1 - 1 / height)
+    pixel = max(both - of_columns, 0.0)
+    of_rows = row[0] - pixel / width
+    column_error = math.hypot(column[1], math.sqrt(2 / width) * pixel / height)
+    row_error = math.hypot(row[1], math.sqrt(2 / height) * pixel / width)
+    return (of_columns, column_error), (of_rows, row_error)
 
 
 class _Pairs:

@@ -16,7 +16,8 @@ from hilstar.bench.build import bench_optics
 from hilstar.bench.cameras import tracker_camera, tracker_psf
 from hilstar.bench.glass import glass_in
 from hilstar.confront.background import FixedPattern
-from hilstar.confront.light import NO_CORRECTION, LightFit, PixelFit
+from hilstar.confront.light import NO_CORRECTION, LightFit
+from hilstar.confront.photon_transfer import PixelFit
 from hilstar.confront.session import FixedCamera, Session, corrected, radius2_of
 from hilstar.confront.star_psf import HALF, STAMP_PX, Stamps, StarPsf, fit_psf
 from hilstar.files import write_whole
@@ -70,9 +71,6 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     write_whole(folder / NAMES[1], "\n".join(lines) + "\n")
     times, exposure_s = _write_efficiency(folder / NAMES[2], session)
     _write_psf(folder / NAMES[3], session)
-    full_e = (session.shots[0].photo.full_dn - pixels.pedestal_dn) * pixels.gain_e_per_dn
-    # a file's levels may be steps of several DN, whose rounding is noise to a detector of steps of one
-    rounding_e = math.sqrt(max(pixels.step_dn**2 - 1, 0) / 12) * pixels.gain_e_per_dn
     pitch_um = tracker.pixel_pitch_um * tracker.resolution_px[0] / camera.resolution_px[0]  # twice that of a mosaic's plane
     table: dict[str, Any] = {
         "aperture_mm": tracker.aperture_mm,
@@ -87,30 +85,12 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     }
     if tracker.frame_hz is not None:
         table["frame_hz"] = tracker.frame_hz
-    detector: dict[str, Any] = {
-        "gain_e_per_dn": pixels.gain_e_per_dn,
-        "full_well_e": max(full_e, 1.0),
-        "bits": int(min(16, max(1, math.ceil(math.log2(session.shots[0].photo.full_dn + 1))))),
-        "offset_dn": max(pixels.pedestal_dn, 0.0),
-        "read_noise_e": math.hypot(pixels.read_noise_e, rounding_e),
-    }
-    if pixels.pattern.rms[0]:
-        detector["prnu"] = pixels.pattern.rms[0]
-    tables: dict[str, Any] = {"tracker": table | {"optics": {"psf": NAMES[3]}, "detector": detector}}
     given_tables = parse_toml(session.file.path, session.file.text)
-    sky = dict(given_tables.get("sky", {}))
-    dated = session.shots[0].sky
-    for key in ("epoch_utc", "epoch_jyear", "observer_velocity_km_s"):
-        sky.pop(key, None)
-    first_ns = session.shots[0].photo.t_ns
-    if session.air is not None and first_ns is not None:
-        sky["epoch_utc"] = f"{np.datetime64(first_ns, 'ns').astype('datetime64[ms]')}Z"
+    detector = _detector(session, given_tables["tracker"].get("detector", {}))
+    tables: dict[str, Any] = {"tracker": table | {"optics": {"psf": NAMES[3]}, "detector": detector}}
+    sky = _dated_sky(session, given_tables)
+    if session.air is not None and session.shots[0].photo.t_ns is not None:
         tables["site"] = {k: v for k, v in given_tables.get("site", {}).items() if not k.startswith("sky_")}
-    else:
-        sky["epoch_jyear"] = round(dated.epoch_jyear, 6)
-    if session.air is None and dated.velocity_km_s is not None and not sky.get("bodies"):
-        sky["observer_velocity_km_s"] = [round(float(v), 4) for v in dated.velocity_km_s]
-    sky.setdefault("faintest_v_mag", 10.0)
     tables["sky"] = sky
     level = float(np.median([np.median(shot.level.level) for shot in session.shots]))
     tables["background"] = {"electrons_per_px": max((level - pixels.pedestal_dn) * pixels.gain_e_per_dn, 0.0)}
@@ -127,6 +107,7 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
         f"By hilstar confront from {', '.join(shot.photo.name for shot in session.shots)}.",
         "Aperture and exposure are those that were given"
         + (f", but more light came than they give: exposure_s is {times:.3g} times it." if times > 1 else "."),
+        f"The gain: {pixels.gain_words}.",
         *([] if has_screen else ["The monitor and the collimator are examples that fill the field: write your own."]),
         *([f"DN are those of the file, made linear: to the power {1 / session.power:.4f}."] if session.power != 1 else []),
     ]
@@ -134,6 +115,54 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     text = "".join(f"# {note}\n" for note in notes) + "\n".join(_toml(_absolute(tables, session.file.folder)))
     write_whole(path, text + "\n")
     return path
+
+
+def _dated_sky(session: Session, given: dict[str, Any]) -> dict[str, Any]:
+    """The keys of [sky], those that were given, at the time of the first photograph.
+
+    Air and bodies need a date: the photograph's, else the one that was given.
+    """
+    sky = dict(given.get("sky", {}))
+    given_utc = sky.pop("epoch_utc", None)
+    for key in ("epoch_jyear", "observer_velocity_km_s"):
+        sky.pop(key, None)
+    first_ns, dated = session.shots[0].photo.t_ns, session.shots[0].sky
+    bodies = bool(sky.get("bodies"))
+    if first_ns is not None and (session.air is not None or bodies):
+        sky["epoch_utc"] = f"{np.datetime64(first_ns, 'ns').astype('datetime64[ms]')}Z"
+    elif bodies and given_utc is not None:
+        sky["epoch_utc"] = given_utc
+    else:
+        sky["epoch_jyear"] = round(dated.epoch_jyear, 6)
+    if session.air is None and dated.velocity_km_s is not None and not bodies:
+        sky["observer_velocity_km_s"] = [round(float(v), 4) for v in dated.velocity_km_s]
+    sky.setdefault("faintest_v_mag", 10.0)
+    return sky
+
+
+def _detector(session: Session, given: dict[str, Any]) -> dict[str, Any]:
+    """The keys of [tracker.detector]; a gain that neither photographs nor the `given` keys tell is none of them."""
+    pixels, full_dn = session.pixels, session.shots[0].photo.full_dn
+    gain = pixels.gain_e_per_dn
+    full_e = (full_dn - pixels.pedestal_dn) * gain
+    # a file's levels may be steps of several DN, whose rounding is noise to a detector of steps of one
+    rounding_e = math.sqrt(max(pixels.step_dn**2 - 1, 0) / 12) * gain
+    bits = math.ceil(math.log2(full_dn + 1))
+    detector: dict[str, Any] = {
+        "gain_e_per_dn": gain,
+        "full_well_e": max(full_e, 1.0),
+        "bits": int(np.clip(bits, 1, 16)),
+        "offset_dn": max(pixels.pedestal_dn, 0.0),
+        "read_noise_e": math.hypot(pixels.read_noise_e, rounding_e),
+    }
+    if not pixels.gain_told and "gain_e_per_dn" not in given:
+        del detector["gain_e_per_dn"]
+    response, offsets_dn, *_ = pixels.pattern.rms
+    if response:
+        detector["prnu"] = response
+    if offsets_dn:
+        detector["dsnu_e"] = offsets_dn * gain
+    return detector
 
 
 def _absolute(tables: dict[str, Any], folder: Path) -> dict[str, Any]:

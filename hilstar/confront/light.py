@@ -7,14 +7,11 @@ star's instrument magnitude less the fitted one: positive where the photograph h
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.confront.background import NO_PATTERN, FixedPattern
 from hilstar.confront.star_psf import MEAN_BV_MAG
-from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import MAD_TO_SIGMA
 
 MAG = 2.5 / math.log(10)
@@ -30,10 +27,8 @@ TRUSTED_SNR = 20.0
 PATTERN_CLIP, ROUNDS = 3.5, 8
 MIN_STARS = 8
 MIN_MASSES, CLOUD_MAG = 0.3, 0.01  # air masses that tell extinction, and by how much skies differ beside it
-BLOCK_PX = 32
-MIN_VARIANCE_DN2 = 1e-9
-SKY_CURVATURE = 0.03  # by how much the shade of the sky's light differs from one photograph to another beyond a slope
-MIN_LEVEL_RANGE = 1.25  # ratio of background levels from which their noise tells the gain
+
+
 LINEAR_OFF, LINEAR_SIGMAS = 0.04, 4.0  # by how much a power differs from 1 where a tone curve is stated
 
 Correction = tuple[float, float]
@@ -285,155 +280,3 @@ def _held_out(design: FloatArray, target: FloatArray, sigma: FloatArray, use: Bo
         off[out] = _robust(design, target, sigma, use & ~out).off[out]
     found = np.clip(off[use], -0.5, 0.5)
     return math.sqrt(float((found**2).mean())) if len(found) else math.nan
-
-
-@dataclass(frozen=True, slots=True)
-class PixelFit:
-    """What pixels tell of the detector: gain, pedestal, read noise, with one sigma where known, and the points (n, 2) of it.
-
-    Points are the background's level and its variance, DN, DN^2. `notes` say what was assumed.
-    """
-
-    gain_e_per_dn: float
-    pedestal_dn: float
-    read_noise_e: float
-    step_dn: float
-    sigma: dict[str, float]
-    points: FloatArray
-    notes: tuple[str, ...] = ()
-    pattern: FixedPattern = NO_PATTERN
-
-    def variance_dn2(self, level_dn: FloatArray) -> FloatArray:
-        """Variance of a pixel at a level."""
-        light = np.maximum(level_dn - self.pedestal_dn, 0)
-        noise = light / self.gain_e_per_dn + (self.read_noise_e / self.gain_e_per_dn) ** 2 + self.step_dn**2 / 12
-        return np.asarray(noise + self.pattern.variance_dn2(light))
-
-
-def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> FloatArray:
-    """Levels and variances (n, 2) of blocks of an image, by differences of neighbours, without pixels of stars.
-
-    A shading within a block counts for nothing: the smooth level is taken off first.
-    """
-    off = dn - level
-    free = ~star
-    parts = []
-    for one, two, both in (
-        (off[:, 1:], off[:, :-1], free[:, 1:] & free[:, :-1]),
-        (off[1:], off[:-1], free[1:] & free[:-1]),
-    ):
-        height, width = (size // BLOCK_PX * BLOCK_PX for size in one.shape)
-        shape = height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX
-        difference = ((one - two)[:height, :width]).reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
-        use = both[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
-        middle = level[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2).mean(axis=1)
-        spread = np.sqrt(np.maximum((difference**2 * use).sum(axis=1) / np.maximum(use.sum(axis=1), 1), 1e-12))
-        use &= np.abs(difference) < 4 * spread[:, None]
-        count = use.sum(axis=1)
-        variance = (difference**2 * use).sum(axis=1) / np.maximum(count, 1) / 2
-        full = count > BLOCK_PX**2 / 2
-        parts.append(np.column_stack([middle, variance])[full])
-    return np.concatenate(parts)
-
-
-def fit_pixels(
-    points: FloatArray, step_dn: float, pedestal: tuple[float, float] | None, assumed: DetectorSettings, pattern: FixedPattern
-) -> PixelFit:
-    """The detector by photon transfer, that of the bench file where photographs cannot tell it.
-
-    `pedestal` comes with its sigma where levels told it. A fixed pattern is no noise of light.
-    """
-    notes = []
-    offset, offset_sigma = pedestal or (assumed.offset_dn, math.nan)
-    if not len(points):
-        notes.append("no part of the background is free of sources: the detector is the bench file's")
-        return PixelFit(assumed.gain_e_per_dn, offset, assumed.read_noise_e, step_dn, {}, points, tuple(notes), pattern)
-    level, variance = points.T
-    if pedestal is None:
-        notes.append(f"the pedestal is the bench file's, {offset:g} DN: levels of these photographs do not tell it")
-    else:
-        offset_sigma = math.hypot(offset_sigma, SKY_CURVATURE * float(np.median(level)))
-        if abs(offset - assumed.offset_dn) < 3 * offset_sigma:
-            told = f"{offset:.0f} +- {offset_sigma:.0f} DN by the skies' levels"
-            offset = assumed.offset_dn
-            notes.append(f"the pedestal is the bench file's, {offset:g} DN ({told})")
-    low, high = np.percentile(level, [5, 95])
-    *_, column, row = pattern.rms  # of which a difference along a row, or down a column, has one
-    variance = variance - pattern.variance_dn2(np.maximum(level - offset, 0)) + (column**2 + row**2) / 2
-    sigma = {"pedestal_dn": offset_sigma}
-    line = _line(level - offset, variance)
-    if high - offset > MIN_LEVEL_RANGE * (low - offset) and line.slope > 5 * line.slope_sigma:
-        gain = 1 / line.slope
-        read = math.sqrt(max(line.at_zero - step_dn**2 / 12, 0.0))
-        sigma["gain_e_per_dn"] = gain * line.slope_sigma / line.slope
-        sigma["read_noise_e"] = gain * min(line.at_zero_sigma / max(2 * read, 1e-9), math.sqrt(line.at_zero_sigma))
-        return PixelFit(gain, offset, read * gain, step_dn, sigma, points, tuple(notes), pattern)
-    # one level alone: shot noise of what is above the pedestal, and the bench's read noise
-    signal, noise2 = float(np.median(level)) - offset, float(np.median(variance)) - step_dn**2 / 12
-    gain, read_e = assumed.gain_e_per_dn, assumed.read_noise_e
-    if signal > 0 and noise2 > 0:
-        gain = (signal + math.sqrt(signal**2 + 4 * noise2 * read_e**2)) / (2 * noise2)
-        notes.append(f"the background has one level: the gain takes the bench file's read noise, {read_e:g} e-")
-    else:
-        notes.append("the background is at the pedestal: the gain is the bench file's")
-        read_e = math.sqrt(max(noise2, 0.0)) * gain
-    return PixelFit(gain, offset, read_e, step_dn, sigma, points, tuple(notes), pattern)
-
-
-class _Line(NamedTuple):
-    slope: float
-    at_zero: float
-    slope_sigma: float
-    at_zero_sigma: float
-
-
-def _line(x: FloatArray, y: FloatArray) -> _Line:
-    """Slope and value at 0 with their sigmas, without what lies far off; errors of y go as y."""
-    kept = np.ones(len(x), dtype=bool)
-    slope = at_zero = math.nan
-    sigma = np.full(2, math.nan)
-    scale = np.maximum(np.maximum(np.median(y) * 0.5, y), MIN_VARIANCE_DN2)
-    for _ in range(ROUNDS):
-        if kept.sum() < 3:  # levels without noise
-            return _Line(math.nan, math.nan, math.nan, math.nan)
-        weight = 1 / scale[kept]
-        design = np.column_stack([x[kept], np.ones(kept.sum())]) * weight[:, None]
-        (slope, at_zero), *_ = np.linalg.lstsq(design, y[kept] * weight, rcond=None)
-        off = y - slope * x - at_zero
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(off[kept] * weight)))
-        sigma = spread * np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
-        kept = np.abs(off) < PATTERN_CLIP * spread * scale
-    return _Line(float(slope), float(at_zero), float(sigma[0]), float(sigma[1]))
-
-
-def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[float, float] | None:
-    """The level without light, and its sigma, by skies of different brightness; None where they cannot tell.
-
-    `levels` (blocks,) of each photograph at `places` (blocks, 2). A sky's light is one shade over the image, common to all
-    photographs, times a slope of its own. Sigma is by leaving out a photograph at a time.
-    """
-    medians = [float(np.median(one)) for one in levels]
-    if len(levels) < 2 or max(medians) < MIN_LEVEL_RANGE * max(min(medians), 1e-9):
-        return None
-    from scipy.optimize import minimize_scalar
-
-    plane = np.column_stack([np.ones(len(places)), places])
-
-    def best(some: Sequence[FloatArray]) -> float:
-        lowest = min(float(one.min()) for one in some)
-
-        def loss(pedestal: float) -> float:
-            logs = np.log(np.array(some) - pedestal)
-            off = (logs - logs.mean(axis=0)).T
-            off = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
-            return float((off**2).sum())
-
-        return float(minimize_scalar(loss, bounds=(lowest - 2 * abs(lowest), 0.98 * lowest), method="bounded").x)
-
-    whole = best(levels)
-    if len(levels) == 2:
-        return whole, abs(whole) / 2
-    parts = [best([*levels[:k], *levels[k + 1 :]]) for k in range(len(levels))]
-    usable = [p for k, p in enumerate(parts) if max(m := medians[:k] + medians[k + 1 :]) > MIN_LEVEL_RANGE * min(m)]
-    sigma = float(np.std(usable)) * math.sqrt(max(len(usable) - 1, 1)) if len(usable) > 1 else abs(whole) / 2
-    return whole, max(sigma, 0.01 * min(medians))

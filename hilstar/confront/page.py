@@ -201,7 +201,7 @@ def _psf_grid(session: Session) -> str:
 def _transfer(session: Session) -> str:
     pixels = session.pixels
     level, variance = pixels.points.T
-    finding = f"{pixels.gain_e_per_dn:.4g} e- a DN, {pixels.read_noise_e:.2f} e- of read noise at {pixels.pedestal_dn:.0f} DN"
+    finding = f"{pixels.gain_words}, {pixels.read_noise_e:.2f} e- of read noise at {pixels.pedestal_dn:.0f} DN"
     with panels_of(finding, height_inch=3.8) as panels:
         axes = panels[0]
         axes.plot(level, variance, ".", ms=2.5, color=MUTED, rasterized=True)

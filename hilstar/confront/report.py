@@ -163,8 +163,8 @@ def lines_of(session: Session, verdicts: Sequence[Verdict], excess: Excess | Non
         f" ({camera.model})",
         f"PSF: {np.median(_fwhms(session)):.2f} px full width at half maximum, pixel included,"
         f" {np.min(_fwhms(session)):.2f} to {np.max(_fwhms(session)):.2f} px over the field",
-        f"detector: {pixels.gain_e_per_dn:.4g} e- a DN ({pixels.gain_e_per_dn * pixels.step_dn:.3g} a step of"
-        f" {pixels.step_dn:.3g} DN), read noise {pixels.read_noise_e:.2f} e-, pedestal {pixels.pedestal_dn:.0f} DN",
+        f"detector: {pixels.gain_words}, {pixels.gain_e_per_dn * pixels.step_dn:.3g} a step of"
+        f" {pixels.step_dn:.3g} DN, read noise {pixels.read_noise_e:.2f} e-, pedestal {pixels.pedestal_dn:.0f} DN",
     ]
     if math.isfinite(pixels.pattern.errors[0]) and not session.fixed:
         found.append(f"fixed pattern: {pixels.pattern.words()}")

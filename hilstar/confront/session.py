@@ -7,6 +7,7 @@ from functools import partial
 
 import msgspec
 import numpy as np
+from msgspec import structs
 from scipy.spatial import cKDTree
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
@@ -32,15 +33,12 @@ from hilstar.confront.light import (
     NO_CORRECTION,
     Correction,
     LightFit,
-    PixelFit,
     StarLight,
     fit_light,
-    fit_pedestal,
-    fit_pixels,
-    transfer_points,
     with_extinction,
 )
 from hilstar.confront.lost_in_space import MAX_SOURCES, MIN_MATCHED, NEAR, SolvedField, SourceField, nearest_once, solve_lost
+from hilstar.confront.photon_transfer import PixelFit, fit_pedestal, fit_pixels, transfer_points
 from hilstar.confront.sky import DatedSky, dated_sky
 from hilstar.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, StarPsf, cut_stamps, fit_psf, join, measure
 from hilstar.errors import InputError
@@ -423,7 +421,11 @@ def _pixels(shots: Sequence[Shot], assumed: DetectorSettings) -> PixelFit:
     pattern = fixed_pattern(
         (s.photo.dn - s.level.level, s.level.level - zero, ~masks[k]) for k, s in enumerate(shots) if k in apart
     )
-    return fit_pixels(np.concatenate(points), max(s.photo.step_dn for s in shots), pedestal, assumed, pattern or NO_PATTERN)
+    exposure_s = shots[0].photo.exposure_s or 0.0
+    dsnu_e = math.hypot(assumed.dsnu_e, assumed.dsnu_e_per_s * exposure_s)
+    exposed = structs.replace(assumed, dsnu_e=dsnu_e)
+    step_dn = max(s.photo.step_dn for s in shots)
+    return fit_pixels(np.concatenate(points), step_dn, pedestal, exposed, pattern or NO_PATTERN)
 
 
 def _identify(shot: Shot, camera: Camera, pointing: Pointing) -> None:

@@ -8,7 +8,6 @@ Then figures of the thesis's chapters 2 to 5 that need no simulation, each with 
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +22,10 @@ from hilstar.sky.electrons import (
     SUN_TEMPERATURE_K,
     Optics,
     Photometry,
-    Weighting,
     ags_electrons_per_s,
     dgs_electrons_per_s,
     library_electrons_per_s,
     load_library,
-    reference_mean_w_m2_m,
     star_temperatures_k,
     tabulate_pickles,
     v_band_mean_w_m2_m,
@@ -41,14 +38,15 @@ from hilstar.sky.spectrum import (
     TEMPERATURE_SCALES,
     Curve,
     blackbody_exitance_w_m2_m,
-    integration_nodes,
     load_curve,
     read_curve_csv,
     torres2010_k,
 )
 from hilstar.sky.synthetic import VEGA_V_MAG, ZERO_W_M2_M, curve_mean, vega
 from hilstar.sky.zodiacal import NEAR_SLOPES, relative_spectrum
+from hilstar.study.rapp import SENSORS, WEIGHTINGS, ChartFinding, rapp
 from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_by_type, held_out_errors, study_optics
+from hilstar.study.sky_figures import FIGURES as SKY_FIGURES
 from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import LIGHT_M_S, flux_ratio, magnitude
 
@@ -85,14 +83,6 @@ DARK_LAWS: dict[str, dict[str, Any]] = {
 COLD_K = 273.0
 CORNERS_HZ = (0.0, 1e4, 1e5)
 ZODIACAL_V_MAG, ZODIACAL_NM = 22.1, (330.0, 1100.0)
-
-
-@dataclass(frozen=True, slots=True)
-class ChartFinding:
-    """A chart, by the stem of its files, and what it says."""
-
-    figure: str
-    text: str
 
 
 def catalogue_errors(directory: Path) -> ChartFinding:
@@ -259,19 +249,12 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
 FIGURES = (catalogue_errors, passbands, curves, detector_laws, zodiacal_spectrum)
 
 
-SENSORS = {"ccd47-20": "CCD47-20", "kai-4021": "KAI-4021 (approximate QE)"}
-WEIGHTINGS: tuple[Weighting, ...] = ("energy", "photon")
 BRIGHT_V_MAG = 7.5
 HELD_OUT = "pickles, leave-one-out"
 BY_TYPE = "mk, leave-one-out"
 
 SETTINGS = [Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS]
 SCALE_BV_MAG = np.arange(-35, 181) / 100  # where Torres 2010 holds; exact at 0, where wang2021 steps
-QUOTED_K = (3000.0, 5000.0, 9000.0, 50_000.0)
-SAID_OF_THESIS = {  # section 5.4, of figures 5.19 and 5.22
-    "ccd47-20": " (thesis: 15 % to 5 %)",
-    "kai-4021": "; RAPP1 at 50000 K is {:.2f}, and {:.2f} with any curve from 300 to 1050 nm (thesis: the CCD47-20's)",
-}
 
 BV_MAG = np.arange(-30, 201) / 100
 WINDOW_MAG = 0.05  # half the width of the running percentiles in B-V
@@ -409,59 +392,6 @@ def temperature_scales(directory: Path) -> ChartFinding:
     return ChartFinding("temperature_scales", text)
 
 
-def rapp(directory: Path, sensor: str) -> ChartFinding:
-    """The three ratios of a sensor, 3000 to 50 000 K, for both passband weightings."""
-    kelvin = np.union1d(np.geomspace(3000, 50_000, 400)[1:-1], QUOTED_K)
-    optics = study_optics(sensor)
-    ratios = {weighting: rapp_ratios(kelvin, optics, weighting) for weighting in WEIGHTINGS}
-    in_full_range = rapp_ratios(kelvin[-1:], study_optics("ccd47-20"), "energy")  # which the range of wavelengths alone makes
-    coolest, cool, hot, hottest = ratios["energy"][2][np.searchsorted(kelvin, QUOTED_K)]
-    text = (
-        f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the average one at 3000 K,"
-        f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by {100 * (hottest - 1):+.1f} %"
-        + SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
-    )
-    title = (
-        f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the average model,"
-        f" one of 5000 K {cool:.2f} times"
-    )
-    low_nm, high_nm = optics.range_nm
-    note = f"DGS over AGS at one V, {low_nm:.0f} to {high_nm:.0f} nm. Solid: energy weighting; dotted: photon (source)."
-    with chart(directory / f"rapp_{sensor}", title, note=note) as (axes,):
-        for k, (name, colour) in enumerate(zip(("irradiance", "photons", "electrons"), SERIES, strict=False)):
-            axes.loglog(kelvin, ratios["energy"][k], color=colour, label=name)
-            axes.loglog(kelvin, ratios["photon"][k], ":", color=colour, label="_photon weighting")
-        axes.axhline(1, color=MUTED, lw=1)
-        axes.set(xlabel="black-body temperature [K]", ylabel="ratio of the models [1]")
-        plain_ticks(axes.xaxis, (3000, 5000, 9000, 15_000, 30_000, 50_000))
-        label_ends(axes)
-    columns = ("temperature_k", *(f"rapp{k}_{weighting}" for weighting in WEIGHTINGS for k in (1, 2, 3)))
-    table = np.column_stack((kelvin, *(ratios[weighting][k] for weighting in WEIGHTINGS for k in range(3))))
-    write_csv(directory / f"rapp_{sensor}.csv", columns, table.tolist())
-    return ChartFinding(f"rapp_{sensor}", text)
-
-
-def rapp_ratios(temperature_k: FloatArray, optics: Optics, weighting: Weighting) -> FloatArray:
-    """RAPP1, RAPP2 and RAPP3, shape (3, n): DGS over AGS in irradiance, photons and electrons (thesis eq. 5.1 to 5.3)."""
-    photometry = Photometry(weighting=weighting)
-    wavelength_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
-    low_nm, high_nm = optics.range_nm
-    photons_per_j = wavelength_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    mean_photons_per_j = (low_nm + high_nm) / 2 * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    reference = reference_mean_w_m2_m(photometry)
-
-    def in_range(kelvin: FloatArray, response: FloatArray) -> FloatArray:
-        spectrum = blackbody_exitance_w_m2_m(wavelength_nm, kelvin[:, None])
-        return np.asarray(reference / v_band_mean_w_m2_m(kelvin, weighting) * (spectrum @ (response * weight_m)))
-
-    ones = np.ones_like(wavelength_nm)
-    average = in_range(np.array([REFERENCE_TEMPERATURE_K]), ones)[0]
-    irradiance = in_range(temperature_k, ones) / average
-    photons = in_range(temperature_k, photons_per_j) / (average * mean_photons_per_j)
-    electrons = dgs_electrons_per_s(temperature_k, optics, photometry) / ags_electrons_per_s(optics, photometry)
-    return np.stack((irradiance, photons, electrons))
-
-
 def choices(directory: Path) -> ChartFinding:
     """The cost of each choice in magnitudes, over B-V and for the stars of Hipparcos."""
     optics, stars = study_optics("ccd47-20"), load_catalog().brighter_than(BRIGHT_V_MAG)
@@ -530,6 +460,8 @@ def running_percentiles(bv_mag: FloatArray, value: FloatArray, at_bv_mag: FloatA
 def run(directory: Path) -> list[ChartFinding]:
     """Write every chart and its table (CSV) into `directory`, and `findings.csv`. Raises InputError."""
     findings = [rapp(directory, sensor) for sensor in SENSORS]
-    findings += [chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES)]
+    findings += [
+        chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES, *SKY_FIGURES)
+    ]
     write_csv(directory / "findings.csv", ("figure", "finding"), [(f.figure, f.text) for f in findings])
     return findings

@@ -1,12 +1,10 @@
-"""Exposures of the virtual tracker as files (FITS, 16-bit greyscale, a picture for people), and as pictures for a simulation.
+"""Exposures of the virtual tracker as files (FITS, 16-bit greyscale, PNG for people), and as pictures for a simulation."""
 
-In the picture for people bright stars are discs, because saturated pixels cannot tell them apart.
-"""
-
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -22,50 +20,12 @@ from hilstar.frame.fault_kinds import Drop, Freeze, Now
 from hilstar.frame.view import STILL, View
 from hilstar.scene.camera import Camera
 from hilstar.sky.stars import Stars
-from hilstar.twin.simulator import Exposure, ExposurePiece, FaultyExposure, FrameNoise, Simulator, simulator_view
+from hilstar.tracker.settings import DetectorSettings
+from hilstar.twin.eye_picture import exposure_picture
+from hilstar.twin.simulator import Exposure, ExposurePiece, FaultyExposure, FrameNoise, Simulator, full_e, simulator_view
 
-BOX_PX = 5  # side of the square over which a star's light is summed: where the middle is full, the wings still grow
-MAX_RADIUS_PX = 8  # radius of the brightest star's disc
-# A disc's radius goes with this power of the star's share of the brightest: enough for a sum that saturates, in which five
-# magnitudes are only a factor of ten.
-RADIUS_POWER = 0.77
-STAR_SIGMA = 8.0  # a box sum this many sigmas above the background is a star
-PIXEL_GREY = 0.7  # the brightest grey of a pixel that no disc covers
 MAX_CARD = 60  # characters of text on a card of FITS
-
-
-def exposure_picture(dn: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
-    """Greys (height, width) of a frame: asinh of the light above the background, and a disc for each star."""
-    from scipy.ndimage import maximum_filter, uniform_filter
-
-    light = dn.astype(np.float32)
-    light -= np.median(light)
-    low, high = np.percentile(light, (16, 84))
-    noise = max(float(high - low) / 2, 1.0)
-    flux = np.maximum(uniform_filter(light, BOX_PX), 0) * BOX_PX**2
-    grey = _stretched(flux, noise * BOX_PX)
-    picture = PIXEL_GREY * _stretched(light, noise)
-    peaks = np.nonzero((flux == maximum_filter(flux, BOX_PX)) & (flux > STAR_SIGMA * noise * BOX_PX))
-    if len(peaks[0]):
-        radius = MAX_RADIUS_PX * (flux[peaks] / flux.max()) ** RADIUS_POWER
-        _draw_discs(picture, peaks, np.rint(radius).astype(np.intp), grey[peaks])
-    return np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
-
-
-def _stretched(light: npt.NDArray[Any], noise: float) -> npt.NDArray[Any]:
-    top = max(float(light.max()) / noise, 1.0)
-    return np.asarray(np.arcsinh(np.maximum(light, 0) / noise) / np.arcsinh(top))
-
-
-def _draw_discs(picture: npt.NDArray[Any], peaks: Any, radius: npt.NDArray[np.intp], grey: npt.NDArray[Any]) -> None:
-    """Draw a disc about each peak (rows, columns); where two overlap the brighter one shows."""
-    reach = np.arange(-MAX_RADIUS_PX, MAX_RADIUS_PX + 1)
-    for down in reach:
-        for across in reach:
-            inside = radius >= np.hypot(down, across)
-            rows, columns = peaks[0][inside] + down, peaks[1][inside] + across
-            on = (rows >= 0) & (rows < picture.shape[0]) & (columns >= 0) & (columns < picture.shape[1])
-            np.maximum.at(picture, (rows[on], columns[on]), grey[inside][on])
+READOUT_SIGMAS = 4.0  # by so much the readout takes a full pixel below the level of full ones
 
 
 class Imager(Protocol):
@@ -106,9 +66,13 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
     write_fits(path, hdus)
 
 
-def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
-    """A picture of a tracker's frame for a person (see `twin.picture`)."""
-    written(path, lambda file: file.write(png_of(exposure_picture(dn))))
+def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16], detector: DetectorSettings) -> None:
+    """A picture of a tracker's frame for a person (see `twin.eye_picture`)."""
+    readout_e = math.hypot(detector.electronics_e, detector.column_noise_e)
+    low_e = full_e(detector) - READOUT_SIGMAS * readout_e
+    full_dn = math.floor(low_e / detector.gain_e_per_dn + detector.offset_dn)
+    picture = exposure_picture(dn, full_dn)
+    written(path, lambda file: file.write(png_of(picture)))
 
 
 def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:

@@ -455,7 +455,11 @@ class TrackerBackground:
     ) -> None:
         self._bayer, tracker = config.tracker.detector.bayer if mosaic else None, config.tracker
         channels = (bench_optics(tracker, folder),) if self._bayer is None else bench_channels(tracker, folder)
-        self.steady_e = in_pixels((background_e(config, optics) for optics in channels), self._bayer)
+        places = camera.grid_px(LATTICE)
+        self._sr = camera.pixel_sr(*places)
+        self._across, self._down = (linear_shares(size, LATTICE) for size in camera.resolution_px)
+        pixel_sr = self._over_pixels(self._sr)
+        self.steady_e = in_pixels((background_e(config, optics, pixel_sr) for optics in channels), self._bayer)
         self._config, self._refuse, self._beyond = config, refuse, False
         self._moving = None if moving is None or moving.air is None or not moving.air.glow_e_per_s_sr.any() else moving
         self._lights: list[ZodiacalLight] = []
@@ -463,11 +467,8 @@ class TrackerBackground:
             self._lights = [ZodiacalLight.through(optics) for optics in channels]
         if not self._lights and self._moving is None:
             return
-        places = camera.grid_px(LATTICE)
         rays = camera.rays(*places)
         self._rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        self._sr = camera.pixel_sr(*places)
-        self._across, self._down = (linear_shares(size, LATTICE) for size in camera.resolution_px)
 
     def of_view_e(self, view: View) -> FloatArray:
         """Electrons per exposure (height, width) in a view. Raises InputError near the Sun."""
@@ -485,8 +486,12 @@ class TrackerBackground:
             glow = glow if self._bayer is not None else glow.sum(axis=0, keepdims=True)
             rates = list(glow) if not rates else [a + b for a, b in zip(rates, glow, strict=True)]
         by_place = self._sr * self._config.tracker.exposure_s
-        images = (self._down @ (rate * by_place).reshape(LATTICE, LATTICE) @ self._across.T for rate in rates)
+        images = (self._over_pixels(rate * by_place) for rate in rates)
         return np.asarray(self.steady_e + in_pixels(images, self._bayer))
+
+    def _over_pixels(self, values: FloatArray) -> FloatArray:
+        """Values at the lattice's places (n,) as an image (height, width)."""
+        return np.asarray(self._down @ values.reshape(LATTICE, LATTICE) @ self._across.T)
 
     def _say(self, nearest_deg: float, *, beyond: bool) -> None:
         """Refuse a field beyond the table, or warn of it where it follows one that was not."""
@@ -498,19 +503,19 @@ class TrackerBackground:
         self._beyond = beyond
 
 
-def background_e(config: BenchConfig, optics: Optics) -> FloatArray:
+def background_e(config: BenchConfig, optics: Optics, pixel_sr: FloatArray) -> FloatArray:
     """Electrons per exposure in every view, (height, width), by a channel's optics: level, plus a gradient, 0 in the middle.
 
-    Zodiacal light is V mag/arcsec^2 through the tracker's optics, times a pixel's solid angle (thesis eq. 4.10, 4.11).
+    Zodiacal light is V mag/arcsec^2 through the tracker's optics, times each pixel's solid angle, `pixel_sr` (height, width)
+    (thesis eq. 4.10 and 4.11, which gives all pixels the middle one's).
     """
     tracker, background = config.tracker, config.background
     width, height = tracker.resolution_px
-    level_e = background.electrons_per_px or 0.0
+    level_e = np.full((height, width), background.electrons_per_px or 0.0)
     if background.zodiacal_v_mag_arcsec2 is not None:
         photometry = Photometry(config.sky.zero_point, config.sky.passband_weighting)
         rate = zodiacal_electrons_per_s_arcsec2(background.zodiacal_v_mag_arcsec2, optics, photometry)
-        pixel_arcsec = tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm * ARCSEC_PER_RAD
-        level_e = rate * pixel_arcsec**2 * tracker.exposure_s
+        level_e = rate * ARCSEC_PER_RAD**2 * tracker.exposure_s * pixel_sr
     across_e, down_e = background.gradient_electrons_across
     ramp_e = across_e * np.linspace(-0.5, 0.5, width) + (down_e * np.linspace(-0.5, 0.5, height))[:, None]
     total_e: FloatArray = level_e + ramp_e

@@ -17,7 +17,7 @@ from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s, v_ban
 from hilstar.sky.facts import facts_of
 from hilstar.sky.spectrum import DATA_DIR, Curve, blackbody_exitance_w_m2_m, load_curve, read_curve_csv
 from hilstar.sky.synthetic import curve_mean, vega, vega_electrons_per_s
-from hilstar.study.models import rapp_ratios
+from hilstar.study.rapp import rapp_ratios
 from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import flux_ratio
 

@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from astropy.wcs import WCS
 from PIL import Image
 
 from hilstar.charts import TITLE_COLUMNS, title_lines
@@ -14,13 +15,15 @@ from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
-from hilstar.study.models import rapp_ratios, running_percentiles, torres2010_k, zero_points
+from hilstar.study.models import running_percentiles, torres2010_k, zero_points
+from hilstar.study.rapp import rapp_ratios
 from hilstar.study.settings import held_out_errors, study_optics
 from tests.support.commands import run_hilstar_here
 from tests.support.waiting import PATIENCE_S
 
 STEMS = ("rapp_ccd47-20", "rapp_kai-4021", "temperature_scales", "zero_points", "choices", "spectra")
 STEMS += ("catalogue_errors", "passbands", "curves", "detector_laws", "zodiacal")
+STEMS += ("star_density", "frames", "sun", "vega_logarithmic", "backgrounds")
 
 # Planck, the zero point and Johnson V written a second time, integrated by pieces to 1e-15; the study's
 # Gauss-Legendre is good to 1e-13, and the constants below are CODATA's, rounded at 1e-9.
@@ -327,3 +330,51 @@ def test_matplotlib_is_imported_by_a_drawing_and_pyplot_by_none():
         "models.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE_S)
+
+
+def test_the_stars_of_the_map_are_those_of_the_catalogue(study):
+    """Figure 2.2: each cell has its stars, counted here one by one; the whole sky has 41 253 square degrees."""
+    table, catalog = columns(study[0] / "star_density.csv"), load_catalog()
+    cell_deg2 = 41_252.96 / len(table["ra_deg"])
+    assert table["stars_deg2"].sum() * cell_deg2 == pytest.approx(len(catalog), rel=1e-5)
+    k = int(table["stars_deg2"].argmax())
+    half = 1 / 18
+    middle = np.sin(np.radians(table["dec_deg"][k]))
+    near = (np.abs(catalog.ra_deg - table["ra_deg"][k]) < 5) & (np.abs(np.sin(np.radians(catalog.dec_deg)) - middle) < half)
+    assert table["stars_deg2"][k] * cell_deg2 == pytest.approx(near.sum(), abs=0.5)
+
+
+def test_the_camera_s_frame_is_astropy_s_tangent_plane(study):
+    """Figure 2.11: x and y over z are Astropy's tangent plane at the boresight, west and south of it."""
+    table = columns(study[0] / "frames.csv")
+    plane = WCS(naxis=2)
+    plane.wcs.ctype, plane.wcs.crval, plane.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [84.057, -1.2], [1.0, 1.0]
+    plane.wcs.crpix = [1.0, 1.0]
+    ra_deg = np.degrees(np.arctan2(table["y_icrs"], table["x_icrs"])) % 360
+    east_deg, north_deg = plane.all_world2pix(ra_deg, np.degrees(np.arcsin(table["z_icrs"])), 0)
+    assert -np.degrees(table["x_cam"] / table["z_cam"]) == pytest.approx(east_deg, abs=1e-9)
+    assert -np.degrees(table["y_cam"] / table["z_cam"]) == pytest.approx(north_deg, abs=1e-9)
+    assert len(ra_deg) == 572
+
+
+def test_zodiacal_light_near_the_earth_has_its_magnitude(study):
+    """Figure 4.11: table 6.4's high zodiacal light is V = 22.1 through Johnson V, as the handbook says."""
+    table, (nm, response) = columns(study[0] / "backgrounds.csv"), curve("johnson-v")
+    per_nm = table["zodiacal"] * 6.62607015e-34 * 299_792_458 / (table["wavelength_nm"] * 1e-9)  # W/m2/arcsec2/nm
+    weight = np.interp(table["wavelength_nm"], nm, response, left=0, right=0)
+    v_mag = -2.5 * np.log10((per_nm * weight).sum() / weight.sum() / (3.631e-9 * 1e-2))
+    assert v_mag == pytest.approx(22.1, abs=0.03)
+    assert table["earthshine_24_deg"] == pytest.approx(2 * table["earthshine_38_deg"])
+    assert np.isnan(table["ground"][-1]) and table["ground"][200] > table["zodiacal"][200]
+
+
+def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(study):
+    """Figures 3.1 and 2.13: both curves have one mean through V, or Vega's flux; Planck's law is written here."""
+    nm, response = curve("johnson-v")
+    for stem, star, kelvin in (("sun", "g2v", 5772.0), ("vega_logarithmic", "vega", 9602.0)):
+        table = columns(study[0] / f"{stem}.csv")
+        weight = np.interp(table["wavelength_nm"], nm, response, left=0, right=0)
+        means = [np.trapezoid(table[name] * weight, table["wavelength_nm"]) for name in (star, "blackbody")]
+        assert means[0] == pytest.approx(means[1], rel=2e-3)
+        shape = table["blackbody"] / planck(table["wavelength_nm"], kelvin)
+        assert shape == pytest.approx(shape[0], rel=1e-6)

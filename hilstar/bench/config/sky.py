@@ -121,7 +121,8 @@ class Background(Table, frozen=True):
 
     #: Electrons that the background makes in each tracker pixel per exposure. Default: `0`
     electrons_per_px: NotNegative | None = None
-    #: Surface brightness of sunlight through the tracker's optics; the thesis takes 22.1. Default: none
+    #: Surface brightness of sunlight through the tracker's optics, times each pixel's solid angle; the thesis takes 22.1.
+    #: Default: none
     zodiacal_v_mag_arcsec2: Magnitude | None = None
     #: Zodiacal light by direction from the Sun, with its spectrum (Leinert 1998, tables 17 and 19). It needs `[sky] epoch_utc`.
     #: A field near the Sun, where the table is blank, is refused; the pictures of a run take the nearest tabled light there,

@@ -85,3 +85,17 @@ def test_bad_input_is_one_line(bench, tmp_path, monkeypatch, arguments, said):
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_b_and_i_are_given_as_measured_beside_the_spectrum_s(bench, tmp_path):
+    """`b_mag` is up to 4 mag from V + (B-V): its description says why, and both are given."""
+    from astropy.io.votable import parse_single_table
+
+    done = run_hilstar_here("catalogue", bench, "-o", tmp_path / "s.vot", "--to", "6")
+    assert done.returncode == 0, done.stderr
+    table = parse_single_table(tmp_path / "s.vot")
+    rows, words = table.array, {field.name: field.description for field in table.fields}
+    assert np.asarray(rows["b_measured_mag"]) == pytest.approx(np.asarray(rows["v_mag"] + rows["b_v_mag"]), abs=1e-9)
+    assert np.asarray(rows["i_measured_mag"]) == pytest.approx(np.asarray(rows["v_mag"] - rows["v_i_mag"]), abs=1e-9)
+    assert np.abs(rows["b_mag"] - rows["b_measured_mag"]).max() > 0.5
+    assert "not V + (B-V)" in words["b_mag"] and "chosen by V-I" in words["b_mag"]

@@ -32,6 +32,21 @@ def test_a_preview_has_a_disc_for_each_lit_pixel_to_the_edges(tmp_path, lit):
     assert np.array_equal(np.asarray(Image.open(tmp_path / "preview.png")), preview_by_filters(codes))
 
 
+@pytest.mark.parametrize("radius_px", [8, 20, 45])
+def test_a_body_has_its_own_size_in_a_preview(tmp_path, radius_px):
+    """Each pixel of the Moon was a disc of its own, by which it grew by 9 px on all sides."""
+    rows, columns = np.mgrid[:120, :160]
+    body = np.hypot(rows - 60, columns - 80) <= radius_px
+    codes = np.where(body, 255, 0).astype(np.uint8)
+    codes[5, 5] = 200
+    write_preview_png(tmp_path / "preview.png", codes)
+    picture = np.asarray(Image.open(tmp_path / "preview.png"))
+    lit = picture[:, 30:] > 127
+    radius_seen_px = np.sqrt(lit.sum() / np.pi)
+    assert abs(radius_seen_px - radius_px) < 1
+    assert (picture[:30, :30] > 127).sum() > 100  # a star has its disc
+
+
 def test_a_preview_of_a_dark_frame_is_dark(tmp_path):
     write_preview_png(tmp_path / "preview.png", np.zeros((20, 30), np.uint8))
     assert not np.asarray(Image.open(tmp_path / "preview.png")).any()

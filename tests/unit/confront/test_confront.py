@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -276,3 +277,20 @@ def test_a_trail_has_the_name_of_the_satellite_that_passed_there(tmp_path: Path)
     trails = [row["explained_by"] for row in rows_of(tmp_path / "out" / "sources.csv") if " px long" in row["explained_by"]]
     assert trails
     assert all(text.startswith("ISS (ZARYA), ") for text in trails)
+
+
+def test_one_photograph_of_a_bench_with_bodies_gives_a_file_that_simulate_takes(tmp_path: Path) -> None:
+    """The date that bodies need was left out; a gain that one photograph does not tell is the bench file's, or not written."""
+    more = '[sky]\nepoch_utc = "2020-09-20T20:00:00Z"\n[sky.bodies]\nmoon = true\n'
+    image = photograph(Planted(), SKY.pointings[2], np.random.default_rng(9), NOTHING_WRONG)
+    Image.fromarray(image).save(tmp_path / "one.png")
+    bench = write_bench(tmp_path / "guess.toml", more=more)
+    found = confronted(bench, [tmp_path / "one.png"], tmp_path / "out")
+    assert found["camera"]["sigma"].get("gain_e_per_dn") is None
+    given = tomllib.loads(bench.read_text())["tracker"].get("detector", {}).get("gain_e_per_dn")
+    written = tomllib.loads((tmp_path / "out" / "tracker.toml").read_text())
+    assert written["tracker"]["detector"].get("gain_e_per_dn") == given
+    assert str(written["sky"]["epoch_utc"]).startswith("2020-09-20")
+    radec = ",".join(map(str, SKY.pointings[2]))
+    done = run_hilstar_here("simulate", tmp_path / "out" / "tracker.toml", f"--radec={radec}", "-o", tmp_path / "a.fits")
+    assert done.returncode == 0, done.stderr

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from typer import Argument, Option
 
@@ -12,6 +12,9 @@ from hilstar.cli.options import Json, check_files
 from hilstar.console.terminal import print_found, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
+
+if TYPE_CHECKING:
+    from hilstar.study.chain.run import ChainStudy
 
 Study = Literal[
     "models",
@@ -60,6 +63,7 @@ def study(
             if images is None
             else f"study {what}: has no photographs; leave out --images"
         )
+    answers: list[str] = []
     with progress(f"study {what}", math.inf if bench is None else CHAIN_SCENES) as advance:
         if images is not None:
             from hilstar.study.confront import run as confront_set
@@ -69,13 +73,14 @@ def study(
         elif bench is None:
             lines, right = study_lines(what, output, quick)
         else:
-            lines, right = chain_lines(bench, output, quick, advance)
-    told = {"study": what, "right": right, "findings": lines, "directory": str(output)}
-    print_found(as_json, told, [*lines, f"figures and tables in {output}"])
+            chain = chain_study(bench, output, quick, advance)
+            lines, right, answers = chain.lines, chain.right, chain.answers
+    told = {"study": what, "right": right, "findings": lines, "answers": answers, "directory": str(output)}
+    print_found(as_json, told, [*lines, f"figures and tables in {output}", *answers])
 
 
-def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:
-    """Run the study of a bench's whole chain; what it found, and whether `auto` is on every front (None: not judged)."""
+def chain_study(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> "ChainStudy":
+    """Run the study of a bench's whole chain."""
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.study.chain.run import OUTPUTS, run
 

@@ -148,6 +148,9 @@ class Times:
     frames: int
 
 
+UNTIMED = Times(math.nan, math.nan, math.nan, math.nan, 0)
+
+
 @dataclass(frozen=True, slots=True)
 class StageTime:
     """The median time of a stage of a frame at a scene's `chosen` point; its fields are the columns of `chain_time.csv`."""
@@ -246,27 +249,31 @@ class SceneMeasurement:
         """Every combination's error and time, and the times of the stages of `auto`."""
         chains = [self.chain(combination) for combination in self.combinations]
         times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
-        rows = []
-        for chain, taken in zip(chains, times, strict=True):
-            own = chain.combination
-            marked = [name for name, at in ((DEFAULT, self.marks.default), (AUTO, self.marks.auto)) if own == at]
-            rows.append(
-                CombinationRow(
-                    scene=self.scene.name,
-                    rate_deg_s=self.scene.rate_deg_s,
-                    exposure_s=rounded(self.judges[0].seen.length_s),
-                    bits=self.parts.own.config.monitor.bits,
-                    sprite_px=chain.sprite_px(),
-                    chosen=" ".join(marked),
-                    as_filed=said(own == self.marks.as_filed),
-                    **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
-                    **asdict(self.error(own)),
-                    **asdict(taken),
-                )
-            )
+        rows = [self.row(chain, taken) for chain, taken in zip(chains, times, strict=True)]
         return rows, [
             StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES)) for stage, ms in zip(STAGES, stages, strict=True)
         ]
+
+    def untimed(self) -> list[CombinationRow]:
+        """Every combination's error, which no machine changes, without times."""
+        return [self.row(self.chain(combination), UNTIMED) for combination in self.combinations]
+
+    def row(self, chain: DrawingChain, taken: Times) -> CombinationRow:
+        """A combination's row of the table."""
+        own = chain.combination
+        marked = [name for name, at in ((DEFAULT, self.marks.default), (AUTO, self.marks.auto)) if own == at]
+        return CombinationRow(
+            scene=self.scene.name,
+            rate_deg_s=self.scene.rate_deg_s,
+            exposure_s=rounded(self.judges[0].seen.length_s),
+            bits=self.parts.own.config.monitor.bits,
+            sprite_px=chain.sprite_px(),
+            chosen=" ".join(marked),
+            as_filed=said(own == self.marks.as_filed),
+            **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
+            **asdict(self.error(own)),
+            **asdict(taken),
+        )
 
     def error(self, combination: choices.Combination) -> Error:
         """A combination's error over all exposures."""

@@ -7,7 +7,7 @@ equal in both are both on it. Figures are the table's, rounded as they stand the
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from hilstar import charts
 from hilstar.bench.bench_file import BenchFile
 from hilstar.errors import InputError
 from hilstar.files import make_directory
+from hilstar.study.chain.answers import answer_lines
 from hilstar.study.chain.choices import DENSE, QUANTISATIONS, Parts, five_scenes, shortened_line
 from hilstar.study.chain.glass import GlassRow, draw_glass, glass_line, glass_rows
 from hilstar.study.chain.measuring import (
@@ -32,7 +33,7 @@ from hilstar.study.chain.measuring import (
     said,
 )
 from hilstar.study.chain.tracker import StudyTracker
-from hilstar.study.sweep import NOT_JUDGED, Judged, Load, OtherWork, beaten_by, pareto_front
+from hilstar.study.sweep import NOT_JUDGED, Load, OtherWork, beaten_by, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,6 +52,18 @@ OUTPUTS = (
     "chain_time.csv",
     "chain_psf.csv",
 )
+
+
+@dataclass(frozen=True, slots=True)
+class ChainStudy:
+    """What the study says: a line for each scene, whether `auto` is on every front or within its noise, and what to do.
+
+    `right` is None on a busy machine.
+    """
+
+    lines: list[str]
+    right: bool | None
+    answers: list[str]
 
 
 def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
@@ -287,10 +300,9 @@ def draw_budget(
             times.set_xlabel("time of a frame [ms]" if scene == last else "")
 
 
-def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]) -> Judged:
+def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]) -> ChainStudy:
     """Measure a bench file's scenes; write OUTPUTS into `directory`.
 
-    A line for each scene, and whether `auto` is on the front of all, or within the noise of it: None on a busy machine.
     `advance` hears how many scenes are done. Raises InputError, MachineError.
     """
     rows: list[CombinationRow] = []
@@ -323,4 +335,4 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
     draw(directory / "chain", rows, headline(rows, load), "; ".join(notes), glass)
     draw_budget(directory / "chain_budget", rows, budget, stages, load)
     right = not any(beating(own, as_filed=True)[0] for own, _, _ in judged)
-    return [*lines, *notes], None if load.busy else right
+    return ChainStudy([*lines, *notes], None if load.busy else right, answer_lines(rows, budget, load))

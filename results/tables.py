@@ -4,6 +4,7 @@ bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv
 `hilstar study NAME -o`, quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on
 which machine; bench_h100.csv on an NVIDIA H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200.
 chain.csv and chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
+limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
 certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine changes it.
 """
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from hilstar.charts import two_digits
+from hilstar.study import limits
 from hilstar.study.chain.answers import STEP_WORDS, Answer, Given, answer, scenes_of
 from hilstar.study.chain.measuring import CombinationRow, ErrorPart
 
@@ -136,6 +138,16 @@ def answer_cells(choice: Answer) -> tuple[str, str]:
     method = choice.row.quantisation + (", bit stealing" if stealing else "")
     times = {(row["bits"], row["method"]): float(row["frame_ms"]) for row in rows_of("quantisation_time.csv")}
     return keys, f"{expected}; {times[str(choice.row.bits), method]:.1f} ms"
+
+
+def limits_table() -> str:
+    """Where each of hilstar's methods leaves its tolerance, and what to do there."""
+    body = []
+    for name, advice in limits.ADVICE.items():
+        row = next(row for row in rows_of("limits.csv") if row["stress"] == name)
+        tolerance = f"{two_digits(float(row['tolerance']))} {row['unit']}"
+        body.append([row["method"], name, two_digits(float(row["meets"])), tolerance, advice])
+    return table(["method", "stress", "leaves its tolerance at", "of", "do"], body)
 
 
 def economy_table() -> str:
@@ -362,6 +374,7 @@ TABLES = {
     "bench": bench_table,
     "card": card_table,
     "kinds": kinds_table,
+    "limits": limits_table,
     "tradeoff": tradeoff_table,
     "economy": economy_table,
     "timing": timing_table,

@@ -31,6 +31,7 @@ Study = Literal[
     "chain",
     "colour",
     "confront",
+    "limits",
 ]
 
 ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file

@@ -1,8 +1,9 @@
-"""Where hilstar itself fails: each of its methods against what stresses it, and the stress at which it leaves its tolerance.
+"""Where hilstar itself fails: each of its methods against what stresses it, and its tolerance.
 
-Every error is measured here, by hilstar's own functions against a truth of another kind: an integral, a movement in closed
-form, held-out spectra, rays onto a tilted plane. The tolerances are those that a bench file has by default, `[render]
-tolerance_px` and `tolerance_mag`; a direction's is `tolerance_px` on the demo's monitor.
+Every error is measured here, by hilstar's own functions against a truth of another kind: an
+integral, a movement in closed form, held-out spectra, rays onto a tilted plane. The tolerances are
+those that a bench file has by default, `[render] tolerance_px` and `tolerance_mag`; a direction's
+is `tolerance_px` on the demo's monitor.
 """
 
 import math
@@ -19,7 +20,13 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.config import RenderSettings
 from hilstar.charts import BLUE, RED, SMALL_PT, capital, chart, two_digits, write_csv
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.rotation import angle_between_rad, from_radec_roll_deg, normalise, propagate, to_radec_roll_deg
+from hilstar.rotation import (
+    angle_between_rad,
+    from_radec_roll_deg,
+    normalise,
+    propagate,
+    to_radec_roll_deg,
+)
 from hilstar.run.sync import Exposures, beat
 from hilstar.scene.psf import GaussianPsf, pixel_shares
 from hilstar.scene.sprites import brightest, max_stars
@@ -33,7 +40,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # The demo's monitor and collimator (configs/demo.toml).
-FOCAL_LENGTH_MM, PITCH_UM, SIZE_PX, ALIGNED = 350.0, 57.65, (1920, 1080), np.array([1.0, 0.0, 0.0, 0.0])
+FOCAL_LENGTH_MM, PITCH_UM, SIZE_PX, ALIGNED = (
+    350.0,
+    57.65,
+    (1920, 1080),
+    np.array([1.0, 0.0, 0.0, 0.0]),
+)
 SIGMA_PX, REFRESH_HZ, PARTED_REFRESHES = 0.85, 60.0, 6.3
 FAINT_MAG, COARSE_BITS = 6.0, 8
 TOLERANCE_PX, TOLERANCE_MAG = RenderSettings().tolerance_px, RenderSettings().tolerance_mag
@@ -43,17 +55,27 @@ COLUMNS, PANEL_INCH, EDGE_INCH = 3, 1.75, 1.4
 SPAN_S, SEED = 4.0, 1
 NEAR_SAMPLES = 4
 WINDOW_VI_MAG = 0.4  # half the width of a running median
-STAR_SLOPE = 0.51  # decades of stars a magnitude, of a sky whose stars fill space evenly, less dust (0.6)
+# Decades of stars a magnitude: 0.6 where stars fill space evenly, less what dust hides.
+STAR_SLOPE = 0.51
 VIBRATION_ARCSEC, Z = 2.0, np.array([0.0, 0.0, 1.0])
 SMALLEST = 1e-9  # as drawn
 LOG_FROM = 20.0  # ratio of the ends of an axis from which on it is logarithmic
 # The stresses of the title: what a bench meets first.
-SIGMA, BITS, FAINT = "sigma of a star [px]", f"bits, {FAINT_MAG:g} mag under white", f"mag under white, {COARSE_BITS} bits"
+SIGMA, BITS, FAINT = (
+    "sigma of a star [px]",
+    f"bits, {FAINT_MAG:g} mag under white",
+    f"mag under white, {COARSE_BITS} bits",
+)
 RED_STARS, CROWD, TILT = "V-I [mag]", "stars in view", "tilt of the screen [deg]"
 TURN = f"turn [deg/s], {PARTED_REFRESHES:g} refreshes"
-AGE, PACKETS, VIBRATION = "age of a packet [ms]", "packets a second", f"vibration of {VIBRATION_ARCSEC:g} arcsec [Hz]"
+AGE, PACKETS, VIBRATION = (
+    "age of a packet [ms]",
+    "packets a second",
+    f"vibration of {VIBRATION_ARCSEC:g} arcsec [Hz]",
+)
 MET_FIRST = (SIGMA, FAINT, TURN, AGE)
-# What to do where a method leaves its tolerance, by its stress; links are those of docs/where-it-fails.md.
+# What to do where a method leaves its tolerance, by its stress, in the words of
+# docs/where-it-fails.md.
 ADVICE = {
     SIGMA: "write a `sprite_sigma_px` of 0.5 or more",
     BITS: "[bit stealing, or a panel of more bits](accuracy-speed.md)",
@@ -68,14 +90,18 @@ ADVICE = {
 }
 
 Unit = Literal["px", "mag", "arcsec"]
-TOLERANCES: dict[Unit, float] = {"px": TOLERANCE_PX, "mag": TOLERANCE_MAG, "arcsec": TOLERANCE_ARCSEC}
+TOLERANCES: dict[Unit, float] = {
+    "px": TOLERANCE_PX,
+    "mag": TOLERANCE_MAG,
+    "arcsec": TOLERANCE_ARCSEC,
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
     """A method's error (n,) against a stress (n,), from easy to hard; `unit` is the error's.
 
-    `says` names the place where the method leaves its tolerance, which comes to stand in its braces with its unit.
+    `says` names the place where the method leaves its tolerance, whose figure stands in its braces.
     """
 
     method: str
@@ -98,7 +124,10 @@ class Limit:
 
     @property
     def meets(self) -> float:
-        """The first stress at which the error crosses the tolerance, between points, by the error's logarithm; NaN for none."""
+        """The first stress at which the error crosses the tolerance; NaN for none.
+
+        Between two points the error's logarithm is a straight line.
+        """
         over = self.error > self.tolerance
         crossing = np.flatnonzero(over[1:] != over[:-1])
         if not len(crossing):
@@ -127,8 +156,8 @@ def narrow_sprites() -> Limit:
         shares = np.stack([pixel_shares(pixels - phase, sigma_px) for phase in phases])
         places = shares @ pixels / shares.sum(axis=1)
         errors.append(float(np.abs(places - phases).max()))
-    stress = SIGMA
-    return Limit("Integral over pixels", stress, "stars under {} px wide", "px", sigmas_px, np.array(errors))
+    says = "stars under {} px wide"
+    return Limit("Integral over pixels", SIGMA, says, "px", sigmas_px, np.array(errors))
 
 
 def coarse_codes(quick: bool) -> Limit:
@@ -136,7 +165,14 @@ def coarse_codes(quick: bool) -> Limit:
     bits = (10, 8, 6, 5) if quick else (12, 10, 9, 8, 7, 6, 5)
     way = next(way for way in codes.WAYS if way.name == "exact")
     errors = [codes.code_errors(each, way, 8, [FAINT_MAG])[0].flux_max_mag for each in bits]
-    return Limit("Exact codes, light", BITS, "codes under {} bits", "mag", np.array(bits, dtype=float), np.array(errors))
+    return Limit(
+        "Exact codes, light",
+        BITS,
+        "codes under {} bits",
+        "mag",
+        np.array(bits, dtype=float),
+        np.array(errors),
+    )
 
 
 def faint_stars(quick: bool) -> Limit:
@@ -149,34 +185,36 @@ def faint_stars(quick: bool) -> Limit:
 
 
 def red_stars() -> Limit:
-    """The light of half of the spectra that are found by V-I, each held out in turn, against V-I."""
+    """The light of spectra that are found by V-I, the median of those held out, against V-I."""
     library = load_library()
-    errors = held_out_errors(library_electrons_per_s(library, study_optics("ccd47-20"), Photometry()))
+    rates = library_electrons_per_s(library, study_optics("ccd47-20"), Photometry())
+    errors = held_out_errors(rates)
     at = np.arange(-0.2, 3.9, 0.2)
     medians = []
     for centre in at:
         near = np.abs(library.vi_mag - centre) <= WINDOW_VI_MAG
         medians.append(float(np.median(np.abs(magnitude(1 + errors[near])))))
-    return Limit("Spectra by colour, median", RED_STARS, "spectra over V-I {}", "mag", at, np.array(medians))
+    says = "spectra over V-I {}"
+    return Limit("Spectra by colour, median", RED_STARS, says, "mag", at, np.array(medians))
 
 
 def crowds() -> Limit:
-    """The light that a frame lacks, whose sprites have room for so many stars, against the stars in view."""
+    """The light of stars that have no room in a frame, against the stars in view."""
     counts = np.geomspace(3e3, 3e6, 19)
     room = max_stars(GaussianPsf((SIGMA_PX, SIGMA_PX)).footprint_px)
     rng, errors = np.random.default_rng(SEED), []
     for count in counts.astype(int).tolist():
         light = flux_ratio(np.log10(rng.uniform(size=count)) / STAR_SLOPE)
         drawn = brightest(light, room)
-        kept = light.sum() if drawn is None else light[drawn].sum()
-        errors.append(abs(magnitude(float(kept / light.sum()))))
+        shown = light if drawn is None else light[drawn]
+        errors.append(abs(magnitude(float(shown.sum() / light.sum()))))
     return Limit("A frame's room for stars", CROWD, "{} stars", "mag", counts, np.array(errors))
 
 
 def tilted_screen() -> Limit:
-    """The places of a collimator without a geometry file, a pinhole, on a screen that is tilted; after alignment, rms."""
+    """The places of a pinhole collimator on a tilted screen, rms after alignment, against the tilt."""
     camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
-    x_px, y_px = (part.ravel() for part in np.meshgrid(np.linspace(0, SIZE_PX[0] - 1, 13), np.linspace(0, SIZE_PX[1] - 1, 9)))
+    x_px, y_px = camera.grid_px((13, 9))
     shown = normalise(camera.rays(x_px, y_px))
     tilts_deg = np.geomspace(0.0003, 3.0, 17)
     errors = []
@@ -185,9 +223,11 @@ def tilted_screen() -> Limit:
         depth = camera.focal_length_px + across * math.sin(tilt)
         true = normalise(np.stack([across * math.cos(tilt), down, depth], axis=1))
         turn = turn_between(true, shown, np.ones(len(true)))
-        left = shown - true - np.cross(turn, true)
-        errors.append(float(np.sqrt((left**2).sum(axis=1).mean())) * camera.focal_length_px)
-    return Limit("Pinhole, no geometry file", TILT, "a tilt over {} deg", "px", tilts_deg, np.array(errors))
+        residual = shown - true - np.cross(turn, true)
+        rms_rad = float(np.sqrt((residual**2).sum(axis=1).mean()))
+        errors.append(rms_rad * camera.focal_length_px)
+    says = "a tilt over {} deg"
+    return Limit("Pinhole, no geometry file", TILT, says, "px", tilts_deg, np.array(errors))
 
 
 def wide_fields() -> Limit:
@@ -198,11 +238,18 @@ def wide_fields() -> Limit:
     true = np.stack([np.sin(angle), np.zeros(len(angle)), np.cos(angle)], axis=1)
     rays = normalise(camera.rays(*camera.project(true)))
     errors = np.linalg.norm(np.cross(rays, true), axis=1) * ARCSEC_PER_RAD
-    return Limit("Perspective", "angle short of 90 deg [deg]", "{} deg short of 90", "arcsec", from_90_deg, errors)
+    return Limit(
+        "Perspective",
+        "angle short of 90 deg [deg]",
+        "{} deg short of 90",
+        "arcsec",
+        from_90_deg,
+        errors,
+    )
 
 
 def poles() -> Limit:
-    """An attitude to right ascension, declination and roll and back, against its distance from the pole."""
+    """An attitude to RA, Dec and roll and back, against its distance from the pole."""
     from_pole_deg = np.geomspace(10.0, 1e-7, 15)
     errors = []
     for distance in from_pole_deg.tolist():
@@ -210,26 +257,46 @@ def poles() -> Limit:
         back = from_radec_roll_deg(*to_radec_roll_deg(q))
         errors.append(angle_between_rad(q, back) * ARCSEC_PER_RAD)
     return Limit(
-        "RA, Dec and roll", "distance from the pole [deg]", "{} deg from the pole", "arcsec", from_pole_deg, np.array(errors)
+        "RA, Dec and roll",
+        "distance from the pole [deg]",
+        "{} deg from the pole",
+        "arcsec",
+        from_pole_deg,
+        np.array(errors),
     )
 
 
 def parted_refreshes() -> Limit:
-    """A star's place over an exposure that is no whole number of refreshes, against the turn; see `study timing`."""
+    """A star's place over an exposure that is no whole number of refreshes, against the turn.
+
+    `study timing` holds this law to the virtual tracker.
+    """
     rates_deg_s = np.geomspace(0.03, 30.0, 13)
     worst = beat(Exposures(REFRESH_HZ, PARTED_REFRESHES / REFRESH_HZ)).worst_arcsec_per_deg_s or 0.0
     stress = TURN
-    return Limit("Refreshes in an exposure", stress, "turns over {} deg/s", "arcsec", rates_deg_s, worst * rates_deg_s)
+    return Limit(
+        "Refreshes in an exposure",
+        stress,
+        "turns over {} deg/s",
+        "arcsec",
+        rates_deg_s,
+        worst * rates_deg_s,
+    )
 
 
-def predicted_rms_arcsec(attitude: Callable[[int], FloatArray], packet_hz: float, age_ms: float) -> float:
-    """How far hilstar's prediction is from a movement, rms over its frames; the newest packet is `age_ms` old or older."""
+def predicted_rms_arcsec(
+    attitude: Callable[[int], FloatArray],
+    packet_hz: float,
+    age_ms: float,
+) -> float:
+    """The error of prediction of a movement, rms over its frames; packets arrive `age_ms` old."""
     way = next(predictor for predictor in predictors() if predictor.is_default)
     errors = []
     for frame in range(int(SPAN_S * REFRESH_HZ)):
         t_ns = round((1 + frame / REFRESH_HZ) * NS_PER_S)
         newest = math.floor((t_ns - age_ms * NS_PER_MS) * packet_hz / NS_PER_S)
-        times_ns = [round(k * NS_PER_S / packet_hz) for k in range(newest + 1 - NEAR_SAMPLES, newest + 1)]
+        numbers = range(newest + 1 - NEAR_SAMPLES, newest + 1)
+        times_ns = [round(number * NS_PER_S / packet_hz) for number in numbers]
         samples = [AttitudeSample(at, attitude(at), rate_of(attitude, at)) for at in times_ns]
         errors.append(angle_between_rad(way.load(samples)(t_ns), attitude(t_ns)) * ARCSEC_PER_RAD)
     return float(np.sqrt(np.mean(np.square(errors))))
@@ -239,14 +306,22 @@ def old_packets(quick: bool) -> Limit:
     """Prediction in a shaken swing, against the age of the newest packet."""
     ages_ms = np.geomspace(0.5, 100.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, 1000.0, age) for age in ages_ms.tolist()]
-    return Limit("Prediction by rates", AGE, "packets over {} ms old", "arcsec", ages_ms, np.array(errors))
+    says = "packets over {} ms old"
+    return Limit("Prediction by rates", AGE, says, "arcsec", ages_ms, np.array(errors))
 
 
 def few_packets(quick: bool) -> Limit:
     """The same without any delay, against the packets a second."""
     rates_hz = np.geomspace(1000.0, 5.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, rate, 0.0) for rate in rates_hz.tolist()]
-    return Limit("Prediction by rates", PACKETS, "under {} packets a second", "arcsec", rates_hz, np.array(errors))
+    return Limit(
+        "Prediction by rates",
+        PACKETS,
+        "under {} packets a second",
+        "arcsec",
+        rates_hz,
+        np.array(errors),
+    )
 
 
 def vibrations(quick: bool) -> Limit:
@@ -260,10 +335,17 @@ def vibrations(quick: bool) -> Limit:
             return propagate(ORION, Z, angle)
 
         errors.append(predicted_rms_arcsec(attitude, 100.0, 20.0))
-    return Limit("Prediction over 20 ms", VIBRATION, "vibrations over {} Hz", "arcsec", frequencies_hz, np.array(errors))
+    return Limit(
+        "Prediction over 20 ms",
+        VIBRATION,
+        "vibrations over {} Hz",
+        "arcsec",
+        frequencies_hz,
+        np.array(errors),
+    )
 
 
-def measured(quick: bool) -> list[Limit]:
+def every_limit(quick: bool) -> list[Limit]:
     """Every limit, in the order of the chain: light, places, time."""
     return [
         *(narrow_sprites(), coarse_codes(quick), faint_stars(quick)),
@@ -275,35 +357,57 @@ def measured(quick: bool) -> list[Limit]:
 
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `limits.csv` and its chart; a line for each limit. Raises InputError."""
-    limits = measured(quick)
+    limits = every_limit(quick)
     rows = [
-        (limit.method, limit.stress, float(at), float(error), limit.unit, limit.tolerance, limit.meets)
+        (
+            limit.method,
+            limit.stress,
+            float(at),
+            float(error),
+            limit.unit,
+            limit.tolerance,
+            limit.meets,
+        )
         for limit in limits
         for at, error in zip(limit.at, limit.error, strict=True)
     ]
-    write_csv(directory / "limits.csv", ("method", "stress", "at", "error", "unit", "tolerance", "meets"), rows)
+    write_csv(
+        directory / "limits.csv",
+        ("method", "stress", "at", "error", "unit", "tolerance", "meets"),
+        rows,
+    )
     draw(directory / "limits", limits)
     finding = limits_finding(limits)
     return [finding, *(f"{limit.method} ({limit.stress}): {limit.words}" for limit in limits)]
 
 
 def limits_finding(limits: Sequence[Limit]) -> str:
-    """In how many of what is tried hilstar leaves its tolerance, and where, of what a bench meets first."""
+    """How many methods leave their tolerance, and where those do that a bench meets first."""
     failing = [limit for limit in limits if (limit.error > limit.tolerance).any()]
     met = [limit.words for limit in failing if limit.stress in MET_FIRST]
-    return f"{len(failing)} of {len(limits)} methods of hilstar leave their tolerance: {', '.join(met)}"
+    count = f"{len(failing)} of {len(limits)} methods of hilstar leave their tolerance"
+    return f"{count}: {', '.join(met)}"
 
 
 def draw(path: Path, limits: Sequence[Limit]) -> None:
     """A panel for each method: its error, the tolerance, and where they meet."""
     rows = math.ceil(len(limits) / COLUMNS)
     note = (
-        f"Blue: the error as measured, largest or rms. Red: the tolerance, {TOLERANCE_MAG:g} mag, {TOLERANCE_PX:g} px, or"
-        f" {two_digits(TOLERANCE_ARCSEC)} arcsec, {TOLERANCE_PX:g} px of the demo's monitor; the dot is where they meet."
+        f"Blue: the error as measured, largest or rms. Red: the tolerance, {TOLERANCE_MAG:g} mag,"
+        f" {TOLERANCE_PX:g} px, or {two_digits(TOLERANCE_ARCSEC)} arcsec, {TOLERANCE_PX:g} px of the"
+        " demo's monitor; the dot is where they meet."
         " Each axis runs from easy to hard. Places by the plain moment."
     )
     height_inch = EDGE_INCH + PANEL_INCH * rows
-    with chart(path, limits_finding(limits), rows, COLUMNS, note=note, share_x=False, height_inch=height_inch) as grid:
+    with chart(
+        path,
+        limits_finding(limits),
+        rows,
+        COLUMNS,
+        note=note,
+        share_x=False,
+        height_inch=height_inch,
+    ) as grid:
         for axes, limit in zip(grid, limits, strict=False):
             draw_limit(axes, limit)
         for axes in grid[len(limits) :]:
@@ -311,7 +415,7 @@ def draw(path: Path, limits: Sequence[Limit]) -> None:
 
 
 def draw_limit(axes: "Axes", limit: Limit) -> None:
-    """One method: error against stress, from easy to hard, and the place where it meets its tolerance."""
+    """One method: error against stress, from easy to hard, and where it meets its tolerance."""
     axes.plot(limit.at, np.maximum(limit.error, SMALLEST), color=BLUE, label="_error")
     axes.axhline(limit.tolerance, color=RED, ls="--", lw=1.2, label="_tolerance")
     axes.set(yscale="log", xlabel=limit.stress, ylabel=f"error [{limit.unit}]")
@@ -321,11 +425,11 @@ def draw_limit(axes: "Axes", limit: Limit) -> None:
         axes.set_xscale("log")
     if limit.at[0] > limit.at[-1]:
         axes.invert_xaxis()
-    words: dict[str, Any] = {"color": RED, "fontsize": SMALL_PT}
+    style: dict[str, Any] = {"color": RED, "fontsize": SMALL_PT}
     if not math.isfinite(limit.meets):
-        axes.text(0.05, 0.5, limit.words, transform=axes.transAxes, **words)
+        axes.text(0.05, 0.5, limit.words, transform=axes.transAxes, **style)
         return
     place = limit.meets, limit.tolerance
     axes.plot(*place, "o", color=RED, ms=6, label="_meets", zorder=4)
     label = f"{two_digits(limit.meets)} {limit.at_unit}".strip()
-    axes.annotate(label, place, (-7, 5), textcoords="offset points", ha="right", **words)
+    axes.annotate(label, place, (-7, 5), textcoords="offset points", ha="right", **style)

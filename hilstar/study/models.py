@@ -135,38 +135,43 @@ def catalogue_errors(directory: Path) -> ChartFinding:
         f"Hipparcos's errors: B-V {medians['sigma_bv_mag']:.4f} mag (thesis: 0.0281), places {medians['sigma_ra_mas']:.2f} and"
         f" {medians['sigma_dec_mas']:.2f} mas (0.77, 0.64); all of table 2.3 within {largest:.3f}"
     )
+    draw_catalogue_errors(directory / "catalogue_errors", text, catalog, medians)
+    return ChartFinding("catalogue_errors", text)
+
+
+def draw_catalogue_errors(
+    path: Path,
+    text: str,
+    catalog: Catalog,
+    medians: Mapping[str, float],
+) -> None:
+    """Each error against the figure that it is of, with its median and the thesis's, and maps."""
+    facts, against = facts_of(catalog.hip), measured_values(catalog)
+    largest = max(abs(medians[name] - printed) for name, (_, printed) in TABLE_2_3.items())
     note = (
-        f"Density of all {len(catalog)} stars; errors over {CLIPPED_TIMES} times the thesis's stand at the top edge. Solid:"
-        f" the figures above them, medians of stars to V = {TABLE_2_3_V_MAG:g} (B-V: the mean of all). Dashed: the thesis's,"
-        f" within {largest:.3f} of them."
+        f"Density of all {len(catalog)} stars; errors over {CLIPPED_TIMES} times the thesis's stand at"
+        " the top edge. Solid: the figures above them, medians of stars to"
+        f" V = {TABLE_2_3_V_MAG:g} (B-V: the mean of all). Dashed: the thesis's, within {largest:.3f}."
     )
-    against = measured_values(catalog)
-    with chart(directory / "catalogue_errors", text, 4, 2, note=note, share_x=False, height_inch=11.0) as panels:
-        for axes, title, (name, (unit, printed)) in zip(panels, NAMES_2_3, TABLE_2_3.items(), strict=False):
-            value = against[name]
+    layout: dict[str, Any] = {"note": note, "share_x": False, "height_inch": 11.0}
+    with chart(path, text, 4, 2, **layout) as panels:
+        titles = dict(zip(TABLE_2_3, NAMES_2_3, strict=True))
+        for axes, (name, (unit, printed)) in zip(panels, TABLE_2_3.items(), strict=False):
+            value, high = against[name], CLIPPED_TIMES * printed
+            style: dict[str, Any] = {"cmap": density(), "norm": "log", "rasterized": True}
+            style |= {"bins": (120, 60), "range": (value.limits, (0.0, high))}
+            axes.hist2d(value.of_star, np.minimum(facts[name], high), **style)
             axes.set(ylabel=f"error [{unit}]", xlabel=value.label)
-            high = CLIPPED_TIMES * printed
-            shown = np.minimum(facts[name], high)
-            axes.hist2d(
-                value.of_star,
-                shown,
-                bins=(120, 60),
-                cmap=density(),
-                norm="log",
-                rasterized=True,
-                range=(value.limits, (0.0, high)),
-            )
-            axes.set_title(f"{title}: {two_digits(medians[name])} {unit}")
+            axes.set_title(f"{titles[name]}: {two_digits(medians[name])} {unit}")
             axes.axhline(medians[name], color=INK, label="_here")
             axes.axhline(printed, color=MUTED, ls="--", label="_thesis")
         for axes, name in zip(panels[6:], ("sigma_ra_mas", "sigma_dec_mas"), strict=True):
             sky_map(axes, catalog, name, facts[name])
-    return ChartFinding("catalogue_errors", text)
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredValue:
-    """A figure of the catalogue's stars (n,), the label of its axis, and the limits of what is drawn."""
+    """A figure of the catalogue's stars (n,), the label of its axis, and the limits that are drawn."""
 
     of_star: FloatArray
     label: str
@@ -175,13 +180,14 @@ class MeasuredValue:
 
 def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
     """What each error of table 2.3 is of, by the error's name."""
+    pm_ra, pm_dec = catalog.pm_ra_cosdec_mas_yr, catalog.pm_dec_mas_yr
     return {
         "sigma_bv_mag": MeasuredValue(catalog.bv_mag, "B-V [mag]", (-0.4, 2.2)),
         "sigma_ra_mas": MeasuredValue(catalog.ra_deg, "right ascension [deg]", (0.0, 360.0)),
         "sigma_dec_mas": MeasuredValue(catalog.dec_deg, "declination [deg]", (-90.0, 90.0)),
         "sigma_parallax_mas": MeasuredValue(catalog.parallax_mas, "parallax [mas]", (-5.0, 40.0)),
-        "sigma_pm_ra_mas_yr": MeasuredValue(catalog.pm_ra_cosdec_mas_yr, "motion in RA [mas/yr]", (-200.0, 200.0)),
-        "sigma_pm_dec_mas_yr": MeasuredValue(catalog.pm_dec_mas_yr, "motion in Dec [mas/yr]", (-200.0, 200.0)),
+        "sigma_pm_ra_mas_yr": MeasuredValue(pm_ra, "motion in RA [mas/yr]", (-200.0, 200.0)),
+        "sigma_pm_dec_mas_yr": MeasuredValue(pm_dec, "motion in Dec [mas/yr]", (-200.0, 200.0)),
     }
 
 
@@ -201,9 +207,10 @@ def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) ->
     for at in np.unique(row * medians.shape[1] + column):
         cell = divmod(int(at), medians.shape[1])
         medians[cell] = np.median(error_mas[(row == cell[0]) & (column == cell[1])])
-    image = axes.pcolormesh(ra_edges, dec_edges, medians, cmap=density(), vmin=0.5, vmax=1.3, rasterized=True)
-    words = NAMES_2_3[list(TABLE_2_3).index(name)]
-    axes.set(title=f"Sky map: {words}, medians", xlabel="right ascension [deg]", ylabel="declination [deg]")
+    style: dict[str, Any] = {"cmap": density(), "vmin": 0.5, "vmax": 1.3, "rasterized": True}
+    image = axes.pcolormesh(ra_edges, dec_edges, medians, **style)
+    title = f"Sky map: {NAMES_2_3[list(TABLE_2_3).index(name)]}, medians"
+    axes.set(title=title, xlabel="right ascension [deg]", ylabel="declination [deg]")
     axes.figure.colorbar(image, ax=axes, label="Error [mas]", fraction=0.06, pad=0.02)
 
 
@@ -330,8 +337,8 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
         f" 1100 nm), {near:.1f} at 30 degrees, {sun:.1f} as sunlight"
     )
     note = (
-        f"V = {ZODIACAL_V_MAG:g}. Leinert 1998, table 19 and equation 22, through Johnson V. The WFC3 handbook's spectrum,"
-        " V = 22.15, gives 101.6."
+        f"V = {ZODIACAL_V_MAG:g}. Leinert 1998, table 19 and equation 22, through Johnson V. The WFC3"
+        " handbook's spectrum, V = 22.15, gives 101.6."
     )
     with chart(directory / "zodiacal", text, note=note) as (axes,):
         for (name, values), colour in zip(spectra.items(), SERIES, strict=False):
@@ -567,9 +574,9 @@ def choices(directory: Path) -> ChartFinding:
     )
     finding = choices_finding(paid)
     note = (
-        f"At a name: half of {len(stars)} Hipparcos stars change by as much (a twentieth). Band: 5 to 95 % of them."
-        f" M giants share the B-V of K giants, and are up to {-np.nanmin(low):.1f} mag brighter than the black body."
-        " + is fainter; CCD47-20."
+        f"At a name: half of {len(stars)} Hipparcos stars change by as much (a twentieth). Band: 5 to"
+        " 95 % of them. M giants share the B-V of K giants, and are up to"
+        f" {-np.nanmin(low):.1f} mag brighter than the black body. + is fainter; CCD47-20."
     )
     with chart(directory / "choices", finding, panels=2, note=note) as (upper, lower):
         for (name, mag), colour in zip(cost.items(), SERIES, strict=False):
@@ -590,17 +597,18 @@ def choices(directory: Path) -> ChartFinding:
 
 
 def choices_finding(paid: Mapping[str, FloatArray]) -> str:
-    """Which choice changes half of the stars most, and which a twentieth, by what each changes both (2,), mag."""
+    """Which choice changes half of the stars most, and which a twentieth; mag (2,) by choice."""
     dearest = max(paid, key=lambda name: float(paid[name][0]))
     for_few = max(paid, key=lambda name: float(paid[name][1]))
     half, most = paid[dearest]
     text = (
-        f"Of the choices of brightness {dearest.split()[-1]} changes most: half of Hipparcos to V = {BRIGHT_V_MAG:g} by"
-        f" {half:.2f} mag and more"
+        f"Of the choices of brightness {dearest.split()[-1]} changes most: half of Hipparcos to"
+        f" V = {BRIGHT_V_MAG:g} by {half:.2f} mag and more"
     )
     if for_few == dearest:
         return f"{text}, a twentieth by {most:.2f} mag"
-    return f"{text}; a twentieth are changed most by {for_few.split()[-1]}, by {paid[for_few][1]:.2f} mag"
+    few = f"{for_few.split()[-1]}, by {paid[for_few][1]:.2f} mag"
+    return f"{text}; a twentieth are changed most by {few}"
 
 
 def choice_costs_mag(bv_mag: FloatArray, optics: Optics) -> dict[str, FloatArray]:

@@ -148,9 +148,6 @@ class Times:
     frames: int
 
 
-UNTIMED = Times(math.nan, math.nan, math.nan, math.nan, 0)
-
-
 @dataclass(frozen=True, slots=True)
 class StageTime:
     """The median time of a stage of a frame at a scene's `chosen` point; its fields are the columns of `chain_time.csv`."""
@@ -256,12 +253,14 @@ class SceneMeasurement:
 
     def untimed(self) -> list[CombinationRow]:
         """Every combination's error, which no machine changes, without times."""
-        return [self.row(self.chain(combination), UNTIMED) for combination in self.combinations]
+        untimed = Times(math.nan, math.nan, math.nan, math.nan, 0)
+        return [self.row(self.chain(combination), untimed) for combination in self.combinations]
 
     def row(self, chain: DrawingChain, taken: Times) -> CombinationRow:
         """A combination's row of the table."""
         own = chain.combination
-        marked = [name for name, at in ((DEFAULT, self.marks.default), (AUTO, self.marks.auto)) if own == at]
+        chosen = {DEFAULT: self.marks.default, AUTO: self.marks.auto}
+        marked = [name for name, combination in chosen.items() if combination == own]
         return CombinationRow(
             scene=self.scene.name,
             rate_deg_s=self.scene.rate_deg_s,

@@ -121,7 +121,8 @@ class BodyScene:
 
 def at_a_step(scene: str) -> bool:
     """Whether each frame of a scene, by its name, is the first of a step of the orbit."""
-    return next(one for one in SCENES if one.name == scene).step_ns != FRAME_NS
+    by_name = {known.name: known for known in SCENES}
+    return by_name[scene].step_ns != FRAME_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,7 +378,8 @@ def light_words(nears: Sequence[Near]) -> str:
 def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> str:
     """What each scene costs; the finding."""
     dearest = max(costs, key=lambda cost: cost.cpu_ms)
-    unseen_ms = max(0.0, *(cost.cpu_ms for cost in costs if not cost.discs and not at_a_step(cost.scene)))
+    unseen = [cost.cpu_ms for cost in costs if not cost.discs and not at_a_step(cost.scene)]
+    unseen_ms = max(0.0, *unseen)
     note = "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x 1080, drawn in software."
     finding = (
         f"Between steps of an orbit bodies that are no discs cost at most {unseen_ms:.1f} ms; the dearest body,"

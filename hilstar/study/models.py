@@ -491,7 +491,7 @@ def temperature_scales(directory: Path) -> ChartFinding:
             for (name, value), style, colour in zip(values.items(), (":", "-", "-"), (MUTED, BLUE, ORANGE), strict=True):
                 words = name.replace("torres2010_supergiant", "Torres, supergiants")
                 if axes is panels[2] and name in within:
-                    words += f": half within {within[name][0]:.3f}"
+                    words = f"{name}: half within {within[name][0]:.3f}"
                 axes.plot(bv, value, style, color=colour, label=words)
         for axes in panels[1:]:
             axes.axhline(0, color=INK, lw=1)
@@ -583,8 +583,9 @@ def choices(directory: Path) -> ChartFinding:
             half, most = paid[name]
             upper.plot(BV_MAG, mag, color=colour, label=f"{name.split()[-1]}: {half:.2f} ({most:.2f})")
         half, most = paid["spectrum pickles"]
-        for axes, words in ((upper, f"pickles: {half:.2f} ({most:.2f})"), (lower, "pickles, median")):
-            axes.plot(BV_MAG, middle, color=INK, label=words)
+        names = {upper: f"pickles: {half:.2f} ({most:.2f})", lower: "pickles, median"}
+        for axes, name in names.items():
+            axes.plot(BV_MAG, middle, color=INK, label=name)
             axes.axhline(0, color=MUTED, lw=1)
             axes.set(ylabel="cost against a black body [mag]")
         lower.fill_between(BV_MAG, low, high, color=MUTED, alpha=0.35, lw=0)

@@ -151,13 +151,14 @@ def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rate
 
 
 def auto_times(found: list[Shaken]) -> float:
-    """The largest error of "auto" as a multiple of the better of the other two, at the usual rate and age."""
-    by = {(s.packets, s.jitter_hz, s.way): s.residual for s in found if (s.packet_hz, s.age_ms) == (USUAL_HZ, USUAL_MS)}
-    return max(
-        residual / min(by[packets, hz, "rate"], by[packets, hz, "newest"])
-        for (packets, hz, way), residual in by.items()
-        if way == "auto"
-    )
+    """The largest error of "auto" as a multiple of the better of the other two."""
+    residuals: dict[tuple[str, float], dict[str, float]] = {}
+    for shaken in found:
+        if (shaken.packet_hz, shaken.age_ms) == (USUAL_HZ, USUAL_MS):
+            by_way = residuals.setdefault((shaken.packets, shaken.jitter_hz), {})
+            by_way[shaken.way] = shaken.residual
+    times = [way["auto"] / min(way["rate"], way["newest"]) for way in residuals.values()]
+    return max(times)
 
 
 def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:

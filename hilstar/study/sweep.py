@@ -34,7 +34,7 @@ Judged = tuple[list[str], bool | None]
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """The cores that other processes took on average while times were taken, and what may be said of such times."""
+    """The cores that others took while times were taken, and what to say of such times."""
 
     cores: float = 0.0
 
@@ -47,12 +47,12 @@ class Load:
     def caution(self) -> str:
         """The line about times that were taken beside other work."""
         return (
-            f"a busy machine: other processes took {self.cores:.1f} of its {os.cpu_count()} cores meanwhile,"
-            " so these times name no winner; run it again when the machine is idle"
+            f"a busy machine: other processes took {self.cores:.1f} of its {os.cpu_count()} cores"
+            " meanwhile, so these times name no winner; run it again when the machine is idle"
         )
 
     def title(self, finding: str, errors: str = "The errors hold") -> str:
-        """The title of a chart whose `finding` rests on times: on a busy machine `errors`, which does not, and NOT_JUDGED."""
+        """The title of a chart of times: `finding`; on a busy machine `errors` and NOT_JUDGED."""
         if self.busy:
             return f"{errors}; {NOT_JUDGED}"
         return finding
@@ -185,9 +185,10 @@ def measured(step: Trials, budget_s: float) -> Trials:
     low, middle, high = np.array([np.percentile([one.wall_ms for one in took], (25, 50, 75)) for took in times.values()]).T
     load = others.load()
     errors = [max(trial.error, step.error.floor) for trial in step.trials]
-    beaten = beaten_by(errors, middle)
+    # On a busy machine every method counts as beaten: none is on the front.
+    beaten = beaten_by(errors, middle) | load.busy
     found = [
-        replace(trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any() and not load.busy)
+        replace(trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any())
         for trial, q1, ms, q3, beats in zip(step.trials, low, middle, high, beaten, strict=True)
     ]
     own = next(k for k, trial in enumerate(found) if trial.is_default)

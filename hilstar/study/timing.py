@@ -116,17 +116,22 @@ def stripe_findings(directory: Path) -> list[str]:
 
 
 def stripe_depth(points: list[StripePoint], whole: bool) -> float:
-    """The largest departure of a row from the mean light, over cases whose exposures are whole refreshes or over the others."""
-    return max(abs(point.light - 1) for point in points if float(point.refreshes).is_integer() == whole)
+    """The largest departure of a row from the mean light, of exposures of whole refreshes or others."""
+    depth = 0.0
+    for point in points:
+        if float(point.refreshes).is_integer() == whole:
+            depth = max(depth, abs(point.light - 1))
+    return depth
 
 
 def draw_stripes(path: Path, points: list[StripePoint]) -> str:
     """The chart of the cases; its finding."""
     off = max(abs(point.light - point.foretold) for point in points)
-    whole, parted = (stripe_depth(points, is_whole) for is_whole in (True, False))
+    whole, parted = stripe_depth(points, True), stripe_depth(points, False)
     finding = (
-        f"Behind a rolling shutter a display's stripes are up to {100 * parted:.0f} % of its light, {100 * whole:.0f} % where"
-        f" exposures are whole refreshes: as foretold within {max(off, ROUNDING):.0e}"
+        f"Behind a rolling shutter a display's stripes are up to {100 * parted:.0f} % of its light,"
+        f" {100 * whole:.0f} % where exposures are whole refreshes: as foretold within"
+        f" {max(off, ROUNDING):.0e}"
     )
     note = (
         f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us each, the top row first."

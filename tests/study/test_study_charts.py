@@ -105,7 +105,7 @@ def test_what_is_wrong_with_a_chart_is_seen(two_lines, spoil, said):
 
 def test_a_title_with_a_figure_that_is_not_drawn_is_seen(tmp_path):
     """As `choices` once told 0.16 mag of one line beside another line at 0.31."""
-    for title, is_drawn in (("The line is at 0.31 mag", True), ("The line is at 0.16 mag", False)):
+    for title, is_drawn in (("The line is at 0.31 mag, within 4.2·10⁻⁸", True), ("The line is at 0.16 mag", False)):
         with charts.panels_of(title) as (axes,):
             axes.plot([1, 2], [0.3082, 0.3079], color=charts.BLUE, label="a line")
             charts.label_ends(axes)

@@ -20,7 +20,7 @@ MIN_TEXT_PX = 11.0  # at that width
 MAX_TITLE_LINES = 2
 TOUCH_PX = 1.5  # boxes are whole pixels of a hinted font: this much is no overlap
 # A figure of a title that stands alone: no part of a name, no power of ten.
-TITLE_FIGURE = re.compile(r"(?<![\w.\-·⁻])\d+(?:\.\d+)?(?![\w·⁻]|-\d)")
+TITLE_FIGURE = re.compile(r"(?<![\w.\-·⁻])\d+(?:\.\d+)?(?![\w·⁻]|-\d|\.\d)")
 # Charts whose titles have figures that are found from what is drawn and not drawn themselves, and how.
 DERIVED = {
     "economy": "the ratio of two bars",

@@ -1,7 +1,8 @@
-"""What to set for a bench and a scene, and what to expect of it: the answers that a chain's rows give.
+"""What to set for a bench and a scene, and what to expect: the answers that a chain's rows give.
 
-An answer is the simplest choice whose error is near the smallest one's. Choices that are right over an exposure only
-(`temporal`), and those that cost more than another and leave more (`dither`), are no answers.
+An answer is the simplest choice whose error is near the smallest one's. Choices that are right
+over an exposure only (`temporal`), and those that cost more than another and leave more
+(`dither`), are no answers.
 """
 
 from collections.abc import Sequence
@@ -18,8 +19,8 @@ BY_ARCSEC, BY_MAG = attrgetter("error_arcsec"), attrgetter("error_mag")
 BY_DEPTH = attrgetter("faintest_v_mag")
 # The codes that are an answer, the cheaper first (results/quantisation_time.csv).
 ANSWERS: tuple[Quantisation, ...] = ("round", "exact")
-# A simpler choice is taken where its error is at most this many times the smallest, and its light within a tenth of the limit
-# of `verify`, 0.05 mag, where the smallest is not larger.
+# A simpler choice is taken where its error is at most this many times the smallest, and its light
+# within a tenth of the limit of `verify`, 0.05 mag, where the smallest is not larger.
 NEAR, NEAR_MAG = 1.1, 0.005
 PREDICTED: tuple[Prediction, ...] = ("rate", "two samples", "held")
 WAYS: dict[str, str] = {
@@ -29,7 +30,7 @@ WAYS: dict[str, str] = {
 }
 # What to do about the step that most of a turning scene's error comes from.
 ADVICE: dict[str, str] = {
-    "refresh": "no key of [render] mends it: a faster panel or a flashing one does (refresh_hz, hold_ms)",
+    "refresh": "no key of [render] mends it: a faster or a flashing panel does (refresh_hz, hold_ms)",
     "smear": 'draw paths ([render] motion = "on")',
     "depth": "write a larger [sky] faintest_v_mag",
     "codes": "more bits, or bit stealing",
@@ -50,7 +51,7 @@ STEP_WORDS = {
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What a bench and its sender give: whether the panel's primaries are known in the tracker's colours, and rates."""
+    """What a bench and its sender give: primaries known in the tracker's colours, and rates."""
 
     primaries: bool
     rates: bool
@@ -76,14 +77,14 @@ class Answer:
 
 
 def answers_among(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
-    """The rows of a scene that may be an answer: whole depth, sprites within the tolerance, paths."""
+    """The rows of a scene that may be an answer: whole depth, sprites within tolerance, paths."""
     deepest = max(rows, key=BY_DEPTH).faintest_v_mag
     whole = [row for row in rows if row.faintest_v_mag == deepest and row.quantisation in ANSWERS]
     return [row for row in whole if row.sprite == "cut" and row.smear == "path"]
 
 
 def is_allowed(row: CombinationRow, given: Given) -> bool:
-    """Whether a choice can be made of what is given: with rates by them, without them in another way."""
+    """Whether a choice can be made of what is given: rates that are given are used."""
     if row.bit_stealing == "true" and not given.primaries:
         return False
     by_rate = row.prediction == "rate"
@@ -142,7 +143,7 @@ def answer_lines(
     budget: Sequence[ErrorPart],
     load: Load,
 ) -> list[str]:
-    """What a person can do, a line each: codes, bit stealing, turns by their largest part, depth."""
+    """What a person can do, a line each: codes, bit stealing, turns, depth."""
     scenes = scenes_of(rows)
     lines: list[str] = []
     if not scenes[0][0].rate_deg_s:
@@ -201,7 +202,8 @@ def turn_lines(
         share = f"{two_digits(part.error_arcsec)} of {two_digits(whole.error_arcsec)} arcsec"
         step = STEP_WORDS.get(part.step, part.step)
         advice = ADVICE.get(part.step) or prediction_words(rows)
-        lines.append(f"from {scene.rate_deg_s:g} deg/s on {step} is the largest part ({share}): {advice}")
+        turn = f"from {scene.rate_deg_s:g} deg/s on"
+        lines.append(f"{turn} {step} is the largest part ({share}): {advice}")
     return lines
 
 
@@ -210,7 +212,8 @@ def prediction_words(rows: Sequence[CombinationRow]) -> str:
     deepest = max(rows, key=BY_DEPTH).faintest_v_mag
     errors: dict[str, float] = {}
     for row in rows:
-        if row.faintest_v_mag == deepest and row.bit_stealing == "false" and row.quantisation in ANSWERS:
+        plain = row.bit_stealing == "false" and row.quantisation in ANSWERS
+        if plain and row.faintest_v_mag == deepest:
             before = errors.get(row.prediction, row.error_arcsec)
             errors[row.prediction] = min(before, row.error_arcsec)
     best = min(errors, key=lambda prediction: errors[prediction])
@@ -228,4 +231,5 @@ def depth_line(rows: Sequence[CombinationRow]) -> str:
     if best.lost:
         loses = f"with {best.faintest_v_mag:g} the tracker loses {best.lost} of {best.stars} stars"
         return f"depth: keep faintest_v_mag = {deepest:g}; {loses}"
-    return f"depth: faintest_v_mag = {best.faintest_v_mag:g} is enough; it loses none of {best.stars} stars"
+    enough = f"faintest_v_mag = {best.faintest_v_mag:g} is enough"
+    return f"depth: {enough}; it loses none of {best.stars} stars"

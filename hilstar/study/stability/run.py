@@ -1,6 +1,7 @@
 """Where methods fail: each case with the failing method, its error, hilstar's way and the reason; charts of curves."""
 
 from collections.abc import Callable
+from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 
@@ -39,33 +40,38 @@ def _recorded_curves(directory: Path, name: str) -> FloatArray:
 
 
 def narrow_sigmas(directory: Path) -> None:
-    """Errors of flux, place and middle pixel against sigma: point sampling, and the integral over pixels."""
+    """Errors of flux, place and middle pixel against sigma: sampling, and integral over pixels."""
     sigmas_px = np.geomspace(0.1, 2.0, 27)
     pairs = [image.narrow_errors(float(sigma)) for sigma in sigmas_px]
-    ours, sampled = (np.array([(e.flux, e.centroid_px, e.peak) for e in errors]).T for errors in zip(*pairs, strict=True))
-    errors = ("flux_error", "centroid_error_px", "peak_error")
-    columns = ("sigma_px", *errors, *(f"sampled_{name}" for name in errors))
-    write_csv(directory / "narrow_stars.csv", columns, np.column_stack([sigmas_px, *ours, *sampled]).tolist())
+    errors = [(*astuple(integrated), *astuple(points)) for integrated, points in pairs]
+    ours, sampled = np.split(np.array(errors).T, 2)
+    columns = ("sigma_px", "flux_error", "centroid_error_px", "peak_error")
+    sampled_columns = ("sampled_flux_error", "sampled_centroid_error_px", "sampled_peak_error")
+    rows = np.column_stack([sigmas_px, errors]).tolist()
+    write_csv(directory / "narrow_stars.csv", (*columns, *sampled_columns), rows)
     note = (
         "Largest errors over sub-pixel phases; the place by the centre of gravity. The errors of a wide sampled star's pixels"
     )
     note += " cancel in its sums, here in float64 and without an end; hilstar draws in float32, and its sprites end."
-    with chart(directory / "narrow_stars", narrow_finding(sigmas_px, ours, sampled), panels=3, note=note) as panels:
-        for axes, theirs, own in zip(panels, sampled, ours, strict=True):
-            axes.loglog(sigmas_px, np.abs(theirs), color=ORANGE, label="sampled")
-            axes.loglog(sigmas_px, np.abs(own), color=BLUE, label="integrated (hilstar)")
-        for axes, label in zip(panels, ("flux error [share]", "place error [px]", "middle pixel's error [share]"), strict=True):
-            axes.set_ylabel(label)
+    finding = narrow_finding(sigmas_px, ours, sampled)
+    with chart(directory / "narrow_stars", finding, panels=3, note=note) as panels:
+        for axes, points, integrated in zip(panels, np.abs(sampled), np.abs(ours), strict=True):
+            axes.loglog(sigmas_px, points, color=ORANGE, label="sampled")
+            axes.loglog(sigmas_px, integrated, color=BLUE, label="integrated (hilstar)")
+        panels[0].set_ylabel("flux error [share]")
+        panels[1].set_ylabel("place error [px]")
+        panels[2].set_ylabel("middle pixel's error [share]")
         panels[-1].set_xlabel("sigma of the star [px]")
         plain_ticks(panels[-1].xaxis, (0.1, 0.2, 0.3, 0.5, 0.85, 1.2, 2))
         label_ends(*panels)
 
 
 def narrow_finding(sigmas_px: FloatArray, ours: FloatArray, sampled: FloatArray) -> str:
-    """From which sigma on (n,) sampling places a star nearer, and how wrong its middle pixel is; errors are (3, n)."""
+    """From which sigma (n,) on sampling places a star nearer, and its middle pixel; errors (3, n)."""
     nearer = sampled[1] < ours[1]
     if not nearer.any():
-        return f"Integrated over pixels a star is placed nearer than sampled at every sigma to {sigmas_px[-1]:g} px"
+        every = f"at every sigma to {sigmas_px[-1]:g} px"
+        return f"Integrated over pixels a star is placed nearer than sampled, {every}"
     at = int(nearer.argmax())
     return (
         f"From sigma {sigmas_px[at]:.2f} px on a star sampled at pixel middles is placed nearer"

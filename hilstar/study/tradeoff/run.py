@@ -75,10 +75,13 @@ def table_lines(step: Trials) -> list[str]:
         errors = "  ".join(f"{value:>{len(name)}.3g} " for value, name in zip((row.error, row.second), columns, strict=False))
         lines.append(f"{marks} {row.method:{wide}}  {errors} {row.time_ms:.3g}")
     beaten = step.default.beaten
-    remarks = [NOT_JUDGED] if step.load.busy else []
-    remarks += [f"the default: {beaten}"] if beaten else []
-    remarks += [step.remark] if step.remark else []
-    return [*lines, *(f"   {remark}" for remark in remarks)]
+    if step.load.busy:
+        lines.append(f"   {NOT_JUDGED}")
+    if beaten:
+        lines.append(f"   the default: {beaten}")
+    if step.remark:
+        lines.append(f"   {step.remark}")
+    return lines
 
 
 def finding(step: Trials) -> str:

@@ -252,6 +252,17 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
     assert "exact" in names and "dither" not in " ".join(names)
 
 
+def test_a_busy_machine_has_no_front(monkeypatch, tmp_path):
+    rows = [run.without_fronts(planted(time_ms=t, error_arcsec=10 / t, chosen=name)) for t, name in ((1.0, "auto"), (3.0, ""))]
+    assert {(row.on_front, row.on_front_mag, row.on_front_as_filed) for row in rows} == {("", "", "")}
+    kept = []
+    monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
+    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
+    (figure,) = kept
+    assert_legible(figure)
+    assert "front" not in figure.get_supxlabel()
+
+
 def test_scenes_that_are_alike_are_drawn_once():
     rates = {"average field": (0.0, 0.23), "dense field": (0.0, 0.24), "faint field": (0.0, 0.9), "1 deg/s": (1.0, 0.25)}
     rows = [planted(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto") for name, (rate, error) in rates.items()]

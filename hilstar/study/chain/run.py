@@ -78,6 +78,11 @@ def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
     ]
 
 
+def without_fronts(row: CombinationRow) -> CombinationRow:
+    """A row that was timed on a busy machine: on which fronts it is, no time says."""
+    return replace(row, on_front="", on_front_mag="", on_front_as_filed="")
+
+
 def front(rows: Sequence[CombinationRow], error: str) -> list[bool]:
     """Whether each row is on the front of its time and `error`, the name of one of its columns."""
     return [bool(on) for on in pareto_front([getattr(row, error) for row in rows], [row.time_ms for row in rows])]
@@ -212,7 +217,9 @@ def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
 def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str, glass: list[GlassRow]) -> None:
     """Error against time, a panel for each scene that differs, two for a glass. Raises InputError where it cannot write."""
     scenes = differing(rows)
-    note = f"The line is the front: nothing else is as right and as fast. Pale: all other choices. {charts.capital(machine)}."
+    note = f"Pale: choices that another beats. {charts.capital(machine)}."
+    if any(row.on_front == "true" for row in rows):
+        note = f"The line is the front: nothing else is as right and as fast. {note}"
     count = len(scenes) + (2 if glass else 0)
     with charts.chart(path, finding, count, note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * count) as grid:
         for axes, (scene, alike) in zip(grid, scenes.items(), strict=False):
@@ -229,7 +236,9 @@ def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
     floor = FLOOR_SHARE * min((row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0)
     at = [(row.time_ms, max(row.error_arcsec, floor)) for row in rows]
     front = [(row, place) for row, place in zip(rows, at, strict=True) if row.on_front == "true"]
-    axes.step(*zip(*(place for _, place in front), strict=True), where="post", color=charts.INK, lw=1.2, zorder=2)
+    if front:
+        times_ms, errors = zip(*(place for _, place in front), strict=True)
+        axes.step(times_ms, errors, where="post", color=charts.INK, lw=1.2, zorder=2)
     for row, place in zip(rows, at, strict=True):
         colour, on_front = COLOURS[row.quantisation], row.on_front == "true"
         early, late = max(place[0] - row.noise_ms, place[0] / 2), place[0] + row.noise_ms
@@ -239,21 +248,32 @@ def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
     for row, place in zip(rows, at, strict=True):
         for name in row.chosen.split():
             axes.plot(*place, "o", color=CHOSEN[name], ms=13 if name == AUTO else 17, mfc="none", mew=1.6, zorder=4)
-    named, last, own = [], math.inf, rows[auto_of(rows)]
-    for row, place in front:
-        if place[1] < LESS * last and not row.chosen:
-            named.append((short_words(row, own), place, COLOURS[row.quantisation]))
+    charts.name_at_side(axes, side_names(rows, at))
+
+
+def side_names(
+    rows: Sequence[CombinationRow],
+    at: Sequence[tuple[float, float]],
+) -> charts.SideNames:
+    """The names beside a scene's points: of the front, of what is chosen, and of other codes."""
+    named: list[tuple[str, tuple[float, float], str]] = []
+    last, auto = math.inf, rows[auto_of(rows)]
+    for row, place in zip(rows, at, strict=True):
+        if row.on_front == "true" and place[1] < LESS * last and not row.chosen:
+            named.append((short_words(row, auto), place, COLOURS[row.quantisation]))
             last = place[1]
     for row, place in zip(rows, at, strict=True):
         if row.chosen:
-            arcsec, ms = (charts.two_digits(value) for value in (row.error_arcsec, row.time_ms))
+            arcsec, ms = charts.two_digits(row.error_arcsec), charts.two_digits(row.time_ms)
             label = f"{row.chosen.replace(' ', ', ')}: {arcsec} arcsec, {ms} ms"
             named.append((label, place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT]))
-    for name, colour in COLOURS.items():
-        if not any(colour == other for *_, other in named):  # the best of what has no place on the front
-            mine = [each for each in zip(rows, at, strict=True) if each[0].quantisation == name]
-            named += [(short_words(row, own), place, colour) for row, place in sorted(mine, key=lambda each: each[1][1])[:1]]
-    charts.name_at_side(axes, named)
+    for quantisation, colour in COLOURS.items():
+        points = [point for point in zip(rows, at, strict=True) if point[0].quantisation == quantisation]
+        # The best of codes that have no place on the front.
+        if points and all(colour != other for *_, other in named):
+            row, place = min(points, key=lambda point: point[1][1])
+            named.append((short_words(row, auto), place, colour))
+    return named
 
 
 def short_words(row: CombinationRow, own: CombinationRow) -> str:
@@ -326,6 +346,8 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
     load = others.load()
+    if load.busy:
+        rows = [without_fronts(row) for row in rows]
     lines = [*(scene_line(*scene, load) for scene in judged), *lines, *([glass_line(glass)] if glass else [])]
     make_directory(directory)
     for name, records in (("chain", rows), ("chain_budget", budget), ("chain_time", stages), ("chain_psf", glass)):

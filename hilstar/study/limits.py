@@ -155,7 +155,7 @@ class Limit:
 
 def narrow_sprites() -> Limit:
     """The place of a star that is integrated over pixels, against its sigma."""
-    sigmas_px = np.geomspace(0.9, 0.25, 27)
+    sigmas_px = np.geomspace(0.9, 0.1, 33)
     phases, pixels = np.linspace(-0.5, 0.5, 21), np.arange(-8.0, 9.0)
     errors = []
     for sigma_px in sigmas_px.tolist():
@@ -168,7 +168,7 @@ def narrow_sprites() -> Limit:
 
 def coarse_codes(quick: bool) -> Limit:
     """The light of a star of exact codes, against the monitor's bits."""
-    bits = (10, 8, 6, 5) if quick else (12, 10, 9, 8, 7, 6, 5)
+    bits = (10, 8, 6, 4) if quick else (12, 10, 9, 8, 7, 6, 5, 4)
     errors: list[float] = []
     for count in bits:
         (star,) = codes.code_errors(count, EXACT, 8, [FAINT_MAG])

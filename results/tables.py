@@ -3,6 +3,8 @@
 bench.csv and bench_h100.csv are written by `hilstar benchmark -o`; tradeoff.csv, economy.csv, timing.csv and those of colour by
 `hilstar study NAME -o`, quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on
 which machine; bench_h100.csv on an NVIDIA H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200.
+chain.csv and chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
+limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
 certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine changes it.
 """
@@ -13,6 +15,12 @@ import csv
 import math
 import re
 from pathlib import Path
+from typing import Any, get_type_hints
+
+from hilstar.charts import two_digits
+from hilstar.study import limits
+from hilstar.study.chain.answers import STEP_WORDS, Answer, Given, answer, scenes_of
+from hilstar.study.chain.measuring import CombinationRow, ErrorPart
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -25,6 +33,13 @@ def rows_of(name: str) -> list[dict[str, str]]:
     """The rows of a CSV file."""
     with (HERE / name).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def records_of(name: str, record: type[Any], **columns: str) -> list[Any]:
+    """The rows of a CSV file whose columns have these values, as a study's dataclasses."""
+    kinds = get_type_hints(record)
+    rows = [row for row in rows_of(name) if all(row[column] == value for column, value in columns.items())]
+    return [record(**{column: kind(row[column]) for column, kind in kinds.items()}) for row in rows]
 
 
 def figure(value: float) -> str:
@@ -88,6 +103,53 @@ def tradeoff_table() -> str:
         beside = f"{exact[0]['method']}: {figure(float(exact[0]['time_ms']))} ms" if exact else "-"
         body.append([step, default["method"], error, f"{figure(float(default['time_ms']))} ms", beside])
     return table(["step", "default", "error", "time", "the exact way"], body)
+
+
+PACKETS = {True: "with rates", False: "without"}
+ANSWERED_BITS = ("8", "10", "12")
+
+
+def answers_table() -> str:
+    """What to set on each panel for each turn, and what to expect, by primaries and rates."""
+    head = ["bits", "turn", "packets", "set", "expect", "set, if primaries are known", "expect", "most of the error"]
+    body: list[list[str]] = []
+    for bits in ANSWERED_BITS:
+        scenes = scenes_of(records_of("chain.csv", CombinationRow, bits=bits))
+        budget = records_of("chain_budget.csv", ErrorPart, bits=bits)
+        for scene in scenes:
+            turn_deg_s = scene[0].rate_deg_s
+            for rates in (True, False) if turn_deg_s else (True,):
+                plain, stealing = (answer(scene, budget, Given(primaries, rates)) for primaries in (False, True))
+                turn = f"{turn_deg_s:g} deg/s" if turn_deg_s else "rest"
+                packets = PACKETS[rates] if turn_deg_s else "any"
+                step = STEP_WORDS.get(plain.largest.step, plain.largest.step)
+                part = f"{step}, {two_digits(plain.largest.error_arcsec)} arcsec"
+                body.append([bits, turn, packets, *answer_cells(plain), *answer_cells(stealing), part])
+    return table(head, body)
+
+
+def answer_cells(choice: Answer) -> tuple[str, str]:
+    """What to set, and what to expect; at rest with the time of a frame of 1000 stars."""
+    stealing = choice.row.bit_stealing == "true"
+    keys = f"`{choice.row.quantisation}`" + (", `bit_stealing`" if stealing else "")
+    expected = choice.expected.replace(", ", "; ")
+    if choice.row.rate_deg_s:
+        return keys, expected
+    method = choice.row.quantisation + (", bit stealing" if stealing else "")
+    times = {(row["bits"], row["method"]): float(row["frame_ms"]) for row in rows_of("quantisation_time.csv")}
+    return keys, f"{expected}; {times[str(choice.row.bits), method]:.1f} ms"
+
+
+def limits_table() -> str:
+    """Where each of hilstar's methods leaves its tolerance, and what to do there."""
+    body = []
+    for name, advice in limits.ADVICE.items():
+        row = next(row for row in rows_of("limits.csv") if row["stress"] == name)
+        if row["meets"] == "nan":  # within it to the last point
+            continue
+        tolerance = f"{two_digits(float(row['tolerance']))} {row['unit']}"
+        body.append([row["method"], name, two_digits(float(row["meets"])), tolerance, advice])
+    return table(["method", "stress", "leaves its tolerance at", "of", "do"], body)
 
 
 def economy_table() -> str:
@@ -299,6 +361,7 @@ def certify_table() -> str:
 
 
 TABLES = {
+    "answers": answers_table,
     "certify": certify_table,
     "colour": colour_table,
     "colour_gamut": gamut_table,
@@ -313,6 +376,7 @@ TABLES = {
     "bench": bench_table,
     "card": card_table,
     "kinds": kinds_table,
+    "limits": limits_table,
     "tradeoff": tradeoff_table,
     "economy": economy_table,
     "timing": timing_table,

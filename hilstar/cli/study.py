@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from typer import Argument, Option
 
@@ -12,6 +12,9 @@ from hilstar.cli.options import Json, check_files, parse_radec
 from hilstar.console.terminal import print_found, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory, make_directory
+
+if TYPE_CHECKING:
+    from hilstar.study.chain.run import ChainStudy
 
 Study = Literal[
     "models",
@@ -28,11 +31,14 @@ Study = Literal[
     "chain",
     "colour",
     "confront",
+    "limits",
 ]
 
 ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file
 OF_A_BENCH = {"chain", "models", "outputs"}
 OF_A_FIELD = {"models", "outputs"}
+# The studies that draw times: on a busy machine they name no winner, and `right` is null.
+TIMED = {"quantisation", "timing", "tradeoff", "economy", "prediction", "bodies", "faults", "colour"}
 CHAIN_SCENES = 5
 
 
@@ -59,6 +65,7 @@ def study(
     check_directory("-o", output)
     refuse_unused(what, bench, radec, images)
     place = None if radec is None else parse_radec(radec)
+    answers: list[str] = []
     steps = CHAIN_SCENES if what == "chain" else math.inf
     with progress(f"study {what}", steps) as advance:
         if images is not None:
@@ -69,11 +76,12 @@ def study(
         elif bench is None:
             lines, right = study_lines(what, output, quick)
         elif what == "chain":
-            lines, right = chain_lines(bench, output, quick, advance)
+            chain = chain_study(bench, output, quick, advance)
+            lines, right, answers = chain.lines, chain.right, chain.answers
         else:
             lines, right = thesis_lines(what, bench, output, place), True
-    told = {"study": what, "right": right, "findings": lines, "directory": str(output)}
-    print_found(as_json, told, [*lines, f"figures and tables in {output}"])
+    told = {"study": what, "right": right, "findings": lines, "answers": answers, "directory": str(output)}
+    print_found(as_json, told, [*lines, f"figures and tables in {output}", *answers])
 
 
 def refuse_unused(what: str, bench: Path | None, radec: str | None, images: Path | None) -> None:
@@ -93,8 +101,8 @@ def refuse_unused(what: str, bench: Path | None, radec: str | None, images: Path
         raise InputError(f"study {what}: has no photographs; leave out --images")
 
 
-def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:
-    """Run the study of a bench's whole chain; what it found, and whether `auto` is on every front (None: not judged)."""
+def chain_study(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> "ChainStudy":
+    """Run the study of a bench's whole chain."""
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.study.chain.run import OUTPUTS, run
 
@@ -119,9 +127,12 @@ def thesis_lines(what: str, bench: Path, output: Path, place: tuple[float, float
 
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool | None]:
-    """Run a study; what it found, and whether everything was right."""
+    """Run a study; what it found, and whether everything was right (None: its times cannot be judged)."""
     make_directory(output)
     study_of = import_module(f"hilstar.study.{what}{'.run' if what in ROOMS else ''}")
+    if what in TIMED:
+        lines, right = study_of.run(output, quick)
+        return lines, right
     if what == "models":
         return [f"{finding.figure}: {finding.text}" for finding in study_of.run(output)], True
     if what == "stability":

@@ -193,11 +193,12 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     write_records(directory / "geometry.csv", outcomes)
     usual = [o for o in outcomes if (o.frames, o.dots_per_frame) == USUAL_SIZE and o.noise_px == USUAL_NOISE_PX]
     best = min(usual, key=lambda o: o.held_out_arcsec)
+    uncalibrated = ideal_arcsec()
     finding = (
-        f"Uncalibrated stars are off by {ideal_arcsec():.0f} arcsec rms, by {usual[0].model} {usual[0].stars_rms_arcsec:.0f},"
+        f"Uncalibrated stars are off by {uncalibrated:.0f} arcsec rms, by {usual[0].model} {usual[0].stars_rms_arcsec:.0f},"
         f" by the model that held-out dots choose ({best.model}) {best.stars_rms_arcsec:.2g}"
     )
-    _draw(directory / "geometry", finding, outcomes)
+    _draw(directory / "geometry", finding, outcomes, uncalibrated)
     lines = []
     for o in usual:
         fails = "" if o.stars_max_arcsec < FAIL_ARCSEC else f"; FAILS: over {FAIL_ARCSEC:g} arcsec"
@@ -242,7 +243,7 @@ def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float
     return np.asarray(np.hypot(shown_x - x, shown_y - y) * ARCSEC_PER_RAD / monitor.focal_length_px)
 
 
-def _draw(path: Path, finding: str, outcomes: list[CalibrationOutcome]) -> None:
+def _draw(path: Path, finding: str, outcomes: list[CalibrationOutcome], uncalibrated_arcsec: float) -> None:
     note = f"Solid: stars all over the screen. Dotted: dots that were held out. {USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots"
     note += f" with {USUAL_NOISE_PX:g} px of noise, one of the two varied."
     with chart(path, finding, panels=2, share_x=False, note=note) as (dots, noise):
@@ -257,6 +258,7 @@ def _draw(path: Path, finding: str, outcomes: list[CalibrationOutcome]) -> None:
                 axes.loglog(places, stars, marker=marker, color=colour, label=SHORT.get(model.name, model.name))
                 axes.loglog(places, held, ":", color=colour, lw=1.2, label="_held out")
         for axes in (dots, noise):
+            axes.axhline(uncalibrated_arcsec, color=INK, ls=":", lw=1.2, label="uncalibrated")
             axes.axhline(FAIL_ARCSEC, color=INK, ls="--", lw=1.2, label="fails above")
             axes.set_ylabel("error, rms [arcsec]")
             label_ends(axes)

@@ -7,16 +7,31 @@ Then figures of the thesis's chapters 2 to 5 that need no simulation, each with 
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import structs
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, SERIES, SMALL_PT, chart, label_ends, plain_ticks, write_csv
-from hilstar.sky.catalog import load_catalog
+from hilstar.charts import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PURPLE,
+    SERIES,
+    SMALL_PT,
+    chart,
+    label_ends,
+    plain_ticks,
+    two_digits,
+    write_csv,
+)
+from hilstar.sky.catalog import Catalog, load_catalog
 from hilstar.sky.electrons import (
     REFERENCE_TEMPERATURE_K,
     SUN_TEMPERATURE_K,
@@ -45,10 +60,14 @@ from hilstar.sky.spectrum import (
 from hilstar.sky.synthetic import VEGA_V_MAG, ZERO_W_M2_M, curve_mean, vega
 from hilstar.sky.zodiacal import NEAR_SLOPES, relative_spectrum
 from hilstar.study.rapp import SENSORS, WEIGHTINGS, ChartFinding, rapp
-from hilstar.study.settings import MAX_RELIABLE_VI_MAG, held_out_by_type, held_out_errors, study_optics
+from hilstar.study.settings import APERTURE_MM, MAX_RELIABLE_VI_MAG, held_out_by_type, held_out_errors, study_optics
 from hilstar.study.sky_figures import FIGURES as SKY_FIGURES
 from hilstar.tracker.settings import DetectorSettings
 from hilstar.units import LIGHT_M_S, flux_ratio, magnitude
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
 
 # Table 2.3, whose medians are those of stars to about V = 9: unit and value by the fact's name.
 TABLE_2_3 = {
@@ -61,6 +80,7 @@ TABLE_2_3 = {
 }
 NAMES_2_3 = ("B-V, mean", "right ascension", "declination", "parallax", "motion in RA", "motion in Dec")
 TABLE_2_3_V_MAG = 9.0
+CLIPPED_TIMES = 4  # errors over so many times the thesis's are drawn at the edge
 # Table 2.2: V and B-V from the ground, from Hipparcos, from Tycho; of all 118 218 rows.
 TABLE_2_2 = {"G": (23_139, 41_205), "H": (94_669, 0), "T": (409, 75_732)}
 # Table 2.5: flux of magnitude 0 by Johnson and by Bessell, erg/s/cm2/A, and Bessell's effective wavelength, nm.
@@ -100,18 +120,89 @@ def catalogue_errors(directory: Path) -> ChartFinding:
         here = facts[name].mean() if name == "sigma_bv_mag" else np.median(facts[name][bright])
         rows.append((name, unit, float(here), printed))
     write_csv(directory / "catalogue_errors.csv", ("what", "unit", "here", "thesis"), rows)
-    largest = max(abs(here - printed) for what, _, here, printed in rows if what in TABLE_2_3)
+    medians = {name: here for name, _, here, _ in rows if name in TABLE_2_3}
+    largest = max(abs(medians[name] - printed) for name, (_, printed) in TABLE_2_3.items())
     text = (
-        f"Hipparcos's errors: B-V {rows[-6][2]:.4f} mag (thesis: 0.0281), places {rows[-5][2]:.2f} and {rows[-4][2]:.2f} mas"
-        f" (0.77, 0.64); all of table 2.3 within {largest:.3f}"
+        f"Hipparcos's errors: B-V {medians['sigma_bv_mag']:.4f} mag (thesis: 0.0281), places {medians['sigma_ra_mas']:.2f} and"
+        f" {medians['sigma_dec_mas']:.2f} mas (0.77, 0.64); all of table 2.3 within {largest:.3f}"
     )
-    note = f"All {len(catalog)} stars, the largest errors in the last bar; lines: the thesis's mean and medians."
-    with chart(directory / "catalogue_errors", text, 2, 3, note=note, share_x=False) as panels:
-        for axes, title, (name, (unit, printed)) in zip(panels, NAMES_2_3, TABLE_2_3.items(), strict=True):
-            axes.hist(np.clip(facts[name], 0, 5 * printed), bins=60, color=BLUE)
-            axes.axvline(printed, color=INK)
-            axes.set(title=title, xlabel=f"error [{unit}]", yscale="log")
+    draw_catalogue_errors(directory / "catalogue_errors", text, catalog, medians)
     return ChartFinding("catalogue_errors", text)
+
+
+def draw_catalogue_errors(
+    path: Path,
+    text: str,
+    catalog: Catalog,
+    medians: Mapping[str, float],
+) -> None:
+    """Each error against the figure that it is of, with its median and the thesis's, and maps."""
+    facts, against = facts_of(catalog.hip), measured_values(catalog)
+    largest = max(abs(medians[name] - printed) for name, (_, printed) in TABLE_2_3.items())
+    note = (
+        f"Density of all {len(catalog)} stars; errors over {CLIPPED_TIMES} times the thesis's stand at"
+        " the top edge. Solid: the figures above them, medians of stars to"
+        f" V = {TABLE_2_3_V_MAG:g} (B-V: the mean of all). Dashed: the thesis's, within {largest:.3f}."
+    )
+    layout: dict[str, Any] = {"note": note, "share_x": False, "height_inch": 11.0}
+    with chart(path, text, 4, 2, **layout) as panels:
+        titles = dict(zip(TABLE_2_3, NAMES_2_3, strict=True))
+        for axes, (name, (unit, printed)) in zip(panels, TABLE_2_3.items(), strict=False):
+            value, high = against[name], CLIPPED_TIMES * printed
+            style: dict[str, Any] = {"cmap": density(), "norm": "log", "rasterized": True}
+            style |= {"bins": (120, 60), "range": (value.limits, (0.0, high))}
+            axes.hist2d(value.of_star, np.minimum(facts[name], high), **style)
+            axes.set(ylabel=f"error [{unit}]", xlabel=value.label)
+            axes.set_title(f"{titles[name]}: {two_digits(medians[name])} {unit}")
+            axes.axhline(medians[name], color=INK, label="_here")
+            axes.axhline(printed, color=MUTED, ls="--", label="_thesis")
+        for axes, name in zip(panels[6:], ("sigma_ra_mas", "sigma_dec_mas"), strict=True):
+            sky_map(axes, catalog, name, facts[name])
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredValue:
+    """A figure of the catalogue's stars (n,), the label of its axis, and the limits that are drawn."""
+
+    of_star: FloatArray
+    label: str
+    limits: tuple[float, float]
+
+
+def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
+    """What each error of table 2.3 is of, by the error's name."""
+    pm_ra, pm_dec = catalog.pm_ra_cosdec_mas_yr, catalog.pm_dec_mas_yr
+    return {
+        "sigma_bv_mag": MeasuredValue(catalog.bv_mag, "B-V [mag]", (-0.4, 2.2)),
+        "sigma_ra_mas": MeasuredValue(catalog.ra_deg, "right ascension [deg]", (0.0, 360.0)),
+        "sigma_dec_mas": MeasuredValue(catalog.dec_deg, "declination [deg]", (-90.0, 90.0)),
+        "sigma_parallax_mas": MeasuredValue(catalog.parallax_mas, "parallax [mas]", (-5.0, 40.0)),
+        "sigma_pm_ra_mas_yr": MeasuredValue(pm_ra, "motion in RA [mas/yr]", (-200.0, 200.0)),
+        "sigma_pm_dec_mas_yr": MeasuredValue(pm_dec, "motion in Dec [mas/yr]", (-200.0, 200.0)),
+    }
+
+
+def density() -> "Colormap":
+    """From clear to blue, on light pages and on dark ones."""
+    from matplotlib.colors import LinearSegmentedColormap, to_rgba
+
+    return LinearSegmentedColormap.from_list("density", [to_rgba(BLUE, 0.06), to_rgba(BLUE, 1.0)])
+
+
+def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) -> None:
+    """The median of an error over the sky, which Hipparcos scanned about the ecliptic's poles."""
+    ra_edges, dec_edges = np.linspace(0, 360, 73), np.degrees(np.arcsin(np.linspace(-1, 1, 37)))
+    column = np.digitize(catalog.ra_deg, ra_edges) - 1
+    row = np.digitize(catalog.dec_deg, dec_edges) - 1
+    medians = np.full((len(dec_edges) - 1, len(ra_edges) - 1), np.nan)
+    for at in np.unique(row * medians.shape[1] + column):
+        cell = divmod(int(at), medians.shape[1])
+        medians[cell] = np.median(error_mas[(row == cell[0]) & (column == cell[1])])
+    style: dict[str, Any] = {"cmap": density(), "vmin": 0.5, "vmax": 1.3, "rasterized": True}
+    image = axes.pcolormesh(ra_edges, dec_edges, medians, **style)
+    title = f"Sky map: {NAMES_2_3[list(TABLE_2_3).index(name)]}, medians"
+    axes.set(title=title, xlabel="right ascension [deg]", ylabel="declination [deg]")
+    axes.figure.colorbar(image, ax=axes, label="Error [mas]", fraction=0.06, pad=0.02)
 
 
 def passbands(directory: Path) -> ChartFinding:
@@ -236,10 +327,13 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
         f"Zodiacal light of V = {ZODIACAL_V_MAG:g} has {far:.1f} photons/s/m2/arcsec2 90 degrees from the Sun (330 to"
         f" 1100 nm), {near:.1f} at 30 degrees, {sun:.1f} as sunlight"
     )
-    note = "Leinert 1998, table 19 and equation 22, through Johnson V. The WFC3 handbook's spectrum, V = 22.15, gives 101.6."
+    note = (
+        f"V = {ZODIACAL_V_MAG:g}. Leinert 1998, table 19 and equation 22, through Johnson V. The WFC3"
+        " handbook's spectrum, V = 22.15, gives 101.6."
+    )
     with chart(directory / "zodiacal", text, note=note) as (axes,):
         for (name, values), colour in zip(spectra.items(), SERIES, strict=False):
-            axes.plot(nm, values, color=colour, label=name)
+            axes.plot(nm, values, color=colour, label=f"{name}: {total[name]:.1f} in all")
         axes.set(xlabel="wavelength [nm]", ylabel="photons/s/m2/arcsec2/nm")
         axes.legend()
     write_csv(directory / "zodiacal.csv", ("wavelength_nm", *spectra), np.column_stack((nm, *spectra.values())))
@@ -325,7 +419,8 @@ def zero_points(directory: Path) -> ChartFinding:
         f"A V = 0 star of 9602 K gives {base[0] / 1e6:.1f} million electrons/s by Vega's flux (CCD47-20, 30 mm),"
         f" {100 * (1 - base[2] / base[0]):.0f} % ({cost[2]:.2f} mag) fewer by the IAU's bolometric zero point"
     )
-    with chart(directory / "zero_points", text, panels=2) as (upper, lower):
+    note = f"A black body of {REFERENCE_TEMPERATURE_K:.0f} K, V = 0, behind {APERTURE_MM:g} mm."
+    with chart(directory / "zero_points", text, panels=2, note=note) as (upper, lower):
         place = np.arange(len(SETTINGS))
         for k, ((sensor, name), colour) in enumerate(zip(SENSORS.items(), (BLUE, ORANGE), strict=True)):
             for axes, height, figure in ((upper, rates[sensor] / 1e6, "%.2f"), (lower, mag[sensor], "%+.3f")):
@@ -379,6 +474,8 @@ def temperature_scales(directory: Path) -> ChartFinding:
         for axes, values in zip(panels, groups.values(), strict=True):
             for (name, value), style, colour in zip(values.items(), (":", "-", "-"), (MUTED, BLUE, ORANGE), strict=True):
                 words = name.replace("torres2010_supergiant", "Torres, supergiants")
+                if axes is panels[2] and name in within:
+                    words = f"{name}: half within {within[name][0]:.3f}"
                 axes.plot(bv, value, style, color=colour, label=words)
         for axes in panels[1:]:
             axes.axhline(0, color=INK, lw=1)
@@ -406,18 +503,20 @@ def choices(directory: Path) -> ChartFinding:
     text = "What each choice costs half of Hipparcos to V = 7.5 (95 %), CCD47-20, mag: " + ", ".join(
         f"{name.split()[-1]} {half:.2f} ({most:.2f})" for name, (half, most) in paid.items()
     )
-    dearest = max(paid, key=lambda name: paid[name][1])
-    finding = (
-        f"Of the choices of brightness {dearest.split()[-1]} changes most: half of Hipparcos to V = {BRIGHT_V_MAG:g} by"
-        f" {paid[dearest][0]:.2f} mag and more, a twentieth by {paid[dearest][1]:.2f} mag"
+    finding = choices_finding(paid)
+    note = (
+        f"At a name: half of {len(stars)} Hipparcos stars change by as much (a twentieth). Band: 5 to"
+        " 95 % of them. M giants share the B-V of K giants, and are up to"
+        f" {-np.nanmin(low):.1f} mag brighter than the black body. + is fainter; CCD47-20."
     )
-    note = f"Band: 5 to 95 % of {len(stars)} Hipparcos stars. M giants share the B-V of K giants, and are up to"
-    note += f" {-np.nanmin(low):.1f} mag brighter than the black body. + is fainter; CCD47-20."
     with chart(directory / "choices", finding, panels=2, note=note) as (upper, lower):
         for (name, mag), colour in zip(cost.items(), SERIES, strict=False):
-            upper.plot(BV_MAG, mag, color=colour, label=name.split()[-1])
-        for axes in (upper, lower):
-            axes.plot(BV_MAG, middle, color=INK, label="pickles, median")
+            half, most = paid[name]
+            upper.plot(BV_MAG, mag, color=colour, label=f"{name.split()[-1]}: {half:.2f} ({most:.2f})")
+        half, most = paid["spectrum pickles"]
+        names = {upper: f"pickles: {half:.2f} ({most:.2f})", lower: "pickles, median"}
+        for axes, name in names.items():
+            axes.plot(BV_MAG, middle, color=INK, label=name)
             axes.axhline(0, color=MUTED, lw=1)
             axes.set(ylabel="cost against a black body [mag]")
         lower.fill_between(BV_MAG, low, high, color=MUTED, alpha=0.35, lw=0)
@@ -427,6 +526,21 @@ def choices(directory: Path) -> ChartFinding:
     columns += ("pickles_p5_mag", "pickles_median_mag", "pickles_p95_mag", "stars_in_window")
     write_csv(directory / "choices.csv", columns, np.column_stack((BV_MAG, *cost.values(), *percentiles)).tolist())
     return ChartFinding("choices", text)
+
+
+def choices_finding(paid: Mapping[str, FloatArray]) -> str:
+    """Which choice changes half of the stars most, and which a twentieth; mag (2,) by choice."""
+    dearest = max(paid, key=lambda name: float(paid[name][0]))
+    for_few = max(paid, key=lambda name: float(paid[name][1]))
+    half, most = paid[dearest]
+    text = (
+        f"Of the choices of brightness {dearest.split()[-1]} changes most: half of Hipparcos to"
+        f" V = {BRIGHT_V_MAG:g} by {half:.2f} mag and more"
+    )
+    if for_few == dearest:
+        return f"{text}, a twentieth by {most:.2f} mag"
+    few = f"{for_few.split()[-1]}, by {paid[for_few][1]:.2f} mag"
+    return f"{text}; a twentieth are changed most by {few}"
 
 
 def choice_costs_mag(bv_mag: FloatArray, optics: Optics) -> dict[str, FloatArray]:

@@ -33,6 +33,7 @@ from hilstar.study.predictors import (
     slew_attitude,
     slew_sample,
 )
+from hilstar.study.sweep import Judged, Load, OtherWork
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 
 RATES_HZ = (5, 10, 20, 50, 100, 200)
@@ -68,13 +69,14 @@ class PredictionOutcome:
     attitude_us: float
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
+def run(directory: Path, quick: bool = False) -> Judged:
     """Measure, and write `prediction.csv` and its chart; a line for each method. Raises InputError."""
-    span_s, outcomes = QUICK_SPAN_S if quick else SPAN_S, []
+    span_s, outcomes, others = QUICK_SPAN_S if quick else SPAN_S, [], OtherWork()
     # Over latency at the usual rate, and over rate at the usual latency.
     for hz, ms in sorted({(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}):
         samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
         outcomes += [_outcome(predictor, samples, hz, ms) for predictor in predictors() if not predictor.waits]
+    load = others.load()
     write_records(directory / "prediction.csv", outcomes)
     usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
     default = next(o for o in usual if o.method == next(g.name for g in predictors() if g.is_default))
@@ -83,7 +85,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is off by "
         f"{default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
     )
-    _draw(directory / "prediction", finding, outcomes)
+    _draw(directory / "prediction", finding, outcomes, load)
     cells, frequencies = (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
     shaken_by = []
     for rates, (packet_hz, age_ms), way, jitter_hz in product((True, False), cells, WAYS, frequencies):
@@ -95,14 +97,14 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     given, derived = (crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS) for packets in ("with rates", "without rates"))
     told = (
         f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is nearer than one predicted by"
-        f' {USUAL_MS} ms; "auto" is near the better of both'
+        f' {USUAL_MS} ms; "auto" is within {auto_times(shaken_by):.1f} times the better of both'
     )
     _draw_shaken(directory / "prediction_jitter", told, shaken_by)
     lines = (
         f"{o.method}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum, {o.attitude_us:.0f} us per attitude"
         for o in usual
     )
-    return [finding, *lines, told]
+    return load.judged([finding, *lines, told])
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +150,17 @@ def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rate
     return float(np.sqrt(2 * np.mean(error**2)) / amplitude), float(np.hypot(fitted[0], fitted[1]) / amplitude)
 
 
+def auto_times(found: list[Shaken]) -> float:
+    """The largest error of "auto" as a multiple of the better of the other two."""
+    residuals: dict[tuple[str, float], dict[str, float]] = {}
+    for shaken in found:
+        if (shaken.packet_hz, shaken.age_ms) == (USUAL_HZ, USUAL_MS):
+            by_way = residuals.setdefault((shaken.packets, shaken.jitter_hz), {})
+            by_way[shaken.way] = shaken.residual
+    times = [way["auto"] / min(way["rate"], way["newest"]) for way in residuals.values()]
+    return max(times)
+
+
 def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:
     """The frequency above which the newest attitude is nearer than one predicted by its rate; infinite for none."""
     mine = [s for s in found if (s.packets, s.packet_hz, s.age_ms) == (packets, packet_hz, age_ms)]
@@ -178,10 +191,10 @@ def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, 
     return PredictionOutcome(predictor.name, rate_hz, latency_ms, rms, max(errors), float(np.median(times_us)))
 
 
-def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome]) -> None:
+def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load) -> None:
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     note = f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the time of one attitude."
-    with chart(path, finding, panels=2, share_x=False, note=note) as (latency, rate):
+    with chart(path, finding, panels=2, share_x=False, note=load.note(note)) as (latency, rate):
         for name, marker, colour in zip(dict.fromkeys(o.method for o in outcomes), MARKERS, SERIES, strict=False):
             mine = [o for o in outcomes if o.method == name]
             took_us = np.median([o.attitude_us for o in mine])

@@ -12,12 +12,24 @@ from pathlib import Path
 import pytest
 
 from hilstar import charts
+from hilstar.study.sweep import Load, OtherWork
+
+
+@pytest.fixture(scope="package", autouse=True)
+def idle_machine() -> Iterator[None]:
+    """Studies of times take this machine for an idle one; test_other_work.py measures, and plants a busy one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OtherWork, "load", lambda self: Load())
+        yield
 
 
 @pytest.fixture(scope="package", autouse=True)
 def every_chart_is_legible() -> Iterator[None]:
-    """No text over another or off the canvas, no curve that leaves its axes or has no name: tests/support/figures.py."""
-    from tests.support.figures import assert_legible  # brings matplotlib
+    """No text over another or off the canvas, no curve without a name, no figure in a title that is not drawn.
+
+    See tests/support/figures.py.
+    """
+    from tests.support.figures import assert_legible, assert_title_is_drawn  # brings matplotlib
 
     save = charts.save
 
@@ -25,6 +37,7 @@ def every_chart_is_legible() -> Iterator[None]:
     def looked_at(figure, path: Path) -> None:
         save(figure, path if path.suffix in charts.ENDINGS else path.with_name(f"{path.name}.png"))
         assert_legible(figure, drawn=path.suffix != ".svg")
+        assert_title_is_drawn(figure, path.stem)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(charts, "save", looked_at)

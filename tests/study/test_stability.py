@@ -59,6 +59,9 @@ def test_the_table_has_every_case_and_the_curves_have_charts(study):
         assert row["verdict"] == "right" and row["failing method"] and row["its failure"] and row["why"]
         assert float(row["error"]) <= float(row["tolerance"])
         assert not float(row["its error"]) <= float(row["tolerance"])
+    peaks = {float(row["sigma_px"]): float(row["sampled_peak_error"]) for row in table(folder / "narrow_stars.csv")}
+    assert all(peak > 0.02 for peak in peaks.values())  # a Gaussian's middle is over the mean of its pixel
+    assert peaks[min(peaks, key=lambda sigma_px: abs(sigma_px - 0.85))] == pytest.approx(0.12, abs=0.02)
     for stem in ("narrow_stars", "weak_perspective", "popping", "turns"):
         assert_drawn(folder / f"{stem}.png")
         assert len(table(folder / f"{stem}.csv")) > 25

@@ -16,7 +16,7 @@ from hilstar import charts
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.optics.psf_file import glass_of, write_glass
 from hilstar.study import predictors
-from hilstar.study.chain import choices, measuring, run
+from hilstar.study.chain import answers, choices, measuring, run
 from hilstar.study.chain import glass as chain_glass
 from hilstar.study.chain.choices import ChainScene, Combination, Parts, five_scenes, lead_ns
 from hilstar.study.chain.glass import draw_glass, glass_rows
@@ -252,6 +252,17 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
     assert "exact" in names and "dither" not in " ".join(names)
 
 
+def test_a_busy_machine_has_no_front(monkeypatch, tmp_path):
+    rows = [run.without_fronts(planted(time_ms=t, error_arcsec=10 / t, chosen=name)) for t, name in ((1.0, "auto"), (3.0, ""))]
+    assert {(row.on_front, row.on_front_mag, row.on_front_as_filed) for row in rows} == {("", "", "")}
+    kept = []
+    monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
+    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
+    (figure,) = kept
+    assert_legible(figure)
+    assert "front" not in figure.get_supxlabel()
+
+
 def test_scenes_that_are_alike_are_drawn_once():
     rates = {"average field": (0.0, 0.23), "dense field": (0.0, 0.24), "faint field": (0.0, 0.9), "1 deg/s": (1.0, 0.25)}
     rows = [planted(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto") for name, (rate, error) in rates.items()]
@@ -298,3 +309,81 @@ def test_a_bench_of_which_no_star_stays_in_view_is_refused(tmp_path):
     (tmp_path / "bench.toml").write_text(SMALL.replace("[320, 320]", "[12, 12]"))
     refused = run_hilstar_here("study", "chain", tmp_path / "bench.toml", "-o", tmp_path / "out", "--quick")
     assert_refused(refused, 2, "no star stands alone in view")
+
+
+def test_the_study_ends_with_answers_from_its_own_rows(study):
+    told, out = study
+    rows, parts = table(out / "chain.csv"), table(out / "chain_budget.csv")
+    assert len(told["answers"]) >= 4
+    still = [row for row in rows if row["scene"] == "average field" and row["sprite"] == "cut"]
+    by_codes = {(row["quantisation"], row["bit_stealing"]): row for row in still if float(row["faintest_v_mag"]) == 9}
+    exact, stealing = (charts.two_digits(float(by_codes["exact", flag]["error_arcsec"])) for flag in ("false", "true"))
+    assert told["answers"][0].startswith(f'at rest on 8 bits: set quantisation = "exact", {exact} arcsec')
+    assert f"takes {exact} arcsec to {stealing}" in told["answers"][1]
+    of_turn = {part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"}
+    whole = charts.two_digits(of_turn.pop("whole"))
+    del of_turn["rss"]
+    largest = max(of_turn, key=of_turn.get)
+    words = answers.STEP_WORDS.get(largest, largest)
+    assert told["answers"][2].startswith(f"from 1 deg/s on {words} is the largest part ({charts.two_digits(of_turn[largest])}")
+    assert f"of {whole} arcsec)" in told["answers"][2]
+    assert told["answers"][-1].startswith("depth: ")
+
+
+def answered(given: answers.Given, rate_deg_s: float = 0.0, **errors: float) -> CombinationRow:
+    """The answer among planted rows: the error of each, arcsec, by codes, then `s` for bit stealing and `t` for two samples."""
+    rows = []
+    for name, arcsec in errors.items():
+        codes, _, flags = name.partition("_")
+        rows.append(
+            planted(
+                error_arcsec=arcsec,
+                error_mag=0.001,
+                quantisation=codes,
+                bit_stealing="true" if "s" in flags else "false",
+                prediction="two samples" if "t" in flags else "rate",
+                rate_deg_s=rate_deg_s,
+            )
+        )
+    return answers.simplest(answers.allowed(rows, given))
+
+
+def test_an_answer_is_the_simplest_that_is_near_the_best_of_what_is_given():
+    bare, known = answers.Given(False, True), answers.Given(True, True)
+    assert answered(bare, round=1.0, exact=0.2, exact_s=0.1).quantisation == "exact"
+    assert answered(bare, round=1.05, exact=1.0).quantisation == "round"
+    assert answered(bare, round=1.0, exact=0.2, exact_s=0.1).bit_stealing == "false"
+    assert answered(known, round=1.0, exact=0.2, exact_s=0.1).bit_stealing == "true"
+    assert answered(known, exact=0.105, exact_s=0.1).bit_stealing == "false"
+    assert answered(bare, temporal=0.01, dither=0.05, exact=0.2).quantisation == "exact"
+    turning = {"exact": 1.2, "exact_t": 0.7}
+    assert answered(answers.Given(False, True), 1.0, **turning).prediction == "rate"
+    assert answered(answers.Given(False, False), 1.0, **turning).prediction == "two samples"
+
+
+def test_a_cheaper_choice_whose_light_is_far_worse_is_no_answer():
+    rows = [
+        planted(quantisation="round", bit_stealing="false", error_arcsec=1.0, error_mag=0.02),
+        planted(quantisation="exact", bit_stealing="false", error_arcsec=1.0, error_mag=0.002),
+    ]
+    assert answers.simplest(rows).quantisation == "exact"
+
+
+def test_each_turn_is_named_from_which_another_step_is_most_of_the_error():
+    rows, budget = [], []
+    for scene, rate, largest in (
+        ("s", 0.0, "codes"),
+        ("a", 1.0, "prediction"),
+        ("b", 3.0, "prediction"),
+        ("c", 10.0, "refresh"),
+    ):
+        for prediction, arcsec in (("rate", 1.0), ("two samples", 2.0)):
+            errors = {"error_arcsec": arcsec, "bit_stealing": "false"}
+            rows.append(planted(scene=scene, rate_deg_s=rate, prediction=prediction, **errors))
+        steps = {step: 2.0 if step == largest else 0.5 for step in ("codes", "prediction", "refresh")}
+        budget += [
+            measuring.ErrorPart(scene, "auto", step, size, 0.0) for step, size in {**steps, "rss": 3.0, "whole": 2.5}.items()
+        ]
+    lines = answers.turn_lines(answers.scenes_of(rows)[1:], budget)
+    assert [line.split(" is ")[0] for line in lines] == ["from 1 deg/s on prediction", "from 10 deg/s on the panel's refresh"]
+    assert "2 of 2.5 arcsec): send rates (by the packets' rates 1, by two samples 2 arcsec)" in lines[0]

@@ -15,7 +15,7 @@ from hilstar.study.speed import report as benchmark_report
 from hilstar.study.speed.report import Machine, MethodTiming, Result, Spread
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.twin.budget import CENTROID_LIMIT_PX, FLUX_LIMITS_MAG, budget, write_report
-from tests.support.figures import assert_legible
+from tests.support.figures import assert_legible, assert_title_is_drawn
 from tests.support.pictures import assert_drawn
 
 
@@ -101,6 +101,19 @@ def test_the_looks_of_a_chart_are_looked_at(two_lines):
 def test_what_is_wrong_with_a_chart_is_seen(two_lines, spoil, said):
     with pytest.raises(AssertionError, match=said):
         assert_legible(two_lines(spoil))
+
+
+def test_a_title_with_a_figure_that_is_not_drawn_is_seen(tmp_path):
+    """As `choices` once told 0.16 mag of one line beside another line at 0.31."""
+    for title, is_drawn in (("The line is at 0.31 mag, within 4.2·10⁻⁸", True), ("The line is at 0.16 mag", False)):
+        with charts.panels_of(title) as (axes,):
+            axes.plot([1, 2], [0.3082, 0.3079], color=charts.BLUE, label="a line")
+            charts.label_ends(axes)
+        if is_drawn:
+            assert_title_is_drawn(axes.figure, "planted")
+        else:
+            with pytest.raises(AssertionError, match=r"0\.16 of the title"):
+                assert_title_is_drawn(axes.figure, "planted")
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,22 @@ PAGE_PX = 700  # the narrowest column of the documentation that a figure is read
 MIN_TEXT_PX = 11.0  # at that width
 MAX_TITLE_LINES = 2
 TOUCH_PX = 1.5  # boxes are whole pixels of a hinted font: this much is no overlap
+# A figure of a title that stands alone: no part of a name, no power of ten.
+TITLE_FIGURE = re.compile(r"(?<![\w.\-·⁻])\d+(?:\.\d+)?(?![\w·⁻]|-\d|\.\d)")
+# Charts whose titles have figures that are found from what is drawn and not drawn themselves, and how.
+DERIVED = {
+    "economy": "the ratio of two bars",
+    "prediction_jitter": "where two lines cross, and the largest ratio of two",
+    "weak_perspective": "between two points of a line, and a ratio of two",
+    "passbands": "table 2.5 beside the spectrum that is drawn",
+    "turns": "half a turn",
+    "rapp_ccd47-20": "a point of a line",
+    "tradeoff_smear": "a count in a method's name",
+    "lyra": "the thesis's figures, by number",
+    "rosetta": "the thesis's figures, by number",
+    "orion": "the thesis's figures, by number",
+}
+DRAWN_AS = (1.0, 1e2, 1e3, 1e-6)  # a share is told in percent, a second in ms, electrons in millions
 PLAIN = {charts.INK, charts.MUTED, charts.GRID, charts.PAPER}  # of axes and of what a text beside it names
 
 
@@ -45,6 +61,33 @@ def assert_legible(figure: Figure, *, drawn: bool = False) -> None:
     for axes in figure.axes:
         assert_capital(axes)
         assert_lines(axes, named)
+
+
+def assert_title_is_drawn(figure: Figure, stem: str) -> None:
+    """Each figure of a title stands in the chart: as a word, or as a value that is drawn, rounded as the title rounds it."""
+    if stem in DERIVED:
+        return
+    title = figure.get_suptitle()
+    words = " ".join(text.get_text() for text in seen(figure) if text.get_text() != title)
+    values = np.abs(drawn_values(figure))
+    for match in TITLE_FIGURE.finditer(title):
+        figure_words = match[0]
+        if re.search(rf"(?<![\d.]){re.escape(figure_words)}(?!\d|\.\d)", words):
+            continue
+        half_digit = 0.505 * 10.0 ** -len(figure_words.partition(".")[2])
+        off = min(float(np.abs(values * scale - float(figure_words)).min(initial=np.inf)) for scale in DRAWN_AS)
+        assert off <= half_digit, f"{stem}: {figure_words} of the title {title!r} is not drawn"
+
+
+def drawn_values(figure: Figure) -> np.ndarray:
+    """Every finite number that a figure draws: of lines, bars and areas."""
+    values: list[np.ndarray] = [np.zeros(0)]
+    for axes in figure.axes:
+        values += [np.asarray(line.get_xydata(), dtype=float).ravel() for line in axes.get_lines()]
+        values += [np.array([patch.get_height(), patch.get_width()]) for patch in axes.patches if hasattr(patch, "get_height")]
+        values += [path.vertices.ravel() for collection in axes.collections for path in collection.get_paths()]
+    every = np.concatenate(values)
+    return every[np.isfinite(every)]
 
 
 def seen(figure: Figure) -> Iterator[Text]:

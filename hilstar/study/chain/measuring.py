@@ -246,27 +246,33 @@ class SceneMeasurement:
         """Every combination's error and time, and the times of the stages of `auto`."""
         chains = [self.chain(combination) for combination in self.combinations]
         times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
-        rows = []
-        for chain, taken in zip(chains, times, strict=True):
-            own = chain.combination
-            marked = [name for name, at in ((DEFAULT, self.marks.default), (AUTO, self.marks.auto)) if own == at]
-            rows.append(
-                CombinationRow(
-                    scene=self.scene.name,
-                    rate_deg_s=self.scene.rate_deg_s,
-                    exposure_s=rounded(self.judges[0].seen.length_s),
-                    bits=self.parts.own.config.monitor.bits,
-                    sprite_px=chain.sprite_px(),
-                    chosen=" ".join(marked),
-                    as_filed=said(own == self.marks.as_filed),
-                    **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
-                    **asdict(self.error(own)),
-                    **asdict(taken),
-                )
-            )
+        rows = [self.row(chain, taken) for chain, taken in zip(chains, times, strict=True)]
         return rows, [
             StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES)) for stage, ms in zip(STAGES, stages, strict=True)
         ]
+
+    def untimed(self) -> list[CombinationRow]:
+        """Every combination's error, which no machine changes, without times."""
+        untimed = Times(math.nan, math.nan, math.nan, math.nan, 0)
+        return [self.row(self.chain(combination), untimed) for combination in self.combinations]
+
+    def row(self, chain: DrawingChain, taken: Times) -> CombinationRow:
+        """A combination's row of the table."""
+        own = chain.combination
+        chosen = {DEFAULT: self.marks.default, AUTO: self.marks.auto}
+        marked = [name for name, combination in chosen.items() if combination == own]
+        return CombinationRow(
+            scene=self.scene.name,
+            rate_deg_s=self.scene.rate_deg_s,
+            exposure_s=rounded(self.judges[0].seen.length_s),
+            bits=self.parts.own.config.monitor.bits,
+            sprite_px=chain.sprite_px(),
+            chosen=" ".join(marked),
+            as_filed=said(own == self.marks.as_filed),
+            **(asdict(own) | {"bit_stealing": said(own.bit_stealing)}),
+            **asdict(self.error(own)),
+            **asdict(taken),
+        )
 
     def error(self, combination: choices.Combination) -> Error:
         """A combination's error over all exposures."""

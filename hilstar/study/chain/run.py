@@ -7,7 +7,7 @@ equal in both are both on it. Figures are the table's, rounded as they stand the
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from hilstar import charts
 from hilstar.bench.bench_file import BenchFile
 from hilstar.errors import InputError
 from hilstar.files import make_directory
+from hilstar.study.chain.answers import answer_lines
 from hilstar.study.chain.choices import DENSE, QUANTISATIONS, Parts, five_scenes, shortened_line
 from hilstar.study.chain.glass import GlassRow, draw_glass, glass_line, glass_rows
 from hilstar.study.chain.measuring import (
@@ -32,12 +33,11 @@ from hilstar.study.chain.measuring import (
     said,
 )
 from hilstar.study.chain.tracker import StudyTracker
-from hilstar.study.sweep import OtherWork, beaten_by, busy_line, is_busy, pareto_front
+from hilstar.study.sweep import NOT_JUDGED, Load, OtherWork, beaten_by, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-NOT_JUDGED = "the times were taken on a busy machine: no combination is named the faster"
 COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (charts.PURPLE, charts.ORANGE, charts.GREEN, charts.BLUE), strict=True))
 PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
 FLOOR_SHARE = 1e-3  # share of the smallest error at which 0 is drawn on a logarithmic axis
@@ -54,6 +54,18 @@ OUTPUTS = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class ChainStudy:
+    """What the study says: a line for each scene, whether `auto` is on every front or within its noise, and what to do.
+
+    `right` is None on a busy machine.
+    """
+
+    lines: list[str]
+    right: bool | None
+    answers: list[str]
+
+
 def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
     """The rows of a scene, the fastest first, with their fronts."""
     rows = sorted(rows, key=lambda row: (row.time_ms, row.error_arcsec))
@@ -64,6 +76,11 @@ def rows_of(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
         replace(row, on_front=said(a), on_front_mag=said(m), on_front_as_filed=said(as_filed.get(k, False)))
         for k, (row, a, m) in enumerate(zip(rows, by_arcsec, by_mag, strict=True))
     ]
+
+
+def without_fronts(row: CombinationRow) -> CombinationRow:
+    """A row that was timed on a busy machine: on which fronts it is, no time says."""
+    return replace(row, on_front="", on_front_mag="", on_front_as_filed="")
 
 
 def front(rows: Sequence[CombinationRow], error: str) -> list[bool]:
@@ -99,11 +116,9 @@ def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[lis
     return beyond, within
 
 
-def scene_line(
-    rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], busy: bool = False
-) -> str:
+def scene_line(rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load) -> str:
     """One scene: the choice of `auto`, its error and time, its place relative to the front, and the largest part of each."""
-    own, stands = rows[auto_of(rows)], NOT_JUDGED if busy else standing(rows)
+    own, stands = rows[auto_of(rows)], NOT_JUDGED if load.busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
     largest, longest = max(steps, key=lambda part: part.error_arcsec), max(stages, key=lambda one: one.time_ms)
     share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
@@ -114,15 +129,15 @@ def scene_line(
     )
 
 
-def headline(rows: Sequence[CombinationRow], busy: bool = False) -> str:
-    """What the whole table says of `auto`; nothing on a `busy` machine."""
-    if busy:
-        return f"The errors hold; {NOT_JUDGED}"
+def headline(rows: Sequence[CombinationRow], load: Load) -> str:
+    """What the whole table says of `auto`; nothing on a busy machine."""
     scenes = [[row for row in rows if row.scene == name] for name in dict.fromkeys(row.scene for row in rows)]
     beaten = [own[0].scene for own in scenes if beating(own)[0]]
     where = f"in {len(scenes) - len(beaten)} of {len(scenes)} scenes"
     said = f", not in {', '.join(beaten)}" if beaten else ""
-    return f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
+    return load.title(
+        f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
+    )
 
 
 def standing(rows: Sequence[CombinationRow]) -> str:
@@ -202,7 +217,9 @@ def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
 def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str, glass: list[GlassRow]) -> None:
     """Error against time, a panel for each scene that differs, two for a glass. Raises InputError where it cannot write."""
     scenes = differing(rows)
-    note = f"The line is the front: nothing else is as right and as fast. Pale: all other choices. {charts.capital(machine)}."
+    note = f"Pale: choices that another beats. {charts.capital(machine)}."
+    if any(row.on_front == "true" for row in rows):
+        note = f"The line is the front: nothing else is as right and as fast. {note}"
     count = len(scenes) + (2 if glass else 0)
     with charts.chart(path, finding, count, note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * count) as grid:
         for axes, (scene, alike) in zip(grid, scenes.items(), strict=False):
@@ -219,7 +236,9 @@ def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
     floor = FLOOR_SHARE * min((row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0)
     at = [(row.time_ms, max(row.error_arcsec, floor)) for row in rows]
     front = [(row, place) for row, place in zip(rows, at, strict=True) if row.on_front == "true"]
-    axes.step(*zip(*(place for _, place in front), strict=True), where="post", color=charts.INK, lw=1.2, zorder=2)
+    if front:
+        times_ms, errors = zip(*(place for _, place in front), strict=True)
+        axes.step(times_ms, errors, where="post", color=charts.INK, lw=1.2, zorder=2)
     for row, place in zip(rows, at, strict=True):
         colour, on_front = COLOURS[row.quantisation], row.on_front == "true"
         early, late = max(place[0] - row.noise_ms, place[0] / 2), place[0] + row.noise_ms
@@ -229,21 +248,32 @@ def _scatter(axes: "Axes", rows: Sequence[CombinationRow]) -> None:
     for row, place in zip(rows, at, strict=True):
         for name in row.chosen.split():
             axes.plot(*place, "o", color=CHOSEN[name], ms=13 if name == AUTO else 17, mfc="none", mew=1.6, zorder=4)
-    named, last, own = [], math.inf, rows[auto_of(rows)]
-    for row, place in front:
-        if place[1] < LESS * last and not row.chosen:
-            named.append((short_words(row, own), place, COLOURS[row.quantisation]))
+    charts.name_at_side(axes, side_names(rows, at))
+
+
+def side_names(
+    rows: Sequence[CombinationRow],
+    at: Sequence[tuple[float, float]],
+) -> charts.SideNames:
+    """The names beside a scene's points: of the front, of what is chosen, and of other codes."""
+    named: list[tuple[str, tuple[float, float], str]] = []
+    last, auto = math.inf, rows[auto_of(rows)]
+    for row, place in zip(rows, at, strict=True):
+        if row.on_front == "true" and place[1] < LESS * last and not row.chosen:
+            named.append((short_words(row, auto), place, COLOURS[row.quantisation]))
             last = place[1]
     for row, place in zip(rows, at, strict=True):
         if row.chosen:
-            arcsec, ms = (charts.two_digits(value) for value in (row.error_arcsec, row.time_ms))
+            arcsec, ms = charts.two_digits(row.error_arcsec), charts.two_digits(row.time_ms)
             label = f"{row.chosen.replace(' ', ', ')}: {arcsec} arcsec, {ms} ms"
             named.append((label, place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT]))
-    for name, colour in COLOURS.items():
-        if not any(colour == other for *_, other in named):  # the best of what has no place on the front
-            mine = [each for each in zip(rows, at, strict=True) if each[0].quantisation == name]
-            named += [(short_words(row, own), place, colour) for row, place in sorted(mine, key=lambda each: each[1][1])[:1]]
-    charts.name_at_side(axes, named)
+    for quantisation, colour in COLOURS.items():
+        points = [point for point in zip(rows, at, strict=True) if point[0].quantisation == quantisation]
+        # The best of codes that have no place on the front.
+        if points and all(colour != other for *_, other in named):
+            row, place = min(points, key=lambda point: point[1][1])
+            named.append((short_words(row, auto), place, colour))
+    return named
 
 
 def short_words(row: CombinationRow, own: CombinationRow) -> str:
@@ -253,7 +283,9 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
     return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
 
 
-def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime]) -> None:
+def draw_budget(
+    path: Path, rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load
+) -> None:
     """Where `auto`'s error and time come from, a row of panels for each scene that differs. Raises InputError."""
     scenes = differing(rows)
     last = list(scenes)[-1]
@@ -269,9 +301,10 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
         largest = max(parts, key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf)
         most.append(f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'} {scene}")
     longest = max(stages, key=lambda one: one.time_ms)
-    finding = f"Of auto's error most is {', '.join(most)}; of its time most is {longest.stage}"
+    errors = f"Of auto's error most is {', '.join(most)}"
+    finding = load.title(f"{errors}; of its time most is {longest.stage}", errors)
     height = TITLE_INCH + BARS_INCH * len(scenes)
-    with charts.chart(path, finding, len(scenes), 3, note=note, share_x=False, height_inch=height) as grid:
+    with charts.chart(path, finding, len(scenes), 3, note=load.note(note), share_x=False, height_inch=height) as grid:
         for k, scene in enumerate(scenes):
             by_step = {part.step: part for part in budget if part.scene == scene}
             place, light, times = grid[3 * k : 3 * k + 3]
@@ -287,10 +320,9 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
             times.set_xlabel("time of a frame [ms]" if scene == last else "")
 
 
-def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:
+def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]) -> ChainStudy:
     """Measure a bench file's scenes; write OUTPUTS into `directory`.
 
-    A line for each scene, and whether `auto` is on the front of all, or within the noise of it: None on a busy machine.
     `advance` hears how many scenes are done. Raises InputError, MachineError.
     """
     rows: list[CombinationRow] = []
@@ -313,14 +345,16 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
         shortened, glass = shortened_line(parts.own), glass_rows(file, scenes[DENSE], quick)
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
-    others_cores = others.cores()
-    busy = is_busy(others_cores)
-    lines = [*(scene_line(*scene, busy) for scene in judged), *lines, *([glass_line(glass)] if glass else [])]
+    load = others.load()
+    if load.busy:
+        rows = [without_fronts(row) for row in rows]
+    lines = [*(scene_line(*scene, load) for scene in judged), *lines, *([glass_line(glass)] if glass else [])]
     make_directory(directory)
     for name, records in (("chain", rows), ("chain_budget", budget), ("chain_time", stages), ("chain_psf", glass)):
         if records:
             charts.write_records(directory / f"{name}.csv", records)
-    notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([busy_line(others_cores)] if busy else [])]
-    draw(directory / "chain", rows, headline(rows, busy), "; ".join(notes), glass)
-    draw_budget(directory / "chain_budget", rows, budget, stages)
-    return [*lines, *notes], None if busy else not any(beating(own, as_filed=True)[0] for own, _, _ in judged)
+    notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([load.caution] if load.busy else [])]
+    draw(directory / "chain", rows, headline(rows, load), "; ".join(notes), glass)
+    draw_budget(directory / "chain_budget", rows, budget, stages, load)
+    right = not any(beating(own, as_filed=True)[0] for own, _, _ in judged)
+    return ChainStudy([*lines, *notes], None if load.busy else right, answer_lines(rows, budget, load))

@@ -144,21 +144,31 @@ def erf_float32(value: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class PhaseErrors:
-    """The largest errors over sub-pixel phases of a star's flux, relative, and of its centre of gravity, px."""
+    """The largest errors over sub-pixel phases of a star's flux, relative, and of its centre of gravity, px.
+
+    `peak` is that of its middle pixel's light, relative to the true share and with its sign.
+    """
 
     flux: float
     centroid_px: float
+    peak: float
 
 
 def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> PhaseErrors:
     """The largest errors of a star's image over sub-pixel phases (n,)."""
-    flux_error, off_px = 0.0, 0.0
+    flux_error, off_px, peak_error = 0.0, 0.0, 0.0
     for phase in phases_px:
         image = draw(one_star(256 + phase, 256.0, on))
         light = float(image.sum())
         flux_error = max(flux_error, abs(light - 1))
         off_px = max(off_px, abs(float(image.sum(axis=0) @ np.arange(IMAGE_PX[0])) / light - 256 - phase))
-    return PhaseErrors(flux_error, off_px)
+        middle = np.rint(phase)
+        across, down = (
+            pixel_shares(np.array([at]), sigma) for at, sigma in zip((middle - phase, 0.0), on.psf.width_px, strict=True)
+        )
+        off = float(image[256, int(256 + middle)]) / float(across[0] * down[0]) - 1
+        peak_error = max(peak_error, off, key=abs)
+    return PhaseErrors(flux_error, off_px, peak_error)
 
 
 def narrow_star() -> FailureCase:

@@ -82,8 +82,8 @@ class Judge:
         self._wanted = wanted
         self._places: dict[Centroider, FloatArray] = {}
 
-    def errors(self, shown: FloatArray, share: float = 1.0, kinds: tuple[Centroider, ...] = FAMILY) -> StarErrors:
-        """The errors of an image of the same stars, whose light should be `share` of those wanted."""
+    def errors(self, shown: FloatArray, share: float | FloatArray = 1.0, kinds: tuple[Centroider, ...] = FAMILY) -> StarErrors:
+        """The errors of an image of the same stars, whose light should be `share` of those wanted: all's, or each one's."""
         light = self._light_of(shown)
         off_px = {}
         for kind in kinds:

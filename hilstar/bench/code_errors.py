@@ -30,6 +30,9 @@ SPANS, COARSE, ABOUT = 60, 6, 3
 GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 # Where each star of a grid is in its span: the first and the last are its ends
 IN_SPAN = np.append((np.arange(PHASES**2 - 1) * GOLDEN) % 1.0, 1.0)
+# A pixel at the threshold of a box falls in or out by any change of light: 0.01 px of a box of 5 that no
+# display takes away (0.013 px at 16 bits, in place of 0.002).
+NO_THRESHOLD = 0.0
 # What 2000 to 4000 stars miss of the worst: the largest error of 200 000 is 1.0 to 1.4 times theirs, flux and place
 # (tests/authority/test_effort.py).
 BEYOND_MAG, BEYOND_PX = 1.4, 1.3
@@ -39,16 +42,25 @@ BEYOND_MAG, BEYOND_PX = 1.4, 1.3
 class CodeErrors:
     """The worst errors of a quantisation, and by whose measure of place; infinite where a star shows nothing.
 
-    `centroider` is None where the flux alone was looked at.
+    `centroider` is None where the flux alone was looked at. `by_span` are the same of the spans that were looked at: the
+    brighter end of each, mag, with its flux and place.
     """
 
     flux_mag: float
     place_px: float
     centroider: Centroider | None
+    by_span: tuple[tuple[float, float, float], ...] = ()
 
     def within(self, limit: tuple[float, float]) -> bool:
         """Whether both are within their limits, mag and px."""
         return self.flux_mag <= limit[0] and self.place_px <= limit[1]
+
+    def brighter_than(self, mag: float) -> tuple[float, float]:
+        """The worst flux and place of stars up to a magnitude: of the spans that begin above it, and of the next one."""
+        fainter = [begin for begin, _, _ in self.by_span if begin >= mag]
+        last = min(fainter, default=math.inf)
+        among = [(flux_mag, place_px) for begin, flux_mag, place_px in self.by_span if begin <= last]
+        return max((flux for flux, _ in among), default=0.0), max((place for _, place in among), default=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +119,8 @@ def code_stars(
 def _grid(psf: Psf, seen: Seen, number: int) -> PhaseGrid:
     sprites, tile_px = phase_grid(PHASES, psf, GRIDS[number])
     bright = phase_image(sprites, psf)
-    judge = Judge(bright, line_places(sprites), psf.width_px, seen.blur_px, seen.pixel_px)
+    places = line_places(sprites)
+    judge = Judge(bright, places, psf.width_px, seen.blur_px, seen.pixel_px, box_share=NO_THRESHOLD)
     return PhaseGrid(sprites, bright, tile_px, judge)
 
 
@@ -147,7 +160,9 @@ class _Search:
         """The largest errors so far, flux and place each by itself."""
         flux_mag = max(one.flux_mag for one in self._found.values())
         furthest = max(self._found.values(), key=lambda one: one.place_px)
-        return CodeErrors(flux_mag, furthest.place_px, furthest.centroider)
+        spans = self._stars.spans
+        by_span = tuple((spans[key[0]][0], one.flux_mag, one.place_px) for key, one in self._found.items())
+        return CodeErrors(flux_mag, furthest.place_px, furthest.centroider, by_span)
 
     def worst_places(self) -> tuple[int, int]:
         """The places of the spans with the largest flux error, and with the largest error of place."""

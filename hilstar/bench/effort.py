@@ -121,10 +121,23 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Sides:
-    """A candidate for sprites: their sides by rate (see `Target.sides`), with what their edges cut."""
+    """A candidate for sprites: their sides by rate (see `Target.sides`), with what their edges cut.
+
+    They cut light that is shown of stars up to `cut_to_mag` below full scale.
+    """
 
     sides: SpriteSides
     choice: Choice
+    cut_to_mag: float = math.inf
+
+    def beside(self, codes: CodeErrors) -> Choice:
+        """The choice, with what it adds to the worst errors of codes: bright stars are cut, and faint ones are rounded."""
+        flux_mag, place_px = codes.brighter_than(self.cut_to_mag)
+        more_mag = flux_mag + self.choice.error_mag - codes.flux_mag
+        more_px = place_px + self.choice.error_px - codes.place_px
+        if not math.isfinite(more_mag) or not math.isfinite(more_px):
+            return self.choice
+        return replace(self.choice, error_mag=max(more_mag, 0.0), error_px=max(more_px, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +211,7 @@ class Effort:
     @cached_property
     def choices(self) -> tuple[Choice, ...]:
         """The choice of each part."""
-        parts = [code_part(self), self.taken.sprites.choice, self.taken.motion.choice]
+        parts = [code_part(self), self.taken.sprites.beside(self.codes), self.taken.motion.choice]
         if self.light.psf_choice is not None:
             parts.append(psf_part(self.light, self.light.psf_choice))
         return (*parts, depth_part(self))
@@ -283,7 +296,9 @@ def _is_within(render: RenderSettings, light: Light, stars: CodeStars, one: Comb
     """Whether the errors of all parts together are within the tolerance."""
     tolerance = render.tolerance_mag, render.tolerance_px
     codes = worst_errors(stars, one.method, tolerance)
-    parts = [one.sprites.choice, one.motion.choice]
+    if not codes.within(tolerance):
+        return False
+    parts = [one.sprites.beside(codes), one.motion.choice]
     if light.psf_choice is not None:
         parts.append(light.psf_choice)
     mag = codes.flux_mag + sum(part.error_mag for part in parts)
@@ -355,7 +370,7 @@ def side_candidates(render: RenderSettings, light: Light, method: Quantisation) 
             chosen = f"{min(side.side_px for side in sides)} to {size} px a side, of {full}"
             saved_ms = pixels_ms * (full**2 - mean_px)
             choice = Choice("sprites", chosen, cut_mag(size, psf), cut_px(size, psf), pixels_ms * mean_px, saved_ms)
-            found.append(Sides(sides, choice))
+            found.append(Sides(sides, choice, _cut_to_mag(light, method, size)))
     sides = _sides(light, method, sizes, full) if render.effort == "auto" and not psf.by_place else ()
     mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
     smallest = min((side.side_px for side in sides), default=full)
@@ -374,6 +389,15 @@ def _sides(light: Light, method: Quantisation, sizes: list[int], largest: int) -
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
         sides += [(unlit / light.psf.outside_share(size), size) for size in sizes[::-1] if size < largest]
     return tuple(SpriteSide(min(rate, 3e38), size) for rate, size in sides[:MAX_SIDES])
+
+
+def _cut_to_mag(light: Light, method: Quantisation, size_px: int) -> float:
+    """The magnitude below full scale from which on what is beyond a sprite lights no pixel."""
+    unlit = UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel)
+    if not unlit:
+        return math.inf
+    rate = unlit / light.psf.outside_share(size_px)
+    return -2.5 * math.log10(rate * light.psf.peak_share / light.white_e_per_s)
 
 
 def _mean_area_px(sides: SpriteSides, rates_e_per_s: FloatArray, full: int) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.tracker.centroiders import FAMILY, Centroider, Pixels, Sigma, brightest, star_places
+from hilstar.tracker.centroiders import BOX_SHARE, FAMILY, Centroider, Pixels, Sigma, brightest, star_places
 from hilstar.units import magnitude
 
 SQUARES_VARIANCE = 1 / 6  # a pixel's width twice: a star is sampled by squares, and shown by squares
@@ -61,12 +61,21 @@ class Judge:
     """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where they should be.
 
     `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a column of tiles at an
-    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in monitor pixels.
+    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in monitor pixels, and
+    `box_share` the threshold of its boxes.
     """
 
     def __init__(
-        self, wanted: FloatArray, places_px: tuple[FloatArray, FloatArray], sigma_px: Sigma, blur_px: float, pixel_px: float
+        self,
+        wanted: FloatArray,
+        places_px: tuple[FloatArray, FloatArray],
+        sigma_px: Sigma,
+        blur_px: float,
+        pixel_px: float,
+        *,
+        box_share: float = BOX_SHARE,
     ) -> None:
+        self._box_share = box_share
         self._count = len(places_px[0])
         self._tile, self._pixel_px = len(wanted) // self._count, pixel_px
         self._in_tile_px = [place - self._tile * np.arange(self._count) for place in places_px]
@@ -101,7 +110,7 @@ class Judge:
         boxed = kind in BOXES
         pixel_px = self._pixel_px if boxed else self._sampled_px
         stamps = self._seen(image, pixel_px)
-        places = star_places(stamps, kind, self._sigma_px, self._middles(stamps, boxed))
+        places = star_places(stamps, kind, self._sigma_px, self._middles(stamps, boxed), self._box_share)
         return np.stack(places) * pixel_px
 
     def _middles(self, stamps: FloatArray, boxed: bool) -> Pixels:

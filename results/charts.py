@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 
 from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, TEAL, chart, value_bars
 from hilstar.study import codes, colour, timing
-from hilstar.study.sweep import Figure, Trial, Trials
+from hilstar.study.sweep import Figure, Load, Trial, Trials
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import ROUNDING_MAG
 
@@ -20,6 +20,7 @@ DOCS = HERE.parent / "docs"
 MACHINE = "llvmpipe (LLVM 15.0.6, 256 bits), 2 cores"  # as machine.txt has it
 TRADEOFF_STEP = "psf"
 TRUE = "True"
+IDLE = Load()  # machine.txt: nothing else was running
 
 
 def tradeoff_step(name: str) -> Trials:
@@ -126,8 +127,8 @@ def read_records(path: Path, record: type[Any]) -> list[Any]:
 if __name__ == "__main__":
     draw_scale(rows_of("scale.csv"))
     draw_tracker(rows_of("tracker.csv"))
-    colour.draw(DOCS / "colour.svg", colour_rows())
-    timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome))
+    colour.draw(DOCS / "colour.svg", colour_rows(), IDLE)
+    timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome), IDLE)
     timing.draw_stripes(DOCS / "stripes.svg", read_records(HERE / "stripes.csv", timing.StripePoint))
     codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.OverFrames))
     tradeoff.draw(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)

@@ -25,7 +25,7 @@ from hilstar.scene.psf import GaussianPsf
 from hilstar.scene.sprites import join_sprites, pack_sprites
 from hilstar.sky.bodies.disc import Disc, lunar_share
 from hilstar.study.settings import FULL_HD, Table, study_bench
-from hilstar.study.sweep import Spent, in_turn
+from hilstar.study.sweep import Judged, Load, OtherWork, Spent, in_turn
 from hilstar.units import NS_PER_S
 
 REFRESH_HZ = 60.0
@@ -117,6 +117,11 @@ class BodyScene:
     off_deg: float
     t_ns: int = 0
     step_ns: int = FRAME_NS
+
+
+def at_a_step(scene: str) -> bool:
+    """Whether each frame of a scene, by its name, is the first of a step of the orbit."""
+    return next(one for one in SCENES if one.name == scene).step_ns != FRAME_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,9 +329,9 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
     )
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
+def run(directory: Path, quick: bool = False) -> Judged:
     """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each finding. Raises InputError."""
-    rounds = QUICK_ROUNDS if quick else ROUNDS
+    others, rounds = OtherWork(), QUICK_ROUNDS if quick else ROUNDS
     scenes = [scene for scene in SCENES if scene.bench in QUICK_BENCHES] if quick else SCENES
     with opened(QUICK_BENCHES if quick else tuple(BODIES)) as benches:
         costs = [measure_cost(benches, scene, rounds) for scene in scenes]
@@ -335,13 +340,14 @@ def run(directory: Path, quick: bool = False) -> list[str]:
             for body, angles in (QUICK_DEG if quick else NEAR_DEG).items()
             for off_deg in angles
         ]
+    load = others.load()
     sizes = [exactness(radius, phase) for phase in PHASES_DEG for radius in (QUICK_RADII_PX if quick else RADII_PX)]
     for name, records in (("bodies_cost", costs), ("bodies_size", sizes), ("bodies_limits", nears)):
         write_records(directory / f"{name}.csv", records)
-    cost_line = draw_costs(directory / "bodies_cost", costs)
+    cost_line = draw_costs(directory / "bodies_cost", costs, load)
     draw_sizes(directory / "bodies_size", sizes)
-    draw_limits(directory / "bodies_limits", nears)
-    return [cost_line, _size_line(sizes), _limits_line(nears)]
+    draw_limits(directory / "bodies_limits", nears, load)
+    return load.judged([cost_line, _size_line(sizes), _limits_line(nears)])
 
 
 def _size_line(sizes: Sequence[Exactness]) -> str:
@@ -355,21 +361,30 @@ def _size_line(sizes: Sequence[Exactness]) -> str:
 
 def _limits_line(nears: Sequence[Near]) -> str:
     slowest = max(nears, key=lambda near: near.cpu_ms)
-    sound = all(near.finite and near.white_is_white for near in nears)
-    light = "finite, and white where it is over white" if sound else "NOT finite, or over white and not white"
     return (
         f"a body in view takes at most {slowest.cpu_ms:.0f} ms of processor time a frame ({slowest.body} at {slowest.off_deg:g}"
-        f" degrees); every pixel's light is {light}"
+        f" degrees); every pixel's light is {light_words(nears)}"
     )
 
 
-def draw_costs(path: Path, costs: Sequence[BodyCost]) -> str:
+def light_words(nears: Sequence[Near]) -> str:
+    """Whether every pixel's light is finite and clips at white, in words."""
+    if all(near.finite and near.white_is_white for near in nears):
+        return "finite, and white where it is over white"
+    return "NOT finite, or over white and not white"
+
+
+def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> str:
     """What each scene costs; the finding."""
     dearest = max(costs, key=lambda cost: cost.cpu_ms)
-    unseen_ms = max(0.0, *(cost.cpu_ms for cost in costs[:-1] if not cost.discs))
+    unseen_ms = max(0.0, *(cost.cpu_ms for cost in costs if not cost.discs and not at_a_step(cost.scene)))
     note = "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x 1080, drawn in software."
-    finding = f"Bodies that are no discs cost at most {unseen_ms:.1f} ms; the dearest, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
-    with chart(path, finding, note=note, height_inch=4.4) as (axes,):
+    finding = (
+        f"Between steps of an orbit bodies that are no discs cost at most {unseen_ms:.1f} ms; the dearest body,"
+        f" {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+    )
+    title = load.title(finding, "Bodies of each kind on top of a frame")
+    with chart(path, title, note=load.note(note), height_inch=4.4) as (axes,):
         value_bars(axes, [capital(cost.scene) for cost in costs], [round(max(cost.cpu_ms, 0.0), 2) for cost in costs], BLUE)
         axes.set_xlabel("processor time on top [ms]")
     return (
@@ -408,10 +423,11 @@ def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
         label_ends(*panels)
 
 
-def draw_limits(path: Path, nears: Sequence[Near]) -> None:
+def draw_limits(path: Path, nears: Sequence[Near], load: Load) -> None:
     """Processor time and light as bodies come near."""
     note = "Earth by its limb, negative on the Earth; Moon and Sun by their middles. 1920 x 1080, drawn in software."
-    with chart(path, _limits_line(nears), panels=2, note=note) as (times, light):
+    title = load.title(_limits_line(nears), f"Every pixel's light is {light_words(nears)}")
+    with chart(path, title, panels=2, note=load.note(note)) as (times, light):
         for body, colour in zip(dict.fromkeys(near.body for near in nears), SERIES, strict=False):
             rows = [near for near in nears if near.body == body]
             off_deg = [near.off_deg for near in rows]

@@ -36,7 +36,7 @@ from hilstar.sky.spectral_types import CLASSES, LETTERS, class_shares, read_type
 from hilstar.sky.spectrum import load_curve
 from hilstar.sky.stars import Stars
 from hilstar.study.settings import GLASS, Isolation, bench_text, centroid_px, lone_windows
-from hilstar.study.sweep import OtherWork, busy_line, in_turn, is_busy
+from hilstar.study.sweep import Judged, Load, OtherWork, in_turn
 from hilstar.tracker.centroids import CentroidSettings, LocalBackground, find_stars
 from hilstar.tracker.mosaic import CHANNELS, SUPERPIXEL_VARIANCE_PX2, in_pixels, luminance
 from hilstar.twin.budget import RED_NM, SOLAR_BV
@@ -275,7 +275,7 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
             yield sigma_px, kelvin, name, float(np.sqrt((off**2).mean())), float(np.abs(off).max())
 
 
-def draw(path: Path, rows: Sequence[Row]) -> str:
+def draw(path: Path, rows: Sequence[Row], load: Load) -> str:
     """The chart of the choices; its finding."""
     choices = [dict(zip(CHOICE, row, strict=True)) for row in rows]
     exact = {one["colour"]: one for one in choices if (one["tracker"], one["method"]) == ("Bayer", "exact")}
@@ -286,7 +286,7 @@ def draw(path: Path, rows: Sequence[Row]) -> str:
     note = "Full: exact; open: round. Circles: mono; triangles: mono to 700 nm; squares: Bayer. Lone stars of"
     note += " V = 1 to 5.5 on an sRGB LCD of 8 bits."
     labels = {"subtypes": "colour, mean\n[subtypes]", "mag": "flux, 95 %\n[mag]", "px": "place, 95 %\n[px]"}
-    with chart(path, finding, 3, note=note) as axes:
+    with chart(path, finding, 3, note=load.note(note)) as axes:
         for axis, (name, label) in zip(axes, labels.items(), strict=True):
             for one in choices:
                 ink, marker = INKS[str(one["colour"])], MARKERS[str(one["tracker"])]
@@ -301,7 +301,7 @@ def draw(path: Path, rows: Sequence[Row]) -> str:
     return finding
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
+def run(directory: Path, quick: bool = False) -> Judged:
     """Write colour.csv and its chart, and the tables colour_gamut, _class, _lateral, _red and _mosaic; findings."""
     others = OtherWork()
     with TemporaryDirectory() as name:
@@ -317,7 +317,8 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     three = (("", CHOICE, choices), ("_gamut", GAMUT, gamut), ("_class", BY_CLASS, by_class), ("_lateral", LATERAL, lateral))
     for table, columns, rows in (*three, ("_red", ("sensor", *LETTERS), red), ("_mosaic", PLACES, mosaic)):
         write_csv(directory / f"colour{table}.csv", columns, rows)
-    lines = [draw(directory / "colour", choices)]
+    load = others.load()
+    lines = [draw(directory / "colour", choices, load)]
     lines += [f"lateral colour of {lens} by {by} on {on}: off by {off:.0%} of the sky's" for lens, on, by, *_, off in lateral]
     lines += [f"a star of {px:g} px, {k:g} K, is {rms:.3f} px off rms in a {name}" for px, k, name, rms, _ in mosaic if px == 1]
-    return [*lines, busy_line(others.cores())] if is_busy(others.cores()) else lines
+    return load.judged(lines)

@@ -14,7 +14,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
 from hilstar.study.settings import FULL_HD, GLASS, Isolation, Table, lone_windows, squares, star_error, study_bench
-from hilstar.study.sweep import medians_ms
+from hilstar.study.sweep import NOT_JUDGED, Judged, Load, OtherWork, medians_ms
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import stamp_errors
 
@@ -102,12 +102,14 @@ class EffortComparison:
         return self.full.frame_ms / self.auto.frame_ms
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
+def run(directory: Path, quick: bool = False) -> Judged:
     """Measure every scene, and write `economy.csv` and its chart; a line for each scene. Raises InputError."""
+    others = OtherWork()
     comparisons = [compare(scene, QUICK_ROUNDS if quick else ROUNDS) for scene in SCENES]
     write_records(directory / "economy.csv", [outcome for c in comparisons for outcome in (c.full, c.auto)])
-    draw(directory / "economy", comparisons)
-    return [_line(comparison) for comparison in comparisons]
+    load = others.load()
+    draw(directory / "economy", comparisons, load)
+    return load.judged([_line(comparison, load) for comparison in comparisons])
 
 
 def compare(scene: EffortScene, rounds: int) -> EffortComparison:
@@ -164,9 +166,11 @@ def _outcome(scene: EffortScene, name: str, bench: Bench, frame_ms: float) -> Ef
     )
 
 
-def _line(comparison: EffortComparison) -> str:
+def _line(comparison: EffortComparison, load: Load) -> str:
     full, auto, ratio = comparison.full, comparison.auto, comparison.speed_up
     compared = f"{ratio:.1f} times as fast" if ratio >= 1 else f"{1 / ratio:.1f} times as SLOW"
+    if load.busy:
+        compared = NOT_JUDGED
     return (
         f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f} ms, {compared};"
         f" largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.worst_px:.4f} px"
@@ -178,8 +182,7 @@ def _line(comparison: EffortComparison) -> str:
 def economy_finding(comparisons: list[EffortComparison]) -> str:
     """What is true of every scene, in one sentence: the range of the speed-up, and whether errors are within tolerance."""
     slowest, quickest = (extreme(comparison.speed_up for comparison in comparisons) for extreme in (min, max))
-    over = sum(not comparison.auto.within for comparison in comparisons)
-    verdict = "within tolerance" if not over else f"{over} of {len(comparisons)} scenes OVER tolerance"
+    verdict = within_words(comparisons)
     if slowest >= 1:
         return f"Auto effort is {slowest:.1f} to {quickest:.1f} times as fast as full effort, {verdict}"
     if quickest < 1:
@@ -188,10 +191,19 @@ def economy_finding(comparisons: list[EffortComparison]) -> str:
     return f"Auto effort {slower} and is up to {quickest:.1f} times as fast in another, {verdict}"
 
 
-def draw(path: Path, comparisons: list[EffortComparison]) -> None:
+def within_words(comparisons: list[EffortComparison]) -> str:
+    """Whether the errors of all scenes are within tolerance, in words."""
+    over = sum(not comparison.auto.within for comparison in comparisons)
+    if over:
+        return f"{over} of {len(comparisons)} scenes OVER tolerance"
+    return "within tolerance"
+
+
+def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
     """The time of each scene at both efforts, and the errors at the effort that it needs, as shares of the tolerance."""
     note = "Errors of stars that stand alone; places by the worst of six centroiders."
-    with chart(path, economy_finding(comparisons), panels=2, note=note, heights=(1, 1)) as (cost, error):
+    title = load.title(economy_finding(comparisons), f"Auto effort is {within_words(comparisons)}")
+    with chart(path, title, panels=2, note=load.note(note), heights=(1, 1)) as (cost, error):
         at = np.arange(len(comparisons))
         autos = [c.auto for c in comparisons]
         for shift, mine, colour, name in (

@@ -18,7 +18,7 @@ from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.scene.extended import GlowLight
 from hilstar.scene.sprites import join_sprites
 from hilstar.study.settings import FULL_HD, Isolation, Table, lone_windows, study_bench
-from hilstar.study.sweep import medians_ms
+from hilstar.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.units import NS_PER_S, magnitude
 
 REFRESH_HZ = 60
@@ -136,21 +136,23 @@ def stray_light(bench: Bench, share: float) -> Stray:
     return Stray(bench.config.render.quantisation, share, len(kept), median, p95, float((kept > LOST_MAG).mean()))
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
+def run(directory: Path, quick: bool = False) -> Judged:
     """Measure; write `faults-cost.csv`, `faults-stray.csv` and their charts; the findings, a line each. Raises InputError."""
     costs: list[FaultCost] = []
     strays: list[Stray] = []
     rounds, shares = (QUICK_ROUNDS, QUICK_SHARES) if quick else (ROUNDS, SHARES)
+    others = OtherWork()
     with TemporaryDirectory() as name:
         for quantisation in QUANTISATIONS:
             with bench_of(Path(name), quantisation) as bench:
                 bench.warm_up()
                 costs += [cost_of(bench, Path(name), case, rounds) for case in CASES]
                 strays += [stray_light(bench, share) for share in shares]
+    load = others.load()
     write_records(directory / "faults-cost.csv", costs)
     write_records(directory / "faults-stray.csv", strays)
     draw_stray(directory / "faults", strays)
-    draw_costs(directory / "faults_cost", costs)
+    draw_costs(directory / "faults_cost", costs, load)
     found = []
     for quantisation in QUANTISATIONS:
         mine = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
@@ -163,7 +165,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         share = spoilt_from(strays, quantisation)
         limit = "no stray light here" if share is None else f"stray light of {share:g} of white"
         found.append(f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from {limit} on")
-    return found
+    return load.judged(found)
 
 
 def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
@@ -193,14 +195,15 @@ def draw_stray(path: Path, strays: list[Stray]) -> None:
         label_ends(axes)
 
 
-def draw_costs(path: Path, costs: list[FaultCost]) -> None:
+def draw_costs(path: Path, costs: list[FaultCost], load: Load) -> None:
     """The time of a frame with each fault and without it."""
     dearest = max(costs, key=lambda cost: cost.frame_ms)
     star = max((cost for cost in costs if "false star" in cost.case), key=lambda cost: cost.frame_ms)
     points = f"With false stars a frame takes at most {star.frame_ms:.1f} ms"
     finding = f"{points}, with the dearest fault, {dearest.case}, {dearest.frame_ms:.0f} ms"
     note = "Filled: a frame with the fault. Open: the same frame without it, in turn in the same run. Medians; 1920 x 1080."
-    with chart(path, finding, 1, len(QUANTISATIONS), note=note, share_y=True, height_inch=5.2) as panels:
+    title, note = load.title(finding, "Times of frames with each fault"), load.note(note)
+    with chart(path, title, 1, len(QUANTISATIONS), note=note, share_y=True, height_inch=5.2) as panels:
         for (name, colour), axes in zip(COLOURS.items(), panels, strict=True):
             mine = [cost for cost in costs if cost.quantisation == name]
             for place, cost in enumerate(mine):

@@ -33,6 +33,7 @@ from hilstar.study.predictors import (
     slew_attitude,
     slew_sample,
 )
+from hilstar.study.sweep import Judged, Load, OtherWork
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 
 RATES_HZ = (5, 10, 20, 50, 100, 200)
@@ -68,13 +69,14 @@ class PredictionOutcome:
     attitude_us: float
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
+def run(directory: Path, quick: bool = False) -> Judged:
     """Measure, and write `prediction.csv` and its chart; a line for each method. Raises InputError."""
-    span_s, outcomes = QUICK_SPAN_S if quick else SPAN_S, []
+    span_s, outcomes, others = QUICK_SPAN_S if quick else SPAN_S, [], OtherWork()
     # Over latency at the usual rate, and over rate at the usual latency.
     for hz, ms in sorted({(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}):
         samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
         outcomes += [_outcome(predictor, samples, hz, ms) for predictor in predictors() if not predictor.waits]
+    load = others.load()
     write_records(directory / "prediction.csv", outcomes)
     usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
     default = next(o for o in usual if o.method == next(g.name for g in predictors() if g.is_default))
@@ -83,7 +85,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is off by "
         f"{default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
     )
-    _draw(directory / "prediction", finding, outcomes)
+    _draw(directory / "prediction", finding, outcomes, load)
     cells, frequencies = (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
     shaken_by = []
     for rates, (packet_hz, age_ms), way, jitter_hz in product((True, False), cells, WAYS, frequencies):
@@ -102,7 +104,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         f"{o.method}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum, {o.attitude_us:.0f} us per attitude"
         for o in usual
     )
-    return [finding, *lines, told]
+    return load.judged([finding, *lines, told])
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,10 +180,10 @@ def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, 
     return PredictionOutcome(predictor.name, rate_hz, latency_ms, rms, max(errors), float(np.median(times_us)))
 
 
-def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome]) -> None:
+def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load) -> None:
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     note = f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the time of one attitude."
-    with chart(path, finding, panels=2, share_x=False, note=note) as (latency, rate):
+    with chart(path, finding, panels=2, share_x=False, note=load.note(note)) as (latency, rate):
         for name, marker, colour in zip(dict.fromkeys(o.method for o in outcomes), MARKERS, SERIES, strict=False):
             mine = [o for o in outcomes if o.method == name]
             took_us = np.median([o.attitude_us for o in mine])

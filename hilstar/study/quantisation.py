@@ -15,7 +15,7 @@ from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
 from hilstar.study import codes
-from hilstar.study.sweep import medians_ms
+from hilstar.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import StarErrors
 from hilstar.units import flux_ratio
@@ -25,7 +25,7 @@ MIN_ERROR = 1e-5  # as drawn
 MARKERS = dict(zip(codes.BITS, "os^", strict=True))
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
+def run(directory: Path, quick: bool = False) -> Judged:
     """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
     phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
     found: Found = {(bits, way.name): codes.code_errors(bits, way, phases, mags) for bits in codes.BITS for way in codes.WAYS}
@@ -36,10 +36,12 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     ]
     write_csv(directory / "quantisation.csv", ("bits", "method", "mag_under_white", *codes.ERROR_COLUMNS), rows)
     faintest = {key: errors[int(np.searchsorted(mags, codes.AIMS[key[0]][1]))] for key, errors in found.items()}
+    others = OtherWork()
     times = _frame_times_ms(3 if quick else 31)
+    load = others.load()
     _draw_magnitudes(directory / "quantisation", found, mags)
     _draw_each(directory / "quantisation_centroiders", faintest)
-    _draw_times(directory / "quantisation_time", faintest, times)
+    _draw_times(directory / "quantisation_time", faintest, times, load)
     write_csv(
         directory / "quantisation_time.csv",
         ("bits", "method", "frame_ms", "mag_under_white", *codes.ERROR_COLUMNS),
@@ -52,13 +54,14 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         for kind in FAMILY
     )
     ms = ", ".join(f"{way.method} {times[10, way.name]:.1f} ms" for way in codes.WAYS[:4])
-    return [
+    lines = [
         *(_summary(bits, found, mags) for bits in codes.BITS),
         f"{coarsest} bits, {codes.AIMS[coarsest][1]:g} magnitudes under white: of the error of round (rms along an axis) exact"
         f" leaves, by each centroider, {left}",
         f"{codes.STARS} stars, {codes.FRAME_PX[0]} x {codes.FRAME_PX[1]}, 10 bits, from light to levels in memory: {ms}",
         codes.study_frames(directory, quick),
     ]
+    return load.judged(lines)
 
 
 def _frame_times_ms(rounds: int) -> dict[tuple[int, str], float]:
@@ -155,13 +158,15 @@ def _draw_each(path: Path, faintest: dict[tuple[int, str], StarErrors]) -> None:
         grid[0].figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
 
 
-def _draw_times(path: Path, faintest: dict[tuple[int, str], StarErrors], times: dict[tuple[int, str], float]) -> None:
+def _draw_times(
+    path: Path, faintest: dict[tuple[int, str], StarErrors], times: dict[tuple[int, str], float], load: Load
+) -> None:
     width, height = codes.FRAME_PX
     note = f"{codes.STARS} stars, {width} x {height}. Circles, squares, triangles: 8, 10 and 12 bits, at the faint end."
     ms = {way.name: times[codes.BITS[1], way.name] for way in codes.WAYS}
     took = f"exact takes {ms['exact']:.1f} ms and round {ms['round']:.1f} ms"
-    finding = f"From light to codes in memory {took}, on {codes.BITS[1]} bits"
-    with chart(path, finding, 2, note=note) as panels:
+    finding = load.title(f"From light to codes in memory {took}, on {codes.BITS[1]} bits")
+    with chart(path, finding, 2, note=load.note(note)) as panels:
         for way in codes.WAYS:
             for bits, marker in MARKERS.items():
                 for axes, error in zip(panels, _rms(faintest[bits, way.name]), strict=True):

@@ -18,12 +18,56 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import BoolArray
+from hilstar.charts import capital
 
 MIN_ROUNDS = 3  # every work runs this often, whatever its share of a budget
 MAX_ROUNDS = 500  # more do not move a median
 SEED = 1
 BUSY_SHARE = 0.15  # share of the cores taken by others above which times are 5 % and more off: a third of one of two cores
 STAT = Path("/proc/stat")
+NOT_JUDGED = "the times were taken on a busy machine: none is named the faster"
+
+
+# What a study found, a line each, and whether it was right: None where its times cannot be judged.
+Judged = tuple[list[str], bool | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """The cores that other processes took on average while times were taken, and what may be said of such times."""
+
+    cores: float = 0.0
+
+    @property
+    def busy(self) -> bool:
+        """Whether other work makes times worthless."""
+        return self.cores > BUSY_SHARE * (os.cpu_count() or 1)
+
+    @property
+    def caution(self) -> str:
+        """The line about times that were taken beside other work."""
+        return (
+            f"a busy machine: other processes took {self.cores:.1f} of its {os.cpu_count()} cores meanwhile,"
+            " so these times name no winner; run it again when the machine is idle"
+        )
+
+    def title(self, finding: str, errors: str = "The errors hold") -> str:
+        """The title of a chart whose `finding` rests on times: on a busy machine `errors`, which does not, and NOT_JUDGED."""
+        if self.busy:
+            return f"{errors}; {NOT_JUDGED}"
+        return finding
+
+    def note(self, note: str) -> str:
+        """The note of a chart that draws times; on a busy machine with the caution about them."""
+        if not self.busy:
+            return note
+        return f"{note} {capital(self.caution)}."
+
+    def judged(self, lines: Sequence[str]) -> Judged:
+        """What a study of times found: on a busy machine with the caution, and not judged."""
+        if self.busy:
+            return [*lines, self.caution], None
+        return list(lines), True
 
 
 class Spent(NamedTuple):
@@ -112,7 +156,7 @@ class Trial:
 class Trials:
     """All methods of a step. `work` names the timed work, `why_default` is the reason for the default where another beats it.
 
-    `remark` is a caution that the figures alone would hide.
+    `remark` is a caution that the figures alone would hide. `load` is what others took while it was timed.
     """
 
     name: str
@@ -122,6 +166,7 @@ class Trials:
     why_default: str
     trials: Sequence[Trial]
     remark: str = ""
+    load: Load = field(default_factory=Load)
 
     @property
     def default(self) -> Trial:
@@ -130,24 +175,29 @@ class Trials:
 
 
 def measured(step: Trials, budget_s: float) -> Trials:
-    """Time the methods of a step in turn, mark the front, and put the fastest first."""
+    """Time the methods of a step in turn, mark the front, and put the fastest first.
+
+    On a busy machine no method is on the front, and none is said to beat the default.
+    """
+    others = OtherWork()
     works = {trial.method: lambda _, work=trial.work: work() for trial in step.trials}
     times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
     low, middle, high = np.array([np.percentile([one.wall_ms for one in took], (25, 50, 75)) for took in times.values()]).T
+    load = others.load()
     errors = [max(trial.error, step.error.floor) for trial in step.trials]
     beaten = beaten_by(errors, middle)
     found = [
-        replace(trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any())
+        replace(trial, time_ms=float(ms), quartiles_ms=(float(q1), float(q3)), on_front=not beats.any() and not load.busy)
         for trial, q1, ms, q3, beats in zip(step.trials, low, middle, high, beaten, strict=True)
     ]
     own = next(k for k, trial in enumerate(found) if trial.is_default)
-    if not found[own].on_front:
+    if not found[own].on_front and not load.busy:
         best = min((trial for trial, beats in zip(found, beaten[own], strict=True) if beats), key=lambda trial: trial.time_ms)
         saved = 100 * (1 - best.time_ms / found[own].time_ms)
         noise = ", and the quartiles of both overlap" if best.quartiles_ms[1] >= found[own].quartiles_ms[0] else ""
         why = f"'{best.method}' is no worse and takes {saved:.0f} % less time{noise}; {step.why_default}"
         found[own] = replace(found[own], beaten=why)
-    return replace(step, trials=sorted(found, key=lambda trial: trial.time_ms))
+    return replace(step, trials=sorted(found, key=lambda trial: trial.time_ms), load=load)
 
 
 class OtherWork:
@@ -161,6 +211,10 @@ class OtherWork:
         all_s, others_s = (now - before for now, before in zip(self._times_s(), self._before, strict=True))
         return max(others_s, 0.0) / all_s * (os.cpu_count() or 1) if all_s > 0 else 0.0
 
+    def load(self) -> Load:
+        """What the others took since creation."""
+        return Load(self.cores())
+
     @staticmethod
     def _times_s() -> tuple[float, float]:
         """Processor time since the machine started, s: of all cores, idle or busy, and that of other processes."""
@@ -173,16 +227,3 @@ class OtherWork:
         busy = user + nice + system + sum(interrupts)
         own = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         return (busy + idle + waiting) * each_s, busy * each_s - sum(used.ru_utime + used.ru_stime for used in own)
-
-
-def is_busy(others_cores: float) -> bool:
-    """Whether other work makes times worthless."""
-    return others_cores > BUSY_SHARE * (os.cpu_count() or 1)
-
-
-def busy_line(others_cores: float) -> str:
-    """The caution about times that were taken beside other work."""
-    return (
-        f"a busy machine: other processes took {others_cores:.1f} of its {os.cpu_count()} cores meanwhile, so these times name"
-        " no winner; run it again when the machine is idle"
-    )

@@ -37,7 +37,7 @@ from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
 from hilstar.study import settings
 from hilstar.study.predictors import Movement, attitude_at
-from hilstar.study.sweep import medians_ms
+from hilstar.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.shutter import S_PER_US
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
@@ -442,21 +442,23 @@ def measure(quick: bool = False) -> list[TimingOutcome]:
         return [compare(panel, sky, slew(rate)) for rate in (QUICK_RATES_DEG_S if quick else RATES_DEG_S) for panel in panels]
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
+def run(directory: Path, quick: bool = False) -> Judged:
     """Measure, and write `timing`, `beat` and `stripes`, each as csv and png; the findings, a line each. Raises InputError."""
+    others = OtherWork()
     outcomes = measure(quick)
+    load = others.load()
     write_records(directory / "timing.csv", outcomes)
-    finding = draw(directory / "timing", outcomes)
+    finding = draw(directory / "timing", outcomes, load)
     lines = [
         f"{o.way}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum, {o.flux_rms_mag:.2g} mag rms,"
         f" {o.draw_ms:.1f} ms a frame ({o.stars} stars)"
         for o in outcomes
         if o.rate_deg_s == QUICK_RATES_DEG_S[0]
     ]
-    return [finding, *lines, *beat_findings(measure_beat(quick), directory), *stripe_findings(directory)]
+    return load.judged([finding, *lines, *beat_findings(measure_beat(quick), directory), *stripe_findings(directory)])
 
 
-def draw(path: Path, outcomes: list[TimingOutcome]) -> str:
+def draw(path: Path, outcomes: list[TimingOutcome], load: Load) -> str:
     """The chart of the outcomes; its finding."""
     at = {(o.way, o.rate_deg_s): o for o in outcomes}
     plain, best = (at[way, QUICK_RATES_DEG_S[0]] for way in ("prediction", "+ smear"))
@@ -465,7 +467,7 @@ def draw(path: Path, outcomes: list[TimingOutcome]) -> str:
         f" and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
     )
     note = "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way adds to the one above it."
-    with chart(path, finding, panels=2, note=note, heights=(1.5, 1)) as (error, cost):
+    with chart(path, finding, panels=2, note=load.note(note), heights=(1.5, 1)) as (error, cost):
         for way, marker in zip(WAYS, "osd^", strict=True):
             mine = [o for o in outcomes if o.way == way]
             rates = [o.rate_deg_s for o in mine]

@@ -8,7 +8,7 @@ import sys
 
 from hilstar.study.chain.run import headline
 from hilstar.study.speed.report import Aim, Machine, Result, lines
-from hilstar.study.sweep import BUSY_SHARE, OtherWork, busy_line, is_busy
+from hilstar.study.sweep import BUSY_SHARE, NOT_JUDGED, Load, OtherWork
 from tests.support.waiting import wait_for
 
 CORES = os.cpu_count() or 1
@@ -19,7 +19,7 @@ def test_processes_that_are_not_this_one_s_are_counted_while_they_run():
     work = OtherWork()
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(CORES)]
     try:
-        wait_for(lambda: is_busy(work.cores()), "nothing else ran")  # a child counts as its own only once it has ended
+        wait_for(lambda: Load(work.cores()).busy, "nothing else ran")  # a child counts as its own only once it has ended
     finally:
         for process in busy:
             process.kill()
@@ -38,9 +38,9 @@ def test_what_this_process_does_itself_is_not_other_work():
 def test_a_busy_machine_is_said_and_no_aim_is_judged():
     others = CORES * BUSY_SHARE * 2
     told = list(lines(Result(MACHINE, aims=[Aim("frame", 1.0, 2.0, None)], others_cores=others)))
-    assert busy_line(others) in told
+    assert Load(others).caution in told
     assert any(line.startswith("aim not judged") for line in told)
     idle = list(lines(Result(MACHINE, aims=[Aim("frame", 1.0, 2.0, False)])))
     assert not any("busy" in line for line in idle)
     assert any(line.startswith("aim NOT reached") for line in idle)
-    assert "no combination is named" in headline([], busy=True)
+    assert NOT_JUDGED in headline([], Load(others))

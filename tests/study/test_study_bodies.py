@@ -15,7 +15,7 @@ def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bodies")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bodies, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        lines = run(folder, quick=True)
+        lines, _ = run(folder, quick=True)
     tables = {}
     for name in ("bodies_cost", "bodies_size", "bodies_limits"):
         assert (folder / f"{name}.png").stat().st_size > 20_000

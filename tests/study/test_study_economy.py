@@ -16,7 +16,7 @@ def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("economy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(economy, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        lines = run(folder, quick=True)
+        lines, _ = run(folder, quick=True)
     with (folder / "economy.csv").open() as file:
         return folder, lines, list(csv.DictReader(file))
 

@@ -17,7 +17,8 @@ pytestmark = pytest.mark.study
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("faults")
-    return folder, faults.run(folder, quick=True)
+    lines, _ = faults.run(folder, quick=True)
+    return folder, lines
 
 
 def rows(path):

@@ -16,7 +16,8 @@ from tests.support.pictures import assert_drawn
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("prediction")
-    return folder, run(folder, quick=True)
+    lines, _ = run(folder, quick=True)
+    return folder, lines
 
 
 def rows_of(path, record):

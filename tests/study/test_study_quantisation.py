@@ -35,7 +35,7 @@ def test_fainter_stars_have_less_light():
 
 
 def test_the_study_writes_charts_tables_and_findings(tmp_path):
-    findings = run(tmp_path, quick=True)
+    findings, _ = run(tmp_path, quick=True)
     assert len(findings) == len(BITS) + 3
     for name in ("quantisation.png", "quantisation_centroiders.png", "quantisation_time.png", "over_frames.png"):
         assert_drawn(tmp_path / name)

@@ -43,7 +43,7 @@ def study(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(timing, "measure", keep)
-        findings = timing.run(folder, quick=True)
+        findings, _ = timing.run(folder, quick=True)
     return folder, findings, measured
 
 

@@ -40,7 +40,7 @@ def study(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # one round: no claim here is of a time
         patch.setattr(sweep, "MIN_ROUNDS", 1)
-        lines = tradeoff.run(folder, quick=True)
+        lines, _ = tradeoff.run(folder, quick=True)
     with (folder / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
     return folder, lines, {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES}

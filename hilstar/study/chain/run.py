@@ -32,12 +32,11 @@ from hilstar.study.chain.measuring import (
     said,
 )
 from hilstar.study.chain.tracker import StudyTracker
-from hilstar.study.sweep import OtherWork, beaten_by, busy_line, is_busy, pareto_front
+from hilstar.study.sweep import NOT_JUDGED, Judged, Load, OtherWork, beaten_by, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-NOT_JUDGED = "the times were taken on a busy machine: no combination is named the faster"
 COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (charts.PURPLE, charts.ORANGE, charts.GREEN, charts.BLUE), strict=True))
 PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
 FLOOR_SHARE = 1e-3  # share of the smallest error at which 0 is drawn on a logarithmic axis
@@ -99,11 +98,9 @@ def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[lis
     return beyond, within
 
 
-def scene_line(
-    rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], busy: bool = False
-) -> str:
+def scene_line(rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load) -> str:
     """One scene: the choice of `auto`, its error and time, its place relative to the front, and the largest part of each."""
-    own, stands = rows[auto_of(rows)], NOT_JUDGED if busy else standing(rows)
+    own, stands = rows[auto_of(rows)], NOT_JUDGED if load.busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
     largest, longest = max(steps, key=lambda part: part.error_arcsec), max(stages, key=lambda one: one.time_ms)
     share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
@@ -114,15 +111,15 @@ def scene_line(
     )
 
 
-def headline(rows: Sequence[CombinationRow], busy: bool = False) -> str:
-    """What the whole table says of `auto`; nothing on a `busy` machine."""
-    if busy:
-        return f"The errors hold; {NOT_JUDGED}"
+def headline(rows: Sequence[CombinationRow], load: Load) -> str:
+    """What the whole table says of `auto`; nothing on a busy machine."""
     scenes = [[row for row in rows if row.scene == name] for name in dict.fromkeys(row.scene for row in rows)]
     beaten = [own[0].scene for own in scenes if beating(own)[0]]
     where = f"in {len(scenes) - len(beaten)} of {len(scenes)} scenes"
     said = f", not in {', '.join(beaten)}" if beaten else ""
-    return f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
+    return load.title(
+        f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
+    )
 
 
 def standing(rows: Sequence[CombinationRow]) -> str:
@@ -253,7 +250,9 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
     return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
 
 
-def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime]) -> None:
+def draw_budget(
+    path: Path, rows: Sequence[CombinationRow], budget: Sequence[ErrorPart], stages: Sequence[StageTime], load: Load
+) -> None:
     """Where `auto`'s error and time come from, a row of panels for each scene that differs. Raises InputError."""
     scenes = differing(rows)
     last = list(scenes)[-1]
@@ -269,9 +268,10 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
         largest = max(parts, key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf)
         most.append(f"{WORDS.get(largest.step, largest.step)} {'in the' if 'field' in scene else 'at'} {scene}")
     longest = max(stages, key=lambda one: one.time_ms)
-    finding = f"Of auto's error most is {', '.join(most)}; of its time most is {longest.stage}"
+    errors = f"Of auto's error most is {', '.join(most)}"
+    finding = load.title(f"{errors}; of its time most is {longest.stage}", errors)
     height = TITLE_INCH + BARS_INCH * len(scenes)
-    with charts.chart(path, finding, len(scenes), 3, note=note, share_x=False, height_inch=height) as grid:
+    with charts.chart(path, finding, len(scenes), 3, note=load.note(note), share_x=False, height_inch=height) as grid:
         for k, scene in enumerate(scenes):
             by_step = {part.step: part for part in budget if part.scene == scene}
             place, light, times = grid[3 * k : 3 * k + 3]
@@ -287,7 +287,7 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Err
             times.set_xlabel("time of a frame [ms]" if scene == last else "")
 
 
-def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:
+def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], object]) -> Judged:
     """Measure a bench file's scenes; write OUTPUTS into `directory`.
 
     A line for each scene, and whether `auto` is on the front of all, or within the noise of it: None on a busy machine.
@@ -313,14 +313,14 @@ def run(file: BenchFile, directory: Path, quick: bool, advance: Callable[[int], 
         shortened, glass = shortened_line(parts.own), glass_rows(file, scenes[DENSE], quick)
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
-    others_cores = others.cores()
-    busy = is_busy(others_cores)
-    lines = [*(scene_line(*scene, busy) for scene in judged), *lines, *([glass_line(glass)] if glass else [])]
+    load = others.load()
+    lines = [*(scene_line(*scene, load) for scene in judged), *lines, *([glass_line(glass)] if glass else [])]
     make_directory(directory)
     for name, records in (("chain", rows), ("chain_budget", budget), ("chain_time", stages), ("chain_psf", glass)):
         if records:
             charts.write_records(directory / f"{name}.csv", records)
-    notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([busy_line(others_cores)] if busy else [])]
-    draw(directory / "chain", rows, headline(rows, busy), "; ".join(notes), glass)
-    draw_budget(directory / "chain_budget", rows, budget, stages)
-    return [*lines, *notes], None if busy else not any(beating(own, as_filed=True)[0] for own, _, _ in judged)
+    notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([load.caution] if load.busy else [])]
+    draw(directory / "chain", rows, headline(rows, load), "; ".join(notes), glass)
+    draw_budget(directory / "chain_budget", rows, budget, stages, load)
+    right = not any(beating(own, as_filed=True)[0] for own, _, _ in judged)
+    return [*lines, *notes], None if load.busy else right

@@ -38,7 +38,7 @@ from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, pack_spr
 from hilstar.sky.stars import Stars, cell_grid
 from hilstar.study.settings import FULL_HD, Table, Value, bench_text
 from hilstar.study.speed import report, tracker
-from hilstar.study.sweep import OtherWork, is_busy
+from hilstar.study.sweep import OtherWork
 
 # A cap this much wider than the monitor's own: culling must have something to throw away.
 SKY_BEYOND = 1.5
@@ -461,5 +461,5 @@ def _aims(result: report.Result) -> list[report.Aim]:
     starts = [start.import_ms + start.first_frame_ms for start in result.startup if start.size == report.REFERENCE_PX]
     if starts:
         aims.append(("import and first frame", START_AIM_MS, float(np.median(starts))))
-    judged = not is_busy(result.others_cores)
+    judged = not result.load.busy
     return [report.Aim(what, aim_ms, ms, ms <= aim_ms if judged else None) for what, aim_ms, ms in aims]

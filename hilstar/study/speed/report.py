@@ -3,11 +3,12 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from msgspec import UNSET, UnsetType
 
 from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, chart, plain_ticks, write_csv
-from hilstar.study.sweep import busy_line, is_busy
+from hilstar.study.sweep import Load
 
 Size = tuple[int, int]
 REFERENCE_PX: Size = (1920, 1080)
@@ -144,6 +145,11 @@ class Result:
     aims: list[Aim] = field(default_factory=list)
     others_cores: float = 0.0  # that other processes took while it ran
 
+    @property
+    def load(self) -> Load:
+        """The same, and what may be said of the times."""
+        return Load(self.others_cores)
+
 
 def lines(result: Result) -> Iterator[str]:
     """A table for each image size: medians in ms, a column for each star count; then notes."""
@@ -162,8 +168,8 @@ def lines(result: Result) -> Iterator[str]:
     yield ""
     yield from _tracker_lines(result.tracker)
     yield from _notes(result)
-    if is_busy(result.others_cores):
-        yield busy_line(result.others_cores)
+    if result.load.busy:
+        yield result.load.caution
 
 
 def _tracker_lines(rows: Sequence[MethodTiming]) -> Iterator[str]:
@@ -212,7 +218,8 @@ def _draw(path: Path, result: Result) -> None:
     across = min(2, len(sizes))
     down = -(-len(sizes) // across)
     height = 2.1 + 2.5 * down
-    with chart(path, _finding(result), down, across, share_x=True, share_y=True, height_inch=height) as grid:
+    layout: dict[str, Any] = {"share_x": True, "share_y": True, "height_inch": height}
+    with chart(path, _finding(result), down, across, note=result.load.note("Medians, in turn."), **layout) as grid:
         for axes in grid[len(sizes) :]:
             axes.set_axis_off()
         for axes, size in zip(grid, sizes, strict=False):
@@ -235,9 +242,8 @@ def _finding(result: Result) -> str:
     whole = [row for row in result.rows if row.kind == "whole_frame"]
     first, last = (pick(whole, key=lambda row: row.ms.median) for pick in (min, max))
     parts = [f"{row.ms.median:.1f} ms with {row.stars} stars on {_words(row.size)}" for row in (first, last)]
-    busy = ", beside other work: no winner is named" if is_busy(result.others_cores) else ""
     where = f"{result.gl_renderer}, {result.machine.cores} cores"
-    return f"A whole frame takes {parts[0]} and {parts[1]} ({where}{busy})"
+    return result.load.title(f"A whole frame takes {parts[0]} and {parts[1]} ({where})", "A whole frame beside other renderers")
 
 
 def _named(rows: Sequence[MethodTiming]) -> dict[str, dict[int, float]]:

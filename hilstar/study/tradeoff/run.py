@@ -10,7 +10,7 @@ import numpy as np
 from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, title_lines, two_digits, write_csv
 from hilstar.render.backend import Target
 from hilstar.render.renderer import Renderer
-from hilstar.study.sweep import Figure, Trials, measured
+from hilstar.study.sweep import NOT_JUDGED, Figure, Judged, Trials, measured
 from hilstar.study.tradeoff.light import brightness, depth, psf, quantisation, spectrum
 from hilstar.study.tradeoff.places import SPRITE_PSF, culling, prediction, projection, smear
 from hilstar.tracker.centroiders import FAMILY
@@ -32,8 +32,11 @@ COLUMNS = (
 MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
 
 
-def run(directory: Path, quick: bool = False) -> list[str]:
-    """Write a chart for each step and one table (CSV) into `directory`; the table as lines for a person."""
+def run(directory: Path, quick: bool = False) -> Judged:
+    """Write a chart for each step and one table (CSV) into `directory`; the table as lines for a person.
+
+    A step that was timed on a busy machine has no front: its `front` and `beaten_by` are empty.
+    """
     machine = this_machine()
     steps = []
     for plan in STEPS:
@@ -44,7 +47,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         (
             *(step.name, step.work, row.method, row.error, step.error.unit, step.error.name),
             *(row.second, step.second.unit, step.second.name, row.time_ms, *row.quartiles_ms),
-            *(row.is_default, row.is_exact, row.on_front, row.beaten),
+            *(row.is_default, row.is_exact, "" if step.load.busy else row.on_front, row.beaten),
             *(row.more.get(name, "") for name in MORE_COLUMNS),
         )
         for step in steps
@@ -52,7 +55,8 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     ]
     write_csv(directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), rows)
     head = f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast; > hilstar's default"
-    return [head, *(line for step in steps for line in table_lines(step))]
+    load = max((step.load for step in steps), key=lambda load: load.cores)
+    return load.judged([head, *(line for step in steps for line in table_lines(step))])
 
 
 def this_machine() -> str:
@@ -71,16 +75,19 @@ def table_lines(step: Trials) -> list[str]:
         errors = "  ".join(f"{value:>{len(name)}.3g} " for value, name in zip((row.error, row.second), columns, strict=False))
         lines.append(f"{marks} {row.method:{wide}}  {errors} {row.time_ms:.3g}")
     beaten = step.default.beaten
-    return [*lines, *([f"   the default: {beaten}"] if beaten else []), *([f"   {step.remark}"] if step.remark else [])]
+    remarks = [NOT_JUDGED] if step.load.busy else []
+    remarks += [f"the default: {beaten}"] if beaten else []
+    remarks += [step.remark] if step.remark else []
+    return [*lines, *(f"   {remark}" for remark in remarks)]
 
 
 def finding(step: Trials) -> str:
-    """The title of a step's chart."""
+    """The title of a step's chart; its times only where they can be judged."""
     own, exact = step.default, next((row for row in step.trials if row.is_exact), None)
     off = "has no error" if own.error <= step.error.floor else f"is off by {said(own.error, step.error)}"
     text = f"{'PSF' if step.name == 'psf' else step.name}: '{own.method}' {off}"
     compared = "" if exact is None else f"; '{exact.method}' takes {exact.time_ms:.3g} ms"
-    return f"{text} in {own.time_ms:.3g} ms{compared}"
+    return step.load.title(f"{text} in {own.time_ms:.3g} ms{compared}", text)
 
 
 def said(value: float, figure: Figure) -> str:
@@ -93,9 +100,10 @@ def draw(path: Path, step: Trials, machine: str) -> None:
     floor, own = step.error.floor, step.default
     shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.trials}
     dotted = f" Dotted: {said(floor, step.error)}, no error below it." if floor else ""
-    note = f"{capital(step.work)}. Blue: the front, which nothing else is as right and as fast as. Ring: hilstar's default."
+    front_words = "" if step.load.busy else " Blue: the front, which nothing else is as right and as fast as."
+    note = f"{capital(step.work)}.{front_words} Ring: hilstar's default. Bars: quartiles.{dotted} {machine}."
     height = max(4.2, 1.9 + 0.17 * len(step.trials))
-    with chart(path, finding(step), note=f"{note} Bars: quartiles.{dotted} {machine}.", height_inch=height) as (axes,):
+    with chart(path, finding(step), note=step.load.note(note), height_inch=height) as (axes,):
         front = [shown[row.method] for row in step.trials if row.on_front]
         if len(front) > 1:
             axes.step(*np.array(front).T, where="post", color=BLUE, lw=1.4)

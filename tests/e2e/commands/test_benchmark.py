@@ -14,7 +14,7 @@ from PIL import Image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.study.speed import benchmark
 from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, numpy_linear, scene
-from hilstar.study.sweep import is_busy
+from hilstar.study.sweep import Load
 from tests.support.commands import assert_refused, run_hilstar_here, run_started
 
 Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
@@ -68,7 +68,7 @@ def test_each_count_is_judged_turning_against_still_and_beside_numba(measured):
         turning = aims[f"turning by 10 deg/s, {count} stars, 640 x 480, 2 still frames"]
         assert turning["aim_ms"] == 2 * at[count, "hilstar", "whole_frame"]
         reached = at[count, "hilstar", "turning"] <= turning["aim_ms"]
-        assert turning["reached"] == (None if is_busy(result["others_cores"]) else reached)
+        assert turning["reached"] == (None if Load(result["others_cores"]).busy else reached)
         beside = aims.get(f"linear image, {count} stars, 640 x 480, numba's time")
         assert (beside and beside["aim_ms"]) == at.get((count, "numba", "linear_only"))
 

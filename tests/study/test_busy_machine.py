@@ -1,0 +1,114 @@
+"""Beside other work no study that draws times names a winner: each of them is run on a machine that is planted as busy."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from hilstar import charts
+from hilstar.cli import study as study_command
+from hilstar.study import bodies, colour, economy, sweep
+from hilstar.study.sweep import NOT_JUDGED, Load, OtherWork
+from hilstar.study.tradeoff import run as tradeoff
+
+BUSY = Load(float(os.cpu_count() or 1))
+STUDIES = get_args(study_command.Study)
+# What takes times: calls of these names.
+TIMERS = {"in_turn", "medians_ms", "measured", "spent", "perf_counter", "perf_counter_ns"}
+# `chain` is run by a way of its own, whose times tests/study/test_study_chain.py plants.
+CHAIN = "chain"
+TIME_LABEL = re.compile(r"\btime\b.*\[(ms|us|s)\]|\(\d+ us\)", re.IGNORECASE | re.DOTALL)
+TIMES_IN_TITLE = re.compile(r"\d m?s\b(?! of latency)|\d us\b|times as (fast|long|SLOW)|of its time")
+WINNERS = re.compile(r"times as (fast|long|SLOW)|less time")
+
+
+def called_names(path: Path) -> set[str]:
+    """The names that a module calls, with or without the module they are of."""
+    calls = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    return {getattr(call, "attr", getattr(call, "id", "")) for call in calls}
+
+
+def files_of(study: str) -> list[Path]:
+    """The modules of a study."""
+    folder = Path(sweep.__file__).parent
+    room = folder / study
+    if room.is_dir():
+        return sorted(room.glob("*.py"))
+    return [folder / f"{study}.py"]
+
+
+def test_every_study_that_takes_times_is_known_as_one():
+    timing = {study for study in STUDIES if any(TIMERS & called_names(path) for path in files_of(study))}
+    assert timing == study_command.TIMED | {CHAIN}
+
+
+@pytest.fixture
+def fewest_rounds(monkeypatch):
+    """One round: no claim here is of a time."""
+    for module, name, value in (
+        (tradeoff, "QUICK_BUDGET_S", 0.0),
+        (sweep, "MIN_ROUNDS", 1),
+        (economy, "QUICK_ROUNDS", 1),
+        (bodies, "QUICK_ROUNDS", 1),
+        (colour, "QUICK_ROUNDS", 1),
+    ):
+        monkeypatch.setattr(module, name, value)
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are saved."""
+    figures = []
+    save = charts.save
+
+    def keep(figure, path):
+        figures.append(figure)
+        save(figure, path)
+
+    monkeypatch.setattr(charts, "save", keep)
+    return figures
+
+
+def words_of(figure) -> list[str]:
+    """The labels of a figure's axes and lines."""
+    words = []
+    for axes in figure.axes:
+        words += [axes.get_xlabel(), axes.get_ylabel(), axes.get_title(loc="left")]
+        words += [text.get_text() for text in axes.texts]
+    return words
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("study", sorted(study_command.TIMED))
+def test_a_study_of_times_declines_on_a_busy_machine(study, tmp_path, monkeypatch, fewest_rounds, drawn):
+    monkeypatch.setattr(OtherWork, "load", lambda self: BUSY)
+    lines, right = study_command.study_lines(study, tmp_path, quick=True)
+    assert right is None
+    assert lines[-1] == BUSY.caution
+    assert not [line for line in lines if WINNERS.search(line)]
+    timed = [figure for figure in drawn if any(TIME_LABEL.search(words) for words in words_of(figure))]
+    assert timed, "no chart of times was seen"
+    for figure in timed:
+        title = " ".join(figure.get_suptitle().split())
+        note = " ".join(figure.get_supxlabel().split())
+        assert "busy machine" in note
+        assert NOT_JUDGED in title or not TIMES_IN_TITLE.search(title), title
+
+
+def test_an_idle_machine_names_its_winners():
+    load = Load()
+    assert load.title("a is 2 times as fast") == "a is 2 times as fast"
+    assert load.note("Medians.") == "Medians."
+    assert load.judged(["a line"]) == (["a line"], True)
+
+
+def test_a_study_of_times_says_what_it_found_through_load():
+    for study in study_command.TIMED:
+        run = import_module(f"hilstar.study.{study}{'.run' if study in study_command.ROOMS else ''}").run
+        assert run.__annotations__["return"] in ("Judged", sweep.Judged)

@@ -1,5 +1,6 @@
 """The choices of a bench's effort for a person (a table) and for a program (the object "effort")."""
 
+import json
 import math
 from typing import Any
 
@@ -23,9 +24,9 @@ def effort_lines(bench: Bench) -> list[str]:
     widths = [max(len(row[column]) for row in rows) for column in range(len(HEAD))]
     lines = ["  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     lines += [f"{choice.part}: {choice.note}" for choice in effort.choices if choice.note]
-    lines += [f"would do: {_remedy_text(remedy)}" for remedy in would_do(bench) if remedy.within]
-    if not effort.within and not lines[-1].startswith("would do"):
-        lines.append("would do: no single key; more bits and fewer faint stars together")
+    for remedy in would_do(bench):
+        head = "would do" if remedy.within else "would not do alone"
+        lines.append(f"{head}: {_remedy_text(remedy)}")
     return lines
 
 
@@ -51,8 +52,9 @@ def _saved(choice: Choice) -> str:
 
 def _remedy_text(remedy: Remedy) -> str:
     value = list(remedy.value) if isinstance(remedy.value, tuple) else remedy.value
-    words = {True: "true", False: "false"}
-    shown = words[value] if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
+    shown = json.dumps(value)  # JSON and TOML write these alike
+    if not math.isfinite(remedy.error_mag + remedy.error_px):
+        return f"{remedy.key} = {shown} (a star shows nothing)"
     return f"{remedy.key} = {shown} ({remedy.error_mag:.4f} mag, {remedy.error_px:.4f} px)"
 
 

@@ -139,11 +139,17 @@ class Judge:
 
 
 def stamp_errors(
-    shown: FloatArray, wanted: FloatArray, sigma_px: Sigma, blur_px: float, pixel_px: float
+    shown: FloatArray,
+    wanted: FloatArray,
+    sigma_px: Sigma,
+    blur_px: float,
+    pixel_px: float,
+    *,
+    box_share: float = BOX_SHARE,
 ) -> dict[Centroider, FloatArray]:
     """How far off each centroider finds the stars of squares `shown` from those `wanted`, both (n, side, side): px (2, n).
 
-    Stars may be paths; sigmas, blur and pixels as for a `Judge`. Infinite where nothing is shown.
+    Stars may be paths; sigmas, blur, pixels and threshold as for a `Judge`. Infinite where nothing is shown.
     """
     count, side = wanted.shape[:2]
     at, light = np.arange(side), wanted.sum(axis=(1, 2))
@@ -165,7 +171,7 @@ def stamp_errors(
         views, width_px, pixels = (
             (boxed, pixel_px, brightest(boxed[0])) if kind in BOXES else (whole, sampled_px, (middle, middle))
         )
-        there, here = (np.stack(star_places(view, kind, (x, y), pixels)) * width_px for view in views)
+        there, here = (np.stack(star_places(view, kind, (x, y), pixels, box_share)) * width_px for view in views)
         off_px[kind] = np.where(shown.sum(axis=(1, 2)) > 0, here - there, np.inf)
     return off_px
 

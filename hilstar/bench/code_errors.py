@@ -1,8 +1,9 @@
-"""The worst errors of a quantisation: over the magnitudes that a catalogue has, and over places within a pixel.
+"""The worst errors of a quantisation: over a catalogue's magnitudes, and over places within a pixel.
 
-An error rises towards faint stars, and jumps from one magnitude to the next: `exact` leaves half a step of a star's light at
-one, and nothing at the next. So the magnitudes are cut into SPANS, and each star of a span has its own magnitude and its own
-phase. The spans are looked at in two steps: every COARSE-th, then all about the worst.
+An error rises towards faint stars, and jumps from one magnitude to the next: `exact` leaves half a
+step of a star's light at one, and nothing at the next. So the magnitudes are cut into SPANS, and
+each star of a span has its own magnitude and its own phase. The spans are looked at in two steps:
+every COARSE-th, then all about the worst.
 """
 
 import math
@@ -24,26 +25,27 @@ from hilstar.tracker.star_errors import Judge
 from hilstar.units import flux_ratio
 
 PHASES = 12  # along each axis of a grid
-# The first phases of the grids along x and y, in steps of 1 / PHASES px: no star is another's mirror image
+# The first phases of the grids along x and y, in steps of 1 / PHASES px: no star is another's
+# mirror image
 GRIDS = ((0.25, 0.375), (0.75, 0.125), (0.5, 0.625), (0.05, 0.875))
 SPANS, COARSE, ABOUT = 60, 6, 3
 GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 # Where each star of a grid is in its span: the first and the last are its ends
 IN_SPAN = np.append((np.arange(PHASES**2 - 1) * GOLDEN) % 1.0, 1.0)
-# A pixel at the threshold of a box falls in or out by any change of light: 0.01 px of a box of 5 that no
-# display takes away (0.013 px at 16 bits, in place of 0.002).
+# A pixel at the threshold of a box falls in or out by any change of light: 0.01 px of a box of 5
+# that no display takes away (0.013 px at 16 bits, in place of 0.002).
 NO_THRESHOLD = 0.0
-# What 2000 to 4000 stars miss of the worst: the largest error of 200 000 is 1.0 to 1.4 times theirs, flux and place
-# (tests/authority/test_effort.py).
+# What 2000 to 4000 stars miss of the worst: the largest error of 200 000 is 1.0 to 1.4 times
+# theirs, flux and place (tests/authority/test_effort.py).
 BEYOND_MAG, BEYOND_PX = 1.4, 1.3
 
 
 @dataclass(frozen=True, slots=True)
 class CodeErrors:
-    """The worst errors of a quantisation, and by whose measure of place; infinite where a star shows nothing.
+    """The worst errors of a quantisation, and by whom a place is measured; infinite for a dark star.
 
-    `centroider` is None where the flux alone was looked at. `by_span` are the same of the spans that were looked at: the
-    brighter end of each, mag, with its flux and place.
+    `centroider` is None where the flux alone was looked at. `by_span` are the same of the spans
+    that were looked at: the brighter end of each, mag, with its flux and place.
     """
 
     flux_mag: float
@@ -56,7 +58,7 @@ class CodeErrors:
         return self.flux_mag <= limit[0] and self.place_px <= limit[1]
 
     def brighter_than(self, mag: float) -> tuple[float, float]:
-        """The worst flux and place of stars up to a magnitude: of the spans that begin above it, and of the next one."""
+        """The worst flux and place of stars up to a magnitude: of the spans up to the next beyond it."""
         fainter = [begin for begin, _, _ in self.by_span if begin >= mag]
         last = min(fainter, default=math.inf)
         among = [(flux_mag, place_px) for begin, flux_mag, place_px in self.by_span if begin <= last]
@@ -67,8 +69,8 @@ class CodeErrors:
 class CodeStars:
     """The stars of a bench by their magnitudes below full scale, and the tracker that looks at them.
 
-    `spans` are the ends of each span of magnitudes, the brighter first, by rising magnitudes. `tables` are the response's
-    arrays, by whose content two benches' stars are the same.
+    `spans` are the ends of each span of magnitudes, the brighter first, by rising magnitudes.
+    `tables` are the response's arrays, by whose content two benches' stars are the same.
     """
 
     psf: Psf
@@ -100,8 +102,8 @@ def code_stars(
 ) -> CodeStars:
     """The stars of a catalogue for `worst_errors`, by what their brightest pixels have of white, `peaks` (n,).
 
-    Those brighter than white clip, which is told elsewhere. Up to SPANS magnitudes are looked at as they are; more are many
-    stars, which have any magnitude between the first and the last.
+    Those brighter than white clip, which is told elsewhere. Up to SPANS magnitudes are looked at as
+    they are; more are many stars, which have any magnitude between the first and the last.
     """
     shown = peaks[peaks <= 1.0]
     mags = np.unique(np.maximum(-2.5 * np.log10(shown), 0.0)) if len(shown) else np.zeros(1)
@@ -126,7 +128,7 @@ def _grid(psf: Psf, seen: Seen, number: int) -> PhaseGrid:
 
 @lru_cache(maxsize=64)  # the benches of a campaign, a verdict or a study have few monitors
 def worst_errors(stars: CodeStars, method: Quantisation, limit: tuple[float, float] = (math.inf, math.inf)) -> CodeErrors:
-    """The worst errors of a method; beyond the limit (mag, px) the first that are over it, and not the worst."""
+    """The worst errors of a method; of one beyond the limit (mag, px) the first that are over it."""
     search = _Search(stars, method, limit)
     faintest_first = range(len(stars.spans) - 1, -1, -1)
     for place in faintest_first[::COARSE]:
@@ -150,7 +152,7 @@ class _Search:
         self._found: dict[tuple[int, int], CodeErrors] = {}
 
     def is_over(self, place: int, phases: int | None = None) -> bool:
-        """Whether the errors of the span at a place are over the limit, by its own grid or another one."""
+        """Whether the errors of the span at a place are over the limit, by its own or another grid."""
         key = place, (place if phases is None else phases) % len(GRIDS)
         if key not in self._found:
             self._found[key] = self._errors(*key)
@@ -165,7 +167,7 @@ class _Search:
         return CodeErrors(flux_mag, furthest.place_px, furthest.centroider, by_span)
 
     def worst_places(self) -> tuple[int, int]:
-        """The places of the spans with the largest flux error, and with the largest error of place."""
+        """The places of the spans with the largest errors of flux and of place."""
         of_flux = max(self._found, key=lambda key: self._found[key].flux_mag)
         of_place = max(self._found, key=lambda key: self._found[key].place_px)
         return of_flux[0], of_place[0]

@@ -1,7 +1,8 @@
 """The cheapest sprites, paths and codes whose errors together are within a bench's tolerance.
 
-Each part of a frame is a list of candidates, with the worst error and the time of each. The errors of the parts add up, and
-all parts share one tolerance: the cheapest combination is taken whose sum is within it.
+Each part of a frame is a list of candidates, with the worst error and the time of each. The errors
+of the parts add up, and all parts share one tolerance: the cheapest combination is taken whose sum
+is within it.
 """
 
 import math
@@ -25,22 +26,26 @@ from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, level_cos
 from hilstar.scene.psf import MAX_CUT, Psf
 from hilstar.tracker.centroiders import FAMILY, Centroider
 
-# Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
+# Light beyond a small sprite is under this share of what lights a pixel: only where the wings of
+# stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
-# Of a frame's time by the table (MS_A_STAR, EXACT_MS_A_STAR): what a pixel of a sprite takes, and a star on a path more than
-# one at a point. 1000 stars of 100 px in place of 22 take 0.3 ms, on paths 0.7 ms, where `round` takes 3.9 ms in all and
-# `exact` 7.0 (llvmpipe, two busy cores, processor time, turning at 1 deg/s; in a ratio to 0.002 ms a star).
+# Of a frame's time by the table (MS_A_STAR, EXACT_MS_A_STAR): what a pixel of a sprite takes, and a
+# star on a path more than one at a point. 1000 stars of 100 px in place of 22 take 0.3 ms, on paths
+# 0.7 ms, where `round` takes 3.9 ms in all and `exact` 7.0 (llvmpipe, two busy cores, processor
+# time, turning at 1 deg/s; in a ratio to 0.002 ms a star).
 PIXEL_MS, PATH_MS = 2e-6, 4e-4
 GLASS_MS_A_STAR = 0.01  # results/kinds_h200.csv: 27 ms more for 3615 stars
 # Stars that move less than these shares of the tolerance may be drawn as points.
 MOTION_SHARES = (0.05, 0.1, 0.25, 0.5)
-# Where no combination is within the tolerance, the other parts may add so much of it to the codes' error.
+# Where no combination is within the tolerance, the other parts may add so much of it to the codes'
+# error.
 SLIGHT = 0.01
 IN_TIME_SHARE = 0.5  # share of a refresh period that a frame may take
 CHEAP, BEST = BY_COST[0], BY_COST[-1]
-# Between these times, in limits, a measured frame leaves the choice as the table has it: two starts of a run then have the same
-# codes. Other programs slow frames down, and nothing speeds them up: the upper time is a whole refresh.
+# Between these times, in limits, a measured frame leaves the choice as the table has it: two starts
+# of a run then have the same codes. Other programs slow frames down, and nothing speeds them up:
+# the upper time is a whole refresh.
 SURELY_IN_TIME, SURELY_LATE = 0.8, 2.0
 NO_ERROR = (0.0, 0.0)
 
@@ -66,11 +71,13 @@ class FieldCost:
 class Light:
     """The light of a bench: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
 
-    `sky_share` is the share of the whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider`
-    what it finds stars by: None where the bench does not say, and then all of them judge. `psf` is how stars are drawn, and
-    `psf_choice` why so where the tolerance decides. The exposure has `exposure_frames`. `cost` is what a quantiser costs by
-    the table, `measured` what it costs where the bench is drawn (None: not measured). Of a scene that turns, `turning` is how
-    far a star of a frame without paths is from its place, in units of its motion; 0 for a scene at rest.
+    `sky_share` is the share of the whole sky that the screen covers. `seen` is how the tracker sees
+    the monitor, `centroider` what it finds stars by: None where the bench does not say, and then
+    all of them judge. `psf` is how stars are drawn, and `psf_choice` why so where the tolerance
+    decides. The exposure has `exposure_frames`. `cost` is what a quantiser costs by the table,
+    `measured` what it costs where the bench is drawn (None: not measured). Of a scene that turns,
+    `turning` is how far a star of a frame without paths is from its place, in units of its motion;
+    0 for a scene at rest.
     """
 
     response: Response
@@ -106,7 +113,12 @@ class Light:
     def tabulated_cost(self, psf: Psf) -> FieldCost:
         """The cost of codes by the quantisers' own figures: on two cores without a GPU."""
         cheap, best = (self.cost(QUANTISERS[method], psf) for method in (CHEAP, BEST))
-        return FieldCost(cheap.a_star_ms * self.stars, best.a_star_ms * self.stars, "on two cores without a GPU", best.why)
+        return FieldCost(
+            cheap.a_star_ms * self.stars,
+            best.a_star_ms * self.stars,
+            "on two cores without a GPU",
+            best.why,
+        )
 
     @property
     def refresh_ms(self) -> float:
@@ -131,7 +143,7 @@ class Sides:
     cut_to_mag: float = math.inf
 
     def beside(self, codes: CodeErrors) -> Choice:
-        """The choice, with what it adds to the worst errors of codes: bright stars are cut, and faint ones are rounded."""
+        """The choice, with what it adds to the codes' worst: bright stars are cut, faint ones rounded."""
         flux_mag, place_px = codes.brighter_than(self.cut_to_mag)
         more_mag = flux_mag + self.choice.error_mag - codes.flux_mag
         more_px = place_px + self.choice.error_px - codes.place_px
@@ -165,11 +177,11 @@ class Combination:
 
 @dataclass(frozen=True)
 class Effort:
-    """The effort for a bench's stars: quantisation, sprite sides by rate (see `Target.sides`), and the smallest motion drawn.
+    """The effort for a bench's stars: quantisation, sprite sides by rate, and the smallest motion drawn.
 
-    `by_cost` says whether the time of a frame took part in the choice of the quantisation, `asked` and `light` what the choice
-    was made for. Errors are the worst of all choices together, of the catalogue's stars at any phase; they are found when they
-    are first asked for.
+    `by_cost` says whether the time of a frame took part in the choice of the quantisation, `asked`
+    and `light` what the choice was made for. Errors are the worst of all choices together, of the
+    catalogue's stars at any phase; they are found when they are first asked for.
     """
 
     asked: RenderSettings
@@ -194,7 +206,7 @@ class Effort:
 
     @cached_property
     def _found(self) -> CodeErrors:
-        """The worst errors of the codes where they are within the tolerance; else the first that are over it."""
+        """The codes' worst errors if they are within the tolerance; else the first that are over it."""
         return worst_errors(self.light.code_stars(), self.quantisation, self._tolerance)
 
     @property
@@ -256,7 +268,8 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
 def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
     """The quantisations to choose among, from the cheapest on.
 
-    `auto` does not take `exact` where that would be late in fields of many stars and `round` would not.
+    `auto` does not take `exact` where that would be late in fields of many stars and `round` would
+    not.
     """
     if render.quantisation != "auto":
         return (render.quantisation,)
@@ -307,7 +320,7 @@ def _is_within(render: RenderSettings, light: Light, stars: CodeStars, one: Comb
 
 
 def _is_slight(render: RenderSettings, one: Combination) -> bool:
-    """Whether sprites and paths add next to nothing to the codes' error, or no less than the file lets them."""
+    """Whether sprites and paths add next to nothing to the codes' error, or as little as they can."""
     sprites, motion = one.sprites.choice, one.motion
     share = max(sprites.error_mag / render.tolerance_mag, sprites.error_px / render.tolerance_px)
     is_whole = sprites.error_mag <= MAG_PER_SHARE * MAX_CUT
@@ -369,7 +382,14 @@ def side_candidates(render: RenderSettings, light: Light, method: Quantisation) 
             mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
             chosen = f"{min(side.side_px for side in sides)} to {size} px a side, of {full}"
             saved_ms = pixels_ms * (full**2 - mean_px)
-            choice = Choice("sprites", chosen, cut_mag(size, psf), cut_px(size, psf), pixels_ms * mean_px, saved_ms)
+            choice = Choice(
+                "sprites",
+                chosen,
+                cut_mag(size, psf),
+                cut_px(size, psf),
+                pixels_ms * mean_px,
+                saved_ms,
+            )
             found.append(Sides(sides, choice, _cut_to_mag(light, method, size)))
     sides = _sides(light, method, sizes, full) if render.effort == "auto" and not psf.by_place else ()
     mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
@@ -424,7 +444,7 @@ def cut_px(size_px: int, psf: Psf) -> float:
 
 
 def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
-    """From which motion on stars are paths: none in a scene at rest; else from the file's on, or from more."""
+    """From which motion on stars are paths: none at rest; else from the file's on, or from more."""
     floor_px = render.motion_above_px
     if not light.turning:
         return [Motion(floor_px, Choice("paths", "none: nothing moves within a frame", *NO_ERROR))]
@@ -437,7 +457,15 @@ def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
         # Only frames between the file's motion and this one are drawn sooner.
         ms, saved_ms = (path_ms, 0.0) if px == floor_px else (0.0, path_ms)
         note = "" if px == floor_px else "saves in frames that move less"
-        choice = Choice("paths", f"from {px:g} px within a frame on", 0.0, px * light.turning, ms, saved_ms, note)
+        choice = Choice(
+            "paths",
+            f"from {px:g} px within a frame on",
+            0.0,
+            px * light.turning,
+            ms,
+            saved_ms,
+            note,
+        )
         found.append(Motion(px, choice))
     return found
 

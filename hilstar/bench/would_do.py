@@ -1,7 +1,8 @@
-"""What would bring a bench within its tolerance: one key of its file at a time, tried by the plan that chose before it is told.
+"""What would bring a bench within its tolerance: one key at a time, tried by the bench's own plan.
 
-The keys stand in the order of what they cost a user: nothing that is seen (bits, bit stealing, `exact` where it is late),
-then frames that are right over an exposure only, stars that clip, wider stars, and stars that are missing.
+The keys stand in the order of what they cost a user: nothing that is seen (bits, bit stealing,
+`exact` where it is late), then frames that are right over an exposure only, stars that clip, wider
+stars, and stars that are missing.
 """
 
 from collections.abc import Iterator
@@ -167,7 +168,10 @@ def _wider(bench: Bench, sky: _Sky) -> Iterator[_Trial]:
         return
     for factor in WIDER:
         x, y = (round(sigma * factor, 2) for sigma in effort.asked.sprite_sigma_px)
-        render, psf = msgspec.structs.replace(effort.asked, sprite_sigma_px=(x, y)), GaussianPsf((x, y))
+        render, psf = (
+            msgspec.structs.replace(effort.asked, sprite_sigma_px=(x, y)),
+            GaussianPsf((x, y)),
+        )
         white_e_per_s = white_of(render, sky.stars, psf, sky.drive) * sky.darkest
         light = replace(effort.light, psf=psf, white_e_per_s=white_e_per_s)
         yield _Trial("[render] sprite_sigma_px", (x, y), render, light)

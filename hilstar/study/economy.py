@@ -17,7 +17,16 @@ from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import CameraTurn, Scan, swept_sprites
-from hilstar.study.settings import FULL_HD, GLASS, Isolation, Table, lone_windows, squares, star_error, study_bench
+from hilstar.study.settings import (
+    FULL_HD,
+    GLASS,
+    Isolation,
+    Table,
+    lone_windows,
+    squares,
+    star_error,
+    study_bench,
+)
 from hilstar.study.sweep import NOT_JUDGED, Judged, Load, OtherWork, Spent, in_turn
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import stamp_errors
@@ -73,10 +82,10 @@ SCENES = (
 class EffortOutcome:
     """A scene at one effort: the times of a frame, the largest errors of stars that stand alone, and the tolerance.
 
-    `tolerance` is "full" at full effort, which has the default's figures. `frame_ms` is the median time of a whole
-    frame, `cpu_ms` that of the processor in it. `claimed_mag` and `claimed_px` are what the plan says of the worst
-    star. `centroid_max_px` is by the plain moment of the light on the monitor, `max_px_...` as each centroider finds
-    stars on the tracker.
+    `tolerance` is "full" at full effort, which has the default's figures. `frame_ms` is the median
+    time of a whole frame, `cpu_ms` that of the processor in it. `claimed_mag` and `claimed_px` are
+    what the plan says of the worst star. `centroid_max_px` is by the plain moment of the light on
+    the monitor, `max_px_...` as each centroider finds stars on the tracker.
     """
 
     scene: str
@@ -157,7 +166,11 @@ def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
     wanted: Table = {"brightest_v_mag": 2.0, "motion": "on" if any(scene.rate_deg_s) else "auto"}
     efforts: dict[str, Table] = {"full": FULL}
     for tolerance in TOLERANCES:
-        efforts[tolerance.name] = {**AUTO, "tolerance_mag": tolerance.mag, "tolerance_px": tolerance.px}
+        efforts[tolerance.name] = {
+            **AUTO,
+            "tolerance_mag": tolerance.mag,
+            "tolerance_px": tolerance.px,
+        }
     turn = scene.turn
     with TemporaryDirectory() as folder, ExitStack() as stack:
         benches = {}
@@ -264,7 +277,14 @@ def draw(path: Path, comparisons: list[EffortComparison], load: Load) -> None:
             colour, alpha = COLOURS[bits], 1.0 if tolerance is DEFAULT else 0.5
             label = f"{bits} bits, {tolerance.name}"
             shift = (place - (len(kinds) - 1) / 2) * width
-            speed.bar(at + shift, [one.speed_up for one in mine], width, label=label, color=colour, alpha=alpha)
+            speed.bar(
+                at + shift,
+                [one.speed_up for one in mine],
+                width,
+                label=label,
+                color=colour,
+                alpha=alpha,
+            )
             error.bar(at + shift, [one.auto.share for one in mine], width, color=colour, alpha=alpha)
         for axes, name in ((speed, "as fast as full effort"), (error, "tolerance")):
             axes.axhline(1.0, color=RED, linewidth=1, label=name)

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import bench_file_of, read_bench_file
-from hilstar.bench.build import TIMED_EXACT_S, load, measured_cost, open_bench, timed_frame_ms
+from hilstar.bench.build import TIMED_EXACT_S, load, measured_cost, open_bench, timed_frame_ms, turning_of
 from hilstar.bench.config import RenderSettings
 from hilstar.bench.effort import Effort, FieldCost, Light, _combinations, cut_px, exact_in_time, plan_effort
 from hilstar.bench.effort_report import effort_keys, effort_lines
+from hilstar.bench.least_psf import Choice
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import level_cost
@@ -23,7 +24,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import GaussianPsf
 from hilstar.tracker.centroiders import FAMILY
-from tests.support.benches import bench_text
+from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import run_hilstar_here
 
 SIGMA = (0.85, 0.85)
@@ -89,6 +90,29 @@ def test_a_scene_at_rest_asks_nothing_of_paths():
     assert part(still, "paths").error_px == 0.0 and "none" in part(still, "paths").choice
     assert part(turning, "paths").error_px == pytest.approx(0.5 * turning.motion_above_px)
     assert turning.motion_above_px >= asked.motion_above_px
+
+
+@pytest.mark.parametrize(
+    ("motion", "on_screen", "turns"),
+    [("auto", False, False), ("auto", True, True), ("on", False, True), ("off", True, False)],
+)
+def test_paths_are_charged_where_frames_may_turn(motion, on_screen, turns, small_bench_file):
+    """A frame without a path is where the middle row's first light has it: half of its light later it is halfway on."""
+    text = f'{SMALL_BENCH}[render]\nmotion = "{motion}"\nquantisation = "round"\n'
+    config = bench_file_of(small_bench_file, text).config
+    scan_s, hold_s = (config.monitor.panel_scanout_ms, config.monitor.panel_hold_ms)
+    wanted = (scan_s + hold_s) / (scan_s + 2 * hold_s) if turns else 0.0
+    assert turning_of(config, on_screen) == pytest.approx(wanted)
+
+
+def test_a_psf_in_place_of_a_glass_shares_the_tolerance():
+    """Its error is taken from what is left for the codes."""
+    sky, asked = light(12, 6.0), settings(tolerance_mag=0.05, tolerance_px=0.1)
+    assert planned(asked, sky).quantisation == "round"
+    near = replace(sky, psf_choice=Choice("PSF", "a Gaussian", 0.045, 0.01))
+    effort = planned(asked, near)
+    assert effort.quantisation == "exact" and part(effort, "PSF").error_mag == 0.045
+    assert effort.error_mag == pytest.approx(effort.codes.flux_mag + 0.045, rel=0.2)
 
 
 def test_the_worst_error_is_of_all_magnitudes_that_the_catalogue_has():

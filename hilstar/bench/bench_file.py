@@ -25,6 +25,7 @@ import msgspec
 from hilstar.attitude.wire.source import HILSTARS, Mounting
 from hilstar.bench.config import GAUSSIAN, GEOCENTRE, SOURCE, AttitudeSettings, BenchConfig, config_of, parse_config
 from hilstar.bench.config.bench_config import HEADS, UNIX, today, with_dates
+from hilstar.bench.config.render import DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX, HASHED_TOLERANCE, RenderSettings
 from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import place_of
 from hilstar.monitor.calibration import BUILT_IN
@@ -111,6 +112,7 @@ def stated_in(config: BenchConfig) -> "Stated":
 
 def _sha256(config: BenchConfig, folder: Path) -> str:
     kept = {name: value for name, value in msgspec.to_builtins(config).items() if name != "certify"}  # changes no frame
+    kept["render"] |= _hashed_tolerance(config.render)
     digest = hashlib.sha256(msgspec.json.encode(kept, order="sorted"))
     tracker = config.tracker
     curves = (*tracker.quantum_efficiencies.values(), tracker.transmission)
@@ -136,6 +138,14 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
             with suppress(InputError):
                 digest.update(file_sha256(folder / large, "").encode())
     return digest.hexdigest()
+
+
+def _hashed_tolerance(render: RenderSettings) -> dict[str, float]:
+    """The tolerance as the hash has it: its default changes no frame of a bench that leaves nothing to it."""
+    if render.effort == "auto" or render.quantisation == "auto" or render.psf != GAUSSIAN:
+        return {}
+    defaults = {"tolerance_mag": DEFAULT_TOLERANCE_MAG, "tolerance_px": DEFAULT_TOLERANCE_PX}
+    return {key: HASHED_TOLERANCE for key, default in defaults.items() if getattr(render, key) == default}
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,25 +5,26 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from msgspec.structs import replace
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.bench.cameras import before_detector, bench_camera, display_psf, tracker_camera, tracker_psf
+from hilstar.bench.cameras import before_detector, bench_camera, display_psfs, tracker_camera, tracker_psf
 from hilstar.bench.colours import Colours, mixed_for
-from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, Tracker
+from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, RenderSettings, Tracker
 from hilstar.bench.config.bench_config import drives_apart, epoch_utc_ns, has_observer, sky_jd
 from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
 from hilstar.bench.effort import BEST, CHEAP, IN_TIME_SHARE, SURELY_IN_TIME, Effort, FieldCost, Light, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.bench.glass import glass_transmission
+from hilstar.bench.least_psf import WHOLE, Choice
 from hilstar.errors import InputError
 from hilstar.frame.layers import NO_SOURCES, Sources, light_of, seen_in, sky_layers
 from hilstar.frame.truth import StarInView, brightest_in_view
@@ -69,66 +70,133 @@ def load(path: str | Path) -> Bench:
     return open_bench(read_bench_file(Path(path)))
 
 
-def open_bench(file: BenchFile, context: Context | None = None, *, timed: bool = False) -> Bench:
+def open_bench(file: BenchFile, context: Context | None = None, *, timed: bool = False, on_screen: bool = False) -> Bench:
     """Assemble the bench of a file, in a `context` if one is given; NumPy draws where OpenGL is missing. Raises InputError.
 
-    `timed` is for runs that a clock paces: where `quantisation = "auto"` depends on what codes cost, that is measured here.
+    `on_screen` is for runs whose frames a screen lights row by row. `timed` is for runs that a clock paces: where
+    `quantisation = "auto"` depends on what codes cost, that is measured here.
     """
     sources = bench_sources(file.config, file.folder)
-    return assembled(file, bench_stars(file.config, file.folder, sources.moving), context, sources, timed=timed)
+    stars = bench_stars(file.config, file.folder, sources.moving)
+    return assembled(file, stars, context, sources, timed=timed, on_screen=on_screen)
 
 
 def assembled(
-    file: BenchFile, stars: Stars, context: Context | None = None, sources: Sources = NO_SOURCES, *, timed: bool = False
+    file: BenchFile,
+    stars: Stars,
+    context: Context | None = None,
+    sources: Sources = NO_SOURCES,
+    *,
+    timed: bool = False,
+    on_screen: bool = False,
 ) -> Bench:
     """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError."""
     if context is not None:  # a window's context, which the window frees
-        return _assembled(file, stars, context, sources, timed)
+        return _assembled(file, stars, context, sources, timed, on_screen)
     context = headless_context(file.config.render.gpu)
     try:
-        return _assembled(file, stars, context, sources, timed)
+        return _assembled(file, stars, context, sources, timed, on_screen)
     except BaseException:
         if context is not None:
             context.release()
         raise
 
 
-def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: Sources, timed: bool) -> Bench:
+class Scene(NamedTuple):
+    """What a bench's light is planned for: how its stars are drawn, full scale with that, and the light of both."""
+
+    psf: Psf
+    choice: Choice | None
+    white_e_per_s: float
+    light: Light
+
+
+class Display(NamedTuple):
+    """What shows a bench's stars: its light, its geometry, its GL; how much of white each star asks for; see `turning_of`."""
+
+    calibration: Calibration
+    camera: Camera
+    context: Context | None
+    drive: FloatArray | float
+    turning: float
+
+
+def _scenes(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
+    """The scene of each way to draw a bench's stars, from the cheapest on."""
+    calibration, camera, context, drive, turning = display
+    render = file.config.render
+    uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
+    darkest = 1.0 if uniformity is None else float(uniformity.min())
+    for psf, choice in display_psfs(file.config, file.folder, camera):
+        white_e_per_s = white_of(render, stars, psf, drive)
+        light = Light(
+            response=calibration.response,
+            # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
+            white_e_per_s=white_e_per_s * darkest,
+            rates_e_per_s=stars.electrons_per_s,
+            sky_share=math.prod(camera.resolution_px) / math.prod(camera.scales_px_rad()) / (4 * math.pi),  # about
+            refresh_hz=file.config.monitor.refresh_hz,
+            seen=seen_by(file, camera),
+            centroider=file.config.verify.judge,
+            psf=psf,
+            psf_choice=choice,
+            exposure_frames=file.config.exposure_frames,
+            cost=partial(level_cost, context=context),
+            turning=turning,
+        )
+        yield Scene(psf, choice, white_e_per_s, light)
+
+
+def _planned(render: RenderSettings, scenes: Iterator[Scene]) -> tuple[Scene, Effort]:
+    """The first scene whose plan is within the tolerance; where none is, the first whose PSF alone is within it."""
+    near: list[tuple[Scene, Effort]] = []
+    for scene in scenes:
+        effort, choice = plan_effort(render, scene.light), scene.choice
+        if choice is None:
+            return scene, effort
+        is_last = choice.choice == WHOLE
+        if not is_last and (choice.error_mag > render.tolerance_mag or choice.error_px > render.tolerance_px):
+            continue
+        near.append((scene, effort))
+        if effort.within:
+            return scene, effort
+    return near[0]
+
+
+def white_of(render: RenderSettings, stars: Stars, psf: Psf, drive: FloatArray | float = 1.0) -> float:
+    """Full scale, electrons per second of a pixel. Raises InputError as `brightest_peak_e_per_s`."""
+    return render.flux_at_white_e_per_s or brightest_peak_e_per_s(stars, psf, render.brightest_v_mag, drive)
+
+
+def turning_of(config: BenchConfig, on_screen: bool) -> float:
+    """How far stars without paths are from the mean of their light at most, in units of their motion; 0 at rest.
+
+    A frame has them where they are at the middle row's first light, and its motion counts to the end of its light.
+    """
+    motion, scan = config.render.motion, scan_of(config.monitor)
+    moves = motion == "on" or (motion == "auto" and on_screen)
+    if not moves or not scan.longest_s:
+        return 0.0
+    return (scan.scanout_s + scan.hold_s) / 2 / scan.longest_s
+
+
+def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: Sources, timed: bool, on_screen: bool) -> Bench:
     render, calibration = file.config.render, bench_calibration(file.config, file.folder)
     camera = bench_camera(file.config, file.folder)
-    psf, drawn = display_psf(file.config, file.folder, camera)
     colours = bench_colours(file.config, file.folder, stars.catalog)
     stars = stars if colours is None else colours.on(stars)
     drive = 1.0 if stars.primaries is None or colours is None else colours.drive(stars.primaries)
-    white_e_per_s = render.flux_at_white_e_per_s or brightest_peak_e_per_s(stars, psf, render.brightest_v_mag, drive)
+    display = Display(calibration, camera, context, drive, turning_of(file.config, on_screen))
+    scenes = _scenes(file, stars, display)
+    (psf, drawn, white_e_per_s, light), planned = _planned(render, scenes)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())
-    light = Light(
-        response=calibration.response,
-        # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
-        white_e_per_s=white_e_per_s * darkest,
-        rates_e_per_s=stars.electrons_per_s,
-        can_steal_bits=calibration.can_steal_bits and not render.bit_stealing,
-        sky_share=math.prod(camera.resolution_px) / math.prod(camera.scales_px_rad()) / (4 * math.pi),  # about
-        refresh_hz=file.config.monitor.refresh_hz,
-        seen=seen_by(file, camera),
-        centroider=file.config.verify.judge,
-        psf=psf,
-        exposure_frames=file.config.exposure_frames,
-        cost=partial(level_cost, context=context),
-    )
-
     panels = () if colours is None else primary_panels(file, colours, white_e_per_s, uniformity)
 
-    def bench_by(effort: Effort | None) -> Bench:
-        config, codes = file.config, render.quantisation
-        if effort is not None:
-            effort = effort if drawn is None else dataclasses.replace(effort, choices=(*effort.choices, drawn))
-            codes = effort.quantisation
-            chosen = replace(render, quantisation=codes, motion_above_px=effort.motion_above_px)
-            config = replace(config, render=chosen)
-        if codes == "auto":
-            raise AssertionError("the effort's plan has chosen")
+    def bench_by(effort: Effort) -> Bench:
+        codes = effort.quantisation
+        chosen = replace(render, quantisation=codes, motion_above_px=effort.motion_above_px)
+        config = replace(file.config, render=chosen)
         target = Target(
             resolution_px=config.monitor.resolution_px,
             psf=psf,
@@ -136,7 +204,7 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
             flux_at_white_e_per_s=white_e_per_s,
             quantisation=codes,
             uniformity=uniformity,
-            sides=() if effort is None else effort.sides,
+            sides=effort.sides,
             seen=light.seen,
         )
         if colours is not None:
@@ -171,12 +239,11 @@ def _assembled(file: BenchFile, stars: Stars, context: Context | None, sources: 
         among = moved(some, sources.moving)
         return among if colours is None else colours.on(among)
 
-    chooses = render.effort == "auto" or render.quantisation == "auto"
-    bench = bench_by(plan_effort(render, light) if chooses else None)
-    if not timed or bench.effort is None or not bench.effort.by_cost or render.codes_ms is not None:
+    bench = bench_by(planned)
+    if not timed or not planned.by_cost or render.codes_ms is not None:
         return bench
     # The one that is not taken stays in the GL context until that is freed.
-    benches: dict[Quantisation, Bench] = {bench.effort.quantisation: bench}
+    benches: dict[Quantisation, Bench] = {planned.quantisation: bench}
 
     def frame_ms(method: Quantisation, for_s: float) -> float:
         if method not in benches:

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from hilstar.bench.config import DEFAULT_PSF_SIGMA_PX, GAUSSIAN, BenchConfig, Tracker
 from hilstar.bench.glass import Onto, bench_glass_psf, decentre_px, glass_in, say_once, through_glass
-from hilstar.bench.least_psf import ONE_PSF, WHOLE, Choice, least_psf
+from hilstar.bench.least_psf import ONE_PSF, WHOLE, Choice, first_within, least_psf, psf_choices
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import load_distortion, load_geometry, monitor_camera
 from hilstar.optics.glass_psf import regridded
@@ -74,11 +74,22 @@ def ideal_monitor(config: BenchConfig) -> Camera:
     )
 
 
-def display_psf(config: BenchConfig, folder: Path, display: Camera) -> tuple[Psf, Choice | None]:
-    """How a star is drawn on the monitor, and why so where the file leaves it to the tolerance. Raises InputError."""
+def display_psf(config: BenchConfig, folder: Path, display: Camera) -> Psf:
+    """How a star is drawn on the monitor; where the tolerance decides, as if all of it were the PSF's. Raises InputError."""
+    render = config.render
+    tolerance = render.tolerance_mag, render.tolerance_px
+    return first_within(display_psfs(config, folder, display), tolerance)[0]
+
+
+def display_psfs(config: BenchConfig, folder: Path, display: Camera) -> Iterator[tuple[Psf, Choice | None]]:
+    """How a star may be drawn on the monitor, from the cheapest to the file's own; None where there is no choice.
+
+    Raises InputError.
+    """
     render = config.render
     if render.psf == GAUSSIAN:
-        return GaussianPsf(render.sprite_sigma_px), None
+        yield GaussianPsf(render.sprite_sigma_px), None
+        return
     tracker = replace(config.tracker, effort="full")
     optics, camera = tracker.optics, tracker_camera(tracker, folder)
     own, onto = tracker_psf(tracker, folder), Onto(display, camera)
@@ -91,7 +102,8 @@ def display_psf(config: BenchConfig, folder: Path, display: Camera) -> tuple[Psf
             spread = onto.matrix @ np.diag(np.square(own.sigma_px)) @ onto.matrix.T
             if abs(spread[0, 1]) > OBLIQUE * spread.trace():
                 raise InputError("its Gaussian is oval and lies obliquely on the display; give [tracker.optics] psf a file")
-            return GaussianPsf((math.sqrt(spread[0, 0]), math.sqrt(spread[1, 1]))), None
+            yield GaussianPsf((math.sqrt(spread[0, 0]), math.sqrt(spread[1, 1]))), None
+            return
         if isinstance(own, SampledPsf) and own.pixel_integrated:
             raise InputError("it has the tracker's pixel in it (PIXINT), which the detector adds again; give one without")
         glass = glass_in(tracker, folder)
@@ -102,7 +114,7 @@ def display_psf(config: BenchConfig, folder: Path, display: Camera) -> tuple[Psf
             samples, per_px = regridded(image.samples[None], image.per_px, onto.matrix)
             drawn = SampledPsf(samples[0], per_px)
         among = None if render.effort == "auto" else frozenset((ONE_PSF, WHOLE))
-        return least_psf(drawn, places_px, (render.tolerance_mag, render.tolerance_px), among)
+        yield from psf_choices(drawn, places_px, among)
     except InputError as error:
         raise InputError(f'[render] psf = "tracker", with {optics.psf}: {error}') from error
 

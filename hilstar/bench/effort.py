@@ -1,80 +1,53 @@
-"""The cheapest sprites, paths and codes that keep a bench's errors within its tolerance.
+"""The cheapest sprites, paths and codes whose errors together are within a bench's tolerance.
 
-Half of the tolerance is for the codes, a quarter for the sprites' edges and a quarter for motion that is not drawn.
+Each part of a frame is a list of candidates, with the worst error and the time of each. The errors
+of the parts add up, and all parts share one tolerance: the cheapest combination is taken whose sum
+is within it.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.code_errors import CodeErrors, CodeStars, code_stars, worst_errors
 from hilstar.bench.config import RenderSettings
 from hilstar.bench.least_psf import MAG_PER_SHARE, Choice
-from hilstar.monitor.balance import AS_USUAL, Balance, Seen
-from hilstar.monitor.phases import UNLIKE, USUAL_PSF, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.monitor.balance import AS_USUAL, Seen
+from hilstar.monitor.phases import USUAL_PSF
 from hilstar.monitor.quantise import EXPOSURE_FRAMES, LevelCost, Panel, Quantiser
 from hilstar.monitor.quantisers import BY_COST, QUANTISERS, Quantisation
 from hilstar.monitor.response import Response
+from hilstar.optics.glass_psf import GlassPsf
 from hilstar.render.backend import MAX_SIDES, SpriteSide, SpriteSides, level_cost
 from hilstar.scene.psf import MAX_CUT, Psf
-from hilstar.scene.sprites import Sprites
 from hilstar.tracker.centroiders import FAMILY, Centroider
-from hilstar.tracker.star_errors import Judge
-from hilstar.units import flux_ratio
 
-CODES_SHARE, EDGES_SHARE, MOTION_SHARE = 0.5, 0.25, 0.25
-PHASES = 12
-MAGNITUDES = 5  # at which codes are judged, from white down to the faintest star
-# Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
+# Light beyond a small sprite is under this share of what lights a pixel: only where the wings of
+# stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
+# Of a frame's time by the table (MS_A_STAR, EXACT_MS_A_STAR): what a pixel of a sprite takes, and a
+# star on a path more than one at a point. 1000 stars of 100 px in place of 22 take 0.3 ms, on paths
+# 0.7 ms, where `round` takes 3.9 ms in all and `exact` 7.0 (llvmpipe, two busy cores, processor
+# time, turning at 1 deg/s; in a ratio to 0.002 ms a star).
+PIXEL_MS, PATH_MS = 2e-6, 4e-4
+GLASS_MS_A_STAR = 0.01  # results/kinds_h200.csv: 27 ms more for 3615 stars
+# Stars that move less than these shares of the tolerance may be drawn as points.
+MOTION_SHARES = (0.05, 0.1, 0.25, 0.5)
+# Where no combination is within the tolerance, the other parts may add so much of it to the codes'
+# error.
+SLIGHT = 0.01
 IN_TIME_SHARE = 0.5  # share of a refresh period that a frame may take
 CHEAP, BEST = BY_COST[0], BY_COST[-1]
-# Between these times, in limits, a measured frame leaves the choice as the table has it: two starts of a run then have the same
-# codes. Other programs slow frames down, and nothing speeds them up: the upper time is a whole refresh.
+# Between these times, in limits, a measured frame leaves the choice as the table has it: two starts
+# of a run then have the same codes. Other programs slow frames down, and nothing speeds them up:
+# the upper time is a whole refresh.
 SURELY_IN_TIME, SURELY_LATE = 0.8, 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class CodeErrors:
-    """The maximum errors of a quantisation, and by whose measure of place; no place where its flux alone is too far off."""
-
-    flux_mag: float
-    place_px: float
-    centroider: Centroider | None
-
-    def within(self, limit_mag: float, limit_px: float) -> bool:
-        """Whether both are within their limits."""
-        return self.flux_mag <= limit_mag and self.place_px <= limit_px
-
-
-@dataclass(frozen=True, slots=True)
-class ChosenCodes:
-    """A quantisation with its maximum errors, and whether the time of a frame took part in the choice."""
-
-    method: Quantisation
-    errors: CodeErrors
-    choice: Choice
-    by_cost: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ChosenSides:
-    """The sides of sprites by rate (see `Target.sides`), and what their edges cost: flux, and the shift of a centroid."""
-
-    sides: SpriteSides
-    cut_mag: float
-    moved_px: float
-    choice: Choice
-
-
-ENCODING = Choice(
-    "encoding", "under the sprites, or all pixels where sprites cover more", "exact", "the cheaper one, frame by frame"
-)
-PROJECTION = Choice("projection", "perspective", "exact", "a weak one would save nothing, and fails off the middle")
+NO_ERROR = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,45 +68,31 @@ class FieldCost:
 
 
 @dataclass(frozen=True, slots=True)
-class Effort:
-    """The effort for a bench's stars: quantisation, sprite sides by rate (see `Target.sides`), and the smallest motion drawn.
-
-    `error_mag` and `error_px` bound the error of all choices together, at the faintest star and the worst phase. `by_cost` says
-    whether the time of a frame took part in the choice of the quantisation.
-    """
-
-    quantisation: Quantisation
-    sides: SpriteSides
-    motion_above_px: float
-    error_mag: float
-    error_px: float
-    choices: tuple[Choice, ...]
-    by_cost: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Light:
     """The light of a bench: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
 
-    `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
-    whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider` what it finds stars by: None
-    where the bench does not say, and then all of them judge. `psf` is how stars are drawn. The exposure has
-    `exposure_frames`. `cost` is what a quantiser costs by the table, `measured` what it costs where the bench is drawn (None:
-    not measured).
+    `sky_share` is the share of the whole sky that the screen covers. `seen` is how the tracker sees
+    the monitor, `centroider` what it finds stars by: None where the bench does not say, and then
+    all of them judge. `psf` is how stars are drawn, and `psf_choice` why so where the tolerance
+    decides. The exposure has `exposure_frames`. `cost` is what a quantiser costs by the table,
+    `measured` what it costs where the bench is drawn (None: not measured). Of a scene that turns,
+    `turning` is how far a star of a frame without paths is from its place, in units of its motion;
+    0 for a scene at rest.
     """
 
     response: Response
     white_e_per_s: float
     rates_e_per_s: FloatArray
-    can_steal_bits: bool = False
     sky_share: float = 0.0
     refresh_hz: float = 60.0
     seen: Seen = AS_USUAL
     centroider: Centroider | None = None
     psf: Psf = USUAL_PSF
+    psf_choice: Choice | None = None
     exposure_frames: int = EXPOSURE_FRAMES
     cost: Callable[[type[Quantiser], Psf], LevelCost] = level_cost
     measured: FieldCost | None = None
+    turning: float = 0.0
 
     @property
     def panel(self) -> Panel:
@@ -145,103 +104,186 @@ class Light:
         """The centroiders that judge where codes show a star."""
         return FAMILY if self.centroider is None else (self.centroider,)
 
+    @property
+    def stars(self) -> float:
+        """How many stars an average field shows."""
+        lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
+        return self.sky_share * float(np.count_nonzero(lit))
+
     def tabulated_cost(self, psf: Psf) -> FieldCost:
         """The cost of codes by the quantisers' own figures: on two cores without a GPU."""
-        lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
-        stars = self.sky_share * float(np.count_nonzero(lit))
         cheap, best = (self.cost(QUANTISERS[method], psf) for method in (CHEAP, BEST))
-        return FieldCost(cheap.a_star_ms * stars, best.a_star_ms * stars, "on two cores without a GPU", best.why)
+        return FieldCost(
+            cheap.a_star_ms * self.stars,
+            best.a_star_ms * self.stars,
+            "on two cores without a GPU",
+            best.why,
+        )
 
     @property
     def refresh_ms(self) -> float:
         """The time between two frames."""
         return 1e3 / self.refresh_hz
 
+    def code_stars(self) -> CodeStars:
+        """The catalogue's stars for the worst errors of codes."""
+        peaks = self.rates_e_per_s * (self.psf.peak_share / self.white_e_per_s)
+        return code_stars(self.psf, self.seen, self.exposure_frames, self.judges, self.response, peaks)
+
+
+@dataclass(frozen=True, slots=True)
+class Sides:
+    """A candidate for sprites: their sides by rate (see `Target.sides`), with what their edges cut.
+
+    They cut light that is shown of stars up to `cut_to_mag` below full scale.
+    """
+
+    sides: SpriteSides
+    choice: Choice
+    cut_to_mag: float = math.inf
+
+    def beside(self, codes: CodeErrors) -> Choice:
+        """The choice, with what it adds to the codes' worst: bright stars are cut, faint ones rounded."""
+        flux_mag, place_px = codes.brighter_than(self.cut_to_mag)
+        more_mag = flux_mag + self.choice.error_mag - codes.flux_mag
+        more_px = place_px + self.choice.error_px - codes.place_px
+        if not math.isfinite(more_mag) or not math.isfinite(more_px):
+            return self.choice
+        return replace(self.choice, error_mag=max(more_mag, 0.0), error_px=max(more_px, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A candidate for paths: the smallest motion that is drawn as one."""
+
+    above_px: float
+    choice: Choice
+
+
+@dataclass(frozen=True, slots=True)
+class Combination:
+    """A candidate of each part; the codes' errors are found when they are asked for."""
+
+    method: Quantisation
+    method_ms: float
+    sprites: Sides
+    motion: Motion
+
+    @property
+    def ms(self) -> float:
+        """The time of all parts together."""
+        return self.method_ms + self.sprites.choice.ms + self.motion.choice.ms
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The effort for a bench's stars: quantisation, sprite sides by rate, and the smallest motion drawn.
+
+    `by_cost` says whether the time of a frame took part in the choice of the quantisation, `asked`
+    and `light` what the choice was made for. Errors are the worst of all choices together, of the
+    catalogue's stars at any phase; they are found when they are first asked for.
+    """
+
+    asked: RenderSettings
+    light: Light
+    taken: Combination
+    by_cost: bool = False
+
+    @property
+    def quantisation(self) -> Quantisation:
+        """The codes."""
+        return self.taken.method
+
+    @property
+    def sides(self) -> SpriteSides:
+        """The sides of sprites by rate."""
+        return self.taken.sprites.sides
+
+    @property
+    def motion_above_px(self) -> float:
+        """The smallest motion that is drawn as a path."""
+        return self.taken.motion.above_px
+
+    @cached_property
+    def _found(self) -> CodeErrors:
+        """The codes' worst errors if they are within the tolerance; else the first that are over it."""
+        return worst_errors(self.light.code_stars(), self.quantisation, self._tolerance)
+
+    @property
+    def _tolerance(self) -> tuple[float, float]:
+        return self.asked.tolerance_mag, self.asked.tolerance_px
+
+    @cached_property
+    def codes(self) -> CodeErrors:
+        """The worst errors of the codes."""
+        if self._found.within(self._tolerance):
+            return self._found
+        return worst_errors(self.light.code_stars(), self.quantisation)
+
+    @cached_property
+    def choices(self) -> tuple[Choice, ...]:
+        """The choice of each part."""
+        parts = [code_part(self), self.taken.sprites.beside(self.codes), self.taken.motion.choice]
+        if self.light.psf_choice is not None:
+            parts.append(psf_part(self.light, self.light.psf_choice))
+        return (*parts, depth_part(self))
+
+    @property
+    def error_mag(self) -> float:
+        """The worst error of a star's light."""
+        return sum(choice.error_mag for choice in self.choices)
+
+    @property
+    def error_px(self) -> float:
+        """The worst error of a star's place."""
+        return sum(choice.error_px for choice in self.choices)
+
+    @property
+    def within(self) -> bool:
+        """Whether both are within the tolerance; found sooner than how far they are over it."""
+        if not self._found.within(self._tolerance):
+            return False
+        return self.error_mag <= self.asked.tolerance_mag and self.error_px <= self.asked.tolerance_px
+
 
 def plan_effort(render: RenderSettings, light: Light) -> Effort:
-    """The effort of a bench file's settings."""
-    codes = choose_codes(render, light)
-    method, errors = codes.method, codes.errors
-    if render.effort == "full":
-        motion_px = render.motion_above_px
-        return Effort(
-            method, (), motion_px, errors.flux_mag, errors.place_px + motion_px, (codes.choice,), by_cost=codes.by_cost
-        )
-    sprites, rates = choose_sides(render, light, method), light.rates_e_per_s
-    limit = QUANTISERS[method].faintest_e_per_s(light.panel, light.psf)
-    dark = rates < limit
-    share = float(rates[dark].sum() / rates.sum()) if dark.any() else 0.0
-    stars = Choice(
-        "stars",
-        f"from {limit:.3g} electrons/s on",
-        f"the others light no pixel ({share:.2%} of all light)",
-        f"{int(dark.sum())} of {len(dark)} stars in the sky are not drawn",
-    )
-    motion_px = max(render.motion_above_px, MOTION_SHARE * render.tolerance_px)
-    paths = Choice(
-        "paths",
-        f"stars move from {motion_px:g} px within a frame on, in as few sprites as their paths need",
-        f"{motion_px:g} px maximum",
-        "a slower frame is drawn as points",
-    )
-    return Effort(
-        quantisation=method,
-        sides=sprites.sides,
-        motion_above_px=motion_px,
-        error_mag=errors.flux_mag + sprites.cut_mag,
-        error_px=errors.place_px + sprites.moved_px + motion_px,
-        choices=(stars, codes.choice, sprites.choice, ENCODING, paths, PROJECTION),
-        by_cost=codes.by_cost,
-    )
+    """The cheapest combination within the tolerance; where none is, the most accurate one.
 
-
-def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
-    """One line for each choice, and the total error."""
-    if effort is None:
-        codes = f"quantisation = {render.quantisation}, as the file has it"
-        return [f'effort: full, {codes}; write [render] effort = "auto" or quantisation = "auto" to have it chosen']
-    total = f"{effort.error_mag:.4f} mag of {render.tolerance_mag:g}, {effort.error_px:.4f} px of {render.tolerance_px:g}"
-    within = effort.error_mag <= render.tolerance_mag and effort.error_px <= render.tolerance_px
-    return [
-        *(choice.line() for choice in effort.choices),
-        f"together, worst case: {total}{'' if within else ': OVER the tolerance'}",
-    ]
-
-
-def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
-    """The cheapest quantisation whose errors are within the codes' part of the tolerance; the most accurate one if none is.
-
-    `auto` does not take `exact` where that would be late in fields of many stars and `round` would not.
+    What the file fixes is the only candidate of its part.
     """
-    table = light.tabulated_cost(light.psf)
-    known = light.measured
-    if known is None and render.codes_ms is not None:
-        known = FieldCost(*render.codes_ms, "by [render] codes_ms")
-    cost, in_time = known or table, exact_in_time(table, known, IN_TIME_SHARE * light.refresh_ms)
-    wanted = (BY_COST if in_time else BY_COST[:1]) if render.quantisation == "auto" else (render.quantisation,)
-    limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
-    stars = _code_stars(render, light)
-    for method in wanted:
-        errors = _code_errors(stars, method, math.inf if method == wanted[-1] else limits[0])
-        within = errors.within(*limits)
-        if within:
-            break
-    whom = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
-    whom = f"as `{errors.centroider}` finds stars{whom}, from white to the faintest star"
-    error = f"{errors.flux_mag:.4f} mag and {errors.place_px:.4f} px maximum, {whom}"
     auto = render.quantisation == "auto"
-    if not within and auto and not in_time:
-        price = f"{cost.best_ms:.0f} ms of {light.refresh_ms:.0f} ({CHEAP} {cost.cheap_ms:.0f}) for an average field at 1 deg/s"
-        price += f" {cost.where}, {cost.why}" if cost.why else f" {cost.where}"
-        error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "{BEST}" is nearer and takes {price})'
-    elif not within:
-        ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
-        error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"
-    longer = cost.best_ms / cost.cheap_ms if cost.cheap_ms else 1.0
-    saving = f"{BEST} takes {longer:.2g} times as long" if method == CHEAP else "nothing saved"
-    if method == BEST:
-        saving = f"an average field at 1 deg/s takes {cost.best_ms:.2g} ms of {light.refresh_ms:.3g} {cost.where}"
-    return ChosenCodes(method, errors, Choice("codes", method, error, saving), auto and not (method == CHEAP and within))
+    methods = _methods(render, light)
+    combinations = sorted(_combinations(render, light, methods), key=lambda one: one.ms)
+    best = [one for one in combinations if one.method == methods[-1]]
+    # A single combination is not tested where nothing is left to choose: its errors take 0.1 s.
+    tested = combinations if len(best) > 1 else [one for one in combinations if one.method != methods[-1]]
+    stars = light.code_stars() if tested else None
+    for one in tested:
+        if stars is not None and _is_within(render, light, stars, one):
+            return Effort(render, light, one, by_cost=auto and one.method != CHEAP)
+    taken = next(one for one in best if _is_slight(render, one))
+    return Effort(render, light, taken, by_cost=auto)
+
+
+def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
+    """The quantisations to choose among, from the cheapest on.
+
+    `auto` does not take `exact` where that would be late in fields of many stars and `round` would
+    not.
+    """
+    if render.quantisation != "auto":
+        return (render.quantisation,)
+    table, known = light.tabulated_cost(light.psf), known_cost(render, light)
+    if exact_in_time(table, known, IN_TIME_SHARE * light.refresh_ms):
+        return BY_COST
+    return BY_COST[:1]
+
+
+def known_cost(render: RenderSettings, light: Light) -> FieldCost | None:
+    """What codes cost where they are drawn, measured or by the file; None where neither says so."""
+    if light.measured is None and render.codes_ms is not None:
+        return FieldCost(*render.codes_ms, "by [render] codes_ms")
+    return light.measured
 
 
 def exact_in_time(table: FieldCost, measured: FieldCost | None, limit_ms: float) -> bool:
@@ -253,80 +295,136 @@ def exact_in_time(table: FieldCost, measured: FieldCost | None, limit_ms: float)
     return table.in_time(limit_ms)
 
 
-@dataclass(frozen=True, slots=True)
-class _CodeStars:
-    """Stars at every sub-pixel phase, from full scale to the faintest of a bench, and the tracker that looks at them.
-
-    `tables` are the response's arrays, by whose content two benches' stars are the same.
-    """
-
-    psf: Psf
-    seen: Seen
-    frames: int
-    kinds: tuple[Centroider, ...]
-    mags: tuple[float, ...]
-    tables: tuple[bytes, ...]
-    response: Response = field(compare=False)
+def _combinations(render: RenderSettings, light: Light, methods: tuple[Quantisation, ...]) -> Iterator[Combination]:
+    motions = motion_candidates(render, light)
+    for method in methods:
+        method_ms = codes_ms(render, light, method)
+        sprites = side_candidates(render, light, method)
+        for sides in sprites:
+            for motion in motions:
+                yield Combination(method, method_ms, sides, motion)
 
 
-def _code_stars(render: RenderSettings, light: Light) -> _CodeStars:
-    psf, response = light.psf, light.response
-    faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
-    deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / psf.peak_share / faintest))
-    mags = tuple(np.linspace(0.0, deepest, MAGNITUDES).tolist())
-    arrays = (response.light, response.threshold, *(() if response.rgb is None else (response.rgb,)))
-    tables = tuple(array.tobytes() for array in arrays)
-    return _CodeStars(psf, light.seen, light.exposure_frames, light.judges, mags, tables, response)
+def _is_within(render: RenderSettings, light: Light, stars: CodeStars, one: Combination) -> bool:
+    """Whether the errors of all parts together are within the tolerance."""
+    tolerance = render.tolerance_mag, render.tolerance_px
+    codes = worst_errors(stars, one.method, tolerance)
+    if not codes.within(tolerance):
+        return False
+    parts = [one.sprites.beside(codes), one.motion.choice]
+    if light.psf_choice is not None:
+        parts.append(light.psf_choice)
+    mag = codes.flux_mag + sum(part.error_mag for part in parts)
+    px = codes.place_px + sum(part.error_px for part in parts)
+    return mag <= tolerance[0] and px <= tolerance[1]
 
 
-@lru_cache(maxsize=4)
-def _looked_at(psf: Psf, seen: Seen) -> tuple[Sprites, FloatArray, Judge]:
-    """The stars as bright as white, their light, and the tracker that looks at them."""
-    sprites, _ = phase_grid(PHASES, psf, UNLIKE)
-    bright = phase_image(sprites, psf)
-    return sprites, bright, Judge(bright, line_places(sprites), psf.width_px, seen.blur_px, seen.pixel_px)
+def _is_slight(render: RenderSettings, one: Combination) -> bool:
+    """Whether sprites and paths add next to nothing to the codes' error, or as little as they can."""
+    sprites, motion = one.sprites.choice, one.motion
+    share = max(sprites.error_mag / render.tolerance_mag, sprites.error_px / render.tolerance_px)
+    is_whole = sprites.error_mag <= MAG_PER_SHARE * MAX_CUT
+    return (is_whole or share <= SLIGHT) and motion.above_px <= render.motion_above_px
 
 
-@lru_cache(maxsize=16)  # the benches of a campaign, a verdict or a study have few monitors, and this is half of loading one
-def _code_errors(stars: _CodeStars, method: Quantisation, limit_mag: float) -> CodeErrors:
-    """The maximum errors of a method over phases and magnitudes; where its light is beyond a limit, of its light alone."""
-    sprites, bright, judge = _looked_at(stars.psf, stars.seen)
-    panel, balance = Panel(stars.response, WHITE), Balance(stars.psf, stars.seen)
-    flux_mag, shown = 0.0, []
-    for mag in reversed(stars.mags):  # the faintest are off the furthest
-        linear = (bright * flux_ratio(mag)).astype(np.float32)
-        image = shown_by(method, stars.frames, panel, linear, fainter(sprites, mag), balance)
-        flux_mag = max(flux_mag, judge.errors(image, flux_ratio(mag), ()).flux_max_mag)
-        if flux_mag > limit_mag:
-            return CodeErrors(flux_mag, math.inf, None)
-        shown.append(image.copy())
-    found = [judge.errors(image, flux_ratio(mag), stars.kinds) for image in shown]
-    worst = max(found, key=lambda errors: errors.max_px(errors.worst()))
-    kind = worst.worst()
-    return CodeErrors(flux_mag, worst.max_px(kind), kind)
+def _scale(render: RenderSettings, light: Light) -> float:
+    """How long a frame takes where it is drawn, by the table's time."""
+    table, known = light.tabulated_cost(light.psf), known_cost(render, light)
+    return 1.0 if known is None or not table.cheap_ms else known.cheap_ms / table.cheap_ms
 
 
-def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> ChosenSides:
-    """The smallest sprites whose edges stay within their part of the tolerance."""
+def codes_ms(render: RenderSettings, light: Light, method: Quantisation) -> float:
+    """The time of a frame of an average field that is not its sprites' pixels and paths."""
+    scale = _scale(render, light)
+    known = known_cost(render, light)
+    whole_ms = light.cost(QUANTISERS[method], light.psf).a_star_ms * light.stars * scale
+    if known is not None and method in BY_COST:
+        whole_ms = known.cheap_ms if method == CHEAP else known.best_ms
+    others_ms = scale * light.stars * (PIXEL_MS * light.psf.footprint_px**2 + PATH_MS)
+    return max(whole_ms - others_ms, 0.0)
+
+
+def code_part(effort: Effort) -> Choice:
+    """The choice of the codes."""
+    render, light, method = effort.asked, effort.light, effort.quantisation
+    errors = effort.codes
+    cost = known_cost(render, light) or light.tabulated_cost(light.psf)
+    ms = codes_ms(render, light, method)
+    saved_ms = max(codes_ms(render, light, BEST) - ms, 0.0)
+    notes = []
+    if errors.centroider is not None:
+        whom = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
+        notes.append(f"as `{errors.centroider}` finds stars{whom}")
+    if not math.isfinite(errors.flux_mag):
+        notes.append("the faintest stars of the catalogue show nothing")
+    if method == BEST or (render.quantisation == "auto" and len(_methods(render, light)) == 1):
+        notes.append(_price(cost, light))
+    return Choice("codes", method, errors.flux_mag, errors.place_px, ms, saved_ms, "; ".join(notes))
+
+
+def _price(cost: FieldCost, light: Light) -> str:
+    """What `exact` takes of a refresh."""
+    words = f"exact takes {cost.best_ms:.2g} ms of {light.refresh_ms:.3g} (round {cost.cheap_ms:.2g})"
+    words += f" for an average field at 1 deg/s {cost.where}"
+    return f"{words}, {cost.why}" if cost.why else words
+
+
+def side_candidates(render: RenderSettings, light: Light, method: Quantisation) -> list[Sides]:
+    """Sprites from the smallest to the whole footprint; the whole one alone at full effort."""
     psf = light.psf
     full = psf.footprint_px
-    allowed_mag, allowed_px = EDGES_SHARE * render.tolerance_mag, EDGES_SHARE * render.tolerance_px
-    sizes = range(0) if psf.by_place else range(full % 2 or 2, full, 2)
-    largest = next((s for s in sizes if cut_mag(s, psf) <= allowed_mag and cut_px(s, psf) <= allowed_px), full)
+    sizes = list(range(full % 2 or 2, full, 2))
+    pixels_ms = PIXEL_MS * light.stars * _scale(render, light)
+    found = []
+    if render.effort == "auto" and not psf.by_place:
+        for size in sizes:
+            sides = _sides(light, method, sizes, size)
+            mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
+            chosen = f"{min(side.side_px for side in sides)} to {size} px a side, of {full}"
+            saved_ms = pixels_ms * (full**2 - mean_px)
+            choice = Choice(
+                "sprites",
+                chosen,
+                cut_mag(size, psf),
+                cut_px(size, psf),
+                pixels_ms * mean_px,
+                saved_ms,
+            )
+            found.append(Sides(sides, choice, _cut_to_mag(light, method, size)))
+    sides = _sides(light, method, sizes, full) if render.effort == "auto" and not psf.by_place else ()
+    mean_px = _mean_area_px(sides, light.rates_e_per_s, full)
+    smallest = min((side.side_px for side in sides), default=full)
+    chosen = f"{smallest} to {full} px a side" if smallest < full else f"{full} px a side"
+    saved_ms = pixels_ms * (full**2 - mean_px)
+    cut = MAG_PER_SHARE * MAX_CUT
+    found.append(Sides(sides, Choice("sprites", chosen, cut, 0.0, pixels_ms * mean_px, saved_ms)))
+    return found
+
+
+def _sides(light: Light, method: Quantisation, sizes: list[int], largest: int) -> SpriteSides:
+    """The largest sprite, and the smaller ones of stars whose light beyond them lights no pixel."""
     sides = [(math.inf, largest)]
-    if unlit := UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel):
+    unlit = UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel)
+    if unlit:
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
-        sides += [(unlit / psf.outside_share(size), size) for size in sizes[::-1] if size < largest]
-    kept = tuple(SpriteSide(min(rate, 3e38), size) for rate, size in sides[:MAX_SIDES])
-    rates = light.rates_e_per_s
-    area = np.full(len(rates), full**2)
-    for side in kept:
-        area[rates < side.below_e_per_s] = side.side_px**2
-    cut = (cut_mag(largest, psf), cut_px(largest, psf)) if largest < full else (MAG_PER_SHARE * MAX_CUT, 0.0)
-    mean = float(area.mean()) if len(area) else float(full**2)
-    chosen = f"{min(side.side_px for side in kept)} to {largest} px a side instead of {full}"
-    error = f"{cut[0]:.1e} mag and {cut[1]:.1e} px cut"
-    return ChosenSides(kept, *cut, Choice("sprites", chosen, error, f"{full**2 / mean:.1f} times fewer pixels"))
+        sides += [(unlit / light.psf.outside_share(size), size) for size in sizes[::-1] if size < largest]
+    return tuple(SpriteSide(min(rate, 3e38), size) for rate, size in sides[:MAX_SIDES])
+
+
+def _cut_to_mag(light: Light, method: Quantisation, size_px: int) -> float:
+    """The magnitude below full scale from which on what is beyond a sprite lights no pixel."""
+    unlit = UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel)
+    if not unlit:
+        return math.inf
+    rate = unlit / light.psf.outside_share(size_px)
+    return -2.5 * math.log10(rate * light.psf.peak_share / light.white_e_per_s)
+
+
+def _mean_area_px(sides: SpriteSides, rates_e_per_s: FloatArray, full: int) -> float:
+    area = np.full(len(rates_e_per_s), full**2)
+    for side in sides:
+        area[rates_e_per_s < side.below_e_per_s] = side.side_px**2
+    return float(area.mean()) if len(area) else float(full**2)
 
 
 def cut_mag(size_px: int, psf: Psf) -> float:
@@ -343,3 +441,52 @@ def cut_px(size_px: int, psf: Psf) -> float:
         moments = np.array([(shares @ at).sum(), (at @ shares).sum()])
         worst = np.maximum(worst, np.abs(moments / shares.sum()))
     return math.hypot(*worst)
+
+
+def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
+    """From which motion on stars are paths: none at rest; else from the file's on, or from more."""
+    floor_px = render.motion_above_px
+    if not light.turning:
+        return [Motion(floor_px, Choice("paths", "none: nothing moves within a frame", *NO_ERROR))]
+    path_ms = PATH_MS * light.stars * _scale(render, light)
+    above_px = [floor_px]
+    if render.effort == "auto":
+        above_px += [share * render.tolerance_px for share in MOTION_SHARES if share * render.tolerance_px > floor_px]
+    found = []
+    for px in above_px:
+        # Only frames between the file's motion and this one are drawn sooner.
+        ms, saved_ms = (path_ms, 0.0) if px == floor_px else (0.0, path_ms)
+        note = "" if px == floor_px else "saves in frames that move less"
+        choice = Choice(
+            "paths",
+            f"from {px:g} px within a frame on",
+            0.0,
+            px * light.turning,
+            ms,
+            saved_ms,
+            note,
+        )
+        found.append(Motion(px, choice))
+    return found
+
+
+def psf_part(light: Light, choice: Choice) -> Choice:
+    """The choice of the PSF, with what a glass takes."""
+    glass_ms = GLASS_MS_A_STAR * light.stars
+    if isinstance(light.psf, GlassPsf):
+        return replace(choice, ms=glass_ms)
+    return replace(choice, saved_ms=glass_ms)
+
+
+def depth_part(effort: Effort) -> Choice:
+    """The stars that are drawn: all but those that light no pixel."""
+    light = effort.light
+    rates = light.rates_e_per_s
+    limit = QUANTISERS[effort.quantisation].faintest_e_per_s(light.panel, light.psf)
+    dark = rates < limit
+    if not dark.any():
+        return Choice("depth", "all stars of the catalogue", *NO_ERROR)
+    share = float(rates[dark].sum() / rates.sum())
+    saved_ms = light.sky_share * float(dark.sum()) * light.cost(QUANTISERS[effort.quantisation], light.psf).a_star_ms
+    note = f"{int(dark.sum())} of {len(dark)} stars light no pixel, {share:.2%} of all light"
+    return Choice("depth", f"from {limit:.3g} electrons/s on", *NO_ERROR, 0.0, saved_ms, note)

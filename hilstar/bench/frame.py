@@ -119,19 +119,19 @@ class Drawn:
 class Bench:
     """A bench, assembled (see `build`): stars, geometry, light and a renderer. Free it with `close`.
 
-    `config` is that of `file` with everything chosen that the file left to its tolerance (`effort`, None where it left
-    nothing). Of `stars` those from `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are
-    `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of white, None where that is 1 everywhere, and
-    `darkest` its minimum. `tracker_psf` is how collimator and tracker spread a monitor's point. `drawn` says which PSF
-    stars are drawn by where the display brings the tracker's; `spectra` are their shares of its wavelengths, by place.
-    `sources` are the sky's light beside stars, whose bodies have places among `stars` and `shown_stars`.
-    `output` says how the display's output is set that its frames are shown on; {} without one. `panel` is the monitor's light
-    by its levels. Where its primaries are driven apart, `colours` says what for, and stars have the light of each.
+    `config` is that of `file` with everything chosen that the file left to its tolerance, by `effort`. Of `stars` those from
+    `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are `faint_stars`. `uniformity`, float32
+    (height, width), is each pixel's share of white, None where that is 1 everywhere, and `darkest` its minimum. `tracker_psf`
+    is how collimator and tracker spread a monitor's point. `drawn` says which PSF stars are drawn by where the display brings
+    the tracker's; `spectra` are their shares of its wavelengths, by place. `sources` are the sky's light beside stars, whose
+    bodies have places among `stars` and `shown_stars`. `output` says how the display's output is set that its frames are shown
+    on; {} without one. `panel` is the monitor's light by its levels. Where its primaries are driven apart, `colours` says what
+    for, and stars have the light of each.
     """
 
     file: BenchFile
     config: BenchConfig
-    effort: Effort | None
+    effort: Effort
     camera: Camera
     scan: Scan
     calibration: Calibration

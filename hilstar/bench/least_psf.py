@@ -25,16 +25,25 @@ COMPONENTS = (3, 6, 12)
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One choice: its subject, its value, its error, and what it saves compared with full effort."""
+    """One choice of a part of a frame: its largest errors, its time in a frame of an average field, and what that saves.
 
-    what: str
-    chosen: str
-    error: str
-    saving: str
+    `note` is what else there is to know of it, "" for nothing.
+    """
+
+    part: str
+    choice: str
+    error_mag: float
+    error_px: float
+    ms: float = 0.0
+    saved_ms: float = 0.0
+    note: str = ""
 
     def line(self) -> str:
         """The choice as one line of text."""
-        return f"{self.what}: {self.chosen}; {self.error}; {self.saving}"
+        error = "exact"
+        if self.error_mag or self.error_px:
+            error = f"{self.error_mag:.2g} mag and {self.error_px:.2g} px off at most"
+        return "; ".join(part for part in (f"{self.part}: {self.choice}", error, self.note) if part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,24 +71,47 @@ def candidates(psf: SampledPsf) -> Iterator[tuple[str, Callable[[], Psf]]]:
     yield WHOLE if isinstance(psf, GlassPsf) else ONE_PSF, lambda: psf
 
 
-def least_psf(
-    psf: SampledPsf, places_px: FloatArray, tolerance: tuple[float, float], among: frozenset[str] | None = None
-) -> tuple[Psf, Choice]:
-    """The first of `candidates` (by name those `among` them) within a tolerance, mag and px, at places (n, 2) of the field."""
-    seen: list[str] = []
+def psf_choices(psf: SampledPsf, places_px: FloatArray, among: frozenset[str] | None = None) -> Iterator[tuple[Psf, Choice]]:
+    """Each of `candidates` (by name those `among` them) with its errors at places (n, 2) of the field, itself at last.
+
+    A choice's note says how far off those before it are.
+    """
+    before: list[str] = []
     for name, make in candidates(psf):
         if among is not None and name not in among:
             continue
         try:
-            found = make()
+            other = make()
         except InputError:  # negative lobes or noise, which only the whole sum makes up for
             continue
-        errors = psf_errors(psf, found, places_px)
-        if (errors.mag <= tolerance[0] and errors.px <= tolerance[1]) or found is psf:
+        errors = PsfErrors(0.0, 0.0) if other is psf else psf_errors(psf, other, places_px)
+        note = "; ".join(before) or "more would gain no more than that"
+        yield other, Choice("PSF", name, errors.mag, errors.px, note=note)
+        before.append(f"{name} would be {errors.line()} off")
+
+
+def least_psf(
+    psf: SampledPsf, places_px: FloatArray, tolerance: tuple[float, float], among: frozenset[str] | None = None
+) -> tuple[Psf, Choice]:
+    """The first of `psf_choices` within a tolerance, mag and px; the last where none is."""
+    found, choice = first_within(psf_choices(psf, places_px, among), tolerance)
+    if choice is None:
+        raise AssertionError("each of them has its errors")
+    return found, choice
+
+
+def first_within(
+    found: Iterator[tuple[Psf, Choice]] | Iterator[tuple[Psf, Choice | None]], tolerance: tuple[float, float]
+) -> tuple[Psf, Choice | None]:
+    """The first PSF whose own errors are within a tolerance, mag and px, or that is no choice; the last where none is."""
+    last: tuple[Psf, Choice | None] | None = None
+    for last in found:
+        choice = last[1]
+        if choice is None or (choice.error_mag <= tolerance[0] and choice.error_px <= tolerance[1]):
             break
-        seen.append(f"{name} would be {errors.line()} off")
-    error = "exact" if found is psf else f"{errors.line()} off at most"
-    return found, Choice("PSF", name, error, "; ".join(seen) or "more would gain no more than that")
+    if last is None:
+        raise AssertionError("the PSF itself is always among them")
+    return last
 
 
 def psf_errors(psf: SampledPsf, other: Psf, places_px: FloatArray) -> PsfErrors:

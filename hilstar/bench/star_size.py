@@ -166,7 +166,7 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
     """The star of a bench whose monitor stands as `display` has it. Raises InputError."""
     tracker, limit = tracker_camera(config.tracker, folder), config.verify.star_sigma_ratio
     ratio = tracker.focal_length_px / display.focal_length_px
-    sprite, _ = display_psf(config, folder, display)
+    sprite = display_psf(config, folder, display)
     lens, sky = (_in_the_middle(psf) for psf in (before_detector(config, folder, display), tracker_psf(config.tracker, folder)))
     blur_px = config.collimator.psf_sigma_px
     # A sprite that is the tracker's own PSF is as wide on the detector whatever the ratio.

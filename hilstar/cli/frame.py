@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from hilstar.cli import options
-from hilstar.cli.running import explain_bench, optional_scenario, say_optics
+from hilstar.cli.running import explain_bench, explained_effort, optional_scenario, say_optics
 from hilstar.console.terminal import print_found
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, check_ending
@@ -39,13 +39,7 @@ def frame(
 
     file = read_bench_file(bench_file)
     q = options.parse_attitude("frame", radec, quaternion)
-    targets = [path for path in (output, truth, codes, preview) if path is not None]
-    if not targets:
-        raise InputError("frame: no output was asked for; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
-    check_ending("-o", output, FITS)
-    check_ending("--truth", truth, CSV)
-    check_ending("--codes", codes, PNG)
-    check_ending("--preview", preview, PNG)
+    targets = _targets(output, truth, codes, preview)
     t_ns, wrong = options.parse_at("frame", at, file.config, scenario is not None), optional_scenario(scenario)
     file = at_moment(file, t_ns)
     options.check_files([scenario], targets, file)
@@ -83,6 +77,7 @@ def frame(
             "star": star.keys(),
             "gl_renderer": bench.renderer.gl_renderer,
         }
+        summary |= explained_effort(bench, explain and as_json)
     names = f", clipped: {clipped_text(summary['clipped_mag'])}" if clipped else ""
     missing = summary["left_out"]
     if missing["stars"]:
@@ -92,6 +87,18 @@ def frame(
     drawn = f"{len(shot.rows)} stars{names}; wrote {', '.join(summary['written'])}"
     print_found(as_json, summary, [drawn, fields.line(), star.line()])
     say_optics(fields, star)  # after the refusals: a failing command prints one line
+
+
+def _targets(output: Path | None, truth: Path | None, codes: Path | None, preview: Path | None) -> list[Path]:
+    """The files to write. Raises InputError for none, and for one of another kind."""
+    check_ending("-o", output, FITS)
+    check_ending("--truth", truth, CSV)
+    check_ending("--codes", codes, PNG)
+    check_ending("--preview", preview, PNG)
+    targets = [path for path in (output, truth, codes, preview) if path is not None]
+    if not targets:
+        raise InputError("frame: no output was asked for; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
+    return targets
 
 
 def clipped_text(loss_mag: dict[int | str, float]) -> str:

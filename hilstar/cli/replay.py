@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
+from msgspec.structs import replace as replaced
 from typer import Argument, Option
 
 from hilstar.cli import options, running
@@ -88,4 +89,5 @@ def replay(
         ):
             outlet = Outlet(screen, kept, notices, None, follower, requests, wrong, pulse, answers)
             summary = replay_log(bench, play, sink, outlet)
+        summary = replaced(summary, **running.effort_of_run(bench, explain, as_json))
     running.end_of_run(summary, screen, kept, notices, as_json, strict)

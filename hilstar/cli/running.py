@@ -102,7 +102,7 @@ FRAMES_HELP = "Send each frame's codes to whoever watches there, such as tcp://1
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
     """Explain the attitudes' source, that of the stars, the choices within the tolerance, and bodies that are discs then."""
-    from hilstar.bench.effort import explain
+    from hilstar.bench.effort_report import effort_lines
     from hilstar.bench.moving import observer_lines, satellite_lines, wide_bodies
     from hilstar.frame.diffuse import DiffuseLayer
 
@@ -110,13 +110,27 @@ def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] 
     for line in [
         *of_source,
         *bench.stars.catalog.notes,
-        *explain(bench.effort, bench.config.render),
+        *effort_lines(bench),
         *observer_lines(bench.config),
         *wide_bodies(moving, bench.camera, t_ns),
         *satellite_lines(moving, t_ns),
         *(layer.line() for layer in bench.layers if isinstance(layer, DiffuseLayer)),
     ]:
         say(line)
+
+
+def effort_of_run(bench: Any, explain: bool, as_json: bool) -> dict[str, dict[str, Any]]:
+    """The key "effort" of a run's JSON, where the bench leaves something to its tolerance or it is to be explained; else {}."""
+    asked = bench.effort.asked
+    chosen = asked.effort == "auto" or asked.quantisation == "auto"
+    return explained_effort(bench, as_json and (explain or chosen))
+
+
+def explained_effort(bench: Any, wanted: bool) -> dict[str, dict[str, Any]]:
+    """The key "effort" of a JSON object, if it is wanted; else {}."""
+    from hilstar.bench.effort_report import effort_keys
+
+    return {"effort": effort_keys(bench)} if wanted else {}
 
 
 @contextmanager

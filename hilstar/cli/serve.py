@@ -188,6 +188,7 @@ def serve(
         ):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), *fed[1:], wrong, pulse, answers)
             summary = serve_stream(bench, link, limit, fed[0], outlet)
+        optics |= running.effort_of_run(bench, explain, as_json)
     whole_summary = replaced(summary, beat=beat, **optics)
     running.end_of_run(whole_summary, screen, kept, notices, as_json, strict)
     if not summary.packets.accepted:

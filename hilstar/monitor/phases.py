@@ -66,8 +66,8 @@ def phase_image(sprites: Sprites, psf: Psf) -> FloatArray:
     return image
 
 
-def fainter(sprites: Sprites, mag: float) -> Sprites:
-    """The same stars, `mag` magnitudes fainter."""
+def fainter(sprites: Sprites, mag: float | FloatArray) -> Sprites:
+    """The same stars, `mag` magnitudes fainter: all, or each by its own (n,)."""
     data = sprites.data.copy()
     data["electrons_per_s"] *= flux_ratio(mag)
     return Sprites(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)

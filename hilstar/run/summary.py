@@ -118,6 +118,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     ledger: dict[str, str | int | None] | UnsetType = UNSET
     faults: dict[str, Any] | UnsetType = UNSET
     answers: TrackerFigures | UnsetType = UNSET
+    effort: dict[str, Any] | UnsetType = UNSET
     beat: BeatSummary | UnsetType = UNSET
     sync: SyncSummary | UnsetType = UNSET
     fields_of_view: dict[str, Any] | UnsetType = UNSET

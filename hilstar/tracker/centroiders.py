@@ -26,6 +26,7 @@ PACE = 1.5
 SETTLED_PX = 1e-6
 MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
 BOX_SHARE = 0.02
+BOX_HALVES: dict[str, int] = {"box3": 1, "box5": 2}
 MIN_LIGHT = 1e-30
 SLOPE_PX = 0.02  # to either side of a place, for a told PSF's slope
 
@@ -37,18 +38,29 @@ Places = tuple[FloatArray, FloatArray]
 ToldPsf = Callable[[FloatArray, FloatArray], FloatArray]
 
 
-def star_places(stamps: FloatArray, kind: Centroider, sigma_px: Sigma, pixels: Pixels | None = None) -> Places:
+def star_places(
+    stamps: FloatArray,
+    kind: Centroider,
+    sigma_px: Sigma,
+    pixels: Pixels | None = None,
+    box_share: float = BOX_SHARE,
+) -> Places:
     """Each star's x and y (n,), px from the middle of its square (n, side, side), side odd; 0 for a square without light.
 
     `sigma_px` (x, y) is the star's. A box is about one of `pixels`, at least two from the edge, by default the brightest: two
-    images of a star between two pixels are to be compared in one box. The others begin there.
+    images of a star between two pixels are to be compared in one box. The others begin there. Of a box those pixels count
+    that have over `box_share` of its brightest.
     """
     lit = np.flatnonzero(stamps.sum(axis=(1, 2)) > MIN_LIGHT)
     x, y = np.zeros(len(stamps)), np.zeros(len(stamps))
     kind = "fit" if kind == "psf" else kind
     if len(lit):
         rows, columns = brightest(stamps) if pixels is None else pixels
-        x[lit], y[lit] = _KINDS[kind](stamps[lit], sigma_px, (rows[lit], columns[lit]))
+        near = rows[lit], columns[lit]
+        if kind in BOX_HALVES:
+            x[lit], y[lit] = _box(stamps[lit], BOX_HALVES[kind], near, box_share)
+        else:
+            x[lit], y[lit] = _KINDS[kind](stamps[lit], sigma_px, near)
     return x, y
 
 
@@ -157,19 +169,15 @@ def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> Places:
     return np.diff(ndtr(edges)), -np.diff(np.exp(-(edges**2) / 2)) / (np.sqrt(2 * np.pi) * sigma_px)
 
 
-def _box(stamps: FloatArray, half: int, pixels: Pixels) -> Places:
+def _box(stamps: FloatArray, half: int, pixels: Pixels, share: float = BOX_SHARE) -> Places:
     rows, columns = pixels
     side = stamps.shape[1]
     near = np.arange(-half, half + 1)
     y, x = rows[:, None, None] + near[:, None], columns[:, None, None] + near
     box = stamps[np.arange(len(stamps))[:, None, None], y, x]
-    box = np.where(box > BOX_SHARE * box.max(axis=(1, 2), keepdims=True), box, 0.0)
+    box = np.where(box > share * box.max(axis=(1, 2), keepdims=True), box, 0.0)
     light = np.maximum(box.sum(axis=(1, 2)), MIN_LIGHT)
     return (box * (x - side // 2)).sum(axis=(1, 2)) / light, (box * (y - side // 2)).sum(axis=(1, 2)) / light
-
-
-def _box_about(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels, half: int) -> Places:
-    return _box(stamps, half, pixels)
 
 
 _KINDS: dict[Kind, Callable[[FloatArray, Sigma, Pixels], Places]] = {
@@ -177,6 +185,4 @@ _KINDS: dict[Kind, Callable[[FloatArray, Sigma, Pixels], Places]] = {
     "window": _window,
     "wide": partial(_window, wide=WIDE),
     "fit": _fit,
-    "box3": partial(_box_about, half=1),
-    "box5": partial(_box_about, half=2),
 }

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.tracker.centroiders import FAMILY, Centroider, Pixels, Sigma, brightest, star_places
+from hilstar.tracker.centroiders import BOX_SHARE, FAMILY, Centroider, Pixels, Sigma, brightest, star_places
 from hilstar.units import magnitude
 
 SQUARES_VARIANCE = 1 / 6  # a pixel's width twice: a star is sampled by squares, and shown by squares
@@ -61,12 +61,21 @@ class Judge:
     """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where they should be.
 
     `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a column of tiles at an
-    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in monitor pixels.
+    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in monitor pixels, and
+    `box_share` the threshold of its boxes.
     """
 
     def __init__(
-        self, wanted: FloatArray, places_px: tuple[FloatArray, FloatArray], sigma_px: Sigma, blur_px: float, pixel_px: float
+        self,
+        wanted: FloatArray,
+        places_px: tuple[FloatArray, FloatArray],
+        sigma_px: Sigma,
+        blur_px: float,
+        pixel_px: float,
+        *,
+        box_share: float = BOX_SHARE,
     ) -> None:
+        self._box_share = box_share
         self._count = len(places_px[0])
         self._tile, self._pixel_px = len(wanted) // self._count, pixel_px
         self._in_tile_px = [place - self._tile * np.arange(self._count) for place in places_px]
@@ -82,8 +91,8 @@ class Judge:
         self._wanted = wanted
         self._places: dict[Centroider, FloatArray] = {}
 
-    def errors(self, shown: FloatArray, share: float = 1.0, kinds: tuple[Centroider, ...] = FAMILY) -> StarErrors:
-        """The errors of an image of the same stars, whose light should be `share` of those wanted."""
+    def errors(self, shown: FloatArray, share: float | FloatArray = 1.0, kinds: tuple[Centroider, ...] = FAMILY) -> StarErrors:
+        """The errors of an image of the same stars, whose light should be `share` of those wanted: all's, or each one's."""
         light = self._light_of(shown)
         off_px = {}
         for kind in kinds:
@@ -101,7 +110,7 @@ class Judge:
         boxed = kind in BOXES
         pixel_px = self._pixel_px if boxed else self._sampled_px
         stamps = self._seen(image, pixel_px)
-        places = star_places(stamps, kind, self._sigma_px, self._middles(stamps, boxed))
+        places = star_places(stamps, kind, self._sigma_px, self._middles(stamps, boxed), self._box_share)
         return np.stack(places) * pixel_px
 
     def _middles(self, stamps: FloatArray, boxed: bool) -> Pixels:
@@ -130,11 +139,17 @@ class Judge:
 
 
 def stamp_errors(
-    shown: FloatArray, wanted: FloatArray, sigma_px: Sigma, blur_px: float, pixel_px: float
+    shown: FloatArray,
+    wanted: FloatArray,
+    sigma_px: Sigma,
+    blur_px: float,
+    pixel_px: float,
+    *,
+    box_share: float = BOX_SHARE,
 ) -> dict[Centroider, FloatArray]:
     """How far off each centroider finds the stars of squares `shown` from those `wanted`, both (n, side, side): px (2, n).
 
-    Stars may be paths; sigmas, blur and pixels as for a `Judge`. Infinite where nothing is shown.
+    Stars may be paths; sigmas, blur, pixels and threshold as for a `Judge`. Infinite where nothing is shown.
     """
     count, side = wanted.shape[:2]
     at, light = np.arange(side), wanted.sum(axis=(1, 2))
@@ -156,7 +171,7 @@ def stamp_errors(
         views, width_px, pixels = (
             (boxed, pixel_px, brightest(boxed[0])) if kind in BOXES else (whole, sampled_px, (middle, middle))
         )
-        there, here = (np.stack(star_places(view, kind, (x, y), pixels)) * width_px for view in views)
+        there, here = (np.stack(star_places(view, kind, (x, y), pixels, box_share)) * width_px for view in views)
         off_px[kind] = np.where(shown.sum(axis=(1, 2)) > 0, here - there, np.inf)
     return off_px
 

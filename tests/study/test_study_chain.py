@@ -46,6 +46,8 @@ pixel_pitch_um = 57.65
 focal_length_mm = 350
 [render]
 brightest_v_mag = 4
+tolerance_mag = 0.01  # sprites of 8 px: what edges of 6 cut, `exact` makes up for in part, and steps do not add up
+tolerance_px = 0.05
 """
 PLAN = Rounds(exposures=1, time_s=0.05)
 # The centroider's own error for stars of sigma 1.05 px is 0.0012 px in the median (0.05 arcsec); a display's is ten times that.

@@ -7,7 +7,7 @@ import csv
 import pytest
 
 from hilstar.study import economy
-from hilstar.study.economy import SCENES, run
+from hilstar.study.economy import BITS, SCENES, TOLERANCES, run
 from hilstar.tracker.centroiders import FAMILY
 
 
@@ -22,20 +22,29 @@ def study(tmp_path_factory):
 
 
 def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(study):
-    full, auto = [row for row in study[2] if row["scene"] == SCENES[2].name]
-    assert (full["effort"], auto["effort"]) == ("full", "auto")
-    assert auto["quantisation"] == "round" and full["quantisation"] == "exact"
-    for row in (full, auto):
+    full, *autos = [row for row in study[2] if (row["scene"], row["bits"]) == (SCENES[2].name, "12")]
+    assert full["tolerance"] == "full" and full["quantisation"] == "exact"
+    assert [row["tolerance"] for row in autos] == ["default", "0.1"]
+    for row in autos:
+        assert row["quantisation"] == "round" and int(row["measured_stars"]) == int(full["measured_stars"]) > 100
         places_px = [float(row[f"max_px_{kind}"]) for kind in FAMILY]
-        assert max(float(row["flux_max_mag"]), float(row["centroid_max_px"]), *places_px) <= float(row["tolerance"])
-        assert len(set(places_px)) == 6 and float(row["max_px_fit"]) < float(row["max_px_moment"])
-    assert int(auto["measured_stars"]) == int(full["measured_stars"]) > 100
-    assert float(full["flux_max_mag"]) < float(auto["flux_max_mag"])
+        assert float(row["max_px_fit"]) < float(row["max_px_moment"])
+        assert max(float(row["centroid_max_px"]), *places_px) <= float(row["tolerance_px"])
+        assert float(full["flux_max_mag"]) < float(row["flux_max_mag"]) <= float(row["tolerance_mag"])
 
 
-def test_the_study_has_five_scenes_each_within_its_tolerance(study):
+def test_what_is_within_by_the_plan_is_within_by_its_stars(study):
+    claimed = [row for row in study[2] if row["claimed_within"].lower() == "true"]
+    assert len(claimed) > 20
+    for row in claimed:
+        assert float(row["flux_max_mag"]) <= float(row["tolerance_mag"])
+        # A path's codes are not in the claim: `exact` at 12 bits and 1 deg/s leaves 0.0024 mag for 0.0011.
+        if "deg/s" not in row["scene"]:
+            assert float(row["flux_max_mag"]) <= float(row["claimed_mag"]) <= float(row["tolerance_mag"])
+
+
+def test_the_study_has_five_scenes_of_three_depths_at_two_tolerances(study):
     folder, lines, rows = study
-    assert len(lines) == len(SCENES) == 5
-    assert all("within" in line for line in lines)
+    assert len(rows) == len(SCENES) * len(BITS) * (1 + len(TOLERANCES)) == 45
+    assert len([line for line in lines if " bits, " in line and "instead of" in line]) == 30
     assert (folder / "economy.png").stat().st_size > 20_000
-    assert len(rows) == 10

@@ -11,6 +11,11 @@ from hilstar.toml_tables import Table
 # White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is 100 in the median (38 with
 # Sirius for white), `verify` sees flux 0.065 mag off at 95 % (0.41), and 13 stars clip, one of them in 8 % of fields.
 DEFAULT_BRIGHTEST_V_MAG = 1.5
+# The limits of [verify]. README's bench keeps them at 8 bits by `exact`: 0.026 mag and 0.092 px, the
+# worst star of its catalogue by the worst of six centroiders. At 12 bits `round` does: 0.02 and 0.03.
+DEFAULT_TOLERANCE_MAG, DEFAULT_TOLERANCE_PX = 0.05, 0.1
+# What the default was when benches that leave nothing to it got their hashes, which they keep.
+HASHED_TOLERANCE = 0.02
 MAX_JUDGED_FRAMES = 16  # without `cycle_frames`; errors of longer exposures are smaller still
 
 
@@ -18,10 +23,10 @@ class RenderSettings(Table, frozen=True):
     """From electrons to code values."""
 
     # results/tradeoff.csv, quantisation: `exact` is 9 times as right as `round`, which does where a panel has levels enough.
-    #: How light becomes codes. {QUANTISERS}`"auto"`: `round` where that stays within the tolerance, else `exact`, unless an
-    #: average field, turning at 1 deg/s, would take it more than half a refresh and would not take `round` as long; `--explain`
-    #: of `frame`, `serve` and `replay` says which. `serve` and `replay` in real time measure that when they start; lockstep and
-    #: all other commands take the time on two cores without a GPU.
+    #: How light becomes codes. {QUANTISERS}`"auto"`: `round` where all errors together stay within the tolerance, else
+    #: `exact`, unless an average field, turning at 1 deg/s, would take it more than half a refresh and would not take `round`
+    #: as long; `--explain` of `frame`, `serve` and `replay` says which. `serve` and `replay` in real time measure that when
+    #: they start; lockstep and all other commands take the time on two cores without a GPU.
     quantisation: Literal[Quantisation, "auto"] = "auto"
     #: What a frame of an average field takes by `round` and by `exact`, for `auto` of every command: nothing is measured then.
     #: `--explain` of a run that measured prints the line to write. Default: measured, or tabulated
@@ -50,12 +55,15 @@ class RenderSettings(Table, frozen=True):
     #: Full scale, where `flux_at_white_e_per_s` is not given: the peak pixel of the brightest star whose V is not below this.
     #: Brighter stars clip, and are listed. Default: `{DEFAULT_BRIGHTEST_V_MAG}`
     brightest_v_mag: Magnitude | None = None
-    #: `"auto"`: sprites no larger and paths no finer than the tolerance requires; `--explain` of `frame`, `serve` and `replay`
-    #: says what was chosen. `"full"`: no such economy.
+    #: `"auto"`: the cheapest combination of codes, sprites and paths whose worst errors together are within the tolerance;
+    #: `--explain` of `frame`, `serve` and `replay` has a table of what was chosen. `"full"`: no such economy.
     effort: Literal["full", "auto"] = "full"
-    #: Flux error that a star may have, codes included, for `effort = "auto"` and `quantisation = "auto"`.
-    tolerance_mag: Positive = 0.02
-    tolerance_px: Positive = 0.02  #: Centroid error that a star may have, likewise.
+    #: Flux error that any star of the catalogue may have at any phase, all parts together, for `effort = "auto"` and
+    #: `quantisation = "auto"`. The default is what 8 bits keep down to V = 7.5, six magnitudes under white.
+    tolerance_mag: Positive = DEFAULT_TOLERANCE_MAG
+    #: Centroid error that a star may have, monitor pixels, likewise: by the worst of six centroiders, or by that of
+    #: `[verify] centroider`.
+    tolerance_px: Positive = DEFAULT_TOLERANCE_PX
     # results/timing.csv: 69 arcsec at 2 deg/s without, 0.1 with it.
     #: Whether stars are drawn along their paths, each row at its own moment. `"auto"`: on a screen only. `"on"`: headless too.
     #: `"off"`: never.

@@ -63,7 +63,7 @@ class StarSpot:
         """The spot of the bench file's sprite, with the PSF of the step `focus`. Raises InputError."""
         geometry = context.geometry()
         ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-        sprite = display_psf(context.file.config, context.file.folder, geometry.monitor)[0].width_px
+        sprite = display_psf(context.file.config, context.file.folder, geometry.monitor).width_px
         # A sprite's shares are those of whole pixels, and each pixel is a square of light: a twelfth of its area each.
         drawn = [ratio * math.sqrt(width**2 + 2 / 12) for width in sprite]
         own = context.psf_sigma_px / float(np.mean(context.tracker_psf.width_px))

@@ -237,7 +237,7 @@ def scale(context: StepContext) -> StepOutcome:
     """Find what white is worth by stars, and set it in the bench file. Raises InputError."""
     seen = see_stars(context)
     white = _white_e_per_s(context.file)
-    drawn, _ = display_psf(context.file.config, context.file.folder, context.geometry().monitor)
+    drawn = display_psf(context.file.config, context.file.folder, context.geometry().monitor)
     clips = seen.e_per_s * drawn.peak_share > white
     used = (seen.noise_mag < READ_MAG) & ~clips
     if used.sum() < MIN_STARS:

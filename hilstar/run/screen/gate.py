@@ -88,7 +88,7 @@ def open_screen(file: BenchFile, today: datetime.date, *, windowed: bool, force:
 @contextmanager
 def _bench_on(window: Window, file: BenchFile, found: MonitorCheck, *, timed: bool, force: bool) -> Iterator[Screen]:
     """The bench of a file in a window, past the gate."""
-    with open_bench(file, window_context(), timed=timed) as bench:
+    with open_bench(file, window_context(), timed=timed, on_screen=True) as bench:
         wanted, draws = file.config.render.gpu, bench.renderer.gl_renderer
         if isinstance(wanted, str) and wanted.lower() not in draws.lower():
             log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)

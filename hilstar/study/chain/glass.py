@@ -88,7 +88,7 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
         taken = in_turn(works, MAX_ROUNDS, (QUICK_TIME_S if quick else TIME_S) / len(works))
     times: dict[str, Times] = {name: times_of(np.array(one)) for name, one in taken.items()}
     fronts = pareto_front([errors[name][1] for name in found], [times[name].time_ms for name in found])
-    auto = least_tracker_psf(whole, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px))[1].chosen
+    auto = least_tracker_psf(whole, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px))[1].choice
     return [
         GlassRow(
             scene.name,

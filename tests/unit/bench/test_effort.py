@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from functools import partial
@@ -10,10 +11,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.build import TIMED_EXACT_S, load, measured_cost, open_bench, timed_frame_ms
+from hilstar.bench.bench_file import bench_file_of, read_bench_file
+from hilstar.bench.build import TIMED_EXACT_S, load, measured_cost, open_bench, timed_frame_ms, turning_of
 from hilstar.bench.config import RenderSettings
-from hilstar.bench.effort import FieldCost, Light, choose_codes, choose_sides, cut_px, exact_in_time, explain, plan_effort
+from hilstar.bench.effort import Effort, FieldCost, Light, _combinations, cut_px, exact_in_time, plan_effort
+from hilstar.bench.effort_report import effort_keys, effort_lines
+from hilstar.bench.least_psf import Choice
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.response import srgb_response
 from hilstar.render.backend import level_cost
@@ -21,6 +24,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import GaussianPsf
 from hilstar.tracker.centroiders import FAMILY
+from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import run_hilstar_here
 
 SIGMA = (0.85, 0.85)
@@ -39,11 +43,88 @@ def light(bits: int, magnitudes: float) -> Light:
     return Light(srgb_response(bits), 1e6, 5e6 * 10 ** (-0.4 * np.linspace(0, magnitudes, 50)))
 
 
+def planned(asked: RenderSettings, of: Light) -> Effort:
+    return plan_effort(asked, of)
+
+
+def part(effort: Effort, name: str):
+    return next(choice for choice in effort.choices if choice.part == name)
+
+
 def test_round_is_chosen_where_it_does_and_exact_where_it_does_not():
-    assert choose_codes(settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0)).method == "round"
-    assert choose_codes(settings(tolerance_mag=0.02, tolerance_px=0.04), light(8, 6.0)).method == "exact"
-    codes = choose_codes(settings(tolerance_mag=1e-4), light(8, 6.0))
-    assert codes.method == "exact" and "over 5e-05 mag" in codes.choice.error and codes.errors.flux_mag > 1e-4
+    assert planned(settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0)).quantisation == "round"
+    assert planned(settings(tolerance_mag=0.05, tolerance_px=0.08), light(8, 6.0)).quantisation == "exact"
+    over = planned(settings(tolerance_mag=1e-4), light(8, 6.0))
+    assert over.quantisation == "exact" and not over.within and over.error_mag > 1e-4
+
+
+def test_no_part_owns_a_share_of_the_tolerance():
+    """Codes may take all of it but what the cheapest sprites need; half was theirs, a quarter each for edges and motion."""
+    sky = light(10, 6.0)
+    alone = planned(settings(quantisation="round", tolerance_mag=9, tolerance_px=9, effort="full"), sky)
+    tight = {"tolerance_mag": 1.05 * alone.error_mag, "tolerance_px": 1.05 * alone.error_px}
+    taken = planned(settings(**tight), sky)
+    assert taken.quantisation == "round" and taken.within
+    none = {"tolerance_mag": 0.95 * alone.error_mag, "tolerance_px": 1.05 * alone.error_px}
+    assert planned(settings(**none), sky).quantisation == "exact"
+
+
+def test_the_cheapest_of_all_combinations_within_is_taken():
+    """By every combination of sprites and motions: none that is within takes less time than the one taken."""
+    asked = settings(tolerance_mag=0.05, tolerance_px=0.08)
+    moving = replace(light(12, 6.0), turning=2 / 3, sky_share=0.1)
+    taken = planned(asked, moving)
+    assert taken.within
+    tried = 0
+    for one in _combinations(asked, moving, ("round", "exact")):
+        other = Effort(asked, moving, one)
+        tried += 1
+        assert not other.within or one.ms >= taken.taken.ms
+    assert tried > 20
+
+
+def test_a_scene_at_rest_asks_nothing_of_paths():
+    """0.01 px were charged at rest, too."""
+    asked, sky = settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0)
+    still, turning = planned(asked, sky), planned(asked, replace(sky, turning=0.5))
+    assert part(still, "paths").error_px == 0.0 and "none" in part(still, "paths").choice
+    assert part(turning, "paths").error_px == pytest.approx(0.5 * turning.motion_above_px)
+    assert turning.motion_above_px >= asked.motion_above_px
+
+
+@pytest.mark.parametrize(
+    ("motion", "on_screen", "turns"),
+    [("auto", False, False), ("auto", True, True), ("on", False, True), ("off", True, False)],
+)
+def test_paths_are_charged_where_frames_may_turn(motion, on_screen, turns, small_bench_file):
+    """A frame without a path is where the middle row's first light has it: half of its light later it is halfway on."""
+    text = f'{SMALL_BENCH}[render]\nmotion = "{motion}"\nquantisation = "round"\n'
+    config = bench_file_of(small_bench_file, text).config
+    scan_s, hold_s = (config.monitor.panel_scanout_ms, config.monitor.panel_hold_ms)
+    wanted = (scan_s + hold_s) / (scan_s + 2 * hold_s) if turns else 0.0
+    assert turning_of(config, on_screen) == pytest.approx(wanted)
+
+
+def test_a_psf_in_place_of_a_glass_shares_the_tolerance():
+    """Its error is taken from what is left for the codes."""
+    sky, asked = light(12, 6.0), settings(tolerance_mag=0.05, tolerance_px=0.1)
+    assert planned(asked, sky).quantisation == "round"
+    near = replace(sky, psf_choice=Choice("PSF", "a Gaussian", 0.045, 0.01))
+    effort = planned(asked, near)
+    assert effort.quantisation == "exact" and part(effort, "PSF").error_mag == 0.045
+    assert effort.error_mag == pytest.approx(effort.codes.flux_mag + 0.045, rel=0.2)
+
+
+def test_the_worst_error_is_of_all_magnitudes_that_the_catalogue_has():
+    """Of stars of half a step more than a whole number, and of none: `exact` leaves half a step of the first alone."""
+    one_step = srgb_response(8).light[1]
+    whole, half = (np.array([steps * one_step * 1e6]) for steps in (60.0, 60.5))
+    errors = []
+    for rates in (whole, half, np.concatenate([whole, half])):
+        sky = Light(srgb_response(8), 1e6, rates)
+        errors.append(planned(settings(quantisation="exact"), sky).error_mag)
+    assert errors[0] < errors[1] / 2 and errors[2] == pytest.approx(errors[1], rel=0.3)
+    assert errors[1] > 2.5 * math.log10(60.5 / 60.0)
 
 
 def test_auto_leaves_exact_where_numpy_would_be_late():
@@ -51,45 +132,41 @@ def test_auto_leaves_exact_where_numpy_would_be_late():
     asked = settings(tolerance_mag=0.02, tolerance_px=0.04)
     bright = replace(light(8, 6.0), rates_e_per_s=np.repeat(light(8, 6.0).rates_e_per_s, 200), sky_share=0.1)
     by_shader, by_numpy = (
-        choose_codes(asked, replace(bright, cost=partial(level_cost, context=SimpleNamespace(version_code=version))))
+        planned(asked, replace(bright, cost=partial(level_cost, context=SimpleNamespace(version_code=version))))
         for version in (430, 330)
     )
-    assert (by_shader.method, by_numpy.method) == ("exact", "round")
-    assert "in NumPy" in by_numpy.choice.error and "OpenGL 4.3" in by_numpy.choice.error
+    assert (by_shader.quantisation, by_numpy.quantisation) == ("exact", "round")
+    assert "in NumPy" in part(by_numpy, "codes").note and "OpenGL 4.3" in part(by_numpy, "codes").note
 
 
 def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
-    """12 bits, 6.5 magnitudes, 0.02 px: a fit is served by `round`, a plain moment is not."""
-    asked, sky = settings(tolerance_mag=0.05, tolerance_px=0.02), light(12, 6.5)
-    of_fit, of_all = choose_codes(asked, replace(sky, centroider="fit")), choose_codes(asked, sky)
-    assert (of_fit.method, of_all.method) == ("round", "exact")
-    assert of_fit.errors.centroider == "fit" and "as `fit` finds stars, from white" in of_fit.choice.error
-    assert f"as `{of_all.errors.centroider}` finds stars, the worst of 6 centroiders" in of_all.choice.error
-    rounded = {
-        (kind, pixel_px): choose_codes(
-            settings(quantisation="round"), replace(sky, centroider=kind, seen=Seen(0.55 * pixel_px, pixel_px))
-        ).errors
-        for kind in FAMILY
-        for pixel_px in (0.5, 1.0, 2.0)
-    }
-    assert len({errors.flux_mag for errors in rounded.values()}) == 1
+    """12 bits, 6.5 magnitudes: a fit is served by `round`, the worst of six centroiders is not."""
+    asked, sky = settings(tolerance_mag=0.05, tolerance_px=0.012), light(12, 6.5)
+    of_fit, of_all = planned(asked, replace(sky, centroider="fit")), planned(asked, sky)
+    assert (of_fit.quantisation, of_all.quantisation) == ("round", "exact")
+    assert part(of_fit, "codes").note == "as `fit` finds stars"
+    assert f"as `{of_all.codes.centroider}` finds stars, the worst of 6 centroiders" in part(of_all, "codes").note
+    rounded = {}
+    for kind in FAMILY:
+        for pixel_px in (0.5, 1.0, 2.0):
+            seen = Seen(0.55 * pixel_px, pixel_px)
+            effort = planned(settings(quantisation="round"), replace(sky, centroider=kind, seen=seen))
+            rounded[kind, pixel_px] = effort.codes
     narrow, even, wide = (rounded["box3", pixel_px].place_px for pixel_px in (0.5, 1.0, 2.0))
     assert narrow < even / 2 < wide / 4
-    assert len({round(rounded["moment", pixel_px].place_px, 12) for pixel_px in (0.5, 1.0, 2.0)}) == 1
     assert len({round(rounded[kind, 1.0].place_px, 12) for kind in FAMILY}) == 6
 
 
 def test_what_the_file_asks_for_is_not_overruled():
-    assert choose_codes(settings(quantisation="round", tolerance_mag=1e-6), light(8, 8.0)).method == "round"
+    assert planned(settings(quantisation="round", tolerance_mag=1e-6), light(8, 8.0)).quantisation == "round"
 
 
 def test_sprites_are_as_small_as_the_tolerance_lets_them_be():
-    wide = choose_sides(settings(tolerance_mag=1e-6, tolerance_px=1e-6), light(8, 6.0), "exact")
-    narrow = choose_sides(settings(tolerance_mag=0.2, tolerance_px=0.2), light(8, 6.0), "exact")
+    wide = planned(settings(quantisation="exact", tolerance_mag=1e-6, tolerance_px=1e-6), light(8, 6.0))
+    narrow = planned(settings(quantisation="exact", tolerance_mag=0.2, tolerance_px=0.2), light(8, 6.0))
     full = GaussianPsf(SIGMA).footprint_px
     assert (wide.sides[0].below_e_per_s, wide.sides[0].side_px) == (pytest.approx(3e38), full)
-    assert narrow.sides[0].side_px < full
-    assert narrow.cut_mag <= 0.05 and narrow.moved_px <= 0.05
+    assert narrow.sides[0].side_px < full and narrow.within
 
 
 @pytest.mark.parametrize("size", [4, 6, 8, 5, 7])
@@ -132,32 +209,96 @@ def test_the_linear_image_is_whole_all_the_same(bench_with):
     assert bench.renderer.linear().sum() == pytest.approx(shown.sum(), rel=FLOAT32)
 
 
-def test_the_plan_adds_up_and_says_when_it_cannot():
-    within = plan_effort(settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0))
-    assert within.error_mag <= 0.1 and within.error_px <= 0.1
-    lines = explain(within, settings(tolerance_mag=0.1, tolerance_px=0.1))
-    names = [line.split(":")[0] for line in lines]
-    assert names == ["stars", "codes", "sprites", "encoding", "paths", "projection", "together, worst case"]
-    assert "OVER" not in lines[-1]
-    tight = settings(tolerance_mag=1e-4, tolerance_px=1e-4)
-    assert "OVER" in explain(plan_effort(tight, light(8, 6.0)), tight)[-1]
-    assert "full" in explain(None, RenderSettings())[0]
+def test_the_parts_add_up():
+    effort = planned(settings(tolerance_mag=0.1, tolerance_px=0.1), replace(light(12, 6.0), turning=0.5))
+    assert [choice.part for choice in effort.choices] == ["codes", "sprites", "paths", "depth"]
+    assert effort.error_mag == pytest.approx(sum(choice.error_mag for choice in effort.choices))
+    assert effort.error_px == pytest.approx(sum(choice.error_px for choice in effort.choices))
+    assert effort.within
 
 
-def test_a_bench_s_centroider_stands_in_what_it_explains(small_bench_file):
-    small_bench_file.write_text(small_bench_file.read_text() + '[verify]\ncentroider = "box5"\n')
-    with load(small_bench_file) as bench:
-        assert "as `box5` finds stars, from white" in explain(bench.effort, bench.config.render)[0]
+def test_a_table_says_what_was_chosen(bench_with):
+    bench = bench_with('[render]\neffort = "auto"\n[verify]\ncentroider = "box5"\n')
+    lines = effort_lines(bench)
+    assert lines[0].split() == ["part", "choice", "error", "of", "the", "tolerance", "saves"]
+    assert [line.split()[0] for line in lines[1:6]] == ["codes", "sprites", "paths", "depth", "together"]
+    assert "within 0.05 mag, 0.1 px" in lines[5]
+    assert any(line.startswith("codes: as `box5` finds stars") for line in lines)
+    assert not any("would do" in line for line in lines)
 
 
-def test_explain_is_said_beside_the_json(tmp_path, small_bench_file):
+def test_a_bench_over_its_tolerance_says_what_would_do(bench_with):
+    bench = bench_with("[render]\ntolerance_mag = 0.005\ntolerance_px = 0.03\n")
+    keys = effort_keys(bench)
+    assert not keys["within"] and keys["would_do"]
+    assert all(remedy["within"] for remedy in keys["would_do"])
+    lines = effort_lines(bench)
+    assert sum(line.startswith("would do: ") for line in lines) == len(keys["would_do"])
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+def test_what_would_do_does(bits, tmp_path):
+    """Each key that is told is written to the file, whose own plan then has the errors that were told."""
+    limit = {"tolerance_mag": 0.01, "tolerance_px": 0.05} if bits == 8 else {"tolerance_mag": 0.005, "tolerance_px": 0.02}
+    tables = {"monitor": {"bits": bits}, "render": limit}
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(tables))
+    with load(path) as bench:
+        told = effort_keys(bench)["would_do"]
+    assert len(told) >= 3
+    for remedy in told:
+        table, key = remedy["key"].removeprefix("[").split("] ")
+        changed = tables | {table: tables.get(table, {}) | {key: remedy["value"]}}
+        path.write_text(bench_text(changed))
+        with load(path) as mended:
+            keys = effort_keys(mended)
+        assert keys["within"] is remedy["within"] is True
+        assert keys["error_mag"] == pytest.approx(remedy["error_mag"], rel=1e-6)
+        assert keys["error_px"] == pytest.approx(remedy["error_px"], rel=1e-6)
+
+
+def test_stars_that_show_nothing_are_null_in_json(bench_with):
+    bench = bench_with('[sky]\nfaintest_v_mag = 9\n[render]\nbrightest_v_mag = -2\nquantisation = "round"\n')
+    keys = effort_keys(bench)
+    assert keys["error_mag"] is None and keys["choices"][0]["error_px"] is None and not keys["within"]
+    assert any("a star shows nothing" in line for line in effort_lines(bench))
+    json.dumps(keys, allow_nan=False)
+
+
+def test_explain_has_the_effort_in_its_json(tmp_path, small_bench_file):
     small_bench_file.write_text(small_bench_file.read_text() + '[render]\neffort = "auto"\n')
-    result = run_hilstar_here(
-        "frame", small_bench_file, "--radec", "84,-1,0", "--truth", tmp_path / "t.csv", "--explain", "--json"
-    )
+    words = ("frame", small_bench_file, "--radec", "84,-1,0", "--truth", tmp_path / "t.csv", "--json")
+    result = run_hilstar_here(*words, "--explain")
     assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith("{")
-    assert "sprites:" in result.stderr and "together, worst case" in result.stderr
+    assert "part " in result.stderr and "together" in result.stderr
+    effort = json.loads(result.stdout)["effort"]
+    assert set(effort) == {
+        *("within", "quantisation", "error_mag", "error_px", "tolerance_mag", "tolerance_px", "choices", "would_do"),
+    }
+    assert all(set(choice) == {"part", "choice", "error_mag", "error_px", "ms"} for choice in effort["choices"])
+    assert "effort" not in json.loads(run_hilstar_here(*words).stdout)
+
+
+def test_a_run_has_the_effort_once(tmp_path, small_bench_file):
+    log = tmp_path / "log.csv"
+    log.write_text("t_s,qw,qx,qy,qz\n0,0.5,0.5,-0.5,0.5\n0.1,0.5,0.5,-0.5,0.5\n")
+    result = run_hilstar_here("replay", small_bench_file, log, "--headless", "--speed", "max", "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["effort"]["quantisation"] == "exact"
+    assert result.stdout.count('"effort"') == 1
+
+
+def test_a_fixed_bench_keeps_its_hash_and_one_left_to_the_default_does_not(tmp_path, small_bench_file):
+    """The default of the tolerance was 0.02 mag and 0.02 px; no frame of a fixed bench changed with it."""
+    text = small_bench_file.read_text()
+
+    def hashed(render: str) -> str:
+        return bench_file_of(small_bench_file, f"{text}[render]\n{render}").sha256
+
+    stated = "tolerance_mag = 0.02\ntolerance_px = 0.02\n"
+    assert hashed('quantisation = "exact"\n') == hashed(f'quantisation = "exact"\n{stated}')
+    assert hashed("") != hashed(stated)
+    assert hashed('quantisation = "exact"\neffort = "auto"\n') != hashed(f'quantisation = "exact"\neffort = "auto"\n{stated}')
 
 
 def test_auto_codes_become_the_bench_s_own(tmp_path, small_bench_file):
@@ -178,16 +319,16 @@ def test_a_file_that_says_nothing_gets_the_codes_that_its_tolerance_needs(small_
 def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_say_so():
     """3000 stars on a screen that has the whole sky, at two refresh rates; 70 as wide as only NumPy takes them."""
     crowded = replace(light(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(3000, 1e4))
-    chosen = choose_codes(settings(), crowded)
-    assert chosen.method == "round"
-    assert 'quantisation = "exact" is nearer and takes 9 ms of 17' in chosen.choice.error
-    assert choose_codes(settings(), replace(crowded, refresh_hz=30.0)).method == "exact"
-    assert choose_codes(settings(), replace(crowded, refresh_hz=90.0)).method == "exact"  # `round` would be late, too
-    assert choose_codes(settings(quantisation="exact"), crowded).method == "exact"
-    assert "9 ms of 16.7" in choose_codes(settings(quantisation="exact"), crowded).choice.saving
+    chosen = planned(settings(), crowded)
+    assert chosen.quantisation == "round"
+    assert "exact takes 9 ms of 16.7 (round 6)" in part(chosen, "codes").note
+    assert planned(settings(), replace(crowded, refresh_hz=30.0)).quantisation == "exact"
+    assert planned(settings(), replace(crowded, refresh_hz=90.0)).quantisation == "exact"  # `round` would be late, too
+    assert planned(settings(quantisation="exact"), crowded).quantisation == "exact"
+    assert "9 ms of 16.7" in part(planned(settings(quantisation="exact"), crowded), "codes").note
     few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
     wide = replace(few, psf=GaussianPsf((2.5, 2.5)))
-    assert (choose_codes(settings(), few).method, choose_codes(settings(), wide).method) == ("exact", "round")
+    assert (planned(settings(), few).quantisation, planned(settings(), wide).quantisation) == ("exact", "round")
 
 
 def cost(cheap_ms: float, best_ms: float) -> FieldCost:
@@ -219,15 +360,17 @@ def test_a_measured_cost_overrules_the_table_only_where_it_is_clear_of_the_limit
 def test_a_machine_that_holds_exact_takes_it_where_the_table_would_not():
     """3000 stars in view at 60 Hz: 9 ms on two cores without a GPU; and 70 on a slow machine."""
     crowded = replace(light(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(3000, 1e4))
-    by_gpu = choose_codes(settings(), replace(crowded, measured=cost(0.2, 0.4)))
-    assert (by_gpu.method, by_gpu.by_cost) == ("exact", True) and "takes 0.4 ms of 16.7 here" in by_gpu.choice.saving
+    by_gpu = planned(settings(), replace(crowded, measured=cost(0.2, 0.4)))
+    assert (by_gpu.quantisation, by_gpu.by_cost) == ("exact", True)
+    assert "exact takes 0.4 ms of 16.7 (round 0.2)" in part(by_gpu, "codes").note
     few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
-    slow = choose_codes(settings(), replace(few, measured=cost(2.0, 25.0)))
-    assert slow.method == "round" and "takes 25 ms of 17 (round 2) for an average field at 1 deg/s here" in slow.choice.error
-    assert choose_codes(settings(codes_ms=(2.0, 25.0)), few).method == "round"
-    assert "by [render] codes_ms" in choose_codes(settings(codes_ms=(0.2, 0.4)), crowded).choice.saving
-    assert not choose_codes(settings(), light(16, 6.0)).by_cost  # `round` is within the tolerance, whatever it costs
-    assert not choose_codes(settings(quantisation="exact"), few).by_cost
+    slow = planned(settings(), replace(few, measured=cost(2.0, 25.0)))
+    assert slow.quantisation == "round"
+    assert "takes 25 ms of 16.7 (round 2) for an average field at 1 deg/s here" in part(slow, "codes").note
+    assert planned(settings(codes_ms=(2.0, 25.0)), few).quantisation == "round"
+    assert "by [render] codes_ms" in part(planned(settings(codes_ms=(0.2, 0.4)), crowded), "codes").note
+    assert not planned(settings(), light(16, 6.0)).by_cost  # `round` is within the tolerance, whatever it costs
+    assert not planned(settings(quantisation="exact"), few).by_cost
 
 
 def test_round_is_timed_only_where_exact_may_be_late():
@@ -259,15 +402,13 @@ def test_frames_are_timed_for_no_longer_than_asked(small_bench_file):
 
 def test_a_timed_bench_has_measured_codes_and_any_other_has_not(small_bench_file):
     file = read_bench_file(small_bench_file)
-    with open_bench(file, timed=True) as timed, open_bench(file) as planned:
+    with open_bench(file, timed=True) as timed, open_bench(file) as untimed:
         cheap_ms, best_ms = timed.config.render.codes_ms
         assert min(cheap_ms, best_ms) > 0
-        assert (
-            f"measured here ([render] codes_ms = [{cheap_ms:g}, {best_ms:g}] fixes it)"
-            in explain(timed.effort, timed.config.render)[0]
-        )
-        assert planned.config.render.codes_ms is None and "without a GPU" in explain(planned.effort, planned.config.render)[0]
-        assert timed.file.sha256 == planned.file.sha256
+        measured = f"measured here ([render] codes_ms = [{cheap_ms:g}, {best_ms:g}] fixes it)"
+        assert measured in part(timed.effort, "codes").note
+        assert untimed.config.render.codes_ms is None and "without a GPU" in part(untimed.effort, "codes").note
+        assert timed.file.sha256 == untimed.file.sha256
     small_bench_file.write_text(small_bench_file.read_text() + "[render]\ncodes_ms = [2, 500]\n")
     with open_bench(read_bench_file(small_bench_file), timed=True) as fixed:
         assert fixed.config.render.codes_ms == (2, 500) and fixed.renderer.target.quantisation == "round"

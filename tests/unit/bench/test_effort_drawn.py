@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from hilstar.bench.build import load
-from hilstar.bench.effort import explain
 from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import GaussianPsf
@@ -45,27 +44,27 @@ centroider = "{centroider}"
 KINDS = [
     (8, "srgb", "false", 13, "fit", 0.02, "exact"),
     (12, "srgb", "false", 13, "fit", 0.05, "round"),
-    (12, "srgb", "false", 13, "moment", 0.02, "exact"),
-    (10, "gamma2.2", "false", 23, "wide", 0.02, "exact"),
-    (10, "gamma2.2", "false", 5.75, "box3", 0.02, "exact"),
+    (12, "srgb", "false", 13, "moment", 0.02, "round"),
+    (10, "gamma2.2", "false", 23, "wide", 0.02, "round"),
+    (10, "gamma2.2", "false", 5.75, "box3", 0.02, "round"),
     (8, "lcd-example", "false", 13, "window", 0.05, "exact"),
-    (8, "lcd-example", "true", 13, "box5", 0.02, "exact"),
+    (8, "lcd-example", "true", 13, "box5", 0.02, "round"),
     (16, "srgb", "false", 13, "fit", 0.02, "round"),
 ]
-# The largest of 500 stars at random against the largest of 720 others: measured 0.6 to 1.5, flux and place.
-MOST = 1.7
-ROUNDED = 5e-5  # what is said has four decimals
+# What is claimed of the worst star, against the largest of 500 at random: `exact` has its worst flux in one star of a
+# thousand (tests/authority/test_effort.py looks at more of them).
+MOST_MAG, MOST_PX = 6.0, 2.5
 
 
 def drawn_errors(bench, rng):
-    """The largest errors of stars at random, of the plan's five magnitudes: flux, and place by the bench's centroider."""
+    """The largest errors of stars at random, of any magnitude under white: flux, and place by the bench's centroider."""
     x, y = np.meshgrid(np.arange(20, SIZE[0] - 20, STEP_PX), np.arange(20, SIZE[1] - 20, STEP_PX))
     whole = x.ravel(), y.ravel()
     x_px, y_px = (place + rng.uniform(-0.5, 0.5, place.size) for place in whole)
     sigma_px, white = bench.config.render.sprite_sigma_px, bench.flux_at_white_e_per_s * bench.darkest
     brightest = white / GaussianPsf(sigma_px).peak_share
     deepest = 2.5 * math.log10(brightest / bench.stars.electrons_per_s.min())
-    rates = brightest * 10 ** (-0.4 * rng.choice(np.linspace(0, deepest, 5), x_px.size))
+    rates = brightest * 10 ** (-0.4 * rng.uniform(0, deepest, x_px.size))
     sprites = pack_sprites(x_px, y_px, rates, np.arange(x_px.size), SIZE, bench.psf.footprint_px)
     bench.renderer.draw(sprites, 0)
     images = shown_light(bench.renderer.levels(), bench.panel), linear_image(sprites, SIZE, GaussianPsf(sigma_px))
@@ -87,9 +86,8 @@ def test_what_is_said_of_codes_holds_for_what_is_drawn(
         BENCH.format(bits=bits, light=light, stealing=stealing, pitch_um=pitch_um, centroider=centroider, tolerance=tolerance)
     )
     with load(path) as bench:
-        said = explain(bench.effort, bench.config.render)[0]
+        claimed, method = bench.effort.codes, bench.effort.quantisation
         flux_mag, off_px = drawn_errors(bench, rng)
-    assert said.startswith(f"codes: {taken}; ") and f"as `{centroider}` finds stars" in said
-    of_flux, of_place = (float(words.split()[-2]) for words in said.split(" maximum")[0].split(";")[1].split(" and "))
-    assert (of_flux - ROUNDED) / MOST < flux_mag < (of_flux + ROUNDED) * MOST
-    assert (of_place - ROUNDED) / MOST < off_px < (of_place + ROUNDED) * MOST
+    assert (method, claimed.centroider) == (taken, centroider)
+    assert flux_mag <= claimed.flux_mag <= MOST_MAG * flux_mag
+    assert off_px <= claimed.place_px <= MOST_PX * off_px

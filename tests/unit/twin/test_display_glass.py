@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import open_bench
-from hilstar.bench.cameras import before_detector, bench_camera, display_psf, tracker_camera, tracker_psf
+from hilstar.bench.cameras import before_detector, bench_camera, display_psfs, tracker_camera, tracker_psf
 from hilstar.bench.frame import drawn_line
 from hilstar.bench.least_psf import candidates, least_psf, psf_errors
 from hilstar.errors import InputError
@@ -141,8 +141,8 @@ def test_the_least_that_the_tolerance_allows_is_drawn(bench):
         assert type(shown.psf) is SampledPsf and "one PSF for all stars" in drawn_line(shown)
         camera = shown.camera
     asked = bench(glass=glass_of(even), effort="auto", tolerance_mag=0.2, tolerance_px=0.1)
-    psf, choice = display_psf(asked.config, asked.folder, camera)
-    assert isinstance(psf, GaussianPsf) and choice.saving == "more would gain no more than that"
+    psf, choice = next(display_psfs(asked.config, asked.folder, camera))
+    assert isinstance(psf, GaussianPsf) and choice.note == "more would gain no more than that"
 
 
 def test_more_components_are_nearer_to_the_whole(bench):
@@ -156,7 +156,7 @@ def test_more_components_are_nearer_to_the_whole(bench):
     ]
     assert px[2] < px[0] and px[3] > px[4] > px[5] > px[6] == 0
     found, choice = least_psf(psf, places, (errors["a basis of 6"].mag, errors["a basis of 6"].px))
-    assert len(found.optics.basis) == 6 and "a basis of 3 would be" in choice.saving
+    assert len(found.optics.basis) == 6 and "a basis of 3 would be" in choice.note
 
 
 def test_the_virtual_tracker_takes_the_least_too(bench, caplog):
@@ -179,4 +179,4 @@ def test_what_cannot_be_drawn_is_refused(bench, tmp_path):
     camera = bench_camera(wide.config, wide.folder)
     camera = replace(camera, cam_to_image=np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]))
     with pytest.raises(InputError, match="oval and lies obliquely"):
-        display_psf(wide.config, wide.folder, camera)
+        next(display_psfs(wide.config, wide.folder, camera))

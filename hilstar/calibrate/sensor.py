@@ -18,10 +18,10 @@ import numpy as np
 from hilstar import charts
 from hilstar.arrays import FloatArray
 from hilstar.calibrate.geometric.observed import read_image
-from hilstar.csv_tables import finite_numbers, read_rows
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import read_text
+from hilstar.text_tables import finite_numbers, read_rows
 from hilstar.tracker.settings import BOLTZMANN_EV_PER_K, DetectorSettings
 
 MAX_EMVA_BYTES = 1_000_000

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.csv_tables import finite_numbers, read_rows
 from hilstar.errors import InputError
 from hilstar.reading import read_text
 from hilstar.sky.electrons import Optics
 from hilstar.sky.spectrum import MAX_CURVE_BYTES, RANGE_NM, Curve, integration_nodes
+from hilstar.text_tables import finite_numbers, read_rows
 
 PRIMARIES = ("r", "g", "b")
 COLUMNS = ("wavelength_nm", *PRIMARIES)

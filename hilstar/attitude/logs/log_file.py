@@ -1,7 +1,6 @@
 """Attitude logs of every format: the content decides how a file is read, the ending of its name how it is written.
 
-CSV and JSON lines are read and written here. CSV columns, in any order: `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s),
-`sequence` and `discontinuity`. A JSON line is the wire's JSON form of an attitude. The other formats have a module each.
+JSON lines are read and written here: a line is the wire's JSON form of an attitude. The other formats have a module each.
 
 What a user states of a log is used or refused:
 1. Each format of FORMATS declares the statements that its reader uses. Any other is refused by
@@ -12,14 +11,12 @@ What a user states of a log is used or refused:
 """
 
 import contextlib
-import csv
 import importlib.util
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from decimal import Decimal
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Literal, NamedTuple
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 import msgspec
 from msgspec import structs
@@ -27,10 +24,12 @@ from msgspec import structs
 from hilstar.attitude.clock.rate_causes import ReadAs
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
+from hilstar.attitude.logs.csv_log import CSV_COLUMNS, VALID_KIND, CsvLog, write_csv_log
 from hilstar.attitude.logs.entries import (
     MAX_QUOTED_CHARACTERS,
     MAX_SAMPLES,
     OPTIONS,
+    SORT_ADVICE,
     AttitudeLog,
     LogEntry,
     LogJoins,
@@ -39,7 +38,7 @@ from hilstar.attitude.logs.entries import (
     log_joins,
 )
 from hilstar.attitude.logs.log_times import time_notices
-from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, checked_sample, decode
+from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Event, Refusal, decode
 from hilstar.attitude.wire.source import HILSTARS, PACKETS, Convention, Conventions, components, packet_conventions
 from hilstar.errors import InputError, MachineError
 from hilstar.files import whole_file
@@ -55,20 +54,19 @@ from hilstar.reading import (
     read_text,
 )
 from hilstar.rotation import conjugate, multiply
+from hilstar.text_tables import open_table
 from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
     from hilstar.arrays import FloatArray
     from hilstar.attitude.logs.earth import Reference
 
-CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
-RATE_COLUMNS = ("rx", "ry", "rz")
-# A JSON number that msgspec takes as an integer: what one format can hold, all can.
-WHOLE_NUMBERS = range(-(2**63), 2**64)
 MAX_NAMED_TOPICS = 12
 MAX_LOG_BYTES = 500_000_000
 MAX_AEM_BYTES = 50_000_000
 NOTHING_STATED = Stated()
+JSON_KEYS = ('"t_ns"', '"q"', '"rate"', '"sequence"', '"discontinuity"')
+VALID_KEY = '"valid"'
 ENDINGS = (".csv", ".jsonl", ".json", ".mcap", ".aem", ".kvn", ".xml")
 READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP, SPICE CKs, bags of ROS and ULogs of PX4"
 YEAR_NS = 31_557_600 * NS_PER_S
@@ -76,74 +74,40 @@ SECONDS_FORM = "write seconds after its first sample"
 TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 
 
-def _read_csv(lines: Iterable[str], scalar: Literal["first", "last"]) -> Iterator[LogEntry]:
-    """The attitudes of a CSV, each quaternion as it was sent: with the scalar last, its columns
-    count as x, y, z, w in turn.
-    """
-    reader = csv.reader(lines)
-    rows = (row for row in reader if row and not row[0].startswith("#"))
-    header = [name.strip() for name in next(rows, [])]
-    if not header:
-        return
-    needed = CSV_COLUMNS + (RATE_COLUMNS if any(name in header for name in RATE_COLUMNS) else ())
-    missing = [name for name in needed if name not in header]
-    if missing:
-        detail = f"column {missing[0]} is missing; the header must have {','.join(needed)}"
-        if missing[0] == "t_s" and "t_ns" in header:
-            detail = f"column t_ns: a CSV has its times in seconds; divide by 1e9, and write {','.join(needed)}"
-        yield LogEntry(f":{reader.line_num}", Refusal("format", detail))
-        return
-    places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
-    numbers: tuple[str, ...] = CSV_COLUMNS[1:]
-    if scalar == "last":  # whatever the columns are called: a table that says so by its names needs no statement
-        numbers = tuple(sorted(numbers, key=lambda name: places[name]))
-    wanted = f"write finite numbers for {','.join(CSV_COLUMNS)}"
-    if len(places) > len(CSV_COLUMNS):
-        wanted += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
-    for row in rows:
-        try:
-            cells = {name: row[place].strip() for name, place in places.items()}
-            q = tuple(float(cells[name]) for name in numbers)
-            turning = [cells.get(name, "") for name in RATE_COLUMNS]
-            rate = tuple(map(float, turning)) if any(turning) else None
-            sequence = int(cells.get("sequence") or 0)
-            discontinuity = {"": False, "0": False, "1": True}[cells.get("discontinuity", "")]
-            if sequence not in WHOLE_NUMBERS:
-                raise ValueError
-            event = checked_sample(ns_of_seconds(cells["t_s"]), q, rate, sequence, discontinuity)
-        except (ValueError, LookupError, ArithmeticError):
-            event = Refusal("format", f"{','.join(row)[:MAX_QUOTED_CHARACTERS]!r}; {wanted}")
-        yield LogEntry(f":{reader.line_num}", event)
-
-
-def ns_of_seconds(seconds: str) -> int:
-    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns.
-
-    Raises ValueError or ArithmeticError.
-    """
-    value = Decimal(seconds)
-    if not value.is_finite() or value.adjusted() > 40:
-        raise ValueError
-    return int(value.scaleb(9).to_integral_value())
-
-
-def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
-    for sample in samples:
-        rate = sample.rate_cam_rad_s
-        numbers = [*map(repr, sample.q_icrs_to_cam.tolist()), *(("", "", "") if rate is None else map(repr, rate.tolist()))]
-        seconds, ns = divmod(abs(sample.t_ns), NS_PER_S)
-        t_s = f"{'-' if sample.t_ns < 0 else ''}{seconds}.{ns:09}"
-        file.write((",".join((t_s, *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")) + "\n").encode())
-
-
-def _read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
+def _read_json_lines(lines: Iterable[str], told: list[tuple[str, str]]) -> Iterator[LogEntry]:
+    """The attitudes of JSON lines; at their end `told` gets a notice of those that say `"valid": false`."""
+    invalid = 0
     for number, line in enumerate(lines, start=1):
-        if line.strip():
-            event = decode(line.strip().encode())
-            if not isinstance(event, AttitudeSample | Refusal):
-                event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
-            yield LogEntry(f":{number}", event)
+        text = line.strip()
+        if not text:
+            continue
+        event: Event = _json_fault(text) or decode(text.encode())
+        if not isinstance(event, AttitudeSample | Refusal):
+            event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
+        if VALID_KEY in text and _says_invalid(text):
+            invalid += 1
+            continue
+        yield LogEntry(f":{number}", event)
+    if invalid:
+        lines_are = "1 line is" if invalid == 1 else f"{invalid} lines are"
+        told.append((VALID_KIND, f"{lines_are} marked as not valid by the log itself, and left out"))
+
+
+def _json_fault(text: str) -> Refusal | None:
+    """What msgspec would not say of a line: an object over several lines, a key twice (it takes the last)."""
+    if text in ("{", "["):
+        return Refusal("format", "a JSON object over several lines; write each on one line (jq -c . FILE)")
+    for key in JSON_KEYS:
+        if text.count(key) > 1:
+            return Refusal("format", f"key {key} is there twice; write each once")
+    return None
+
+
+def _says_invalid(text: str) -> bool:
+    try:
+        return msgspec.json.decode(text, type=dict[str, object]).get("valid") in (False, 0)
+    except msgspec.MsgspecError:
+        return False  # refused by `decode`
 
 
 def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
@@ -178,12 +142,11 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
                 if isinstance(event, Refusal):
                     raise InputError(f"{path}{where}: {event.detail}")
                 if samples and event.t_ns <= samples[-1].t_ns:
-                    times = f"t_ns {event.t_ns} after {samples[-1].t_ns}"
-                    raise InputError(f"{path}{where}: time does not increase ({times}); {reading.advice}")
+                    raise InputError(f"{path}{where}: {_order_fault(event.t_ns, samples[-1].t_ns, reading.advice)}")
                 samples.append(mounting.sample(event) if conventions.of_body else event)
                 if len(samples) > MAX_SAMPLES:
                     raise InputError(f"{path}{where}: more than {MAX_SAMPLES} attitudes; split the log into several")
-    except (OSError, csv.Error) as error:
+    except OSError as error:
         raise InputError(f"{path}: cannot be read as a log ({error})") from error
     if not samples:
         _refuse_other_topics(path)
@@ -193,6 +156,12 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
         told += time_notices(samples, conventions.time_unit)
     read_as = ReadAs.of(conventions, stated.convention or HILSTARS, mounting, stated.convention_by)
     return AttitudeLog(samples, conventions, told, read_as)
+
+
+def _order_fault(t_ns: int, before_ns: int, advice: str) -> str:
+    if t_ns == before_ns and advice == SORT_ADVICE:
+        return f"time does not increase (t_ns {t_ns} after {before_ns}): two attitudes have one time; write more of its digits"
+    return f"time does not increase (t_ns {t_ns} after {before_ns}); {advice}"
 
 
 def _refuse_other_topics(path: Path) -> None:
@@ -220,7 +189,7 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
         raise InputError(f"{path}: no attitude to write")
     with whole_file(path) as file:
         if ending == ".csv":
-            _write_csv(file, samples)
+            write_csv_log(file, samples)
         elif ending in {".jsonl", ".json"}:
             _write_json_lines(file, samples)
         elif ending == ".mcap":
@@ -297,9 +266,7 @@ def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
         yield reading
 
 
-def _of_packets(
-    path: Path, entries: Iterator[LogEntry], source: str, stated: Stated, advice: str = "sort the log by time"
-) -> LogReading:
+def _of_packets(path: Path, entries: Iterator[LogEntry], source: str, stated: Stated, advice: str = SORT_ADVICE) -> LogReading:
     """The reading of entries that have the numbers of a packet, as they were sent: their
     convention, then their reference.
 
@@ -417,15 +384,21 @@ def _open_other_ccsds(path: Path, stated: Stated) -> Iterator[LogReading]:
 @contextlib.contextmanager
 def _open_json_lines(path: Path, stated: Stated) -> Iterator[LogReading]:
     with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        yield _of_packets(path, _read_json_lines(lines), "JSON lines", stated)
+        told: list[tuple[str, str]] = []
+        reading = _of_packets(path, _read_json_lines(lines, told), "JSON lines", stated)
+        yield reading
+        reading.told.extend(told)
 
 
 @contextlib.contextmanager
 def _open_csv(path: Path, stated: Stated) -> Iterator[LogReading]:
     scalar = (stated.convention or HILSTARS).scalar
-    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        reading = _of_packets(path, _read_csv(lines, scalar), "CSV", stated)
-        yield replace(reading, conventions=replace(reading.conventions, time_unit="s"))
+    with open_table(path, READABLE, MAX_LOG_BYTES) as table:
+        csv_log = CsvLog(table, scalar)
+        reading = _of_packets(path, csv_log.entries(), "CSV", stated)
+        reading.told.extend(csv_log.told)
+        csv_log.told = reading.told
+        yield replace(reading, conventions=replace(reading.conventions, time_unit=csv_log.time_unit))
 
 
 def _is_bag(beginning: LogHead) -> bool:

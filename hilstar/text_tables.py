@@ -68,9 +68,6 @@ OTHER_NAMES = {
     "t": ("time", "timestamp", "seconds", "epoch", "time_since_start"),
     "wavelength": ("lambda", "λ", "wl", "wave", "wavelengths", "wvl", "lam"),
     "exposure": ("exposure_time", "exptime", "t_exp", "integration_time"),
-    "host": (),
-    "x": (),
-    "y": (),
 }
 
 
@@ -85,12 +82,13 @@ class Column(NamedTuple):
 class Chosen(NamedTuple):
     """A column that was asked for: its place in a row, and by what its numbers are multiplied (None: as they are).
 
-    `inverted`: its flags say which rows do not hold.
+    `inverted`: its flags say which rows do not hold. `has_unit` is False where no unit is stated that was wanted.
     """
 
     place: int
     factor: Decimal | None = None
     inverted: bool = False
+    has_unit: bool = True
 
 
 @dataclass
@@ -198,11 +196,11 @@ class TextTable:
             reason += " (a decimal comma, or commas between thousands? write 1234.5)"
         raise self.refusal(line, reason)
 
-    def chosen(self, name: str, unit: str = "", other_names: Sequence[str] = ()) -> Chosen | None:
+    def chosen(self, name: str, unit: str = "", other_names: Sequence[str] = (), must_state: bool = True) -> Chosen | None:
         """The column of hilstar's `name`, in any unit that it states; None where there is none.
 
-        `unit` is the wanted one, by default that at the end of `name`. Raises InputError for two such columns, and
-        for one whose unit is missing or another.
+        `unit` is the wanted one, by default that at the end of `name`. Raises InputError for two such columns, for
+        one in a unit of another kind, and, with `must_state`, for one without a unit.
         """
         base, by_name = quantity_of(name)
         wanted = unit or by_name
@@ -224,6 +222,8 @@ class TextTable:
             return None
         place = self._only(name, plain)
         column = self.columns[place]
+        if not column.unit and wanted and not must_state:
+            return Chosen(place, has_unit=False)
         if not column.unit and wanted:
             raise self.refusal(
                 self.header_line, f"column {column.header} has no unit; write {name}, or its unit as {column.name} [{wanted}]"
@@ -289,6 +289,13 @@ class TextTable:
         if chosen.inverted and text.lower() in FLAGS:
             text = str(int(not FLAGS[text.lower()])) if text else ""
         return text
+
+    def not_used(self, used: Sequence[Chosen]) -> None:
+        """Add a notice of the columns that are not among those `used`."""
+        places = {chosen.place for chosen in used}
+        rest = [column.header for place, column in enumerate(self.columns) if place not in places and column.header]
+        if rest:
+            self.notices.append(f"not used: {', '.join(rest[:MAX_NAMED])}")
 
     def warn(self) -> None:
         """Log each notice as a warning, once in a process."""

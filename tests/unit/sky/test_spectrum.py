@@ -57,7 +57,7 @@ def test_integration_nodes_integrate_pieces_of_straight_lines():
         ("wavelength_nm,value\n400,0.5\n", "at least two rows"),
         ("400,0.5\n300,0.5\n", "do not rise"),
         ("400,0.5\n400,0.5\n", "do not rise"),
-        ("400,0.5\n500,nan\n", "not finite"),
+        ("400,0.5\n500,nan\n", "not a finite number"),
         ("400,0.5\n500,1.5\n", "fractions from 0 to 1"),
         ("400,0.5\n500,-0.1\n", "fractions from 0 to 1"),
         ("400,0.5\n500\n", ":2:"),

@@ -156,6 +156,32 @@ class TextTable:
         except csv.Error as error:
             raise self.refusal(before + reader.line_num, f"not CSV ({error})") from error
 
+    def blocks(self, characters: int) -> Iterator[tuple[int, list[str]]]:
+        """The lines of the rows in pieces of about so many characters, each with the number of its first line.
+
+        No quoted cell goes over the end of a piece. For a parser of whole columns; a doubtful end is warned of.
+        """
+        number, size, quotes = self.first_row, 0, 0
+        lines: list[str] = []
+        for line in self._watched():
+            lines.append(line)
+            size += len(line)
+            quotes += line.count('"') if self.quoted else 0
+            if size < characters or (quotes % 2 and size < 2 * characters):
+                continue
+            yield number, lines
+            number, size, quotes, lines = number + len(lines), 0, 0, []
+        if not lines:
+            return
+        if self._unended and not self._is_whole(split(lines[-1], self.delimiter), []):
+            self.is_cut = True
+            warn_once(f"{self.path}:{number + len(lines) - 1}: {DOUBTFUL_END}")
+        yield number, lines
+
+    def row_of(self, line: int, text: str) -> list[str]:
+        """The cells of one line, as many as there are columns. Raises InputError where it has more or fewer."""
+        return self._counted(line, split(text, self.delimiter))
+
     def _is_whole(self, cells: list[str], previous: list[str]) -> bool:
         """Whether a row whose line has no end is whole by its last cell, beside those of the first rows and the row before.
 
@@ -181,7 +207,7 @@ class TextTable:
         for line in self.lines:
             if line[-1] not in "\r\n":
                 self._unended = True
-            yield " ".join(line.split()) if blanks else line
+            yield " ".join(line.split()) + "\n" if blanks else line
 
     def _counted(self, line: int, cells: list[str]) -> list[str]:
         """A row's cells where further ones are blank. Raises InputError for another number than there are columns."""

@@ -67,6 +67,8 @@ SUFFIXES = {
 OTHER_NAMES = {
     "t": ("time", "timestamp", "seconds", "epoch", "time_since_start"),
     "wavelength": ("lambda", "λ", "wl", "wave", "wavelengths", "wvl", "lam"),
+    "quantity": ("parameter", "symbol", "property"),
+    "unit": ("units",),
     "exposure": ("exposure_time", "exptime", "t_exp", "integration_time"),
 }
 
@@ -136,7 +138,7 @@ class TextTable:
         """
         count = len(self.columns)
         quote = '"' if self.quoted else None
-        reader = csv.reader(self._watched(), delimiter=self.delimiter, quotechar=quote)
+        reader = csv.reader(self._watched(), delimiter=self.delimiter, quotechar=quote, strict=True)
         before = self.first_row - 1
         previous: list[str] = []
         try:
@@ -306,7 +308,7 @@ class TextTable:
         if chosen is None:
             return ""
         text = cells[chosen.place].strip()
-        if not text.isascii():
+        if not text.isascii() and is_number(text):
             text = ascii_text(text)
         if self.decimal_comma and DECIMAL_COMMA.fullmatch(text):
             text = text.replace(",", ".")
@@ -382,10 +384,11 @@ def _scaled(text: str, size: Decimal) -> str:
 def open_table(path: Path, advice: str, limit_bytes: int) -> Iterator[TextTable]:
     """A text table with its head read. Raises InputError, with `advice`, for what is no text and for a header too long."""
     with open_lines(path, advice, limit_bytes) as lines:
-        yield _table(path, advice, lines)
+        yield table_of(path, advice, lines)
 
 
-def _table(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
+def table_of(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
+    """The text table of lines, each with its end, with its head read. Raises InputError, with `advice`."""
     comments, sample, number, delimiter = _head(path, advice, lines)
     following = itertools.chain(sample, lines)
     if not sample:
@@ -507,11 +510,11 @@ def _is_rule(cells: Sequence[str]) -> bool:
 
 
 def _is_units(cells: Sequence[str], count: int) -> bool:
-    """Whether each cell that is not blank is a unit, and one of them no number."""
+    """Whether each cell that is not blank is a unit, and none a number."""
     if len(cells) != count:
         return False
     units = [cell.strip("[]() ") for cell in cells if cell]
-    return bool(units) and all(is_unit(plain_unit(unit)) for unit in units) and not all(map(is_number, units))
+    return bool(units) and all(is_unit(plain_unit(unit)) for unit in units) and not any(map(is_number, units))
 
 
 def _has_decimal_comma(table: TextTable, lines: Sequence[str]) -> bool:

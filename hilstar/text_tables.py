@@ -194,10 +194,10 @@ class TextTable:
             return False
         last = cells[-1].strip()
         others = [row[-1].strip() for row in (*self.sample, previous) if len(row) == len(cells)]
-        if "e" in "".join([last, *others]).lower():
-            return False
         if not others or not is_number(last):
             return last in others
+        if "e" in "".join([last, *others]).lower():
+            return False
         decimals = min(map(_decimals, others))
         if decimals:
             return _decimals(last) >= min(decimals, SHARP_DECIMALS)

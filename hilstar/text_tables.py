@@ -241,14 +241,14 @@ class TextTable:
                 raise self.refusal(self.header_line, reason)
             return self._in_unit(place, stated or wanted, wanted)
         bases = (base, *OTHER_NAMES.get(base, ()), *other_names)
-        united = self._united(bases, wanted)
-        if united:
-            place = self._only(name, sorted(united))
-            return self._in_unit(place, united[place], wanted)
-        plain = self._places(bases)
-        if not plain:
+        united, plain = self._united(bases, wanted), self._places(bases)
+        if not united and not plain:
             return None
-        place = self._only(name, plain)
+        # Where a unit has to be stated, one that states none is another quantity.
+        places = sorted(united) if united and must_state else sorted({*united, *plain})
+        place = self._only(name, places)
+        if place in united:
+            return self._in_unit(place, united[place], wanted)
         column = self.columns[place]
         if not column.unit and wanted and not must_state:
             return Chosen(place, has_unit=False)

@@ -166,9 +166,7 @@ def _curve_columns(table: TextTable, highest: float) -> tuple[Chosen, Chosen]:
     if wavelength is None:
         raise table.refusal(table.header_line, f"no column wavelength_nm among {table.names}")
     unit = "1" if highest == 1 else ""
-    values = table.chosen("value", unit, must_state=False)
-    if values is None:
-        values = table.chosen(VALUE_NAMES[0], unit, VALUE_NAMES[1:], must_state=False)
+    values = table.chosen("value", unit, VALUE_NAMES, must_state=False)
     if values is None:
         raise table.refusal(table.header_line, f"no column value among {table.names}")
     return wavelength, values

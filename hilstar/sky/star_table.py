@@ -41,6 +41,8 @@ GAIA_DR2_JYEAR, GAIA_DR3_JYEAR = 2015.5, 2016.0
 EPOCHS_JYEAR = (1800.0, 2200.0)
 # Right ascensions below this may be hours, and below 2 pi radians: without a unit they are refused, whatever the rest says.
 HOURS_A_TURN, RAD_A_TURN = 24.0, 2 * math.pi
+TURNS = {"h": HOURS_A_TURN, "hr": HOURS_A_TURN, "hrs": HOURS_A_TURN, "hou": HOURS_A_TURN, "rad": RAD_A_TURN}
+ROUNDED = 1e-6  # of a turn in radians, as written
 # Half of all stars to V = 6.5 move by over 30 mas a year, and half of those of the Magellanic Clouds by 1.9. In arcsec a year
 # half of the brightest 900 move by less than 0.05.
 MIN_MEDIAN_MAS_YR, MOTION_STARS = 1.0, 3
@@ -86,6 +88,7 @@ def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float
     Raises InputError where no row is a star, and where a unit or the epoch has to be stated.
     """
     columns = _Columns(path, table)
+    columns.check_turn()
     ra_deg, dec_deg = columns.places()
     v_mag, bv_mag, vi_mag, words = columns.magnitudes()
     pm = {role: columns.role(role, 0.0) for role in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")}
@@ -157,27 +160,31 @@ class _Columns:
             self.notices.append(notice)
         return values * factor
 
+    def check_turn(self) -> None:
+        """Raises InputError for right ascensions beyond a turn of their unit."""
+        name = self.pair[0]
+        unit = (self.table.unit.get(name) or "").strip()
+        turn = TURNS.get(plain_unit(unit)[:3])
+        largest = float(np.nanmax(self.table.columns[name], initial=0.0))
+        if turn is not None and largest > turn + ROUNDED:
+            raise InputError(
+                f"{self.path}: column {name} is in {unit} and runs to {largest:g}; name it ra_deg if it is in degrees"
+            )
+
     def check_places(self) -> None:
-        """Raises InputError for places without a unit that may be hours or radians, and for others beyond their unit."""
-        ra, dec = (np.asarray(self.table.columns[name], dtype=np.float64) for name in self.pair)
+        """Raises InputError for places without a unit that may be hours or radians."""
+        name = self.pair[0]
+        ra, dec = (np.asarray(self.table.columns[column], dtype=np.float64) for column in self.pair)
         placed = np.isfinite(ra) & np.isfinite(dec)
-        if not placed.any():
+        if self.has_unit(name) or not placed.any():
             return
         low, high, steepest = ra[placed].min(), ra[placed].max(), np.abs(dec[placed]).max()
-        name, unit = self.pair[0], (self.table.unit.get(self.pair[0]) or "").strip()
-        turn = {"h": HOURS_A_TURN, "rad": RAD_A_TURN}.get(plain_unit(unit).replace("hours", "h"))
-        if turn is not None and high > turn + 1e-6:
-            raise InputError(
-                f"{self.path}: column {name} is in {unit} and runs to {high:g}; name it ra_deg if it is in degrees"
-            )
-        if unit:
-            return
-        base = f"column {name} has no unit and runs from {low:.6g} to {high:.6g}"
+        base = f"{self.path}: column {name} has no unit and runs from {low:.6g} to {high:.6g}"
         names = "ra_deg, ra_hours or ra_rad"
-        if low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
-            raise InputError(f"{self.path}: {base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or dec_rad")
+        if -RAD_A_TURN / 2 <= low and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
+            raise InputError(f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or dec_rad")
         if low >= 0 and high < HOURS_A_TURN:
-            raise InputError(f"{self.path}: {base}: so it is in hours, or of one field in degrees; {UNIT_ADVICE}: {names}")
+            raise InputError(f"{base}: so it is in hours, or of one field in degrees; {UNIT_ADVICE}: {names}")
 
     def check_motions(self, motions: dict[str, FloatArray]) -> None:
         """Raises InputError for proper motions without a unit that are too small to be mas a year."""
@@ -576,7 +583,8 @@ def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArra
     )
     if not any(role in columns.layout.role for role in table_reader.ERROR_NAMES):
         return facts
-    identifier = columns.identifiers()[1]
+    by_row = columns.row_numbers()
+    identifier = by_row[1] if stars.designation == by_row[0] else columns.identifiers()[1]
     order = np.argsort(identifier, kind="stable")
     row = order[np.minimum(np.searchsorted(identifier, stars.identifier, sorter=order), len(order) - 1)]
     own = (identifier[row] == stars.identifier) & ~(choice.with_hipparcos & (stars.hip == stars.identifier))

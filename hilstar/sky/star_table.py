@@ -181,7 +181,7 @@ class _Columns:
         low, high, steepest = ra[placed].min(), ra[placed].max(), np.abs(dec[placed]).max()
         base = f"{self.path}: column {name} has no unit and runs from {low:.6g} to {high:.6g}"
         names = "ra_deg, ra_hours or ra_rad"
-        if -RAD_A_TURN / 2 <= low and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
+        if low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
             raise InputError(f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or dec_rad")
         if low >= 0 and high < HOURS_A_TURN:
             raise InputError(f"{base}: so it is in hours, or of one field in degrees; {UNIT_ADVICE}: {names}")

@@ -46,6 +46,7 @@ DOUBTFUL_END = "the last line has no line end, and may be cut off: is the file w
 SHARP_DECIMALS = 12  # of a quaternion or a place: a thousandth of a milliarcsecond
 # Excel's own first line, which names the delimiter.
 EXCEL_MARK = re.compile(r"sep=(.)\s*", re.IGNORECASE)
+PERCENT_OF = re.compile(r"% ?(?:of )?([^\W\d].*)")
 BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:[,'  ]\d{3})+(?:[.]\d*)?|[-+]?\d{1,3}(?:\.\d{3})+,\d*")
@@ -253,9 +254,8 @@ class TextTable:
         if not column.unit and wanted and not must_state:
             return Chosen(place, has_unit=False)
         if not column.unit and wanted:
-            raise self.refusal(
-                self.header_line, f"column {column.header} has no unit; write {name}, or its unit as {column.name} [{wanted}]"
-            )
+            advice = f"write {name}, or its unit as {column.name} [{wanted}]"
+            raise InputError(f"{self.path}:{self.header_line}: column {column.header} has no unit; {advice}")
         return self._in_unit(place, column.unit or wanted, wanted)
 
     def valid(self) -> Chosen | None:
@@ -292,7 +292,7 @@ class TextTable:
     def _in_unit(self, place: int, unit: str, wanted: str) -> Chosen:
         column = self.columns[place]
         if not wanted:
-            if column.unit:
+            if column.unit and factor(column.unit, "1") != 1:
                 self.notices.append(f"column {column.header} is taken as it is, in {column.unit}")
             return Chosen(place)
         size = factor(unit, wanted)
@@ -352,6 +352,9 @@ def column_of(header: str) -> Column:
     """The column of a header, with the unit in its brackets, if it has one."""
     text = header.strip().strip('"').strip()
     match = BRACKETS.fullmatch(text)
+    percent = PERCENT_OF.fullmatch(text)
+    if percent is not None:
+        return Column(text, percent[1], "%")
     if match is None or not match[1]:
         return Column(text, text)
     unit = match[2] if match[2] is not None else match[3]

@@ -24,7 +24,7 @@ DISCONTINUITY = {"": False, "0": False, "1": True}
 TIME_UNITS = {Decimal("1e-3"): "ms", Decimal("1e-6"): "us", Decimal("1e-9"): "ns"}
 # Columns by which other programs mark rows, in words or numbers of their own.
 MARKS = frozenset(("status", "quality", "flag", "flags", "state", "mode", "health", "fix", "tracking", "quality_flag"))
-UNITS_ADVICE = "t_s is in seconds: name a column of ms, us or ns t_ms, t_us or t_ns"
+UNITS_ADVICE = "t_s is in seconds; name the column t_ms, t_us or t_ns if it is in ms, us or ns"
 JSON_ADVICE = "write JSON lines, on each an object of t_ns and q (jq -c '.[]' FILE)"
 TABLE_KIND, VALID_KIND, CUT_KIND = "log-table", "log-valid", "log-cut"
 

@@ -147,7 +147,7 @@ REFUSED = {
     f'[{{"t_ns": 1, "q": [{Q}]}},{{"t_ns": 2, "q": [{Q}]}}]': "is a JSON array, or an object over several lines; write",
     f'[\n {{"t_ns": 1,\n "q": [{Q}]}}\n]\n': "is a JSON array, or an object over several lines",
     f'{{\n "t_ns": 1,\n "q": [{Q}]\n}}\n': ":1: a JSON object over several lines; write each on one line",
-    HEAD + f"1763800000000,{Q}\n": ":2: t_s = 1763800000000 s does not fit 64 bits of ns; t_s is in seconds: name",
+    HEAD + f"1763800000000,{Q}\n": ":2: t_s = 1763800000000 s does not fit 64 bits of ns; t_s is in seconds; name",
     HEAD
     + f"100.01,{Q}\n100.01,{Q}\n": ":3: time does not increase (t_ns 100010000000 after 100010000000): two attitudes have one",
     HEAD + f"2,{Q}\n1,{Q}\n": "; sort the log by time",

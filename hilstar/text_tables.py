@@ -1,4 +1,4 @@
-r"""Text tables as users have them: one reader for logs, telemetry, curves, data sheets, dots and star catalogues.
+r"""Text tables as users have them: one reader for logs, curves, data sheets and catalogues.
 
 How a table is read, by its first lines:
 1. The lines between cells are split by comma, tab, semicolon, | or blanks: the one that gives most
@@ -26,11 +26,20 @@ from typing import NamedTuple
 
 from hilstar.errors import InputError, shortened
 from hilstar.reading import open_lines, warn_once
-from hilstar.spelled_units import ascii_text, factor, is_unit, plain_unit, suffix_unit
+from hilstar.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 
 VALID = "valid"
 # The names of a column that says which rows hold, and of one that says which do not.
-VALID_NAMES = (VALID, "is_valid", "valid_flag", "validity", "q_valid", "quat_valid", "att_valid", "attitude_valid")
+VALID_NAMES = (
+    VALID,
+    "is_valid",
+    "valid_flag",
+    "validity",
+    "q_valid",
+    "quat_valid",
+    "att_valid",
+    "attitude_valid",
+)
 INVALID_NAMES = ("invalid", "is_invalid", "lost")
 FLAGS = dict.fromkeys(("", "1", "1.0", "true", "t", "yes", "y", "valid", "ok", "good"), True)
 FLAGS |= dict.fromkeys(("0", "0.0", "false", "f", "no", "n", "invalid", "bad", "lost"), False)
@@ -75,7 +84,7 @@ OTHER_NAMES = {
 
 
 class Column(NamedTuple):
-    """A column: its header as written, its name without a unit, and the unit that header or line of units states ("": none)."""
+    """A column: its header as written, its name without a unit, and the unit that is stated ("": none)."""
 
     header: str
     name: str
@@ -83,9 +92,10 @@ class Column(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """A column that was asked for: its place in a row, and by what its numbers are multiplied (None: as they are).
+    """A column that was asked for: its place in a row, and what its numbers are multiplied by, if any.
 
-    `inverted`: its flags say which rows do not hold. `has_unit` is False where no unit is stated that was wanted.
+    `inverted`: its flags say which rows do not hold. `has_unit` is False where no unit is stated
+    that was wanted.
     """
 
     place: int
@@ -131,10 +141,10 @@ class TextTable:
         return ", ".join(names) + more
 
     def rows(self, keep_cut: bool = True) -> Iterator[tuple[int, list[str]]]:
-        """Line numbers with the cells of each row, as many as there are columns; neither stripped nor converted.
+        """Line numbers with the cells of each row, as many as there are columns, as they stand.
 
-        Blank rows and comments are skipped. A last line without an end, which is not surely whole (`_is_whole`), is left
-        out, or with `keep_cut` read with a warning; `is_cut` is then True.
+        Blank rows and comments are skipped. A last line without an end, which is not surely whole
+        (`_is_whole`), is left out, or with `keep_cut` read with a warning; `is_cut` is then True.
         Raises InputError, with `advice`, for a row of more or fewer cells.
         """
         count = len(self.columns)
@@ -160,9 +170,10 @@ class TextTable:
             raise self.refusal(before + reader.line_num, f"not CSV ({error})") from error
 
     def blocks(self, characters: int) -> Iterator[tuple[int, list[str]]]:
-        """The lines of the rows in pieces of about so many characters, each with the number of its first line.
+        """The lines of the rows in pieces of about so many characters, with each first line's number.
 
-        No quoted cell goes over the end of a piece. For a parser of whole columns; a doubtful end is warned of.
+        No quoted cell goes over the end of a piece. For a parser of whole columns; a doubtful end is
+        warned of.
         """
         number, size, quotes = self.first_row, 0, 0
         lines: list[str] = []
@@ -182,14 +193,15 @@ class TextTable:
         yield number, lines
 
     def row_of(self, line: int, text: str) -> list[str]:
-        """The cells of one line, as many as there are columns. Raises InputError where it has more or fewer."""
+        """The cells of one line, as many as there are columns. Raises InputError for another number."""
         return self._counted(line, split(text, self.delimiter))
 
     def _is_whole(self, cells: list[str], previous: list[str]) -> bool:
-        """Whether a row whose line has no end is whole by its last cell, beside those of the first rows and the row before.
+        """Whether a row whose line has no end is whole, by its last cell beside those of other rows.
 
-        Numbers of one format all have as many decimals, and beyond SHARP_DECIMALS of them no further one matters; a whole
-        number is as long as the one before. A number whose exponent may be missing tells nothing.
+        Numbers of one format all have as many decimals, and beyond SHARP_DECIMALS no further one
+        matters; a whole number is as long as the one before. One whose exponent may be missing tells
+        nothing.
         """
         if len(cells) != len(self.columns):
             return False
@@ -213,7 +225,7 @@ class TextTable:
             yield " ".join(line.split()) + "\n" if blanks else line
 
     def _counted(self, line: int, cells: list[str]) -> list[str]:
-        """A row's cells where further ones are blank. Raises InputError for another number than there are columns."""
+        """A row's cells where further ones are blank. Raises InputError for another number of them."""
         count = len(self.columns)
         rest = cells[count:]
         if len(cells) >= count and not any(map(str.strip, rest)):
@@ -228,38 +240,45 @@ class TextTable:
     def chosen(self, name: str, unit: str = "", other_names: Sequence[str] = (), must_state: bool = True) -> Chosen | None:
         """The column of hilstar's `name`, in any unit that it states; None where there is none.
 
-        `unit` is the wanted one, by default that at the end of `name`. Raises InputError for two such columns, for
-        one in a unit of another kind, and, with `must_state`, for one without a unit.
+        `unit` is the wanted one, by default that at the end of `name`. Raises InputError for two
+        such columns, for one in a unit of another kind and, with `must_state`, for one without.
         """
         base, by_name = quantity_of(name)
         wanted = unit or by_name
         exact = self._places((name.casefold(),))
         if exact:
-            place = self._only(name, exact)
-            stated = self.columns[place].unit
-            if stated and by_name and factor(stated, by_name) != 1:
-                reason = f"column {self.columns[place].header} states two units"
-                raise self.refusal(self.header_line, reason)
-            return self._in_unit(place, stated or wanted, wanted)
+            return self._named(self._only(name, exact), by_name, wanted)
         bases = (base, *OTHER_NAMES.get(base, ()), *other_names)
         united, plain = self._united(bases, wanted), self._places(bases)
-        if not united and not plain:
-            return None
         # Where a unit has to be stated, one that states none is another quantity.
-        places = sorted(united) if united and must_state else sorted({*united, *plain})
-        place = self._only(name, places)
-        if place in united:
-            return self._in_unit(place, united[place], wanted)
-        column = self.columns[place]
-        if not column.unit and wanted and not must_state:
+        places = set(united)
+        if not united or not must_state:
+            places.update(plain)
+        if not places:
+            return None
+        place = self._only(name, sorted(places))
+        stated = united.get(place) or self.columns[place].unit
+        if wanted and not stated:
+            if must_state:
+                raise self._no_unit(place, name, wanted)
             return Chosen(place, has_unit=False)
-        if not column.unit and wanted:
-            advice = f"write {name}, or its unit as {column.name} [{wanted}]"
-            raise InputError(f"{self.path}:{self.header_line}: column {column.header} has no unit; {advice}")
+        return self._in_unit(place, stated or wanted, wanted)
+
+    def _named(self, place: int, by_name: str, wanted: str) -> Chosen:
+        """A column of hilstar's own name, whose unit `by_name` a bracket may only repeat."""
+        column = self.columns[place]
+        if column.unit and by_name and factor(column.unit, by_name) != 1:
+            raise self.refusal(self.header_line, f"column {column.header} states two units")
         return self._in_unit(place, column.unit or wanted, wanted)
 
+    def _no_unit(self, place: int, name: str, wanted: str) -> InputError:
+        column = self.columns[place]
+        advice = f"write {name}, or its unit as {column.name} [{wanted}]"
+        where = f"{self.path}:{self.header_line}"
+        return InputError(f"{where}: column {column.header} has no unit; {advice}")
+
     def valid(self) -> Chosen | None:
-        """The column that says which rows hold, or which do not, by any of its names; None where there is none."""
+        """The column that says which rows hold, or which do not, by any of its names, if there is one."""
         places = self._places(VALID_NAMES)
         if places:
             return Chosen(self._only(VALID, places))
@@ -267,10 +286,14 @@ class TextTable:
         return Chosen(self._only("invalid", places), inverted=True) if places else None
 
     def _places(self, names: Sequence[str]) -> list[int]:
-        return [place for place, column in enumerate(self.columns) if plain_name(column.name) in names]
+        places = []
+        for place, column in enumerate(self.columns):
+            if plain_name(column.name) in names:
+                places.append(place)
+        return places
 
     def _united(self, bases: Sequence[str], wanted: str) -> dict[int, str]:
-        """The unit by place of the columns whose names are one of `bases` with a unit of the wanted kind at the end."""
+        """The unit by place of the columns named like one of `bases` with a unit of the wanted kind."""
         united = {}
         for place, column in enumerate(self.columns):
             name = plain_name(column.name)
@@ -297,14 +320,16 @@ class TextTable:
             return Chosen(place)
         size = factor(unit, wanted)
         if size is None:
-            raise self.refusal(self.header_line, f"column {column.header} is in {unit!r}, and {wanted} is wanted")
+            reason = f"column {column.header} is in {unit!r}, and {wanted} is wanted"
+            raise self.refusal(self.header_line, reason)
         if size == 1:
             return Chosen(place)
-        self.notices.append(f"column {column.header} is in {unit}: its numbers are multiplied by {size:.9g}, to be in {wanted}")
+        change = f"its numbers are multiplied by {size:.9g}, to be in {wanted}"
+        self.notices.append(f"column {column.header} is in {unit}: {change}")
         return Chosen(place, size)
 
     def cell(self, cells: Sequence[str], chosen: Chosen | None) -> str:
-        """The text of a chosen column in a row, its number in the wanted unit; "" where there is no such column."""
+        """The text of a chosen column in a row, its number in the wanted unit; "" for no column."""
         if chosen is None:
             return ""
         text = cells[chosen.place].strip()
@@ -321,7 +346,8 @@ class TextTable:
     def not_used(self, used: Sequence[Chosen]) -> None:
         """Add a notice of the columns that are not among those `used`."""
         places = {chosen.place for chosen in used}
-        rest = [column.header for place, column in enumerate(self.columns) if place not in places and column.header]
+        rest = [column.header for place, column in enumerate(self.columns) if place not in places]
+        rest = list(filter(None, rest))
         if rest:
             self.notices.append(f"not used: {', '.join(rest[:MAX_NAMED])}")
 
@@ -385,7 +411,7 @@ def _scaled(text: str, size: Decimal) -> str:
 
 @contextmanager
 def open_table(path: Path, advice: str, limit_bytes: int) -> Iterator[TextTable]:
-    """A text table with its head read. Raises InputError, with `advice`, for what is no text and for a header too long."""
+    """A text table with its head read. Raises InputError, with `advice`, for what is no text table."""
     with open_lines(path, advice, limit_bytes) as lines:
         yield table_of(path, advice, lines)
 
@@ -396,33 +422,44 @@ def table_of(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
     following = itertools.chain(sample, lines)
     if not sample:
         return TextTable(path, advice, [], ",", number, following, header=False)
-    if len(sample[0]) > MAX_HEADER_CHARACTERS:
-        raise InputError(f"{path}:{number}: its first line is longer than {MAX_HEADER_CHARACTERS} characters; {advice}")
     delimiter = delimiter or delimiter_of(sample)
     header = split(sample[0], delimiter)
-    if len(header) > MAX_COLUMNS:
-        raise InputError(f"{path}:{number}: its first line names more than {MAX_COLUMNS} columns; {advice}")
     table = TextTable(path, advice, [], delimiter, number, following, header_line=number)
-    numbers = sum(map(is_number, header))
-    ended = [line for line in sample if line[-1] in "\r\n"]
-    if 2 * numbers >= len(header):
+    if len(sample[0]) > MAX_HEADER_CHARACTERS:
+        reason = f"its first line is longer than {MAX_HEADER_CHARACTERS} characters"
+        raise table.refusal(number, reason)
+    if len(header) > MAX_COLUMNS:
+        raise table.refusal(number, f"its first line names more than {MAX_COLUMNS} columns")
+    if 2 * sum(map(is_number, header)) >= len(header):
         _name_by_comment(table, comments, len(header))
-        table.sample = [split(line, delimiter) for line in ended]
-        table.decimal_comma = _has_decimal_comma(table, sample)
-        return table
-    next(following)
-    rows = [split(line, delimiter) for line in sample[1:]]
-    if not header[-1].strip() and rows and len(rows[0]) == len(header) - 1:
-        del header[-1]  # a delimiter at the end of the header alone
-    table.columns = [column_of(name) for name in header]
-    table.first_row = number + 1 + _skip_units(table, rows, following)
-    table.decimal_comma = _has_decimal_comma(table, sample[1:])
-    table.sample = [split(line, delimiter) for line in ended[table.first_row - number :]]
+    else:
+        next(following)
+        _name_by_header(table, header, sample[1:], following)
+    rows = sample[table.first_row - number :]
+    table.decimal_comma = _has_decimal_comma(table, rows)
+    table.sample = [split(line, delimiter) for line in rows if line[-1] in "\r\n"]
     return table
 
 
-def _head(path: Path, advice: str, lines: Iterator[str]) -> tuple[list[str], list[str], int, str | None]:
-    """The comments, the first lines that are none, the number of the first of these, and Excel's delimiter."""
+def _name_by_header(table: TextTable, header: list[str], sample: Sequence[str], following: Iterator[str]) -> None:
+    """Name the columns by the header and the lines of units and dashes below it."""
+    rows = [split(line, table.delimiter) for line in sample]
+    if not header[-1].strip() and rows and len(rows[0]) == len(header) - 1:
+        del header[-1]  # a delimiter at the end of the header alone
+    table.columns = [column_of(name) for name in header]
+    table.first_row += 1 + _skip_units(table, rows, following)
+
+
+class Head(NamedTuple):
+    """The comments before a table, its first lines, the number of the first, and Excel's delimiter."""
+
+    comments: list[str]
+    sample: list[str]
+    number: int
+    delimiter: str | None
+
+
+def _head(path: Path, advice: str, lines: Iterator[str]) -> Head:
     comments: list[str] = []
     delimiter = None
     number = 0
@@ -434,10 +471,12 @@ def _head(path: Path, advice: str, lines: Iterator[str]) -> tuple[list[str], lis
         elif _is_comment(line):
             comments.append(line)
         elif line.strip():
-            return comments, [line, *itertools.islice(lines, SAMPLE_LINES)], number, delimiter
+            sample = [line, *itertools.islice(lines, SAMPLE_LINES)]
+            return Head(comments, sample, number, delimiter)
         if number > MAX_HEAD_LINES:
-            raise InputError(f"{path}: {MAX_HEAD_LINES} lines, and none with a table's header; {advice}")
-    return comments, [], max(number, 1), delimiter
+            reason = f"{MAX_HEAD_LINES} lines, and none with a table's header"
+            raise InputError(f"{path}: {reason}; {advice}")
+    return Head(comments, [], max(number, 1), delimiter)
 
 
 def _is_comment(line: str) -> bool:
@@ -459,7 +498,7 @@ def split(line: str, delimiter: str) -> list[str]:
 
 
 def delimiter_of(lines: Sequence[str]) -> str:
-    """What stands between the cells of a table's first lines, the first of which is the header or a row."""
+    """What stands between the cells of a table's first lines, a header or a row before the others."""
     best, best_rank = ",", (0, 0.0, 0)
     rows = [line for line in lines if line.strip() and not _is_comment(line)]
     for delimiter in DELIMITERS:
@@ -477,7 +516,7 @@ def delimiter_of(lines: Sequence[str]) -> str:
 
 
 def _name_by_comment(table: TextTable, comments: Sequence[str], count: int) -> None:
-    """The columns of a table whose first line is a row, by the last comment where that has a name for each."""
+    """Name the columns of a table whose first line is a row, where the last comment has all names."""
     table.header = False
     table.columns = [Column("", "")] * count
     text = comments[-1].strip().lstrip("#%!;").strip() if comments else ""
@@ -490,7 +529,7 @@ def _name_by_comment(table: TextTable, comments: Sequence[str], count: int) -> N
 
 
 def _skip_units(table: TextTable, rows: Sequence[list[str]], following: Iterator[str]) -> int:
-    """Read a line of units and one of dashes below the header, if there are any; how many lines these are."""
+    """Read a line of units and one of dashes below the header, where they are; how many these are."""
     skipped = 0
     dashes = [bool(row) and len(row) == len(table.columns) and _is_rule(row) for row in rows[:2]]
     has_dashes = any(dashes)
@@ -500,16 +539,16 @@ def _skip_units(table: TextTable, rows: Sequence[list[str]], following: Iterator
     elif rows and _is_units(rows[0], len(table.columns)):
         skipped = 1
     if skipped and not (has_dashes and skipped == 1):
-        units = itertools.chain(rows[0], itertools.repeat(""))
-        named = zip(table.columns, units, strict=False)
-        table.columns = [column._replace(unit=unit.strip().strip('"[]()')) if unit else column for column, unit in named]
+        for place, unit in enumerate(rows[0][: len(table.columns)]):
+            if unit:
+                table.columns[place] = table.columns[place]._replace(unit=unit.strip('"[]()'))
     for _ in range(skipped):
         next(following)
     return skipped
 
 
 def _is_rule(cells: Sequence[str]) -> bool:
-    return any(cells) and all(DASHES.fullmatch(cell) for cell in cells) and any(len(cell) > 1 for cell in cells)
+    return max(map(len, cells)) > 1 and all(map(DASHES.fullmatch, cells))
 
 
 def _is_units(cells: Sequence[str], count: int) -> bool:
@@ -517,11 +556,13 @@ def _is_units(cells: Sequence[str], count: int) -> bool:
     if len(cells) != count:
         return False
     units = [cell.strip("[]() ") for cell in cells if cell]
-    return bool(units) and all(is_unit(plain_unit(unit)) for unit in units) and not any(map(is_number, units))
+    if not units or any(map(is_number, units)):
+        return False
+    return all(map(is_unit, map(plain_unit, units)))
 
 
 def _has_decimal_comma(table: TextTable, lines: Sequence[str]) -> bool:
-    """Whether the numbers of the sampled rows have decimal commas. Raises InputError for what may be thousands."""
+    """Whether numbers of the first rows have decimal commas. Raises InputError for likely thousands."""
     commas = []
     points = False
     for line in lines:
@@ -549,10 +590,11 @@ def read_rows(
     more: tuple[str, ...] = (VALID,),
     keep_cut: bool = True,
 ) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers with the cells of `columns` and of `more`, "" where these are not there, numbers in hilstar's units.
+    """Line numbers with the cells of `columns` and of `more` ("": not there), in hilstar's units.
 
     What was taken that is not plainly stated is logged as a warning.
-    Raises InputError, with `advice`, for a column that is missing or there twice, and for a row that is cut short.
+    Raises InputError, with `advice`, for a column that is missing or there twice, and for a row of
+    more or fewer cells.
     """
     with open_table(path, advice, limit_bytes) as table:
         places: list[Chosen | None] = [needed(table, name) for name in columns]
@@ -590,7 +632,7 @@ def number_fault(text: str) -> str:
 
 
 def finite_numbers(path: Path, line: int, columns: Iterable[str], cells: Iterable[str], advice: str) -> list[float]:
-    """The numbers of the cells of `columns`. Raises InputError, with `advice`, for a cell without a finite number."""
+    """The numbers of the cells of `columns`. Raises InputError, with `advice`, for one not finite."""
     numbers = []
     for name, cell in zip(columns, cells, strict=True):
         try:

@@ -21,9 +21,9 @@ from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import read_text
-from hilstar.spelled_units import ascii_text, plain_unit
 from hilstar.text_tables import finite_numbers, read_rows
 from hilstar.tracker.settings import BOLTZMANN_EV_PER_K, DetectorSettings
+from hilstar.units import ascii_text, plain_unit
 
 MAX_EMVA_BYTES = 1_000_000
 FRAME_ADVICE = "give raw frames as FITS or PNG, 8 to 16 bits of grey"
@@ -32,6 +32,12 @@ ICE_K = 273.15
 MAX_EXPOSURE_S = 1e6
 ROUNDING_DN2 = 1 / 12
 LINEAR_SHARE = 0.7  # share of saturation: the standard's range for the slope of variance over signal
+
+
+GREEK = {"σ": "sigma", "μ": "mu", "µ": "mu", "η": "eta", "τ": "tau"}
+# Of one quantity in DN and in electrons, both rounded.
+ROUNDED_ALIKE = 0.05
+WAVELENGTH = re.compile(r"(?:lambda=)?(\d+(?:\.\d+)?)nm")
 
 
 class Quantity(NamedTuple):
@@ -63,10 +69,6 @@ QUANTITIES = (
     Quantity(("td", "doublingtemperature"), "doubling_k", {"k": float, "degc": float}),
     Quantity(("eta", "quantumefficiency", "qe"), "eta", SHARES),
 )
-GREEK = {"σ": "sigma", "μ": "mu", "µ": "mu", "η": "eta", "τ": "tau"}
-# Of one quantity in DN and in electrons, both rounded.
-ROUNDED_ALIKE = 0.05
-WAVELENGTH = re.compile(r"(?:lambda=)?(\d+(?:\.\d+)?)nm")
 
 
 @dataclass(frozen=True, slots=True)

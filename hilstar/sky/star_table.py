@@ -33,7 +33,7 @@ from hilstar.reading import open_regular
 from hilstar.sky import table_reader
 from hilstar.sky.catalog import PACKAGED_CATALOG, RANGES, TYC_REGION, TYCHO, Catalog, column_names, load_catalog, plain_catalog
 from hilstar.sky.stars import cell_grid, unit_vectors_icrs
-from hilstar.spelled_units import plain_unit
+from hilstar.units import plain_unit
 
 # Epochs of the places, Julian years, where a table has its catalogue's own names and no epoch.
 EPOCH_OF_PLACES = {"ramdeg": 2000.0, "raicrs": 1991.25, "raj2000": 2000.0, "_raj2000": 2000.0}
@@ -61,6 +61,10 @@ ODD_MAG = 1.0
 OVERLAP_LIMIT_MAG = 0.03  # limit for the median
 FEW_MATCHES, BRIGHT_STARS, BRIGHT_V_MAG = 0.5, 20, 7.0
 RAD_PER_ARCSEC = np.pi / (180 * 3600)
+NO_IDENTIFIER = (
+    "no identifier of their own (blank, repeated, or a floating-point number: its 15 digits hold no source_id); all are named"
+    " by their rows"
+)
 VERSION = 3  # version of the cached result: count up whenever it changes
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
 HASH_BYTES = 1 << 22
@@ -289,10 +293,6 @@ class _Columns:
         return np.full(self.table.row_count, GAIA_DR3_JYEAR), "places without motion"
 
 
-NO_IDENTIFIER = (
-    "no identifier of their own (blank, repeated, or a floating-point number: its 15 digits hold no source_id); all are named"
-    " by their rows"
-)
 MAY_BE_UNKNOWN = ("vi_mag", "parallax_mas")
 _STATE_EPOCH = "write [sky] catalogue_epoch_jyear, such as 2000.0"
 _REASONS = ("", "without a place", "without a magnitude and a colour", "beyond what a star has", "repeated")

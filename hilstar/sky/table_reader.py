@@ -23,8 +23,8 @@ from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, cannot_read, shortened
 from hilstar.reading import HEAD_BYTES, UTF_16_MARKS, kind_of, open_regular, size_text
 from hilstar.sky.catalog import load_catalog
-from hilstar.spelled_units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 from hilstar.text_tables import TextTable, open_table
+from hilstar.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 
 # BT - VT to V - VT, and to (B - V) - (BT - VT) in the blue and in the red: Mamajek, Meyer and Liebert 2002, AJ 124, 1670,
 # appendix C, with the sign of the erratum (2006, AJ 131, 2360). For -0.25 < BT - VT < 2; beyond, the offsets of the ends.
@@ -389,18 +389,27 @@ def _read_text(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
                 count += len(chunk)
                 _check_rows(path, count)
                 for name, pieces in parts.items():
-                    column = chunk[_numbered(names.index(name))]
-                    values, mask = np.asarray(column), np.ma.getmaskarray(column)
-                    sexagesimal = SEXAGESIMAL.get((unit[name] or "").strip('"'))
-                    if sexagesimal is not None and values.dtype.kind == "U":
-                        values = _degrees(values, mask, sexagesimal)
+                    values, mask = _cells(chunk[_numbered(names.index(name))], unit[name])
                     pieces.append(_numbers(path, layout, name, values, mask))
     if not count:
         raise InputError(f"{path}: has no rows; {FILE_WANTED}")
-    for name, stated in unit.items():
-        if (stated or "").strip('"') in SEXAGESIMAL:
-            unit[name] = "deg"
-    return RawTable(layout, {name: np.concatenate(pieces) for name, pieces in parts.items()}, unit, count, tuple(table.notices))
+    columns = {name: np.concatenate(pieces) for name, pieces in parts.items()}
+    plain = {name: "deg" if _turn_of(stated) else stated for name, stated in unit.items()}
+    return RawTable(layout, columns, plain, count, tuple(table.notices))
+
+
+def _turn_of(unit: str | None) -> str | None:
+    """The unit of the first figure of sexagesimal places; None for another unit."""
+    return SEXAGESIMAL.get((unit or "").strip('"'))
+
+
+def _cells(column: Any, unit: str | None) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+    """A column's values and which are blank; sexagesimal ones as degrees."""
+    values, mask = np.asarray(column), np.ma.getmaskarray(column)
+    turn = _turn_of(unit)
+    if turn is not None and values.dtype.kind == "U":
+        values = _degrees(values, mask, turn)
+    return values, mask
 
 
 def _degrees(values: npt.NDArray[Any], mask: npt.NDArray[np.bool_], unit: str) -> FloatArray:

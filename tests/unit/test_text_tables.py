@@ -9,8 +9,8 @@ import pytest
 
 from hilstar.errors import InputError
 from hilstar.reading import warn_once
-from hilstar.spelled_units import factor, plain_unit
 from hilstar.text_tables import open_table, read_rows
+from hilstar.units import factor, plain_unit
 
 LIMIT = 1_000_000
 COLUMNS = ("t_s", "x_px")

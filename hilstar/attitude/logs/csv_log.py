@@ -1,14 +1,15 @@
-"""Attitude logs as CSV: columns `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s), `sequence`, `discontinuity`, `valid`.
+"""Attitude logs as CSV.
 
-In any order and any dialect of a text table; times and rates in any unit that their columns state (`t_ms`, `rx [deg/s]`).
-Rows that the file marks as not valid are left out, and so is a last line without an end, each with a notice.
+Columns `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s), `sequence`, `discontinuity`, `valid`, in
+any order and any dialect of a text table; times and rates in the units that their columns state
+(`t_ms`, `rx [deg/s]`). Rows that the file marks as not valid are left out, and so is a last line that
+was cut off, each with a notice.
 """
 
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from typing import IO, Literal
 
-from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, LogEntry
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.errors import InputError
 from hilstar.text_tables import CUT, Chosen, TextTable, is_valid, number_fault, plain_name
@@ -16,6 +17,7 @@ from hilstar.units import NS_PER_S
 
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
 RATE_COLUMNS = ("rx", "ry", "rz")
+MAX_QUOTED_CHARACTERS = 80
 RATE_UNIT = "rad/s"
 # A JSON number that msgspec takes as an integer: what one format can hold, all can.
 WHOLE_NUMBERS = range(-(2**63), 2**64)
@@ -23,16 +25,18 @@ INT64_NS = range(-(2**63), 2**63)
 DISCONTINUITY = {"": False, "0": False, "1": True}
 TIME_UNITS = {Decimal("1e-3"): "ms", Decimal("1e-6"): "us", Decimal("1e-9"): "ns"}
 # Columns by which other programs mark rows, in words or numbers of their own.
-MARKS = frozenset(("status", "quality", "flag", "flags", "state", "mode", "health", "fix", "tracking", "quality_flag"))
+MARKS = frozenset(["status", "quality", "quality_flag", "flag", "flags", "state", "mode", "health", "fix", "tracking"])
+MORE_ADVICE = ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
 UNITS_ADVICE = "t_s is in seconds; name the column t_ms, t_us or t_ns if it is in ms, us or ns"
 JSON_ADVICE = "write JSON lines, on each an object of t_ns and q (jq -c '.[]' FILE)"
 TABLE_KIND, VALID_KIND, CUT_KIND = "log-table", "log-valid", "log-cut"
 
 
 class CsvLog:
-    """A CSV log: its `entries`, once, and in `told` the notices for the user, complete when these are read.
+    """A CSV log: its `entries`, once, and in `told` the notices, complete when these are read.
 
-    `time_unit` is that of its time column. With the scalar last, the quaternion's columns count as x, y, z, w in turn.
+    `time_unit` is that of its time column. With the scalar last, the quaternion's columns count as
+    x, y, z, w in turn.
     Raises InputError for a header without the columns of an attitude, or with one of them twice.
     """
 
@@ -51,59 +55,67 @@ class CsvLog:
         # Whatever the columns are called: a table that says so by its names needs no statement.
         self._q = sorted(numbers) if scalar == "last" else numbers
         self._rates = [self._needed(name, names) for name in names[len(CSV_COLUMNS) :]]
-        self._sequence, self._discontinuity = table.chosen("sequence"), table.chosen("discontinuity")
+        self._sequence = table.chosen("sequence")
+        self._discontinuity = table.chosen("discontinuity")
         self._valid = table.valid()
         self.time_unit = TIME_UNITS.get(self._t.factor or Decimal(1), "s")
         self.told += [(TABLE_KIND, notice) for notice in table.notices]
         self._tell_marks()
         if has_rates or self._sequence or self._discontinuity:
-            table.advice += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
+            table.advice += MORE_ADVICE
 
     def _needed(self, name: str, names: Sequence[str]) -> Chosen:
         unit = RATE_UNIT if name in RATE_COLUMNS else ""
         chosen = self.table.chosen(name, unit)
         if chosen is None:
             place = f"{self.table.path}:{self.table.header_line}"
-            there = f" (its columns are {self.table.names})" if self.table.header else ", as no line names the columns"
-            raise InputError(f"{place}: column {name} is missing{there}; the header must have {','.join(names)}")
+            missing = f"column {name} is missing"
+            if self.table.header:
+                missing += f" (its columns are {self.table.names})"
+            else:
+                missing += ", as no line names the columns"
+            raise InputError(f"{place}: {missing}; the header must have {','.join(names)}")
         return chosen
 
     def _tell_marks(self) -> None:
         marks = [column.header for column in self.table.columns if plain_name(column.name) in MARKS]
         if marks and self._valid is None:
             named = ", ".join(marks)
-            self.told.append(
-                (TABLE_KIND, f"column {named} is not used: rows of every value of it are shown; name it valid, 1 or 0")
-            )
+            rows = f"column {named} is not used: rows of every value of it are shown"
+            self.told.append((TABLE_KIND, f"{rows}; name it valid, 1 or 0"))
 
     def _refuse_json(self) -> None:
         if self.table.columns[0].header.startswith(("[", "{")):
-            raise InputError(f"{self.table.path}: is a JSON array, or an object over several lines; {JSON_ADVICE}")
+            what = "is a JSON array, or an object over several lines"
+            raise InputError(f"{self.table.path}: {what}; {JSON_ADVICE}")
 
-    def entries(self) -> Iterator[LogEntry]:
-        """Each attitude, or why it is refused, in the file's order."""
+    def entries(self) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
+        """Each attitude, or why it is refused, with its place in the file (":12"), in its order."""
         table = self.table
         if not table.columns:
             return
         invalid = 0
         converted = self._conversions()
         for line, cells in table.rows(keep_cut=False):
-            if self._valid is not None and not is_valid(table.path, line, table.cell(cells, self._valid)):
-                invalid += 1
-                continue
+            if self._valid is not None:
+                flag = table.cell(cells, self._valid)
+                if not is_valid(table.path, line, flag):
+                    invalid += 1
+                    continue
             if converted:
                 cells = self._converted(cells, converted)
-            yield LogEntry(f":{line}", self._event(cells))
+            yield f":{line}", self._event(cells)
         if invalid:
-            rows = "1 row is" if invalid == 1 else f"{invalid} rows are"
-            self.told.append((VALID_KIND, f"{rows} marked as not valid by the log itself, and left out"))
+            self.told.append(invalid_notice(invalid, "row"))
         if table.is_cut:
             self.told.append((CUT_KIND, CUT))
 
     def _conversions(self) -> list[Chosen]:
         """The columns whose cells are not taken as they stand."""
         columns = [self._t, *self._q, *self._rates]
-        return columns if self.table.decimal_comma else [column for column in columns if column.factor is not None]
+        if self.table.decimal_comma:
+            return columns
+        return [column for column in columns if column.factor is not None]
 
     def _converted(self, cells: list[str], columns: Sequence[Chosen]) -> list[str]:
         cells = cells.copy()
@@ -124,13 +136,14 @@ class CsvLog:
                 pass
         faults = [number_fault(cells[column.place].strip()) for column in (self._t, *self._q)]
         fault = next(filter(None, faults), "")
-        return Refusal("format", f"{row.strip()[:MAX_QUOTED_CHARACTERS]!r}{fault}; {self.table.advice}")
+        quoted = row.strip()[:MAX_QUOTED_CHARACTERS]
+        return Refusal("format", f"{quoted!r}{fault}; {self.table.advice}")
 
     def _sample(self, cells: list[str]) -> AttitudeSample | Refusal:
-        """The attitude of a row, as it was sent. Raises ValueError, LookupError or ArithmeticError."""
+        """The attitude of a row, as sent. Raises ValueError, LookupError or ArithmeticError."""
         t_ns = ns_of_seconds(cells[self._t.place])
-        w, x, y, z = self._q
-        q = float(cells[w.place]), float(cells[x.place]), float(cells[y.place]), float(cells[z.place])
+        w, x, y, z = (cells[column.place] for column in self._q)
+        q = float(w), float(x), float(y), float(z)
         rate = None
         if self._rates:
             turning = [cells[column.place].strip() for column in self._rates]
@@ -144,14 +157,19 @@ class CsvLog:
         if self._discontinuity is not None:
             discontinuity = DISCONTINUITY[cells[self._discontinuity.place].strip()]
         if t_ns not in INT64_NS:
-            text = cells[self._t.place].strip()
-            detail = f"t_s = {text[:MAX_QUOTED_CHARACTERS]} s does not fit 64 bits of ns; {UNITS_ADVICE}"
-            return Refusal("format", detail)
+            text = cells[self._t.place].strip()[:MAX_QUOTED_CHARACTERS]
+            return Refusal("format", f"t_s = {text} s does not fit 64 bits of ns; {UNITS_ADVICE}")
         return checked_sample(t_ns, q, rate, sequence, discontinuity)
 
 
+def invalid_notice(count: int, what: str) -> tuple[str, str]:
+    """The notice of rows or lines that a log itself marks as not valid."""
+    number = f"1 {what} is" if count == 1 else f"{count} {what}s are"
+    return VALID_KIND, f"{number} marked as not valid by the log itself, and left out"
+
+
 def ns_of_seconds(seconds: str) -> int:
-    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns.
+    """Decimal seconds as nanoseconds, to the nearest; a float of Unix time would be off by 100 ns.
 
     Raises ValueError or ArithmeticError.
     """
@@ -163,7 +181,8 @@ def ns_of_seconds(seconds: str) -> int:
 
 def write_csv_log(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
     """Write samples as a CSV log with every column, every bit of them."""
-    file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
+    header = ",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity"))
+    file.write(f"{header}\n".encode())
     for sample in samples:
         cells = [_seconds_text(sample.t_ns), *map(repr, sample.q_icrs_to_cam.tolist())]
         rate = sample.rate_cam_rad_s

@@ -24,7 +24,7 @@ from msgspec import structs
 from hilstar.attitude.clock.rate_causes import ReadAs
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
-from hilstar.attitude.logs.csv_log import CSV_COLUMNS, VALID_KIND, CsvLog, write_csv_log
+from hilstar.attitude.logs.csv_log import CSV_COLUMNS, CsvLog, invalid_notice, write_csv_log
 from hilstar.attitude.logs.entries import (
     MAX_QUOTED_CHARACTERS,
     MAX_SAMPLES,
@@ -89,8 +89,7 @@ def _read_json_lines(lines: Iterable[str], told: list[tuple[str, str]]) -> Itera
             continue
         yield LogEntry(f":{number}", event)
     if invalid:
-        lines_are = "1 line is" if invalid == 1 else f"{invalid} lines are"
-        told.append((VALID_KIND, f"{lines_are} marked as not valid by the log itself, and left out"))
+        told.append(invalid_notice(invalid, "line"))
 
 
 def _json_fault(text: str) -> Refusal | None:
@@ -395,7 +394,7 @@ def _open_csv(path: Path, stated: Stated) -> Iterator[LogReading]:
     scalar = (stated.convention or HILSTARS).scalar
     with open_table(path, READABLE, MAX_LOG_BYTES) as table:
         csv_log = CsvLog(table, scalar)
-        reading = _of_packets(path, csv_log.entries(), "CSV", stated)
+        reading = _of_packets(path, itertools.starmap(LogEntry, csv_log.entries()), "CSV", stated)
         reading.told.extend(csv_log.told)
         csv_log.told = reading.told
         yield replace(reading, conventions=replace(reading.conventions, time_unit=csv_log.time_unit))

@@ -192,14 +192,21 @@ def _nm_of(table: TextTable, wavelength: Chosen, wavelengths: FloatArray) -> flo
             table.notices.append(f"{span} without a unit are taken as {unit}; {UNIT_HEADERS['nm']} says that they are nm")
         size = factor(unit, "nm")
         return 1.0 if size is None else float(size)
-    if wavelength.factor is None and unit in {"um", "angstrom"}:
-        header = UNIT_HEADERS[unit]
-        advice = f"write {header} in the header, or wavelength_um for the far infrared"
-        raise InputError(f"{table.path}: {span} nm, which look like {unit}; {advice}")
+    if wavelength.factor is None:
+        refuse_other_units(table.path, low, high)
     if high < MIN_STATED_NM:
         stated = table.columns[wavelength.place].header
         raise InputError(f"{table.path}: {span} nm by its column {stated}, which no tracker sees; check its unit")
     return 1.0
+
+
+def refuse_other_units(path: Path, low_nm: float, high_nm: float) -> None:
+    """Refuse (InputError) wavelengths stated in nm that lie where only um or angstrom can."""
+    unit = _unit_by_range(low_nm, high_nm)
+    if unit in {"um", "angstrom"}:
+        advice = f"write {UNIT_HEADERS[unit]} in the header, or wavelength_um for the far infrared"
+        span = f"wavelengths from {low_nm:g} to {high_nm:g} nm"
+        raise InputError(f"{path}: {span}, which look like {unit}; {advice}")
 
 
 def _unit_by_range(low: float, high: float) -> str | None:

@@ -115,9 +115,11 @@ def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float
         )
     dated = compared or any((motion[kept] != 0).any() for motion in pm.values())
     epoch, epoch_words = columns.epoch(stated_epoch_jyear, dated, designation)
-    if not columns.is_gaia:
-        columns.check_places()
-        columns.check_motions(pm)
+    for doubt in (columns.places_doubt(), columns.motions_doubt(pm)):
+        if doubt and not columns.is_gaia:
+            raise InputError(f"{path}: {doubt}")
+        if doubt:
+            columns.notices.append(f"{doubt}; taken as Gaia's archive has it")
     if _repeats(identifier[kept]):
         columns.notices.append(f"{_repeats(identifier[kept])} of its stars have {NO_IDENTIFIER}")
         designation, identifier = columns.row_numbers()
@@ -175,33 +177,34 @@ class _Columns:
                 f"{self.path}: column {name} is in {unit} and runs to {largest:g}; name it ra_deg if it is in degrees"
             )
 
-    def check_places(self) -> None:
-        """Raises InputError for places without a unit that may be hours or radians."""
+    def places_doubt(self) -> str:
+        """Why places without a unit may be hours or radians, and what to write; "" where they are degrees."""
         name = self.pair[0]
         ra, dec = (np.asarray(self.table.columns[column], dtype=np.float64) for column in self.pair)
         placed = np.isfinite(ra) & np.isfinite(dec)
         if self.has_unit(name) or not placed.any():
-            return
+            return ""
         low, high, steepest = ra[placed].min(), ra[placed].max(), np.abs(dec[placed]).max()
-        base = f"{self.path}: column {name} has no unit and runs from {low:.6g} to {high:.6g}"
+        base = f"column {name} has no unit and runs from {low:.6g} to {high:.6g}"
         names = "ra_deg, ra_hours or ra_rad"
         if low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
-            raise InputError(f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or dec_rad")
+            return f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or dec_rad"
         if low >= 0 and high < HOURS_A_TURN:
-            raise InputError(f"{base}: so it is in hours, or of one field in degrees; {UNIT_ADVICE}: {names}")
+            return f"{base}: so it is in hours, or of one field in degrees; {UNIT_ADVICE}: {names}"
+        return ""
 
-    def check_motions(self, motions: dict[str, FloatArray]) -> None:
-        """Raises InputError for proper motions without a unit that are too small to be mas a year."""
+    def motions_doubt(self, motions: dict[str, FloatArray]) -> str:
+        """Why proper motions without a unit are too small to be mas a year; "" where they are not."""
         given = [self.layout.role[role] for role in motions if role in self.layout.role]
-        if not given or any(self.has_unit(column) for column in given):
-            return
+        if not given or any(map(self.has_unit, given)):
+            return ""
         total = np.hypot(*motions.values())
         moving = total[total > 0]
         if len(moving) < MOTION_STARS or np.median(moving) >= MIN_MEDIAN_MAS_YR:
-            return
+            return ""
         median = f"half of its stars move by less than {np.median(moving):.3g}"
         advice = f"{UNIT_ADVICE}: {given[0]}_arcsec_yr or {given[0]}_mas_yr"
-        raise InputError(f"{self.path}: column {given[0]} has no unit, and {median}, so they are in arcsec a year; {advice}")
+        return f"column {given[0]} has no unit, and {median}, so they are in arcsec a year; {advice}"
 
     def role(self, role: str, blank: float) -> FloatArray:
         if role not in self.layout.role:

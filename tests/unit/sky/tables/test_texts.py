@@ -219,3 +219,11 @@ def test_a_catalogue_cut_off_is_said(read, caplog):
     text = lines(["ra,dec,b-v,vmag"], RA, DEC, BV, [f"{v:.4f}" for v in V])
     read(text[:-3])
     assert "stars.txt:7: the last line has no line end, and may be cut off" in caplog.text
+
+
+def test_a_field_of_gaia_s_own_table_is_taken_as_its_archive_has_it_and_that_is_said(read, caplog):
+    text = lines([f"source_id,{GAIA}"], range(1, 7), [2016.0] * 6, np.subtract(RA, 77), DEC, V, BV)
+    catalog, order = read(text)
+    assert catalog.ra_deg[order] == pytest.approx(np.subtract(RA, 77))
+    assert "or of one field in degrees" in caplog.text
+    assert "taken as Gaia's archive has it" in caplog.text

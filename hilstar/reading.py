@@ -72,8 +72,8 @@ MAGIC = {
     b"\xfe\xff": "text in UTF-16, not UTF-8",
 }
 UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-# What Windows-1252 has in place of Latin-1's control characters has no other use in a text, but these five bytes are no
-# character of it. Of the control characters a text has tabs, line ends and form feeds.
+# Bytes that no text in Windows-1252 has: control characters other than tabs, line ends and form
+# feeds, and the five bytes that are no character of it.
 NO_TEXT = re.compile("[\x00-\x08\x0b\x0e-\x1f\x7f\x81\x8d\x8f\x90\x9d]")
 
 log = logging.getLogger(__name__)
@@ -163,10 +163,12 @@ def refuse_kind(path: Path, head: bytes, advice: str) -> None:
 
 @contextmanager
 def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[str]]:
-    """The lines of a text, one after another, so that a large file needs no memory; each ends as in the file.
+    """The lines of a text, one after another, so that a large file needs no memory; each ends as in
+    the file.
 
     UTF-8, UTF-16 with its mark, and Windows-1252 with a warning: a line that is no UTF-8.
-    Raises InputError as `read_text` does, for what is no text, and for a line of more than MAX_LINE_CHARACTERS.
+    Raises InputError as `read_text` does, for what is no text, and for a line of more than
+    MAX_LINE_CHARACTERS.
     """
     with open_regular(path, advice, limit_bytes) as file:
         try:
@@ -195,7 +197,9 @@ def _bounded(path: Path, text: IO[str], advice: str) -> Iterator[str]:
 
 
 def _decoded(path: Path, number: int, line: str, advice: str) -> str:
-    """A line as it is, or as Windows-1252 where bytes of it are no UTF-8. Raises InputError for bytes of no text."""
+    """A line as it is, or as Windows-1252 where bytes of it are no UTF-8. Raises InputError for
+    bytes of no text.
+    """
     try:
         line.encode("utf-8")
     except UnicodeEncodeError:

@@ -50,7 +50,8 @@ SAMPLE_LINES = 100
 MAX_HEAD_LINES = 20_000  # of comments
 MAX_COLUMNS, MAX_HEADER_CHARACTERS = 1000, 50_000
 MAX_NAMED = 12
-CUT = "the last line has no line end, as of a file that was cut off, and is left out; end the line where it is whole"
+CUT = "the last line has no line end, as of a file that was cut off, and is left out"
+CUT += "; end the line where it is whole"
 DOUBTFUL_END = "the last line has no line end, and may be cut off: is the file whole?"
 SHARP_DECIMALS = 12  # of a quaternion or a place: a thousandth of a milliarcsecond
 # Excel's own first line, which names the delimiter.
@@ -84,7 +85,9 @@ OTHER_NAMES = {
 
 
 class Column(NamedTuple):
-    """A column: its header as written, its name without a unit, and the unit that is stated ("": none)."""
+    """A column: its header as written, its name without a unit, and the unit that is stated ("":
+    none).
+    """
 
     header: str
     name: str
@@ -92,7 +95,8 @@ class Column(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """A column that was asked for: its place in a row, and what its numbers are multiplied by, if any.
+    """A column that was asked for: its place in a row, and what its numbers are multiplied by, if
+    any.
 
     `inverted`: its flags say which rows do not hold. `has_unit` is False where no unit is stated
     that was wanted.
@@ -170,10 +174,11 @@ class TextTable:
             raise self.refusal(before + reader.line_num, f"not CSV ({error})") from error
 
     def blocks(self, characters: int) -> Iterator[tuple[int, list[str]]]:
-        """The lines of the rows in pieces of about so many characters, with each first line's number.
+        """The lines of the rows in pieces of about so many characters, with each first line's
+        number.
 
-        No quoted cell goes over the end of a piece. For a parser of whole columns; a doubtful end is
-        warned of.
+        No quoted cell goes over the end of a piece. For a parser of whole columns; a doubtful end
+        is warned of.
         """
         number, size, quotes = self.first_row, 0, 0
         lines: list[str] = []
@@ -193,15 +198,18 @@ class TextTable:
         yield number, lines
 
     def row_of(self, line: int, text: str) -> list[str]:
-        """The cells of one line, as many as there are columns. Raises InputError for another number."""
+        """The cells of one line, as many as there are columns. Raises InputError for another
+        number.
+        """
         return self._counted(line, split(text, self.delimiter))
 
     def _is_whole(self, cells: list[str], previous: list[str]) -> bool:
-        """Whether a row whose line has no end is whole, by its last cell beside those of other rows.
+        """Whether a row whose line has no end is whole, by its last cell beside those of other
+        rows.
 
         Numbers of one format all have as many decimals, and beyond SHARP_DECIMALS no further one
-        matters; a whole number is as long as the one before. One whose exponent may be missing tells
-        nothing.
+        matters; a whole number is as long as the one before. One whose exponent may be missing
+        tells nothing.
         """
         if len(cells) != len(self.columns):
             return False
@@ -237,7 +245,13 @@ class TextTable:
             reason += " (a decimal comma, or commas between thousands? write 1234.5)"
         raise self.refusal(line, reason)
 
-    def chosen(self, name: str, unit: str = "", other_names: Sequence[str] = (), must_state: bool = True) -> Chosen | None:
+    def chosen(
+        self,
+        name: str,
+        unit: str = "",
+        other_names: Sequence[str] = (),
+        must_state: bool = True,
+    ) -> Chosen | None:
         """The column of hilstar's `name`, in any unit that it states; None where there is none.
 
         `unit` is the wanted one, by default that at the end of `name`. Raises InputError for two
@@ -278,7 +292,9 @@ class TextTable:
         return InputError(f"{where}: column {column.header} has no unit; {advice}")
 
     def valid(self) -> Chosen | None:
-        """The column that says which rows hold, or which do not, by any of its names, if there is one."""
+        """The column that says which rows hold, or which do not, by any of its names, if there is
+        one.
+        """
         places = self._places(VALID_NAMES)
         if places:
             return Chosen(self._only(VALID, places))
@@ -293,7 +309,9 @@ class TextTable:
         return places
 
     def _united(self, bases: Sequence[str], wanted: str) -> dict[int, str]:
-        """The unit by place of the columns named like one of `bases` with a unit of the wanted kind."""
+        """The unit by place of the columns named like one of `bases` with a unit of the wanted
+        kind.
+        """
         united = {}
         for place, column in enumerate(self.columns):
             name = plain_name(column.name)
@@ -417,7 +435,9 @@ def open_table(path: Path, advice: str, limit_bytes: int) -> Iterator[TextTable]
 
 
 def table_of(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
-    """The text table of lines, each with its end, with its head read. Raises InputError, with `advice`."""
+    """The text table of lines, each with its end, with its head read. Raises InputError, with
+    `advice`.
+    """
     comments, sample, number, delimiter = _head(path, advice, lines)
     following = itertools.chain(sample, lines)
     if not sample:
@@ -441,7 +461,12 @@ def table_of(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
     return table
 
 
-def _name_by_header(table: TextTable, header: list[str], sample: Sequence[str], following: Iterator[str]) -> None:
+def _name_by_header(
+    table: TextTable,
+    header: list[str],
+    sample: Sequence[str],
+    following: Iterator[str],
+) -> None:
     """Name the columns by the header and the lines of units and dashes below it."""
     rows = [split(line, table.delimiter) for line in sample]
     if not header[-1].strip() and rows and len(rows[0]) == len(header) - 1:
@@ -562,7 +587,9 @@ def _is_units(cells: Sequence[str], count: int) -> bool:
 
 
 def _has_decimal_comma(table: TextTable, lines: Sequence[str]) -> bool:
-    """Whether numbers of the first rows have decimal commas. Raises InputError for likely thousands."""
+    """Whether numbers of the first rows have decimal commas. Raises InputError for likely
+    thousands.
+    """
     commas = []
     points = False
     for line in lines:
@@ -631,7 +658,13 @@ def number_fault(text: str) -> str:
     return ""
 
 
-def finite_numbers(path: Path, line: int, columns: Iterable[str], cells: Iterable[str], advice: str) -> list[float]:
+def finite_numbers(
+    path: Path,
+    line: int,
+    columns: Iterable[str],
+    cells: Iterable[str],
+    advice: str,
+) -> list[float]:
     """The numbers of the cells of `columns`. Raises InputError, with `advice`, for one not finite."""
     numbers = []
     for name, cell in zip(columns, cells, strict=True):

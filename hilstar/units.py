@@ -1,6 +1,7 @@
 """Units: the constants and conversions that the rooms share, and units as people spell them.
 
-Spelled units stand in headers, in lines of units and on data sheets; `factor` turns each into another.
+Spelled units stand in headers, in lines of units and on data sheets; `factor` turns each into
+another.
 """
 
 import math
@@ -24,7 +25,8 @@ MAX_SPEED_KM_S = 10_000.0  # of an observer: a thirtieth of that of light
 MAG_PER_RELATIVE = 2.5 / math.log(10)  # a small relative error of a flux, in magnitudes
 
 DEG_PER_RAD = math.degrees(1.0)
-# Spellings in small ASCII letters without blanks, and how large each unit is beside the first of its table.
+# Spellings in small ASCII letters without blanks, and how large each unit is beside the first of
+# its table.
 TIME = {
     "s sec secs second seconds": "1",
     "ms msec msecs millisecond milliseconds millis": "1e-3",
@@ -178,7 +180,9 @@ def is_unit(plain: str) -> bool:
 
 
 def factor(unit: str, wanted: str) -> Decimal | None:
-    """By what figures in `unit` are multiplied to be in `wanted`; None where the two are of different kinds."""
+    """By what figures in `unit` are multiplied to be in `wanted`; None where the two are of
+    different kinds.
+    """
     plain, target = plain_unit(unit), plain_unit(wanted)
     if plain == target:
         return Decimal(1)

@@ -121,7 +121,9 @@ def _rows(path: Path) -> Iterator[_Row]:
 
 
 def _columns(table: TextTable) -> dict[str, Chosen]:
-    """The columns by hilstar's names. Raises InputError for one that is missing, unknown or there twice."""
+    """The columns by hilstar's names. Raises InputError for one that is missing, unknown or there
+    twice.
+    """
     place = f"{table.path}: line {table.header_line}"
     columns: dict[str, Chosen] = {}
     for name in COLUMNS:

@@ -41,7 +41,8 @@ WAVELENGTH = re.compile(r"(?:lambda=)?(\d+(?:\.\d+)?)nm")
 
 
 class Quantity(NamedTuple):
-    """A quantity of the standard: its names as of `symbol`, the key that it gives, and what turns each unit into the key's.
+    """A quantity of the standard: its names as of `symbol`, the key that it gives, and what turns
+    each unit into the key's.
 
     With `by_gain` it may be in DN, which the sheet's gain turns into electrons.
     """
@@ -100,14 +101,18 @@ class SensorFile:
 
 
 def symbol(text: str) -> str:
-    """A quantity's name in small ASCII letters without underscores, braces and blanks: "σ_{d}" is sigmad, "μ_e,sat" mue.sat."""
+    """A quantity's name in small ASCII letters without underscores, braces and blanks: "σ_{d}" is
+    sigmad, "μ_e,sat" mue.sat.
+    """
     for letter, word in GREEK.items():
         text = text.replace(letter, word)
     return re.sub(r"[\s_{}\\$]", "", ascii_text(text)).replace(",", ".").lower()
 
 
 def sheet_unit(text: str) -> str:
-    """A unit of a data sheet: DN for ADU and counts, e- for electrons, degc for °C, nothing by pixel."""
+    """A unit of a data sheet: DN for ADU and counts, e- for electrons, degc for °C, nothing by
+    pixel.
+    """
     plain = plain_unit(text).replace("lambda", "")
     plain = re.sub(r"[/.*(]?(?:pixel|pix|px)\)?", "", plain).removesuffix("rms").removesuffix("/")
     plain = re.sub(r"[()]", "", plain)
@@ -117,7 +122,9 @@ def sheet_unit(text: str) -> str:
 
 
 class Reading(NamedTuple):
-    """A row of a data sheet: its place, its quantity as written, and its value in the key's unit, or in DN."""
+    """A row of a data sheet: its place, its quantity as written, and its value in the key's unit,
+    or in DN.
+    """
 
     place: str
     name: str
@@ -127,9 +134,11 @@ class Reading(NamedTuple):
 
 
 def import_emva(path: Path) -> SensorFile:
-    """The sensor of a table `quantity,value,unit` (CSV, or JSON: a list of objects), in the units of the standard.
+    """The sensor of a table `quantity,value,unit` (CSV, or JSON: a list of objects), in the units
+    of the standard.
 
-    What is given in DN counts by the sheet's own gain. Raises InputError, also for a quantity with two values.
+    What is given in DN counts by the sheet's own gain. Raises InputError, also for a quantity with
+    two values.
     """
     readings: list[Reading] = []
     efficiency: list[tuple[float, float]] = []
@@ -159,7 +168,9 @@ def import_emva(path: Path) -> SensorFile:
 
 
 def _reading(place: str, name: str, quantity: Quantity, value: float, unit: str) -> Reading:
-    """A row's value by its unit. Raises InputError for another unit, and for a gain that is not above 0."""
+    """A row's value by its unit. Raises InputError for another unit, and for a gain that is not
+    above 0.
+    """
     plain = sheet_unit(unit)
     if quantity.by_gain and plain == quantity.by_gain:
         return Reading(place, name, quantity, value, True)
@@ -170,7 +181,9 @@ def _reading(place: str, name: str, quantity: Quantity, value: float, unit: str)
 
 
 def _keys(path: Path, readings: Sequence[Reading]) -> dict[str, Any]:
-    """The keys of a sheet's readings. Raises InputError where there is no gain, and for a quantity with two values."""
+    """The keys of a sheet's readings. Raises InputError where there is no gain, and for a quantity
+    with two values.
+    """
     gains = [reading for reading in readings if reading.quantity.key == "gain_e_per_dn"]
     if not gains:
         raise InputError(f"{path}: has no K; {EMVA_ADVICE}")

@@ -345,7 +345,9 @@ def _table(path: Path, read: list[bytes] | None) -> TextTable:
 
 
 def _numbers(table: TextTable, columns: Sequence[Chosen]) -> FloatArray:
-    """The numbers of a table's columns (rows, columns). Raises InputError with the line of what is none, or is negative."""
+    """The numbers of a table's columns (rows, columns). Raises InputError with the line of what is
+    none, or is negative.
+    """
     rows = []
     names = [table.columns[column.place].header or f"column {column.place + 1}" for column in columns]
     for line, cells in table.rows():

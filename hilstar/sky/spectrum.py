@@ -49,8 +49,9 @@ VALUE_NAMES = (
     "intensity",
 )
 UNIT_HEADERS = {"nm": "wavelength_nm", "um": "wavelength_um", "angstrom": "wavelength_angstrom"}
-# Where curves of sensors, glasses and skies begin (from, below) and end in each unit. Silicon and InGaAs see 200 to 2600 nm;
-# what begins at 1000 to 2000 and goes on may be nm of the infrared or angstrom of the ultraviolet: its unit has to be stated.
+# Where curves of sensors, glasses and skies begin (from, below) and end in each unit. Silicon and
+# InGaAs see 200 to 2600 nm; what begins at 1000 to 2000 and goes on may be nm of the infrared or
+# angstrom of the ultraviolet: its unit has to be stated.
 UNIT_RANGES = (
     ("um", 0.1, 30.0, 30.0),
     ("nm", 100.0, 1000.0, 5000.0),
@@ -135,10 +136,12 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR, built_in
 
 
 def read_curve_csv(path: Path, highest: float = 1.0) -> Curve:
-    """Read a text table of wavelengths and values, values 0 to `highest`: `wavelength_nm,value`, or in units that it states.
+    """Read a text table of wavelengths and values, values 0 to `highest`: `wavelength_nm,value`, or
+    in units that it states.
 
-    Shares (`highest` 1) may be in percent. Without a header there are two columns, and without a unit of wavelength its
-    range says the unit (`_unit_by_range`). Raises InputError with the line number.
+    Shares (`highest` 1) may be in percent. Without a header there are two columns, and without a
+    unit of wavelength its range says the unit (`_unit_by_range`). Raises InputError with the line
+    number.
     """
     with open_table(path, CURVE_ADVICE, MAX_CURVE_BYTES) as table:
         if not table.columns:
@@ -161,7 +164,9 @@ def read_curve_csv(path: Path, highest: float = 1.0) -> Curve:
 
 
 def _curve_columns(table: TextTable, highest: float) -> tuple[Chosen, Chosen]:
-    """The columns of wavelength and value. Raises InputError where the header does not say which these are."""
+    """The columns of wavelength and value. Raises InputError where the header does not say which
+    these are.
+    """
     wavelength = None
     if table.header:
         wavelength = table.chosen("wavelength_nm", must_state=False)
@@ -181,7 +186,9 @@ def _curve_columns(table: TextTable, highest: float) -> tuple[Chosen, Chosen]:
 
 
 def _nm_of(table: TextTable, wavelength: Chosen, wavelengths: FloatArray) -> float:
-    """By what wavelengths are multiplied to be nm. Raises InputError where their range and their unit disagree."""
+    """By what wavelengths are multiplied to be nm. Raises InputError where their range and their
+    unit disagree.
+    """
     low, high = float(wavelengths.min()), float(wavelengths.max())
     unit = _unit_by_range(low, high)
     span = f"wavelengths from {low:g} to {high:g}"
@@ -210,7 +217,9 @@ def refuse_other_units(path: Path, low_nm: float, high_nm: float) -> None:
 
 
 def _unit_by_range(low: float, high: float) -> str | None:
-    """The unit of wavelengths of a silicon or an infrared sensor by their range; None where two would do."""
+    """The unit of wavelengths of a silicon or an infrared sensor by their range; None where two
+    would do.
+    """
     for unit, first, before, last in UNIT_RANGES:
         if first <= low < before and high <= last:
             return unit

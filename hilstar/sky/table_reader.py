@@ -214,9 +214,11 @@ class Layout:
 
 
 def layout_of(path: Path, names: Sequence[str], roles: Mapping[str, tuple[str, ...]] = NAMES) -> Layout:
-    """Which of a table's columns have the `roles`, by their names with or without a unit at the end (`ra_hours`).
+    """Which of a table's columns have the `roles`, by their names with or without a unit at the end
+    (`ra_hours`).
 
-    Raises InputError where there is no place or no magnitude with a colour, and for a column that is there twice.
+    Raises InputError where there is no place or no magnitude with a colour, and for a column that
+    is there twice.
     """
     known = _plain_names(names, roles)
     places = tuple((known[ra], known[dec]) for ra, dec in PLACES if ra in known and dec in known)
@@ -237,7 +239,9 @@ def layout_of(path: Path, names: Sequence[str], roles: Mapping[str, tuple[str, .
 
 
 def _plain_names(names: Sequence[str], roles: Mapping[str, tuple[str, ...]]) -> dict[str, str]:
-    """A table's names by the names that are known: in small letters, without a unit at the end where that one is not known."""
+    """A table's names by the names that are known: in small letters, without a unit at the end
+    where that one is not known.
+    """
     known = {name.strip().lower(): name for name in reversed(names)}
     bases = set(itertools.chain(*PLACES, *roles.values()))
     for name in names:
@@ -258,7 +262,9 @@ def _name_and_unit(name: str) -> tuple[str, str]:
 
 
 def unit_by_name(name: str) -> str | None:
-    """The unit that a column's name says: `ra_hours`, `RArad`, `pm_ra_mas_yr`; None where it says none."""
+    """The unit that a column's name says: `ra_hours`, `RArad`, `pm_ra_mas_yr`; None where it says
+    none.
+    """
     plain, unit = _name_and_unit(name)
     if unit:
         return unit
@@ -285,9 +291,11 @@ def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RawTable:
-    """The columns of a table by its own names: figures as float64 with NaN where blank, identifiers as int64 with 0.
+    """The columns of a table by its own names: figures as float64 with NaN where blank, identifiers
+    as int64 with 0.
 
-    `unit` is as the table or the column's name states it; `notices` say what was taken that is not plain.
+    `unit` is as the table or the column's name states it; `notices` say what was taken that is not
+    plain.
     """
 
     layout: Layout
@@ -439,7 +447,9 @@ def _numbered(place: int) -> str:
 
 
 def _chunks(table: TextTable, places: list[int]) -> Iterator[Any]:
-    """Pieces of a text's rows as Astropy tables of the columns at `places`; its parser reads ASCII alone."""
+    """Pieces of a text's rows as Astropy tables of the columns at `places`; its parser reads ASCII
+    alone.
+    """
     from astropy.io import ascii as text
 
     # A line that begins or ends with a tab has a blank cell there, and Astropy strips tabs.
@@ -476,7 +486,9 @@ def _plain_block(table: TextTable, block: str) -> str:
 
 
 def _even_block(table: TextTable, number: int, lines: list[str]) -> str:
-    """The rows of a piece without blank cells behind the last column. Raises InputError for the first row of other cells."""
+    """The rows of a piece without blank cells behind the last column. Raises InputError for the
+    first row of other cells.
+    """
     rows = []
     for line, text in enumerate(lines, start=number):
         if text.strip() and not text.startswith("#"):

@@ -1,9 +1,9 @@
 """Attitude logs as CSV.
 
-Columns `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s), `sequence`, `discontinuity`, `valid`, in
-any order and any dialect of a text table; times and rates in the units that their columns state
-(`t_ms`, `rx [deg/s]`). Rows that the file marks as not valid are left out, and so is a last line that
-was cut off, each with a notice.
+Columns `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s), `sequence`, `discontinuity`,
+`valid`, in any order and any dialect of a text table; times and rates in the units that their
+columns state (`t_ms`, `rx [deg/s]`). Rows that the file marks as not valid are left out, and so is
+a last line that was cut off, each with a notice.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,9 @@ INT64_NS = range(-(2**63), 2**63)
 DISCONTINUITY = {"": False, "0": False, "1": True}
 TIME_UNITS = {Decimal("1e-3"): "ms", Decimal("1e-6"): "us", Decimal("1e-9"): "ns"}
 # Columns by which other programs mark rows, in words or numbers of their own.
-MARKS = frozenset(["status", "quality", "quality_flag", "flag", "flags", "state", "mode", "health", "fix", "tracking"])
+MARKS = frozenset(
+    ["status", "quality", "quality_flag", "flag", "flags", "state", "mode", "health", "fix", "tracking"],
+)
 MORE_ADVICE = ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
 UNITS_ADVICE = "t_s is in seconds; name the column t_ms, t_us or t_ns if it is in ms, us or ns"
 JSON_ADVICE = "write JSON lines, on each an object of t_ns and q (jq -c '.[]' FILE)"

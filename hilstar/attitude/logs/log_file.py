@@ -1,6 +1,7 @@
 """Attitude logs of every format: the content decides how a file is read, the ending of its name how it is written.
 
-JSON lines are read and written here: a line is the wire's JSON form of an attitude. The other formats have a module each.
+JSON lines are read and written here: a line is the wire's JSON form of an attitude. The other
+formats have a module each.
 
 What a user states of a log is used or refused:
 1. Each format of FORMATS declares the statements that its reader uses. Any other is refused by
@@ -75,7 +76,9 @@ TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 
 
 def _read_json_lines(lines: Iterable[str], told: list[tuple[str, str]]) -> Iterator[LogEntry]:
-    """The attitudes of JSON lines; at their end `told` gets a notice of those that say `"valid": false`."""
+    """The attitudes of JSON lines; at their end `told` gets a notice of those that say `"valid":
+    false`.
+    """
     invalid = 0
     for number, line in enumerate(lines, start=1):
         text = line.strip()
@@ -93,7 +96,9 @@ def _read_json_lines(lines: Iterable[str], told: list[tuple[str, str]]) -> Itera
 
 
 def _json_fault(text: str) -> Refusal | None:
-    """What msgspec would not say of a line: an object over several lines, a key twice (it takes the last)."""
+    """What msgspec would not say of a line: an object over several lines, a key twice (it takes the
+    last).
+    """
     if text in ("{", "["):
         return Refusal("format", "a JSON object over several lines; write each on one line (jq -c . FILE)")
     for key in JSON_KEYS:

@@ -45,8 +45,8 @@ def span_line(samples: Sequence[AttitudeSample]) -> str:
 
 
 def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str, str]]:
-    """What to tell of the times of a log whose format states `unit` ("s", "ms", "us" or "ns"): another
-    one by the rates, or an odd step.
+    """What to tell of the times of a log whose format states `unit` ("s", "ms", "us" or "ns"):
+    another one by the rates, or an odd step.
     """
     if len(samples) < 2:
         return []

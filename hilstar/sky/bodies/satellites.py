@@ -307,7 +307,9 @@ def read_table(text: str, file: str) -> dict[int, Row]:
 
 
 def _columns(table: TextTable) -> list[tuple[str, Chosen]]:
-    """The columns by name, the catalogue number's first. Raises InputError for one that is unknown or there twice."""
+    """The columns by name, the catalogue number's first. Raises InputError for one that is unknown
+    or there twice.
+    """
     chosen = [(name, table.chosen(name)) for name in (KEY, *COLUMNS)]
     known = [(name, column) for name, column in chosen if column is not None]
     if not table.columns or chosen[0][1] is None:

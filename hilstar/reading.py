@@ -5,12 +5,14 @@ A pipe would be awaited for ever, a device never ends, and a file of gigabytes i
 
 import codecs
 import io
+import logging
 import os
 import re
 import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -59,6 +61,12 @@ MAGIC = {
     b"\xff\xfe": "text in UTF-16, not UTF-8",
     b"\xfe\xff": "text in UTF-16, not UTF-8",
 }
+UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+# Bytes that no text in Windows-1252 has: control characters other than tabs, line ends and form
+# feeds, and the five bytes that are no character of it.
+NO_TEXT = re.compile("[\x00-\x08\x0b\x0e-\x1f\x7f\x81\x8d\x8f\x90\x9d]")
+
+log = logging.getLogger(__name__)
 
 
 # Where other rooms say what kinds of files they read; asked only where a file is refused.
@@ -159,19 +167,24 @@ def refuse_kind(path: Path, head: bytes, advice: str) -> None:
 
 @contextmanager
 def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[str]]:
-    """The lines of a text (UTF-8), one after another, so that a large file needs no memory; each ends as in the file.
+    """The lines of a text, one after another, so that a large file needs no memory; each ends as in
+    the file.
 
-    Raises InputError as `read_text` does, and for a line of more than MAX_LINE_CHARACTERS.
+    UTF-8, UTF-16 with its mark, and Windows-1252 with a warning: a line that is no UTF-8.
+    Raises InputError as `read_text` does, for what is no text, and for a line of more than
+    MAX_LINE_CHARACTERS.
     """
     with open_regular(path, advice, limit_bytes) as file:
         try:
-            refuse_kind(path, file.read(HEAD_BYTES), advice)
+            head = file.read(HEAD_BYTES)
             file.seek(0)
-            text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+            encoding = "utf-16" if head.startswith(UTF_16_MARKS) else "utf-8-sig"
+            if encoding == "utf-8-sig":
+                refuse_kind(path, head, advice)
+            text = io.TextIOWrapper(file, encoding=encoding, errors="surrogateescape", newline="")
             yield _bounded(path, text, advice)
         except UnicodeDecodeError as error:
-            file.seek(0)
-            raise cannot_read(path, _not_text(file), advice) from error
+            raise cannot_read(path, "it is cut off or damaged: not UTF-16 to its end", advice) from error
         except OSError as error:
             raise cannot_read(path, error, advice) from error
 
@@ -182,7 +195,32 @@ def _bounded(path: Path, text: IO[str], advice: str) -> Iterator[str]:
         number += 1
         if len(line) == MAX_LINE_CHARACTERS and line[-1] not in "\r\n":
             raise InputError(f"{path}:{number}: the line has {MAX_LINE_CHARACTERS} characters or more; {advice}")
+        if not line.isascii():
+            line = _decoded(path, number, line, advice)
         yield line
+
+
+def _decoded(path: Path, number: int, line: str, advice: str) -> str:
+    """A line as it is, or as Windows-1252 where bytes of it are no UTF-8. Raises InputError for
+    bytes of no text.
+    """
+    try:
+        line.encode("utf-8")
+    except UnicodeEncodeError:
+        raw = line.encode("utf-8", "surrogateescape")
+        wrong = NO_TEXT.search(raw.decode("latin-1"))
+        if wrong:
+            byte = ord(wrong[0])
+            raise cannot_read(path, f"it is no text: line {number} has a byte 0x{byte:02x}", advice) from None
+        warn_once(f"{path}: line {number} is not UTF-8, and is read as Windows-1252; save the file as UTF-8")
+        return raw.decode("cp1252")
+    return line
+
+
+@cache
+def warn_once(line: str) -> None:
+    """Log a warning, once in a process: a file is read several times in one command."""
+    log.warning("%s", line)
 
 
 def _not_text(file: IO[bytes]) -> str:

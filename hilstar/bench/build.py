@@ -35,6 +35,7 @@ from hilstar.monitor.primaries import chromatic_primaries, read_primaries
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.quantisers import QUANTISERS, Quantisation
 from hilstar.optics.glass_psf import GlassPsf, NodeSpline
+from hilstar.reading import warn_once
 from hilstar.render.backend import Target, level_cost
 from hilstar.render.numpy_backend import headless_context, open_backend
 from hilstar.rotation import from_radec_roll_deg
@@ -62,6 +63,7 @@ BAND_NM, KNOT_NM = 25.0, 5.0
 TIMED_FIELDS = [from_radec_roll_deg(*place, 0.0) for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))]
 TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])
 SUNLIGHT, V_NM = (0.0, 0.65, 0.70), 545.0  # V, B-V and V-I; the wavelength of V
+V_BAND_NM, V_BAND_POINTS = (470.0, 700.0), 231  # Johnson V
 TIMED_EXACT_S, TIMED_ROUND_S, MAX_TIMED = 0.1, 0.05, 10
 
 
@@ -300,10 +302,18 @@ def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
     given = tracker.quantum_efficiencies.items()
     efficiencies = [load_curve(source, f"[tracker] {key}", folder, QUANTUM_EFFICIENCIES) for key, source in given]
     transmission = glass_transmission(tracker, folder)
+    if not any(_sees_v(curve) for curve in efficiencies):
+        names = ", ".join(tracker.quantum_efficiencies)
+        band = f"{V_BAND_NM[0]:g} to {V_BAND_NM[1]:g} nm"
+        warn_once(f"[tracker] {names}: no light of V ({band}), in which magnitudes are; all light is from their colours")
     return tuple(
         Optics(tracker.aperture_mm, Curve(one.wavelength_nm, one.value * tracker.detector.fill_factor), transmission)
         for one in efficiencies
     )
+
+
+def _sees_v(efficiency: Curve) -> bool:
+    return bool(efficiency(np.linspace(*V_BAND_NM, V_BAND_POINTS)).any())
 
 
 def bench_optics(tracker: Tracker, folder: Path) -> Optics:

@@ -20,10 +20,10 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.csv_tables import finite_numbers, is_valid, read_rows
 from hilstar.errors import InputError
 from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_matrix, to_rotation_vector
 from hilstar.run.record.commanded import read_commanded
+from hilstar.text_tables import finite_numbers, is_valid, read_rows
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA, NS_PER_S
 
 MAX_TABLE_BYTES = 200_000_000

@@ -15,12 +15,12 @@ from hilstar.attitude.wire.serial_link import read_lines
 from hilstar.bench.bench_file import with_key
 from hilstar.bench.config import BenchConfig, Monitor
 from hilstar.charts import BLUE, ORANGE, chart, write_csv
-from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError, shortened
 from hilstar.files import make_directory, write_whole
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.run.record.ledger_records import NO_FRAMES, FrameRecord, config_of, read_head, run_records
 from hilstar.run.sync import beat, exposures_of
+from hilstar.text_tables import read_rows
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_MS, NS_PER_S, NS_PER_US
 
 INT64 = range(-(2**63), 2**63)

@@ -1,6 +1,5 @@
 """Measured patches: reading MEASURED.csv, and the checks that refuse a set of measurements."""
 
-import csv
 import hashlib
 import math
 from collections.abc import Iterator
@@ -13,7 +12,8 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError, shortened
-from hilstar.reading import as_text, read_bytes
+from hilstar.reading import read_bytes
+from hilstar.text_tables import Chosen, TextTable, open_table
 
 PRIMARIES = ("r", "g", "b")
 CHANNELS = ("w", *PRIMARIES)
@@ -115,7 +115,7 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     Raises InputError: file, line, what is wrong.
     """
     raw = read_bytes(path, ADVICE, MAX_BYTES)
-    rows = list(_rows(path, as_text(path, raw, ADVICE)))
+    rows = list(_rows(path))
     if not rows:
         raise InputError(f"{path}: it has no measurement; write code,channel,value rows below the header")
     codes = np.array([row.code for row in rows], dtype=np.intp)
@@ -147,33 +147,34 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     )
 
 
-def _rows(path: Path, text: str) -> Iterator[_Row]:
-    header: list[str] | None = None
-    try:
-        for number, line in enumerate(text.splitlines(), start=1):
-            if not line.strip() or line.lstrip().startswith("#"):
-                continue
-            cells = [cell.strip() for cell in next(csv.reader([line]))]
-            if header is None:
-                header = _header(path, number, cells)
-            elif len(cells) != len(header):
-                raise InputError(f"{path}: line {number}: {len(cells)} cells; write {','.join(header)}")
-            else:
-                yield _row(f"{path}: line {number}", dict(zip(header, cells, strict=True)))
-    except csv.Error as error:
-        raise InputError(f"{path}: not CSV ({error}); write code,channel,value rows") from error
+def _rows(path: Path) -> Iterator[_Row]:
+    with open_table(path, f"write {','.join(NEEDED)}", MAX_BYTES) as table:
+        if not table.columns:
+            return
+        columns = _columns(table)
+        table.warn()
+        for number, cells in table.rows():
+            texts = {name: table.cell(cells, column) for name, column in columns.items()}
+            yield _row(f"{path}: line {number}", texts)
 
 
-def _header(path: Path, number: int, cells: list[str]) -> list[str]:
-    missing = [name for name in NEEDED if name not in cells]
-    unknown = [name for name in cells if name not in COLUMNS and not name.startswith(COMMON)]
-    if missing:
-        raise InputError(f"{path}: line {number}: the column {missing[0]} is missing; the header is code,channel,value")
-    if unknown or len(set(cells)) < len(cells):
-        raise InputError(
-            f"{path}: line {number}: unknown or repeated column in {shortened(','.join(cells))}; known are {', '.join(COLUMNS)}"
-        )
-    return cells
+def _columns(table: TextTable) -> dict[str, Chosen]:
+    """The columns by hilstar's names. Raises InputError for one that is missing, unknown or there
+    twice.
+    """
+    place = f"{table.path}: line {table.header_line}"
+    columns: dict[str, Chosen] = {}
+    shared = [column.name for column in table.columns if column.name.startswith(COMMON)]
+    for name in (*COLUMNS, *shared):
+        chosen = table.chosen(name)
+        if chosen is not None:
+            columns[name] = chosen
+        elif name in NEEDED:
+            raise InputError(f"{place}: the column {name} is missing; the header is code,channel,value")
+    if len(columns) < len(table.columns):
+        known = ", ".join(COLUMNS)
+        raise InputError(f"{place}: unknown or repeated column in {shortened(table.names)}; known are {known}")
+    return columns
 
 
 def _row(place: str, cells: dict[str, str]) -> _Row:

@@ -18,11 +18,12 @@ import numpy as np
 from hilstar import charts
 from hilstar.arrays import FloatArray
 from hilstar.calibrate.geometric.observed import read_exposed, read_image
-from hilstar.csv_tables import finite_numbers, read_rows
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import read_text
+from hilstar.text_tables import finite_numbers, read_rows
 from hilstar.tracker.settings import BOLTZMANN_EV_PER_K, DetectorSettings
+from hilstar.units import ascii_text, plain_unit
 
 MAX_EMVA_BYTES = 1_000_000
 FRAME_ADVICE = "give raw frames as FITS or PNG, 8 to 16 bits of grey"
@@ -34,27 +35,41 @@ ROUNDING_DN2 = 1 / 12
 LINEAR_SHARE = 0.7  # share of saturation: the standard's range for the slope of variance over signal
 
 
+GREEK = {"σ": "sigma", "μ": "mu", "µ": "mu", "η": "eta", "τ": "tau"}
+# Of one quantity in DN and in electrons, both rounded.
+ROUNDED_ALIKE = 0.05
+WAVELENGTH = re.compile(r"(?:lambda=)?(\d+(?:\.\d+)?)nm")
+
+
 class Quantity(NamedTuple):
-    """A quantity of the standard: its names, the key that it gives, and what turns each unit into the key's."""
+    """A quantity of the standard: its names as of `symbol`, the key that it gives, and what turns
+    each unit into the key's.
+
+    With `by_gain` it may be in DN, which the sheet's gain turns into electrons.
+    """
 
     names: tuple[str, ...]
     key: str
     units: dict[str, Callable[[float], float]]
+    by_gain: str = ""
 
 
+GAIN_UNITS: dict[str, Callable[[float], float]] = {"dn/e-": lambda value: 1 / value}
+ELECTRONS: dict[str, Callable[[float], float]] = {"e-": float, "ke-": lambda value: 1000 * value}
+SHARES: dict[str, Callable[[float], float]] = {"%": lambda value: value / 100, "1": float}
 QUANTITIES = (
-    Quantity(("k", "overall system gain"), "gain_e_per_dn", {"dn/e-": lambda value: 1 / value}),
-    Quantity(("1/k", "inverse of overall system gain"), "gain_e_per_dn", {"e-/dn": float}),
-    Quantity(("sigma_d", "temporal dark noise"), "read_noise_e", {"e-": float}),
-    Quantity(("mu_e.sat", "saturation capacity"), "full_well_e", {"e-": float}),
-    Quantity(("dsnu1288", "dsnu"), "dsnu_e", {"e-": float}),
-    Quantity(("prnu1288", "prnu"), "prnu", {"%": lambda value: value / 100, "1": float}),
-    Quantity(("mu_i", "mu_i.mean", "dark current"), "dark_e_per_s", {"e-/s": float}),
-    Quantity(("mu_y.dark", "dark signal"), "offset_dn", {"dn": float}),
-    Quantity(("bits", "bit depth"), "bits", {"bit": round}),
+    Quantity(("k", "overallsystemgain", "systemgain", "conversiongain"), "gain_e_per_dn", GAIN_UNITS),
+    Quantity(("1/k", "inverseofoverallsystemgain"), "gain_e_per_dn", {"e-/dn": float}),
+    Quantity(("sigmad", "sigma.d", "temporaldarknoise", "readnoise"), "read_noise_e", ELECTRONS, "dn"),
+    Quantity(("mue.sat", "muesat", "saturationcapacity", "fullwell"), "full_well_e", ELECTRONS, "dn"),
+    Quantity(("dsnu1288", "dsnu"), "dsnu_e", ELECTRONS, "dn"),
+    Quantity(("prnu1288", "prnu"), "prnu", SHARES),
+    Quantity(("mui", "mui.mean", "darkcurrent"), "dark_e_per_s", {"e-/s": float, "ke-/s": lambda value: 1000 * value}, "dn/s"),
+    Quantity(("muy.dark", "muydark", "darksignal"), "offset_dn", {"dn": float}),
+    Quantity(("bits", "bitdepth"), "bits", {"bit": round, "bits": round}),
     Quantity(("temperature",), "temperature_k", {"k": float, "degc": lambda value: value + ICE_K}),
-    Quantity(("t_d", "doubling temperature"), "doubling_k", {"k": float, "degc": float}),
-    Quantity(("eta", "quantum efficiency"), "eta", {"%": lambda value: value / 100, "1": float}),
+    Quantity(("td", "doublingtemperature"), "doubling_k", {"k": float, "degc": float}),
+    Quantity(("eta", "quantumefficiency", "qe"), "eta", SHARES),
 )
 
 
@@ -86,28 +101,64 @@ class SensorFile:
         return DetectorSettings(**self.keys)
 
 
+def symbol(text: str) -> str:
+    """A quantity's name in small ASCII letters without underscores, braces and blanks: "σ_{d}" is
+    sigmad, "μ_e,sat" mue.sat.
+    """
+    for letter, word in GREEK.items():
+        text = text.replace(letter, word)
+    return re.sub(r"[\s_{}\\$]", "", ascii_text(text)).replace(",", ".").lower()
+
+
+def sheet_unit(text: str) -> str:
+    """A unit of a data sheet: DN for ADU and counts, e- for electrons, degc for °C, nothing by
+    pixel.
+    """
+    plain = plain_unit(text).replace("lambda", "")
+    plain = re.sub(r"[/.*(]?(?:pixel|pix|px)\)?", "", plain).removesuffix("rms").removesuffix("/")
+    plain = re.sub(r"[()]", "", plain)
+    plain = re.sub(r"\b(?:adu|lsb|counts?|digit)\b", "dn", plain)
+    plain = re.sub(r"(?<![a-z])(k?)(?:electrons?|el|e)(?![a-z-])-?", r"\1e-", plain)
+    return {"c": "degc", "": "1", "e-s-1": "e-/s", "e-.s-1": "e-/s"}.get(plain, plain)
+
+
+class Reading(NamedTuple):
+    """A row of a data sheet: its place, its quantity as written, and its value in the key's unit,
+    or in DN.
+    """
+
+    place: str
+    name: str
+    quantity: Quantity
+    value: float
+    in_dn: bool
+
+
 def import_emva(path: Path) -> SensorFile:
-    """The sensor of a table `quantity,value,unit` (CSV, or JSON: a list of objects). Raises InputError."""
-    keys: dict[str, Any] = {}
+    """The sensor of a table `quantity,value,unit` (CSV, or JSON: a list of objects), in the units
+    of the standard.
+
+    What is given in DN counts by the sheet's own gain. Raises InputError, also for a quantity with
+    two values.
+    """
+    readings: list[Reading] = []
     efficiency: list[tuple[float, float]] = []
     unused: list[str] = []
     for place, name, value, unit in _emva_rows(path):
-        plain, _, wavelength = name.lower().partition("@")
-        quantity = next((one for one in QUANTITIES if plain.strip() in one.names), None)
+        plain, _, wavelength = symbol(name).replace("(", "@").rstrip(")").partition("@")
+        quantity = next((known for known in QUANTITIES if plain in known.names), None)
         if quantity is None:
             unused.append(name)
             continue
-        convert = quantity.units.get(unit.lower().replace(" ", ""))
-        if convert is None or (quantity.key == "gain_e_per_dn" and not value > 0):
-            raise InputError(f"{place}: {name} = {value:g} {unit}; write it above 0 in {' or '.join(quantity.units)}")
+        reading = _reading(place, name, quantity, value, unit)
+        match = WAVELENGTH.fullmatch(wavelength)
         if quantity.key != "eta":
-            keys[quantity.key] = convert(value)
-        elif not re.fullmatch(r"\s*\d+(\.\d+)?\s*nm\s*", wavelength):
+            readings.append(reading)
+        elif match is None:
             raise InputError(f"{place}: {name}; write its wavelength, such as eta@530nm")
         else:
-            efficiency.append((float(wavelength.replace("nm", "")), convert(value)))
-    if "gain_e_per_dn" not in keys:
-        raise InputError(f"{path}: has no K; {EMVA_ADVICE}")
+            efficiency.append((float(match[1]), reading.value))
+    keys = _keys(path, readings)
     if "temperature_k" in keys:
         keys["dark_reference_temperature_k"] = keys["temperature_k"]
     if (doubling_k := keys.pop("doubling_k", 0.0)) > 0:
@@ -115,6 +166,42 @@ def import_emva(path: Path) -> SensorFile:
         keys["dark_activation_ev"] = math.log(2) * BOLTZMANN_EV_PER_K * kelvin * (kelvin + doubling_k) / doubling_k
     notes = (f"not used: {', '.join(map(shortened, unused))}",) if unused else ()
     return _checked(path, SensorFile(keys, {}, tuple(sorted(efficiency)), notes))
+
+
+def _reading(place: str, name: str, quantity: Quantity, value: float, unit: str) -> Reading:
+    """A row's value by its unit. Raises InputError for another unit, and for a gain that is not
+    above 0.
+    """
+    plain = sheet_unit(unit)
+    if quantity.by_gain and plain == quantity.by_gain:
+        return Reading(place, name, quantity, value, True)
+    convert = quantity.units.get(plain)
+    if convert is None or (quantity.key == "gain_e_per_dn" and not value > 0):
+        raise InputError(f"{place}: {name} = {value:g} {unit}; write it above 0 in {' or '.join(quantity.units)}")
+    return Reading(place, name, quantity, convert(value), False)
+
+
+def _keys(path: Path, readings: Sequence[Reading]) -> dict[str, Any]:
+    """The keys of a sheet's readings. Raises InputError where there is no gain, and for a quantity
+    with two values.
+    """
+    gains = [reading for reading in readings if reading.quantity.key == "gain_e_per_dn"]
+    if not gains:
+        raise InputError(f"{path}: has no K; {EMVA_ADVICE}")
+    keys: dict[str, Any] = {}
+    first: dict[str, Reading] = {}
+    # What is in electrons comes first: in DN it is rounded more coarsely.
+    for reading in sorted(readings, key=lambda reading: reading.in_dn):
+        key = reading.quantity.key
+        value = reading.value * gains[0].value if reading.in_dn else reading.value
+        if key not in keys:
+            keys[key], first[key] = value, reading
+            continue
+        rounded = ROUNDED_ALIKE if reading.in_dn or reading.quantity is not first[key].quantity else 0.0
+        if abs(value - keys[key]) > rounded * abs(keys[key]):
+            other = f"{first[key].place.rpartition(':')[2]} has {first[key].name} for {keys[key]:g}"
+            raise InputError(f"{reading.place}: {reading.name} makes {key} {value:g}, and line {other}; leave one of them")
+    return {key: keys[key] for key in dict.fromkeys(reading.quantity.key for reading in readings)}
 
 
 def _checked(path: Path, sensor: SensorFile) -> SensorFile:

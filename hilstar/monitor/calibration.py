@@ -3,10 +3,10 @@
 configs/CALIBRATION.md describes the files (TOML and CSV).
 """
 
-import csv
 import datetime
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,6 +21,7 @@ from hilstar.files import write_whole
 from hilstar.monitor import response as responses
 from hilstar.monitor.identity import TABLE, MonitorIdentity
 from hilstar.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes, read_text
+from hilstar.text_tables import Chosen, TextTable, finite_numbers, needed, table_of
 from hilstar.toml_tables import Kind, Table, explained, toml_text
 
 FORMULAS = ("srgb", "gamma2.2")
@@ -338,26 +339,28 @@ def read_toml(path: Path, read: list[bytes] | None = None) -> CalibrationFile:
         raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
 
 
-def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> FloatArray:
+def _table(path: Path, read: list[bytes] | None) -> TextTable:
+    lines = _read(path, read).splitlines(keepends=True)
+    table = table_of(path, ADVICE, iter(lines))
+    table.warn()
+    return table
+
+
+def _numbers(table: TextTable, columns: Sequence[Chosen]) -> FloatArray:
+    """The numbers of a table's columns (rows, columns). Raises InputError with the line of what is
+    none, or is negative.
+    """
     rows = []
-    for number, line in lines:
-        try:
-            row = [float(cell) for cell in next(csv.reader([line]))]
-        except (ValueError, csv.Error) as error:
-            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r} is no row of numbers") from error
-        if len(row) != columns:
-            raise InputError(f"{path}: line {number}: {len(row)} cells; write {columns}")
-        if not all(0 <= cell < 1e30 for cell in row):
-            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r}; write finite numbers that are not negative")
+    names = [table.columns[column.place].header or f"column {column.place + 1}" for column in columns]
+    for line, cells in table.rows():
+        texts = [table.cell(cells, column) for column in columns]
+        row = finite_numbers(table.path, line, names, texts, "write numbers that are not negative")
+        if not 0 <= min(row) <= max(row) < 1e30:
+            raise InputError(f"{table.path}:{line}: {','.join(texts)[:40]!r}; write finite numbers that are not negative")
         rows.append(row)
     if not rows:
-        raise InputError(f"{path}: no row of numbers in it")
+        raise InputError(f"{table.path}: no row of numbers in it")
     return np.array(rows, dtype=np.float64)
-
-
-def _lines(text: str) -> list[tuple[int, str]]:
-    numbered = enumerate(text.splitlines(), start=1)
-    return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
 
 
 def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dict[str, FloatArray]:
@@ -365,11 +368,11 @@ def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dic
 
     Raises InputError for a table without code 0 or white, with equal or falling neighbours, or with blacks that disagree.
     """
-    lines = _lines(_read(path, read))
-    header = tuple(cell.strip() for cell in lines[0][1].split(",")) if lines else ()
+    table = _table(path, read)
+    header = tuple(column.name for column in table.columns)
     if header not in (("code", *GREY), ("code", *PRIMARIES)):
         raise InputError(f"{path}: its header is {','.join(header)[:60]!r}; write code,w or code,r,g,b")
-    rows = _numbers(path, lines[1:], len(header))
+    rows = _numbers(table, [needed(table, name) for name in header])
     code, white = rows[:, 0], 2**bits - 1
     if np.any(code != np.rint(code)) or np.any(np.diff(code) <= 0):
         raise InputError(f"{path}: its codes are not whole numbers that rise; sort the rows, one to a code")
@@ -410,8 +413,10 @@ def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, whit
 
 def read_grid(path: Path, read: list[bytes]) -> FloatArray:
     """A grid of relative light (rows, columns), rows from top to bottom, all positive. Raises InputError."""
-    lines = _lines(_read(path, read))
-    grid = _numbers(path, lines, lines[0][1].count(",") + 1 if lines else 1)
+    table = _table(path, read)
+    if table.header:
+        raise InputError(f"{path}:{table.header_line}: {shortened(table.names)!r} is no row of numbers")
+    grid = _numbers(table, [Chosen(place) for place in range(len(table.columns))])
     if not grid.min() > 0:
         raise InputError(f"{path}: a field of the screen has no light; every value must be more than 0")
     return grid

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.csv_tables import finite_numbers, read_rows
 from hilstar.errors import InputError
 from hilstar.reading import read_text
 from hilstar.sky.electrons import Optics
-from hilstar.sky.spectrum import MAX_CURVE_BYTES, RANGE_NM, Curve, integration_nodes
+from hilstar.sky.spectrum import MAX_CURVE_BYTES, RANGE_NM, Curve, integration_nodes, refuse_other_units
+from hilstar.text_tables import finite_numbers, read_rows
 
 PRIMARIES = ("r", "g", "b")
 COLUMNS = ("wavelength_nm", *PRIMARIES)
@@ -67,6 +67,8 @@ def read_primaries(path: Path) -> tuple[Curve, ...]:
         if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
             raise InputError(f"{path}:{line}: wavelengths do not rise from row to row; sort them, each once")
     table = np.array(rows).reshape(-1, len(COLUMNS)).T
+    if len(rows) > 1:
+        refuse_other_units(path, rows[0][0], rows[-1][0])
     dark = [name for name, power in zip(PRIMARIES, table[1:], strict=True) if not power.any()]
     if dark:
         raise InputError(f"{path}: {len(rows)} rows, and no light of {', '.join(dark)}; {ADVICE}")

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.csv_tables import finite_numbers, read_rows
 from hilstar.errors import InputError
 from hilstar.image_files import ImageSizeError, opened_fits
 from hilstar.optics.psf_file import AXES, FACTS, MAX_FILE_BYTES, Glass, Stack, facts_of, glass_of
 from hilstar.reading import read_bytes
+from hilstar.text_tables import finite_numbers, read_rows
 
 STACK_ADVICE = "give a FITS cube (n, height, width) of odd sides, the chief ray in the middle of each image"
 POINTS_ADVICE = f"write x_px,y_px, and as far as known {', '.join((*AXES[2:], *FACTS))}"

@@ -1,7 +1,5 @@
 """Spectra: black bodies, colour temperatures, passbands and curves over wavelength."""
 
-import csv
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, cannot_read, did_you_mean, shortened
-from hilstar.reading import exists, read_text
-from hilstar.units import LIGHT_M_S
+from hilstar.errors import InputError, did_you_mean, shortened
+from hilstar.reading import exists
+from hilstar.text_tables import Chosen, Column, TextTable, finite_numbers, open_table
+from hilstar.units import LIGHT_M_S, factor
 
 PLANCK_J_S = 6.62607015e-34  # SI 2019, exact
 BOLTZMANN_J_K = 1.380649e-23
@@ -21,6 +20,45 @@ DATA_DIR = Path(__file__).resolve().parent / "data"
 MAX_CURVE_BYTES = 1_000_000
 MIN_CONSTANT = 1e-6  # smallest constant curve: no sensor or lens is below, and products stay within float64
 MAX_CURVE_ROWS = 10_000
+CURVE_COLUMNS = ("wavelength_nm", "value")
+CURVE_ADVICE = "write wavelength_nm,value"
+# What the second column may be called where none is called value.
+VALUE_NAMES = (
+    "qe",
+    "quantum_efficiency",
+    "absolute_qe",
+    "external_qe",
+    "eqe",
+    "efficiency",
+    "eta",
+    "η",
+    "transmission",
+    "transmittance",
+    "transmissivity",
+    "trans",
+    "t",
+    "throughput",
+    "tau",
+    "response",
+    "sensitivity",
+    "extinction",
+    "flux",
+    "f_lambda",
+    "flambda",
+    "radiance",
+    "intensity",
+)
+UNIT_HEADERS = {"nm": "wavelength_nm", "um": "wavelength_um", "angstrom": "wavelength_angstrom"}
+# Where curves of sensors, glasses and skies begin (from, below) and end in each unit. Silicon and
+# InGaAs see 200 to 2600 nm; what begins at 1000 to 2000 and goes on may be nm of the infrared or
+# angstrom of the ultraviolet: its unit has to be stated.
+UNIT_RANGES = (
+    ("um", 0.1, 30.0, 30.0),
+    ("nm", 100.0, 1000.0, 5000.0),
+    ("nm", 1000.0, 2000.0, 2600.0),
+    ("angstrom", 2000.0, 100_000.0, 100_000.0),
+)
+MIN_STATED_NM = 100.0  # no curve lies below as a whole
 RANGE_NM = (1.0, 100_000.0)  # beyond any sensor; each MAX_INTERVAL_NM costs nodes
 QUANTUM_EFFICIENCIES = ("ccd47-20", "kai-4021")
 TRANSMISSIONS = ("n-bk7-10mm",)
@@ -98,27 +136,94 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR, built_in
 
 
 def read_curve_csv(path: Path, highest: float = 1.0) -> Curve:
-    """Read `wavelength_nm,value` rows, values 0 to `highest`; '#' starts a comment. Raises InputError with the line number."""
-    wavelength_nm: list[float] = []
-    value: list[float] = []
-    text = read_text(path, "give a CSV of wavelength_nm,value", MAX_CURVE_BYTES)
-    try:
-        for number, row in enumerate(csv.reader(io.StringIO(text, newline="")), start=1):
-            if not row or row[0].lstrip().startswith("#"):
-                continue
-            if not wavelength_nm and row[0].strip() == "wavelength_nm":
-                continue
-            try:
-                pair = float(row[0]), float(row[1])
-            except (ValueError, IndexError) as error:
-                raise InputError(f"{path}:{number}: {shortened(','.join(row))!r}; write wavelength_nm,value") from error
-            wavelength_nm.append(pair[0])
-            value.append(pair[1])
-    except csv.Error as error:
-        raise cannot_read(path, error, "write a CSV: wavelength_nm,value") from error
-    curve = Curve(np.array(wavelength_nm), np.array(value))
+    """Read a text table of wavelengths and values, values 0 to `highest`: `wavelength_nm,value`, or
+    in units that it states.
+
+    Shares (`highest` 1) may be in percent. Without a header there are two columns, and without a
+    unit of wavelength its range says the unit (`_unit_by_range`). Raises InputError with the line
+    number.
+    """
+    with open_table(path, CURVE_ADVICE, MAX_CURVE_BYTES) as table:
+        if not table.columns:
+            raise InputError(f"{path}: 0 rows; write at least two rows wavelength_nm,value")
+        wavelength, values = _curve_columns(table, highest)
+        table.not_used((wavelength, values))
+        rows = []
+        for line, cells in table.rows():
+            pair = table.cell(cells, wavelength), table.cell(cells, values)
+            rows.append(finite_numbers(path, line, CURVE_COLUMNS, pair, CURVE_ADVICE))
+            if len(rows) > MAX_CURVE_ROWS:
+                raise InputError(f"{path}: more than {MAX_CURVE_ROWS} rows; remove some")
+        numbers = np.array(rows, dtype=np.float64).reshape(-1, 2)
+        if len(rows) > 1:
+            numbers[:, 0] *= _nm_of(table, wavelength, numbers[:, 0])
+        table.warn()
+    curve = Curve(numbers[:, 0].copy(), numbers[:, 1].copy())
     _check_curve(curve, path, highest)
     return curve
+
+
+def _curve_columns(table: TextTable, highest: float) -> tuple[Chosen, Chosen]:
+    """The columns of wavelength and value. Raises InputError where the header does not say which
+    these are.
+    """
+    wavelength = None
+    if table.header:
+        wavelength = table.chosen("wavelength_nm", must_state=False)
+    if wavelength is None and not (table.header and not table.commented):
+        # A comment that names no wavelength is no header.
+        if len(table.columns) != 2:
+            raise table.refusal(table.header_line, f"{len(table.columns)} columns, and no header that says which is which")
+        table.columns = [Column("", "")] * 2
+        return Chosen(0, has_unit=False), Chosen(1)
+    if wavelength is None:
+        raise table.refusal(table.header_line, f"no column wavelength_nm among {table.names}")
+    unit = "1" if highest == 1 else ""
+    values = table.chosen("value", unit, VALUE_NAMES, must_state=False)
+    if values is None:
+        raise table.refusal(table.header_line, f"no column value among {table.names}")
+    return wavelength, values
+
+
+def _nm_of(table: TextTable, wavelength: Chosen, wavelengths: FloatArray) -> float:
+    """By what wavelengths are multiplied to be nm. Raises InputError where their range and their
+    unit disagree.
+    """
+    low, high = float(wavelengths.min()), float(wavelengths.max())
+    unit = _unit_by_range(low, high)
+    span = f"wavelengths from {low:g} to {high:g}"
+    if not wavelength.has_unit:
+        if unit is None:
+            raise InputError(f"{table.path}: {span} without a unit; write it in the header: {', '.join(UNIT_HEADERS.values())}")
+        if unit != "nm":
+            table.notices.append(f"{span} without a unit are taken as {unit}; {UNIT_HEADERS['nm']} says that they are nm")
+        size = factor(unit, "nm")
+        return 1.0 if size is None else float(size)
+    if wavelength.factor is None:
+        refuse_other_units(table.path, low, high)
+    if high < MIN_STATED_NM:
+        stated = table.columns[wavelength.place].header
+        raise InputError(f"{table.path}: {span} nm by its column {stated}, which no tracker sees; check its unit")
+    return 1.0
+
+
+def refuse_other_units(path: Path, low_nm: float, high_nm: float) -> None:
+    """Refuse (InputError) wavelengths stated in nm that lie where only um or angstrom can."""
+    unit = _unit_by_range(low_nm, high_nm)
+    if unit in {"um", "angstrom"}:
+        advice = f"write {UNIT_HEADERS[unit]} in the header, or wavelength_um for the far infrared"
+        span = f"wavelengths from {low_nm:g} to {high_nm:g} nm"
+        raise InputError(f"{path}: {span}, which look like {unit}; {advice}")
+
+
+def _unit_by_range(low: float, high: float) -> str | None:
+    """The unit of wavelengths of a silicon or an infrared sensor by their range; None where two
+    would do.
+    """
+    for unit, first, before, last in UNIT_RANGES:
+        if first <= low < before and high <= last:
+            return unit
+    return None
 
 
 def _check_curve(curve: Curve, path: Path, highest: float) -> None:

@@ -33,18 +33,23 @@ from hilstar.reading import open_regular
 from hilstar.sky import table_reader
 from hilstar.sky.catalog import PACKAGED_CATALOG, RANGES, TYC_REGION, TYCHO, Catalog, column_names, load_catalog, plain_catalog
 from hilstar.sky.stars import cell_grid, unit_vectors_icrs
+from hilstar.units import plain_unit
 
 # Epochs of the places, Julian years, where a table has its catalogue's own names and no epoch.
 EPOCH_OF_PLACES = {"ramdeg": 2000.0, "raicrs": 1991.25, "raj2000": 2000.0, "_raj2000": 2000.0}
 GAIA_DR2_JYEAR, GAIA_DR3_JYEAR = 2015.5, 2016.0
 EPOCHS_JYEAR = (1800.0, 2200.0)
-# Right ascensions within 24 and declinations that span more than this, of so many stars, are hours: no field is so narrow.
-HOURS_SPAN_DEG, HOURS_STARS = 60.0, 100
-# The fastest of a thousand stars moves by some 100 mas a year; no star in the sky moves by 12 arcsec a year.
-SLOWEST_MAS_YR, MOTION_STARS = 12.0, 1000
+# Right ascensions below this may be hours, and below 2 pi radians: without a unit they are refused,
+# whatever the rest says.
+HOURS_A_TURN, RAD_A_TURN = 24.0, 2 * math.pi
+TURNS = {"h": HOURS_A_TURN, "hr": HOURS_A_TURN, "hrs": HOURS_A_TURN, "hou": HOURS_A_TURN, "rad": RAD_A_TURN}
+ROUNDED = 1e-6  # of a turn in radians, as written
+# Half of Hipparcos' stars move by more than 23 mas a year, of its brightest 900 by more than 60. In
+# arcsec a year that is 0.06.
+MIN_MEDIAN_MAS_YR, MOTION_STARS = 1.0, 3
 MAX_AMPLITUDE_MAG = 10.0  # half of the range: chi Cygni has 5
 MAX_STEM = 16  # characters of a file's name in the name of its stars, which has 32 in a truth table
-ADVICE = "give the column its unit in a FITS, ECSV or VOTable, or convert it"
+UNIT_ADVICE = "give the column its unit"
 # Two catalogues' places of one star at a common epoch differ by far less, but for orbits. Hipparcos' photometry has the light
 # from both components of an unresolved pair.
 SAME_ARCSEC = 2.0
@@ -57,7 +62,11 @@ ODD_MAG = 1.0
 OVERLAP_LIMIT_MAG = 0.03  # limit for the median
 FEW_MATCHES, BRIGHT_STARS, BRIGHT_V_MAG = 0.5, 20, 7.0
 RAD_PER_ARCSEC = np.pi / (180 * 3600)
-VERSION = 2  # version of the cached result: count up whenever it changes
+NO_IDENTIFIER = (
+    "no identifier of their own (blank, repeated, or a floating-point number: its 15 digits hold no source_id); all are named"
+    " by their rows"
+)
+VERSION = 3  # version of the cached result: count up whenever it changes
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
 HASH_BYTES = 1 << 22
 MAX_STORED_BYTES = 3_000_000_000
@@ -70,11 +79,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Assembled:
-    """A table's stars, and one line about what became of its rows."""
+    """A table's stars, one line about what became of its rows, and what else is to be said each
+    time.
+    """
 
     catalog: Catalog
     line: str
     dropped: int
+    doubts: tuple[str, ...] = ()
 
 
 def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float | None, compared: bool = False) -> Assembled:
@@ -83,11 +95,10 @@ def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float
     Raises InputError where no row is a star, and where a unit or the epoch has to be stated.
     """
     columns = _Columns(path, table)
+    columns.check_turn()
     ra_deg, dec_deg = columns.places()
     v_mag, bv_mag, vi_mag, words = columns.magnitudes()
     pm = {role: columns.role(role, 0.0) for role in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")}
-    if not any(columns.has_unit(table.layout.role[role]) for role in pm if role in table.layout.role):
-        _check_motions(path, *pm.values())
     figures: dict[str, npt.NDArray[Any]] = {
         "ra_deg": ra_deg,
         "dec_deg": dec_deg,
@@ -99,7 +110,6 @@ def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float
         **columns.variables(),
     }
     designation, identifier = columns.identifiers()
-    _check_hours(path, ra_deg, dec_deg, columns.has_unit(columns.pair[0]))
     reason = _dropped(figures)
     kept = reason == 0
     if not kept.any():
@@ -108,11 +118,20 @@ def assemble(path: Path, table: table_reader.RawTable, stated_epoch_jyear: float
         )
     dated = compared or any((motion[kept] != 0).any() for motion in pm.values())
     epoch, epoch_words = columns.epoch(stated_epoch_jyear, dated, designation)
+    for doubt in (columns.places_doubt(), columns.motions_doubt(pm)):
+        if doubt and not columns.is_gaia:
+            raise InputError(f"{path}: {doubt}")
+        if doubt:
+            columns.notices.append(f"{doubt}; taken as Gaia's archive has it")
+    if _repeats(identifier[kept]):
+        columns.notices.append(f"{_repeats(identifier[kept])} of its stars have {NO_IDENTIFIER}")
+        designation, identifier = columns.row_numbers()
     figures |= {"epoch_jyear": epoch, "identifier": identifier, "hip": _once(columns.hip(), kept, v_mag)}
     catalog = plain_catalog(designation, len(kept), {name: values[kept] for name, values in figures.items()})
     rest = "" if kept.all() else f"; not used: {_reasons(reason)}"
     line = f"{path.name}: {len(catalog)} stars of {len(kept)} rows, {words}; {epoch_words}{rest}"
-    return Assembled(catalog, line, int((~kept).sum()))
+    doubts = tuple(f"{path.name}: {notice}" for notice in columns.notices)
+    return Assembled(catalog, line, int((~kept).sum()), doubts)
 
 
 class TableMagnitudes(NamedTuple):
@@ -130,6 +149,12 @@ class _Columns:
     def __init__(self, path: Path, table: table_reader.RawTable) -> None:
         self.path, self.table, self.layout = path, table, table.layout
         self.pair = self.layout.places[0]
+        self.notices = list(table.notices)
+
+    @property
+    def is_gaia(self) -> bool:
+        """Whether the table has the names of Gaia's archive, which say the units."""
+        return all(name in self.layout.role for name in ("gaia", "g_mag")) and self.pair[0].lower() == "ra"
 
     def has_unit(self, column: str) -> bool:
         return bool((self.table.unit.get(column) or "").strip())
@@ -137,7 +162,54 @@ class _Columns:
     def _in_unit(self, role: str, column: str) -> FloatArray:
         factor = table_reader.factor_to(role, column, self.table.unit.get(column), self.path)
         values = np.asarray(self.table.columns[column], dtype=np.float64)
-        return values if factor == 1.0 else values * factor
+        if factor == 1.0:
+            return values
+        notice = f"column {column} is in {self.table.unit.get(column)}, and is multiplied by {factor:.9g}"
+        if notice not in self.notices:
+            self.notices.append(notice)
+        return values * factor
+
+    def check_turn(self) -> None:
+        """Raises InputError for right ascensions beyond a turn of their unit."""
+        name = self.pair[0]
+        unit = (self.table.unit.get(name) or "").strip()
+        turn = TURNS.get(plain_unit(unit)[:3])
+        largest = float(np.nanmax(self.table.columns[name], initial=0.0))
+        if turn is not None and largest > turn + ROUNDED:
+            raise InputError(
+                f"{self.path}: column {name} is in {unit} and runs to {largest:g}; name it ra_deg if it is in degrees"
+            )
+
+    def places_doubt(self) -> str:
+        """Why places without a unit may be hours or radians, and what to write; "" where they are
+        degrees.
+        """
+        name = self.pair[0]
+        ra, dec = (np.asarray(self.table.columns[column], dtype=np.float64) for column in self.pair)
+        placed = np.isfinite(ra) & np.isfinite(dec)
+        if self.has_unit(name) or not placed.any():
+            return ""
+        low, high, steepest = ra[placed].min(), ra[placed].max(), np.abs(dec[placed]).max()
+        base = f"column {name} has no unit and runs from {low:.6g} to {high:.6g}"
+        names = "ra_deg, ra_hours or ra_rad"
+        if low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
+            return f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or dec_rad"
+        if low >= 0 and high < HOURS_A_TURN:
+            return f"{base}: so it is in hours, or of one field in degrees; {UNIT_ADVICE}: {names}"
+        return ""
+
+    def motions_doubt(self, motions: dict[str, FloatArray]) -> str:
+        """Why proper motions without a unit are too small to be mas a year; "" where they are not."""
+        given = [self.layout.role[role] for role in motions if role in self.layout.role]
+        if not given or any(map(self.has_unit, given)):
+            return ""
+        total = np.hypot(*motions.values())
+        moving = total[total > 0]
+        if len(moving) < MOTION_STARS or np.median(moving) >= MIN_MEDIAN_MAS_YR:
+            return ""
+        median = f"half of its stars move by less than {np.median(moving):.3g}"
+        advice = f"{UNIT_ADVICE}: {given[0]}_arcsec_yr or {given[0]}_mas_yr"
+        return f"column {given[0]} has no unit, and {median}, so they are in arcsec a year; {advice}"
 
     def role(self, role: str, blank: float) -> FloatArray:
         if role not in self.layout.role:
@@ -199,6 +271,10 @@ class _Columns:
         if all(name in role for name in ("tyc1", "tyc2", "tyc3")):
             region, number, part = (np.asarray(columns[role[name]], dtype=np.int64) for name in ("tyc1", "tyc2", "tyc3"))
             return TYCHO, region * TYC_REGION + number * 10 + part
+        return self.row_numbers()
+
+    def row_numbers(self) -> tuple[str, npt.NDArray[np.int64]]:
+        """The designation and the number of each row, from 1."""
         return f"{self.path.stem[:MAX_STEM]} row", np.arange(1, self.table.row_count + 1, dtype=np.int64)
 
     def hip(self) -> npt.NDArray[np.int64]:
@@ -268,22 +344,10 @@ def _once(hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], v_mag: FloatA
     return result
 
 
-def _check_hours(path: Path, ra_deg: FloatArray, dec_deg: FloatArray, has_unit: bool) -> None:
-    placed = np.isfinite(ra_deg) & np.isfinite(dec_deg)
-    if has_unit or placed.sum() < HOURS_STARS:
-        return
-    if ra_deg[placed].max() < 24 and ra_deg[placed].min() >= 0 and np.ptp(dec_deg[placed]) > HOURS_SPAN_DEG:
-        raise InputError(
-            f"{path}: right ascension runs from 0 to 24 over the whole sky, so it is in hours; {ADVICE} to degrees"
-        )
-
-
-def _check_motions(path: Path, *motions: FloatArray) -> None:
-    largest = max(float(np.abs(motion).max(initial=0.0)) for motion in motions)
-    if 0 < largest < SLOWEST_MAS_YR and len(motions[0]) >= MOTION_STARS:
-        raise InputError(
-            f"{path}: no proper motion exceeds {largest:.3g}, so they are in arcsec a year; {ADVICE} to mas a year"
-        )
+def _repeats(identifier: npt.NDArray[np.int64]) -> int:
+    """How many stars have no identifier, or that of another star."""
+    _, place, count = np.unique(identifier, return_inverse=True, return_counts=True)
+    return int(((count[place] > 1) | (identifier == 0)).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -501,7 +565,7 @@ def choose_catalog(choice: TableChoice) -> Catalog:
 
 def _made(path: Path, choice: TableChoice) -> Kept:
     found = assemble(path, table_reader.read_table(path), choice.epoch_jyear, choice.with_hipparcos)
-    doubts = [found.line] if found.dropped else []
+    doubts = [*found.doubts, *([found.line] if found.dropped else [])]
     if not choice.with_hipparcos:
         return Kept(_by_cell(found.catalog, found.line), tuple(doubts))
     joined = join(load_catalog(), found.catalog)
@@ -527,7 +591,8 @@ def table_facts(choice: TableChoice, stars: Catalog, facts: dict[str, npt.NDArra
     )
     if not any(role in columns.layout.role for role in table_reader.ERROR_NAMES):
         return facts
-    identifier = columns.identifiers()[1]
+    by_row = columns.row_numbers()
+    identifier = by_row[1] if stars.designation == by_row[0] else columns.identifiers()[1]
     order = np.argsort(identifier, kind="stable")
     row = order[np.minimum(np.searchsorted(identifier, stars.identifier, sorter=order), len(order) - 1)]
     own = (identifier[row] == stars.identifier) & ~(choice.with_hipparcos & (stars.hip == stars.identifier))

@@ -6,6 +6,7 @@ Tables of stars as files: FITS, VOTable, ECSV and CSV through Astropy, only the 
 """
 
 import io
+import itertools
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,8 +23,10 @@ from numpy.polynomial.polynomial import polyval
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, cannot_read, shortened
 from hilstar.image_files import ImageSizeError, is_fits, unpacked
-from hilstar.reading import HEAD_BYTES, kind_of, open_regular, read_bytes, size_text
+from hilstar.reading import HEAD_BYTES, UTF_16_MARKS, kind_of, open_regular, read_bytes, size_text
 from hilstar.sky.catalog import load_catalog
+from hilstar.text_tables import TextTable, open_table
+from hilstar.units import ascii_text, factor, is_unit, plain_unit, suffix_unit
 
 # BT - VT to V - VT, and to (B - V) - (BT - VT) in the blue and in the red: Mamajek, Meyer and Liebert 2002, AJ 124, 1670,
 # appendix C, with the sign of the erratum (2006, AJ 131, 2360). For -0.25 < BT - VT < 2; beyond, the offsets of the ends.
@@ -102,7 +105,10 @@ COLUMNS_WANTED = (
     "phot_bp_mean_mag and phot_rp_mean_mag"
 )
 MAX_NAMED = 12
-HOURS = ("h", "hr", "hour", "hourangle")
+HOURS = ("h", "hr", "hrs", "hour", "hours", "hourangle")
+IN_RADIANS = ("rarad", "derad")
+SEXAGESIMAL = {"h:m:s": "hourangle", "d:m:s": "deg"}
+MAX_WHOLE_FLOAT = {4: 2.0**24, 8: 2.0**53}  # by a float's bytes: beyond, it holds no identifier
 UNITS = {
     "deg": ("ra_deg", "dec_deg"),
     "mas / yr": ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "sigma_pm_ra_mas_yr", "sigma_pm_dec_mas_yr"),
@@ -113,11 +119,10 @@ FILE_WANTED = "give a table of stars as FITS, ECSV, CSV or VOTable, or the CDS I
 MAX_TABLE_BYTES = 4_000_000_000
 MAX_XML_BYTES = 500_000_000  # a VOTable is parsed as a whole
 MAX_HEAD_BYTES = 1_000_000  # lines before a text's rows
-MAX_COLUMNS, MAX_LINE = 1000, 50_000
 MAX_ROWS = 10_000_000
 CHUNK_BYTES = 64_000_000  # parsed at once
 BLANKS = ("", "null", "NULL", "nan", "NaN", "--", "---")
-DELIMITERS = (",", "\t", "|", ";")
+UNIT_SEPARATOR = "\x1f"
 ELSEWHERE = re.compile(rb"<STREAM\b[^>]*\bhref\s*=", re.IGNORECASE)
 
 
@@ -211,8 +216,13 @@ class Layout:
 
 
 def layout_of(path: Path, names: Sequence[str], roles: Mapping[str, tuple[str, ...]] = NAMES) -> Layout:
-    """Which of a table's columns have the `roles`. Raises InputError where there is no place or no magnitude with a colour."""
-    known = {name.strip().lower(): name for name in reversed(names)}
+    """Which of a table's columns have the `roles`, by their names with or without a unit at the end
+    (`ra_hours`).
+
+    Raises InputError where there is no place or no magnitude with a colour, and for a column that
+    is there twice.
+    """
+    known = _plain_names(names, roles)
     places = tuple((known[ra], known[dec]) for ra, dec in PLACES if ra in known and dec in known)
     role = {role: known[found] for role, words in roles.items() if (found := next((w for w in words if w in known), None))}
     magnitudes = tuple(route.roles for route in ROUTES if all(name in role for name in route.roles))
@@ -222,7 +232,47 @@ def layout_of(path: Path, names: Sequence[str], roles: Mapping[str, tuple[str, .
         raise InputError(f"{path}: has no right ascension and declination among its columns ({found}); name them {pairs}")
     if not magnitudes:
         raise InputError(f"{path}: has no magnitude with a colour among its columns ({found}); {COLUMNS_WANTED}")
-    return Layout(role, places, magnitudes)
+    layout = Layout(role, places, magnitudes)
+    small = [name.strip().lower() for name in names]
+    for name in layout.needed():
+        if small.count(name.strip().lower()) > 1:
+            raise InputError(f"{path}: column {name} is there twice; leave one of them")
+    return layout
+
+
+def _plain_names(names: Sequence[str], roles: Mapping[str, tuple[str, ...]]) -> dict[str, str]:
+    """A table's names by the names that are known: in small letters, without a unit at the end
+    where that one is not known.
+    """
+    known = {name.strip().lower(): name for name in reversed(names)}
+    bases = set(itertools.chain(*PLACES, *roles.values()))
+    for name in names:
+        base, unit = _name_and_unit(name)
+        if unit and base in bases:
+            known.setdefault(base, name)
+    return known
+
+
+def _name_and_unit(name: str) -> tuple[str, str]:
+    """A name in small letters and the unit at its end: "pmRA_arcsec_yr" is pmra and arcsec/yr."""
+    plain = name.strip().lower()
+    for place in (place for place, character in enumerate(plain) if character in "_ " and place):
+        unit = suffix_unit(plain[place + 1 :])
+        if is_unit(unit):
+            return plain[:place], unit
+    return plain, ""
+
+
+def unit_by_name(name: str) -> str | None:
+    """The unit that a column's name says: `ra_hours`, `RArad`, `pm_ra_mas_yr`; None where it says
+    none.
+    """
+    plain, unit = _name_and_unit(name)
+    if unit:
+        return unit
+    if plain in IN_RADIANS:
+        return "rad"
+    return "deg" if plain.endswith("deg") else None
 
 
 def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
@@ -232,8 +282,9 @@ def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
     wanted = UNIT_OF.get(role)
     if unit is None or not unit.strip() or wanted is None:
         return 1.0
-    if role == "ra_deg" and unit.strip().lower() in HOURS:
-        return 15.0
+    by_spelling = factor(unit, wanted)
+    if by_spelling is not None and (plain_unit(unit) not in HOURS or role == "ra_deg"):
+        return float(by_spelling)
     try:
         return float(u.Unit(unit, parse_strict="raise").to(u.Unit(wanted), equivalencies=u.dimensionless_angles()))
     except (ValueError, TypeError, u.UnitConversionError) as error:
@@ -242,12 +293,18 @@ def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RawTable:
-    """The columns of a table by its own names: figures as float64 with NaN where blank, identifiers as int64 with 0."""
+    """The columns of a table by its own names: figures as float64 with NaN where blank, identifiers
+    as int64 with 0.
+
+    `unit` is as the table or the column's name states it; `notices` say what was taken that is not
+    plain.
+    """
 
     layout: Layout
     columns: Mapping[str, FloatArray | npt.NDArray[np.int64]]
     unit: Mapping[str, str | None]
     row_count: int
+    notices: tuple[str, ...] = ()
 
 
 Whole = ("gaia", "tyc1", "tyc2", "tyc3", "hip")
@@ -260,7 +317,7 @@ def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawT
     kind = kind_of(head[:HEAD_BYTES])
     if kind == "a gzip file" and is_fits(packed := read_bytes(path, FILE_WANTED, MAX_TABLE_BYTES)):
         return _read_packed_fits(path, packed, roles)
-    if kind is not None and kind != "a FITS file":
+    if kind is not None and kind != "a FITS file" and not head.startswith(UTF_16_MARKS):
         raise cannot_read(path, f"it is {kind}", "unpack it first" if kind.endswith("zip file") else FILE_WANTED)
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     if kind == "a FITS file":
@@ -310,7 +367,7 @@ def _read_fits(path: Path, source: Path | io.BytesIO, roles: Mapping[str, tuple[
             null = by_name[name].null
             values = np.asarray(table.data[name])
             mask = values == null if null is not None and values.dtype.kind in "iu" else None
-            columns[name], unit[name] = _numbers(path, layout, name, values, mask), by_name[name].unit
+            columns[name], unit[name] = _numbers(path, layout, name, values, mask), by_name[name].unit or unit_by_name(name)
         return RawTable(layout, columns, unit, len(table.data))
 
 
@@ -331,68 +388,127 @@ def _read_votable(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
         for name in layout.needed():
             column = table.array[fields[name].ID if fields[name].ID in (table.array.dtype.names or ()) else name]
             columns[name] = _numbers(path, layout, name, np.asarray(column.data), np.ma.getmaskarray(column))
-            unit[name] = None if fields[name].unit is None else str(fields[name].unit)
+            unit[name] = unit_by_name(name) if fields[name].unit is None else str(fields[name].unit)
         return RawTable(layout, columns, unit, len(table.array))
 
 
 def _read_text(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
-    names, unit, delimiter = _text_head(path)
-    layout = layout_of(path, names, roles)
-    needed = layout.needed()
-    parts: dict[str, list[Any]] = {name: [] for name in needed}
-    count = 0
-    with _quiet(path):
-        for chunk in _chunks(path, needed, delimiter):
-            count += len(chunk)
-            _check_rows(path, count)
-            for name in needed:
-                column = chunk[name]
-                parts[name].append(_numbers(path, layout, name, np.asarray(column), np.ma.getmaskarray(column)))
+    with open_table(path, FILE_WANTED, MAX_TABLE_BYTES) as table:
+        if not table.header or len(table.columns) < 2:
+            raise cannot_read(path, "its first line names no columns", FILE_WANTED)
+        names = [column.name for column in table.columns]
+        by_yaml = _ecsv_units(path)
+        layout = layout_of(path, names, roles)
+        unit: dict[str, str | None] = {}
+        for column in table.columns:
+            unit[column.name] = column.unit or by_yaml.get(column.name) or unit_by_name(column.name)
+        parts: dict[str, list[Any]] = {name: [] for name in layout.needed()}
+        count = 0
+        with _quiet(path):
+            for chunk in _chunks(table, [names.index(name) for name in parts]):
+                count += len(chunk)
+                _check_rows(path, count)
+                for name, pieces in parts.items():
+                    values, mask = _cells(chunk[_numbered(names.index(name))], unit[name])
+                    pieces.append(_numbers(path, layout, name, values, mask))
     if not count:
         raise InputError(f"{path}: has no rows; {FILE_WANTED}")
-    return RawTable(layout, {name: np.concatenate(values) for name, values in parts.items()}, unit, count)
+    columns = {name: np.concatenate(pieces) for name, pieces in parts.items()}
+    plain = {name: "deg" if _turn_of(stated) else stated for name, stated in unit.items()}
+    return RawTable(layout, columns, plain, count, tuple(table.notices))
 
 
-def _chunks(path: Path, needed: list[str], delimiter: str) -> Iterator[Any]:
-    """Pieces of a text's rows as Astropy tables of the columns `needed`."""
-    from astropy.io import ascii as text
-
-    yield from text.read(
-        path,
-        format="tab" if delimiter == "\t" else "csv",
-        **({} if delimiter == "\t" else {"delimiter": delimiter}),
-        comment="#",
-        guess=False,
-        include_names=needed,
-        fill_values=[(blank, "0") for blank in BLANKS],
-        fast_reader={"enable": "force", "chunk_size": CHUNK_BYTES, "chunk_generator": True},
-    )
+def _turn_of(unit: str | None) -> str | None:
+    """The unit of the first figure of sexagesimal places; None for another unit."""
+    return SEXAGESIMAL.get((unit or "").strip('"'))
 
 
-def _text_head(path: Path) -> tuple[list[str], dict[str, str | None], str]:
-    """The columns' names and units, and what stands between them, by the comments and the first line of a text."""
+def _cells(column: Any, unit: str | None) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+    """A column's values and which are blank; sexagesimal ones as degrees."""
+    values, mask = np.asarray(column), np.ma.getmaskarray(column)
+    turn = _turn_of(unit)
+    if turn is not None and values.dtype.kind == "U":
+        values = _degrees(values, mask, turn)
+    return values, mask
+
+
+def _degrees(values: npt.NDArray[Any], mask: npt.NDArray[np.bool_], unit: str) -> FloatArray:
+    """Sexagesimal texts as degrees, 0 where masked."""
+    from astropy.coordinates import Angle
+
+    return np.asarray(Angle(np.where(mask, "0", values), unit=unit).deg)
+
+
+def _ecsv_units(path: Path) -> dict[str, str | None]:
+    """The units of an ECSV's columns by its YAML head; nothing for other texts."""
     with open_regular(path, FILE_WANTED) as file:
         head = file.read(MAX_HEAD_BYTES).decode("utf-8-sig", errors="replace")
-    lines = head.splitlines()
-    comments = [line[1:].strip() for line in lines if line.startswith("#")]
-    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    unit: dict[str, str | None] = {}
-    delimiter = max(DELIMITERS, key=first.count)
-    if comments and comments[0].startswith("%ECSV"):
-        from astropy.table import meta
+    comments = [line[1:].strip() for line in head.splitlines() if line.startswith("#")]
+    if not comments or not comments[0].startswith("%ECSV"):
+        return {}
+    from astropy.table import meta
 
-        with _quiet(path):
-            header = meta.get_header_from_yaml([line for line in comments if not line.startswith("%ECSV")])
-        unit = {column["name"]: column.get("unit") for column in header["datatype"]}
-        delimiter = str(header.get("delimiter", " "))
-    elif not first.count(delimiter):
-        raise cannot_read(path, "its first line names no columns", FILE_WANTED)
-    names = [name.strip().strip('"') for name in first[:MAX_LINE].split(None if delimiter == " " else delimiter)]
-    if len(first) > MAX_LINE or len(names) > MAX_COLUMNS:
-        raise cannot_read(
-            path, f"its first line names more than {MAX_COLUMNS} columns or is longer than {MAX_LINE}", FILE_WANTED
-        )
-    return names, unit, delimiter
+    with _quiet(path):
+        header = meta.get_header_from_yaml([line for line in comments if not line.startswith("%ECSV")])
+    return {column["name"]: column.get("unit") for column in header["datatype"]}
+
+
+def _numbered(place: int) -> str:
+    """A column's name for Astropy, which takes none twice."""
+    return f"column{place}"
+
+
+def _chunks(table: TextTable, places: list[int]) -> Iterator[Any]:
+    """Pieces of a text's rows as Astropy tables of the columns at `places`; its parser reads ASCII
+    alone.
+    """
+    from astropy.io import ascii as text
+
+    # A line that begins or ends with a tab has a blank cell there, and Astropy strips tabs.
+    delimiter = UNIT_SEPARATOR if table.delimiter == "\t" else table.delimiter
+    for number, lines in table.blocks(CHUNK_BYTES):
+        block = _plain_block(table, "".join(lines))
+        if not block.strip():
+            continue
+        options = {
+            "format": "fast_no_header",
+            "delimiter": delimiter,
+            "comment": "#",
+            "guess": False,
+            "names": list(map(_numbered, range(len(table.columns)))),
+            "include_names": list(map(_numbered, places)),
+            "fill_values": [(blank, "0") for blank in BLANKS],
+            "fast_reader": {"enable": "force"},
+        }
+        if not table.quoted:
+            options["quotechar"] = UNIT_SEPARATOR if delimiter != UNIT_SEPARATOR else "\x1e"
+        try:
+            yield text.read(block, **options)
+        except text.InconsistentTableError:
+            yield text.read(_even_block(table, number, lines), **(options | {"delimiter": UNIT_SEPARATOR}))
+
+
+def _plain_block(table: TextTable, block: str) -> str:
+    """A piece of a table in ASCII, with points in its numbers and no tab between its cells."""
+    if not block.isascii():
+        block = ascii_text(block).encode("ascii", "replace").decode()
+    if table.decimal_comma:
+        block = block.replace(",", ".")
+    return block.replace("\t", UNIT_SEPARATOR) if table.delimiter == "\t" else block
+
+
+def _even_block(table: TextTable, number: int, lines: list[str]) -> str:
+    """The rows of a piece without blank cells behind the last column. Raises InputError for the
+    first row of other cells.
+    """
+    rows = []
+    for line, text in enumerate(lines, start=number):
+        if text.strip() and not text.startswith("#"):
+            try:
+                rows.append(UNIT_SEPARATOR.join(table.row_of(line, text)))
+            except InputError as error:
+                raise cannot_read(table.path, str(error).removeprefix(f"{table.path}:"), FILE_WANTED) from error
+    return _plain_block(table, "\n".join(rows) + "\n")
 
 
 def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], mask: Any) -> Any:
@@ -409,13 +525,21 @@ def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], ma
             else f"{path}: has no rows; {FILE_WANTED}"
         )
     if whole:
-        numbers = np.nan_to_num(values, nan=0.0) if values.dtype.kind == "f" else values
-        plain = numbers.astype(np.int64)
+        plain = _whole_numbers(values)
         return plain if mask is None else np.where(mask, 0, plain)
     figures = values.astype(np.float64)
     if mask is not None:
         figures[mask] = np.nan
     return figures
+
+
+def _whole_numbers(values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Identifiers as int64, 0 where a floating-point number is too large to hold each."""
+    if values.dtype.kind != "f":
+        return values.astype(np.int64)
+    numbers = np.nan_to_num(values, nan=0.0)
+    lost = np.abs(numbers) > MAX_WHOLE_FLOAT.get(values.dtype.itemsize, 2.0**53)
+    return np.where(lost, 0.0, numbers).astype(np.int64)
 
 
 def _check_rows(path: Path, count: int) -> None:

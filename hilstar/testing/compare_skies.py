@@ -4,8 +4,6 @@ Stars are found in the golden image and fitted in both (see star_fit). Where rou
 fit, that star's limits are wider.
 """
 
-import csv
-import io
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,14 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, cannot_read
+from hilstar.errors import InputError
 from hilstar.fits_headers import read_fits_image
 from hilstar.frame.truth import TRUTH_DTYPE
 from hilstar.image_files import ImageSizeError, unpacked
-from hilstar.reading import read_bytes, read_text
+from hilstar.reading import read_bytes
 from hilstar.scene.psf import Psf
 from hilstar.testing import star_fit
 from hilstar.testing.sky_comparison import Limits, SkyComparison, StarDifference, common_change
+from hilstar.text_tables import finite_numbers, read_rows
 from hilstar.units import MAG_PER_RELATIVE, magnitude
 
 # Error of float32 in any pixel that a star reaches, relative to its flux. Measured 7e-8 on llvmpipe against float64.
@@ -190,18 +189,14 @@ def read_frame_fits(path: Path) -> FloatArray:
 def read_truth_csv(path: Path) -> star_fit.Truth:
     """The stars of a CSV of `hilstar frame --truth`, TRUTH_DTYPE, only `name` and the columns of TRUTH_COLUMNS filled."""
     wanted = "give the CSV that `hilstar frame --truth OUT.csv` writes"
-    try:
-        rows = list(csv.DictReader(io.StringIO(read_text(path, wanted, MAX_TRUTH_BYTES), newline="")))
-    except csv.Error as error:
-        raise cannot_read(path, error, wanted) from error
+    rows = []
+    names = []
+    # A table of stars alone may have no names.
+    for line, (*cells, name) in read_rows(path, TRUTH_COLUMNS, wanted, MAX_TRUTH_BYTES, ("name",)):
+        rows.append(tuple(finite_numbers(path, line, TRUTH_COLUMNS, cells, wanted)))
+        names.append(name)
     truth = np.zeros(len(rows), dtype=TRUTH_DTYPE)
-    for line, row in enumerate(rows):
-        truth["name"][line] = row.get("name") or ""  # a table of stars alone may have no names
-        for name in TRUTH_COLUMNS:
-            try:
-                truth[name][line] = float(row[name])
-            except (KeyError, TypeError, ValueError, OverflowError) as error:
-                raise InputError(f"{path}:{line + 2}: no number in the column {name}; {wanted}") from error
-    if not all(np.isfinite(truth[name]).all() for name in TRUTH_COLUMNS):
-        raise InputError(f"{path}: a number is NaN or infinite; {wanted}")
+    truth["name"] = names
+    for name, column in zip(TRUTH_COLUMNS, np.array(rows).reshape(-1, len(TRUTH_COLUMNS)).T, strict=True):
+        truth[name] = column
     return truth

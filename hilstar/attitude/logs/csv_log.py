@@ -1,11 +1,16 @@
-"""CSV logs of attitudes: the columns `t_s,qw,qx,qy,qz` in any order and, where known, `rx,ry,rz`
-(rad/s), `sequence` and `discontinuity`.
+"""Attitude logs as CSV.
+
+Columns `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s), `sequence`, `discontinuity`,
+`valid`, in any order and any dialect of a text table; times and rates in the units that their
+columns state (`t_ms`, `rx [deg/s]`). Rows that the file marks as not valid are left out, and so is
+a last line that was cut off, each with a notice.
 """
 
 import contextlib
-import csv
-from collections.abc import Iterable, Iterator, Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 from typing import IO, Literal
 
@@ -16,78 +21,194 @@ from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.attitude.wire.source import HILSTARS
 from hilstar.errors import InputError
-from hilstar.reading import open_lines
+from hilstar.text_tables import CUT, Chosen, TextTable, is_valid, number_fault, open_table, plain_name
 from hilstar.units import NS_PER_S
 
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
 RATE_COLUMNS = ("rx", "ry", "rz")
+RATE_UNIT = "rad/s"
 # A JSON number that msgspec takes as an integer: what one format can hold, all can.
 WHOLE_NUMBERS = range(-(2**63), 2**64)
+INT64_NS = range(-(2**63), 2**63)
+DISCONTINUITY = {"": False, "0": False, "1": True}
+TIME_UNITS = {Decimal("1e-3"): "ms", Decimal("1e-6"): "us", Decimal("1e-9"): "ns"}
+# Columns by which other programs mark rows, in words or numbers of their own.
+MARKS = frozenset(
+    ["status", "quality", "quality_flag", "flag", "flags", "state", "mode", "health", "fix", "tracking"],
+)
+MORE_ADVICE = ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
+UNITS_ADVICE = "t_s is in seconds; name the column t_ms, t_us or t_ns if it is in ms, us or ns"
+JSON_ADVICE = "write JSON lines, on each an object of t_ns and q (jq -c '.[]' FILE)"
+TABLE_KIND, VALID_KIND, CUT_KIND = "log-table", "log-valid", "log-cut"
 
 
 @contextlib.contextmanager
 def read_csv_log(path: Path, stated: Stated) -> Iterator[LogReading]:
     """The reading of a CSV. Raises InputError."""
     scalar = (stated.convention or HILSTARS).scalar
-    try:
-        with open_lines(path, readable(), MAX_LOG_BYTES) as lines:
-            reading = of_packets(path, _read_csv(lines, scalar), "CSV", stated)
-            yield replace(reading, conventions=replace(reading.conventions, time_unit="s"))
-    except csv.Error as error:
-        raise InputError(f"{path}: cannot be read as a log ({error})") from error
+    with open_table(path, readable(), MAX_LOG_BYTES) as table:
+        csv_log = CsvLog(table, scalar)
+        entries = itertools.starmap(LogEntry, csv_log.entries())
+        reading = of_packets(path, entries, "CSV", stated)
+        # The last notices are known when the last row is read.
+        reading.told.extend(csv_log.told)
+        csv_log.told = reading.told
+        conventions = replace(reading.conventions, time_unit=csv_log.time_unit)
+        yield replace(reading, conventions=conventions)
 
 
-def _read_csv(lines: Iterable[str], scalar: Literal["first", "last"]) -> Iterator[LogEntry]:
-    """The attitudes of a CSV, each quaternion as it was sent: with the scalar last, its columns
-    count as x, y, z, w in turn.
+class CsvLog:
+    """A CSV log: its `entries`, once, and in `told` the notices, complete when these are read.
+
+    `time_unit` is that of its time column. With the scalar last, the quaternion's columns count as
+    x, y, z, w in turn.
+    Raises InputError for a header without the columns of an attitude, or with one of them twice.
     """
-    reader = csv.reader(lines)
-    rows = (row for row in reader if row and not row[0].startswith("#"))
-    header = [name.strip() for name in next(rows, [])]
-    if not header:
-        return
-    needed = CSV_COLUMNS + (RATE_COLUMNS if any(name in header for name in RATE_COLUMNS) else ())
-    missing = [name for name in needed if name not in header]
-    if missing:
-        detail = f"column {missing[0]} is missing; the header must have {','.join(needed)}"
-        if missing[0] == "t_s" and "t_ns" in header:
-            detail = f"column t_ns: a CSV has its times in seconds; divide by 1e9, and write {','.join(needed)}"
-        yield LogEntry(f":{reader.line_num}", Refusal("format", detail))
-        return
-    places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
-    numbers: tuple[str, ...] = CSV_COLUMNS[1:]
-    if scalar == "last":  # whatever the columns are called: a table that says so by its names needs no statement
-        numbers = tuple(sorted(numbers, key=lambda name: places[name]))
-    wanted = f"write finite numbers for {','.join(CSV_COLUMNS)}"
-    if len(places) > len(CSV_COLUMNS):
-        wanted += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
-    for row in rows:
+
+    def __init__(self, table: TextTable, scalar: Literal["first", "last"]) -> None:
+        self.table = table
+        self.time_unit = "s"
+        self.told: list[tuple[str, str]] = []
+        if not table.columns:
+            return
+        self._refuse_json()
+        table.advice = f"write finite numbers for {','.join(CSV_COLUMNS)}"
+        has_rates = any(table.chosen(name, RATE_UNIT) for name in RATE_COLUMNS)
+        table.notices.clear()
+        names = CSV_COLUMNS + (RATE_COLUMNS if has_rates else ())
+        self._t, *numbers = [self._needed(name, names) for name in CSV_COLUMNS]
+        # Whatever the columns are called: a table that says so by its names needs no statement.
+        self._q = sorted(numbers) if scalar == "last" else numbers
+        self._rates = [self._needed(name, names) for name in names[len(CSV_COLUMNS) :]]
+        self._sequence = table.chosen("sequence")
+        self._discontinuity = table.chosen("discontinuity")
+        self._valid = table.valid()
+        self.time_unit = TIME_UNITS.get(self._t.factor or Decimal(1), "s")
+        self.told += [(TABLE_KIND, notice) for notice in table.notices]
+        self._tell_marks()
+        if has_rates or self._sequence or self._discontinuity:
+            table.advice += MORE_ADVICE
+
+    def _needed(self, name: str, names: Sequence[str]) -> Chosen:
+        unit = RATE_UNIT if name in RATE_COLUMNS else ""
+        chosen = self.table.chosen(name, unit)
+        if chosen is None:
+            place = f"{self.table.path}:{self.table.header_line}"
+            missing = f"column {name} is missing"
+            if self.table.header:
+                missing += f" (its columns are {self.table.names})"
+            else:
+                missing += ", as no line names the columns"
+            raise InputError(f"{place}: {missing}; the header must have {','.join(names)}")
+        return chosen
+
+    def _tell_marks(self) -> None:
+        marks = [column.header for column in self.table.columns if plain_name(column.name) in MARKS]
+        if marks and self._valid is None:
+            named = ", ".join(marks)
+            rows = f"column {named} is not used: rows of every value of it are shown"
+            self.told.append((TABLE_KIND, f"{rows}; name it valid, 1 or 0"))
+
+    def _refuse_json(self) -> None:
+        if self.table.columns[0].header.startswith(("[", "{")):
+            what = "is a JSON array, or an object over several lines"
+            raise InputError(f"{self.table.path}: {what}; {JSON_ADVICE}")
+
+    def entries(self) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
+        """Each attitude, or why it is refused, with its place in the file (":12"), in its order."""
+        table = self.table
+        if not table.columns:
+            return
+        invalid = 0
+        converted = self._conversions()
+        for line, cells in table.rows(keep_cut=False):
+            if self._valid is not None:
+                flag = table.cell(cells, self._valid)
+                if not is_valid(table.path, line, flag):
+                    invalid += 1
+                    continue
+            if converted:
+                cells = self._converted(cells, converted)
+            yield f":{line}", self._event(cells)
+        if invalid:
+            self.told.append(invalid_notice(invalid, "row"))
+        if table.is_cut:
+            self.told.append((CUT_KIND, CUT))
+
+    def _conversions(self) -> list[Chosen]:
+        """The columns whose cells are not taken as they stand."""
+        columns = [self._t, *self._q, *self._rates]
+        if self.table.decimal_comma:
+            return columns
+        return [column for column in columns if column.factor is not None]
+
+    def _converted(self, cells: list[str], columns: Sequence[Chosen]) -> list[str]:
+        cells = cells.copy()
+        for column in columns:
+            cells[column.place] = self.table.cell(cells, column)
+        return cells
+
+    def _event(self, cells: list[str]) -> AttitudeSample | Refusal:
         try:
-            cells = {name: row[place].strip() for name, place in places.items()}
-            q = tuple(float(cells[name]) for name in numbers)
-            turning = [cells.get(name, "") for name in RATE_COLUMNS]
-            rate = tuple(map(float, turning)) if any(turning) else None
-            sequence = int(cells.get("sequence") or 0)
-            discontinuity = {"": False, "0": False, "1": True}[cells.get("discontinuity", "")]
+            return self._sample(cells)
+        except (ValueError, LookupError, ArithmeticError):
+            pass
+        row = self.table.delimiter.join(cells)
+        if not row.isascii():  # a minus or a blank of typesetters
+            try:
+                return self._sample(self._converted(cells, [self._t, *self._q, *self._rates]))
+            except (ValueError, LookupError, ArithmeticError):
+                pass
+        faults = [number_fault(cells[column.place].strip()) for column in (self._t, *self._q)]
+        fault = next(filter(None, faults), "")
+        quoted = row.strip()[:MAX_QUOTED_CHARACTERS]
+        return Refusal("format", f"{quoted!r}{fault}; {self.table.advice}")
+
+    def _sample(self, cells: list[str]) -> AttitudeSample | Refusal:
+        """The attitude of a row, as sent. Raises ValueError, LookupError or ArithmeticError."""
+        t_ns = ns_of_seconds(cells[self._t.place])
+        w, x, y, z = (cells[column.place] for column in self._q)
+        q = float(w), float(x), float(y), float(z)
+        rate = None
+        if self._rates:
+            turning = [cells[column.place].strip() for column in self._rates]
+            if any(turning):
+                rate = float(turning[0]), float(turning[1]), float(turning[2])
+        sequence, discontinuity = 0, False
+        if self._sequence is not None:
+            sequence = int(cells[self._sequence.place].strip() or 0)
             if sequence not in WHOLE_NUMBERS:
                 raise ValueError
-            event = checked_sample(ns_of_seconds(cells["t_s"]), q, rate, sequence, discontinuity)
-        except (ValueError, LookupError, ArithmeticError):
-            event = Refusal("format", f"{','.join(row)[:MAX_QUOTED_CHARACTERS]!r}; {wanted}")
-        yield LogEntry(f":{reader.line_num}", event)
+        if self._discontinuity is not None:
+            discontinuity = DISCONTINUITY[cells[self._discontinuity.place].strip()]
+        if t_ns not in INT64_NS:
+            text = cells[self._t.place].strip()[:MAX_QUOTED_CHARACTERS]
+            return Refusal("format", f"t_s = {text} s does not fit 64 bits of ns; {UNITS_ADVICE}")
+        return checked_sample(t_ns, q, rate, sequence, discontinuity)
 
 
-def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing) -> None:
-    file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
+def invalid_notice(count: int, what: str) -> tuple[str, str]:
+    """The notice of rows or lines that a log itself marks as not valid."""
+    number = f"1 {what} is" if count == 1 else f"{count} {what}s are"
+    return VALID_KIND, f"{number} marked as not valid by the log itself, and left out"
+
+
+def write_csv_log(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing) -> None:
+    """Write samples as a CSV log with every column, every bit of them."""
+    header = ",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity"))
+    file.write(f"{header}\n".encode())
     for sample in samples:
+        cells = [_seconds_text(sample.t_ns), *map(repr, sample.q_icrs_to_cam.tolist())]
         rate = sample.rate_cam_rad_s
-        numbers = [
-            *map(repr, sample.q_icrs_to_cam.tolist()),
-            *(("", "", "") if rate is None else map(repr, rate.tolist())),
-        ]
-        seconds, ns = divmod(abs(sample.t_ns), NS_PER_S)
-        t_s = f"{'-' if sample.t_ns < 0 else ''}{seconds}.{ns:09}"
-        file.write((",".join((t_s, *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")) + "\n").encode())
+        cells += ["", "", ""] if rate is None else map(repr, rate.tolist())
+        cells += [str(sample.sequence), str(int(sample.discontinuity))]
+        file.write((",".join(cells) + "\n").encode())
+
+
+def _seconds_text(t_ns: int) -> str:
+    seconds, ns = divmod(abs(t_ns), NS_PER_S)
+    sign = "-" if t_ns < 0 else ""
+    return f"{sign}{seconds}.{ns:09}"
 
 
 # What no other format takes is read as CSV.
@@ -97,5 +218,5 @@ log_format = LogFormat(
     listed="CSV",
     uses=LIKE_PACKETS,
     endings=(".csv",),
-    write=_write_csv,
+    write=write_csv_log,
 )

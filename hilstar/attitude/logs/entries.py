@@ -33,6 +33,7 @@ from hilstar.rotation import conjugate, multiply
 from hilstar.units import NS_PER_S
 
 MAX_QUOTED_CHARACTERS = 80
+SORT_ADVICE = "sort the log by time"
 MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, so in 2 GB
 REORDER_NS = NS_PER_S  # queues between a driver and a recorder hold less; a clock that was set back jumps by more
 GAP_INTERVALS = 5  # usual (median) intervals; four packets lost in a row are not a gap
@@ -109,7 +110,7 @@ class LogReading:
 
     entries: Iterable[LogEntry]
     conventions: Conventions
-    advice: str = "sort the log by time"
+    advice: str = SORT_ADVICE
     told: list[tuple[str, str]] = field(default_factory=list)
 
 

@@ -19,6 +19,7 @@ from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
 from hilstar.attitude.logs.entries import (
     MAX_SAMPLES,
+    SORT_ADVICE,
     AttitudeLog,
     LogJoins,
     LogReading,
@@ -93,8 +94,8 @@ def _samples(
             unset += 1
             continue
         if samples and event.t_ns <= samples[-1].t_ns:
-            times = f"t_ns {event.t_ns} after {samples[-1].t_ns}"
-            raise InputError(f"{path}{where}: time does not increase ({times}); {reading.advice}")
+            fault = _order_fault(event.t_ns, samples[-1].t_ns, reading.advice)
+            raise InputError(f"{path}{where}: {fault}")
         samples.append(mounting.sample(event) if reading.conventions.of_body else event)
         if len(samples) > MAX_SAMPLES:
             detail = f"more than {MAX_SAMPLES} attitudes; split the log into several"
@@ -104,6 +105,13 @@ def _samples(
     if not samples:
         raise InputError(f"{path}: {NO_ATTITUDE}")
     return samples, unset
+
+
+def _order_fault(t_ns: int, before_ns: int, advice: str) -> str:
+    times = f"time does not increase (t_ns {t_ns} after {before_ns})"
+    if t_ns == before_ns and advice == SORT_ADVICE:
+        return f"{times}: two attitudes have one time; write more of its digits"
+    return f"{times}; {advice}"
 
 
 def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None = None) -> None:

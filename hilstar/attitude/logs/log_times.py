@@ -48,8 +48,8 @@ def span_line(samples: Sequence[AttitudeSample]) -> str:
 
 
 def time_notices(samples: Sequence[AttitudeSample], unit: str) -> list[tuple[str, str]]:
-    """What to tell of the times of a log whose format states `unit` ("s" or "ns"): another one by
-    the rates, or an odd step.
+    """What to tell of the times of a log whose format states `unit` ("s", "ms", "us" or "ns"):
+    another one by the rates, or an odd step.
     """
     if len(samples) < 2:
         return []
@@ -68,8 +68,7 @@ def _named(samples: Sequence[AttitudeSample], unit: str, step_s: float) -> str:
     say nothing.
     """
     ratio = _too_far(samples[: LOOKED_AT + 1])
-    units = SECONDS if unit == "s" else OF_NS
-    for name, factor in units.items():
+    for name, factor in _other_units(unit).items():
         if not abs(ratio * factor - 1) <= MAX_OFF:  # NaN too
             continue
         line = f"the times are in {name}"
@@ -79,6 +78,15 @@ def _named(samples: Sequence[AttitudeSample], unit: str, step_s: float) -> str:
         other = f"the rates are in {rates}"
         return f"{line}, or {other}" if MIN_STEP_S <= step_s * factor <= MAX_STEP_S else other
     return ""
+
+
+def _other_units(unit: str) -> dict[str, float]:
+    """How many of a stated unit the units are that people write instead."""
+    if unit == "ns":
+        return OF_NS
+    units = {"s": 1.0} | SECONDS
+    stated = units.pop(unit)
+    return {name: seconds / stated for name, seconds in units.items()}
 
 
 def _too_far(samples: Sequence[AttitudeSample]) -> float:

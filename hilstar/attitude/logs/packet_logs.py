@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from msgspec import structs
 
-from hilstar.attitude.logs.entries import OPTIONS, LogEntry, LogReading, Stated
+from hilstar.attitude.logs.entries import OPTIONS, SORT_ADVICE, LogEntry, LogReading, Stated
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import (
     HILSTARS,
@@ -36,7 +36,7 @@ def of_packets(
     entries: Iterator[LogEntry],
     source: str,
     stated: Stated,
-    advice: str = "sort the log by time",
+    advice: str = SORT_ADVICE,
 ) -> LogReading:
     """The reading of entries that have the numbers of a packet, as they were sent: their
     convention, then their reference.

@@ -12,9 +12,9 @@ from hilstar.attitude.logs.log_file import read_log
 from hilstar.attitude.logs.log_formats import format_of
 from hilstar.attitude.logs.log_times import ns_of_seconds
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.csv_tables import finite_numbers, is_valid, read_rows
 from hilstar.errors import InputError, shortened
 from hilstar.rotation import normalise
+from hilstar.text_tables import finite_numbers, is_valid, read_rows
 from hilstar.units import NS_PER_S
 
 COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
@@ -60,7 +60,7 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
     q: list[list[float]] = []
     valid: list[bool] = []
     line: list[int] = []
-    for number, cells in read_rows(path, COLUMNS, ADVICE, MAX_BYTES):
+    for number, cells in read_rows(path, COLUMNS, ADVICE, MAX_BYTES, keep_cut=False):
         t_ns.append(_time(path, number, cells[0]))
         if rising and len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
             said = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"

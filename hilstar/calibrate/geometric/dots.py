@@ -16,9 +16,9 @@ from hilstar.arrays import BoolArray, FloatArray
 from hilstar.bench.config import Monitor
 from hilstar.calibrate.geometric.observed import dot_centroids
 from hilstar.charts import write_csv
-from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError
 from hilstar.scene.camera import Camera
+from hilstar.text_tables import read_rows
 
 LIT_SHARE = 0.4  # share of the frames that a dot is lit in
 MIN_LIT, MAX_LIT = 3, 10  # frames that a dot is lit in

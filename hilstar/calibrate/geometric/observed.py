@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.csv_tables import read_rows
 from hilstar.errors import InputError
 from hilstar.fits_headers import FitsImage, read_fits_image
 from hilstar.image_files import ImageSizeError, is_fits, opened_picture
 from hilstar.reading import read_bytes
+from hilstar.text_tables import read_rows
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 MAX_OBSERVED_BYTES = 100_000_000

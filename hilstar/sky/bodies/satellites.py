@@ -16,12 +16,12 @@ of the list at a time, and between them places follow the cubic through both pla
 over three days. A cubic of exact velocities would be within 5 mm; SGP4's own are not quite the slopes of its places.
 """
 
-import csv
 import importlib.util
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +31,7 @@ from hilstar.errors import InputError, MachineError, printable, shortened
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD
 from hilstar.sky.bodies.omm import is_omm, read_omm
 from hilstar.sky.bodies.orbit import TURN_NS, icrs_from_teme
+from hilstar.text_tables import Chosen, TextTable, table_of
 from hilstar.units import NS_PER_S, flux_ratio
 
 if TYPE_CHECKING:
@@ -302,34 +303,32 @@ def _stretched(vectors_km: FloatArray) -> FloatArray:
 
 def read_table(text: str, file: str) -> dict[int, Row]:
     """The rows of a table by catalogue number, each with the columns that are filled. Raises InputError with the line."""
-    lines = _lines(text, file)
-    at, header = next(lines, (1, []))
-    names = [name.lower() for name in header]
-    unknown = [name for name in names if name != KEY and name not in COLUMNS]
-    if KEY not in names or unknown or len(set(names)) < len(names):
-        wrong = f"no column {shortened(unknown[0])!r} is known" if unknown else f"no header with {KEY} and each column once"
-        raise InputError(f"{file}:{at}: {wrong}; {TABLE_FORM}")
     rows: dict[int, Row] = {}
-    for at, cells in lines:
-        where = f"{file}:{at}"
-        if len(cells) > len(names):
-            raise InputError(f"{where}: {len(cells)} values for {len(names)} columns; {TABLE_FORM}")
-        row = dict(zip(names, cells, strict=False))
-        number = _number(row.pop(KEY, ""), where)
+    table = table_of(Path(file), TABLE_FORM, iter(text.splitlines(keepends=True)))
+    (_, key), *columns = _columns(table)
+    table.warn()
+    for line, cells in table.rows():
+        where = f"{file}:{line}"
+        number = _number(table.cell(cells, key), where)
         if number in rows:
             raise InputError(f"{where}: satellite {number} is there twice; leave one row")
-        rows[number] = _values(row, where)
+        rows[number] = _values({name: table.cell(cells, column) for name, column in columns}, where)
     return rows
 
 
-def _lines(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
-    """Each line's number and cells, without empty ones and comments."""
-    for at, line in enumerate(text.splitlines(), start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            try:
-                yield at, [cell.strip() for cell in next(csv.reader([line], strict=True))]
-            except csv.Error as error:
-                raise InputError(f"{file}:{at}: {error}; {TABLE_FORM}") from error
+def _columns(table: TextTable) -> list[tuple[str, Chosen]]:
+    """The columns by name, the catalogue number's first. Raises InputError for one that is unknown
+    or there twice.
+    """
+    chosen = [(name, table.chosen(name)) for name in (KEY, *COLUMNS)]
+    known = [(name, column) for name, column in chosen if column is not None]
+    if not table.columns or chosen[0][1] is None:
+        raise table.refusal(table.header_line, f"no header with {KEY} and each column once")
+    places = {column.place for _, column in known}
+    unknown = [column.header for place, column in enumerate(table.columns) if place not in places]
+    if unknown:
+        raise table.refusal(table.header_line, f"no column {shortened(unknown[0])!r} is known")
+    return known
 
 
 def _number(text: str, where: str) -> int:

@@ -138,7 +138,7 @@ def test_what_is_no_file_or_too_large_is_refused_wherever_a_file_is_named(tmp_pa
         (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
         (b"SIMPLE  =                    T", "a FITS file"),
         (b"\x80\x04\x95" + bytes(64), "a pickle"),
-        (b"t_s,qw,qx,qy,qz\n1,1,0,0,0\n\xff", "not UTF-8: byte 26 is 0xff"),
+        (b"t_s,qw,qx,qy,qz\n1,1,0,0,0\n\xff\x81", "it is no text: line 3 has a byte 0x81"),
         (bytes(64), "column t_s is missing"),
     ],
 )
@@ -185,7 +185,7 @@ def test_whole_numbers_of_any_length_are_refused_by_name(digits):
 def test_a_curve_that_no_sensor_has_is_refused(rows):
     Path("qe.csv").write_text(rows)
     Path("bench.toml").write_text(BENCH.replace('"ccd47-20"', '"qe.csv"'))
-    assert "qe.csv: " in refusal(*FRAME)
+    assert "qe.csv:" in refusal(*FRAME)
 
 
 def test_a_key_of_thousands_of_parts_takes_no_minutes():

@@ -296,8 +296,8 @@ def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):
         ("", "has no measurement"),
         ("code,value\n", "the column channel is missing"),
         ("code,channel,value,colour\n", "unknown or repeated column"),
-        ("code,code,channel,value\n", "unknown or repeated column"),
-        ("code,channel,value\n1,w\n", "line 2: 2 cells"),
+        ("code,code,channel,value\n", "column code is there twice"),
+        ("code,channel,value\n1,w\n", ":2: 2 cells"),
         ("code,channel,value\n1,w,\n", "line 2: value is empty"),
         ("code,channel,value\n# so\n1.5,w,2\n", "line 3: code = 1.5"),
         ("code,channel,value\n-1,w,2\n", "code = -1"),
@@ -327,6 +327,6 @@ def test_bits_are_those_of_the_largest_code_unless_given(tmp_path):
 def test_other_files_are_refused(tmp_path):
     assert "cannot be read" in refused(tmp_path / "none.csv")
     (tmp_path / "m.csv").write_bytes(b"\xff\xfe\x00")
-    assert "UTF-8" in refused(tmp_path / "m.csv")
+    assert "not UTF-16 to its end" in refused(tmp_path / "m.csv")
     (tmp_path / "monitor.csv").write_text("\ufeffcode,channel,value\n" + "".join(f"{c},w,{v}\n" for c, _, v in ramp(STEPS)))
     assert "written over" in refused(tmp_path / "monitor.csv")  # and a byte-order mark is no fault

@@ -212,3 +212,39 @@ def test_the_command_takes_its_darks_up_to_the_next_option(tmp_path, monkeypatch
         assert result.returncode == 2
         assert words in result.stderr
         assert not Path("other.toml").exists()
+
+
+SPELLED = {
+    "K,0.25,DN/e⁻\nσ_d,2.5,e⁻\nμ_e.sat,10.5,ke-\nη@530nm,62,%": {"gain_e_per_dn": 4, "read_noise_e": 2.5, "full_well_e": 10500},
+    "K,0.25,ADU/e-\nσ_{d},0.65,ADU\nDSNU_1288,0.2,counts": {"gain_e_per_dn": 4, "read_noise_e": 2.6, "dsnu_e": 0.8},
+    "sigma_d,0.65,DN\nsigma_d,2.6,e-\nK,0.25,DN/e-": {"gain_e_per_dn": 4, "read_noise_e": 2.6},
+    "K,0.25,DN/e−\nµ_I,3,e-/pixel/s\nTemperature,−10,°C": {"gain_e_per_dn": 4, "dark_e_per_s": 3, "temperature_k": 263.15},
+    "K,0.25,LSB/electron\nmu_I.mean,0.5,DN/s\nmu_I.mean,2,e-/(pixel s)": {"gain_e_per_dn": 4, "dark_e_per_s": 2},
+    "K,0.25,DN/e-\nK,0.25,DN/e-\n1/K,4.02,e-/DN": {"gain_e_per_dn": 4},
+}
+
+
+@pytest.mark.parametrize("rows", SPELLED)
+def test_symbols_and_units_of_a_sheet_are_read_as_people_spell_them(tmp_path, rows):
+    (tmp_path / "sheet.csv").write_text(f"quantity,value,unit\n{rows}\n")
+    sensor = import_emva(tmp_path / "sheet.csv")
+    keys = {key: value for key, value in sensor.keys.items() if key != "dark_reference_temperature_k"}
+    assert keys == pytest.approx(SPELLED[rows])
+    assert sensor.notes == ()
+    assert [nm for nm, _ in sensor.efficiency] == ([530] if "530" in rows else [])
+
+
+TWO_VALUES = {
+    "K,0.25,DN/e-\nK,0.5,DN/e-\nsigma_d,2.5,e-": ":3: K makes gain_e_per_dn 2, and line 2 has K for 4; leave one of them",
+    "K,0.25,DN/e-\n1/K,5,e-/DN": ":3: 1/K makes gain_e_per_dn 5, and line 2 has K for 4",
+    "K,0.25,DN/e-\nsigma_d,2.5,e-\nσ_d,2.6,e⁻": ":4: σ_d makes read_noise_e 2.6, and line 3 has sigma_d for 2.5",
+    "sigma_d,1.2,DN\nsigma_d,2.5,e-\nK,0.25,DN/e-": ":2: sigma_d makes read_noise_e 4.8, and line 3 has sigma_d for 2.5",
+}
+
+
+@pytest.mark.parametrize("rows", TWO_VALUES)
+def test_a_quantity_with_two_values_is_refused(tmp_path, rows):
+    (tmp_path / "sheet.csv").write_text(f"quantity,value,unit\n{rows}\n")
+    with pytest.raises(InputError) as refusal:
+        import_emva(tmp_path / "sheet.csv")
+    assert TWO_VALUES[rows] in str(refusal.value)

@@ -125,3 +125,13 @@ def test_the_budget_of_a_bench_has_the_matrix_and_its_condition_number(tmp_path)
     printed = run_hilstar_here("budget", bench).stdout
     assert f"condition number      {wanted.condition:.2f}, electrons of each channel" in printed
     assert f"quantum_efficiency_g  r {wanted.e_per_s[1, 0]:.4g} e-/s, g {wanted.e_per_s[1, 1]:.4g} e-/s" in printed
+
+
+@pytest.mark.parametrize(("first", "unit"), [(3800, "angstrom"), (0.38, "um")])
+def test_primaries_in_another_unit_than_their_header_states_are_refused(tmp_path, first, unit):
+    rows = "".join(f"{first * factor},1,2,3\n" for factor in (1, 1.5, 2))
+    (tmp_path / "primaries.csv").write_text(f"wavelength_nm,r,g,b\n{rows}")
+    with pytest.raises(InputError, match=f"which look like {unit}|not in nm"):
+        read_primaries(tmp_path / "primaries.csv")
+    (tmp_path / "primaries.csv").write_text(f"wavelength_{unit},r,g,b\n{rows}")
+    assert read_primaries(tmp_path / "primaries.csv")[0].wavelength_nm[2] == pytest.approx(380)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilstar.attitude.logs.log_file import open_log
+from hilstar.attitude.logs.log_file import open_log, read_log
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import run_hilstar_here
 from tests.support.sources.aem_messages import kvn
@@ -115,9 +115,10 @@ def test_a_replay_says_how_long_its_log_is(tmp_path):
     assert "which is" not in result.stderr
 
 
-def test_a_csv_with_t_ns_is_refused_with_what_to_write(tmp_path):
+def test_a_csv_with_t_ns_is_read_in_ns_and_says_so(tmp_path):
     path = tmp_path / "a.csv"
-    path.write_text("t_ns,qw,qx,qy,qz\n0,1,0,0,0\n")
+    path.write_text("t_ns,qw,qx,qy,qz\n0,1,0,0,0\n1763800000123456789,1,0,0,0\n")
     result = run_hilstar_here("attitude", path)
-    assert result.returncode == 2
-    assert "column t_ns: a CSV has its times in seconds; divide by 1e9, and write t_s,qw,qx,qy,qz" in result.stderr
+    assert result.returncode == 0
+    assert "column t_ns is in ns: its numbers are multiplied by 1e-9, to be in s" in result.stderr
+    assert [sample.t_ns for sample in read_log(path)] == [0, 1763800000123456789]

@@ -196,7 +196,8 @@ def test_json_lines_may_begin_with_blank_lines(tmp_path):
         ('{"t_ns":1}\n', ":1:", "q"),
         ("CCSDS_OEM_VERS = 2.0\n", "", "CCSDS_AEM_VERS is read"),
         ("\n" * 5000 + "x\n", "", "t_s is missing"),
-        ("\xff\xfe", "", "cannot be read"),
+        ("\xff\xfe", "", "contains no attitude"),  # UTF-16 of nothing
+        ("\x00\xff\xfe", "", "it is no text: line 1 has a byte 0x00"),
     ],
 )
 def test_a_log_that_is_wrong_is_refused_with_its_line(tmp_path, text, line, word):

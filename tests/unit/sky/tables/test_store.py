@@ -13,7 +13,7 @@ from hilstar.sky.catalog import column_names
 from hilstar.sky.star_table import KEPT_FILES, TableChoice, choose_catalog
 from tests.support.waiting import PATIENCE_S
 
-TEXT = "ra,dec,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
+TEXT = "ra_deg,dec_deg,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from tests.support.skies import STATION_TLE
 
 def test_each_satellite_has_its_row_and_others_the_default():
     found = read_satellites(STATION_TLE + element_set(7, (0.0, 0.0, 0.0, 0.0), 0.0, 1.0027), "f", 0)
-    text = "# seen\nNORAD, standard_mag,period_s,amplitude_mag,size_m\r\n25544,-1.8,,,109\n\n00099,3,1,2\n"
+    text = "# seen\nNORAD, standard_mag,period_s,amplitude_mag,size_m\r\n25544,-1.8,,,109\n\n00099,3,1,2,\n"
     light = brightness_of(found, read_table(text, "table.csv"), 6.0, 1000.0)
     assert np.allclose(light.standard_e_per_s, 1000.0 * 10 ** (-0.4 * np.array([-1.8, 6.0])), rtol=1e-12)
     assert light.size_m.tolist() == [109.0, 0.0]
@@ -24,14 +24,15 @@ def test_each_satellite_has_its_row_and_others_the_default():
     ("text", "said"),
     [
         ("", r"table\.csv:1: no header with norad"),
-        ("25544,-1.8\n", r"table\.csv:1: no column '25544' is known"),
+        ("25544,-1.8\n", r"table\.csv:1: no header with norad and each column once"),
         ("norad,mag\n", r"no column 'mag' is known"),
-        ("norad,norad\n", r"each column once"),
+        ("norad,norad\n", r"column norad is there twice"),
+        ("norad,size_m\n5\n", r":2: 1 cells and 2 columns"),
         ("norad\nISS\n", r"table\.csv:2: norad = 'ISS'; write a catalogue number"),
         ("norad\n\n5\n5\n", r"table\.csv:4: satellite 5 is there twice"),
         ("norad,standard_mag\n5,bright\n", r"table\.csv:2: standard_mag = 'bright'"),
         ("norad,standard_mag\n5,nan\n", r"standard_mag = 'nan'"),
-        ("norad,standard_mag\n5,1,2\n", r"3 values for 2 columns"),
+        ("norad,standard_mag\n5,1,2\n", r":2: 3 cells and 2 columns"),
         ("norad,period_s\n5,3\n", r"a period_s and an amplitude_mag"),
         ("norad,period_s,amplitude_mag\n5,0,1\n", r"period_s = '0'"),
         ("norad,period_s,amplitude_mag,flash_s\n5,1,2,0.6\n", r"flash_s is over half of period_s"),
